@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+#include <stdint.h>
+
+#include "core/scan_plan.h"
+#include "core/scanner.h"
+
+// The whole hardware contract: what a board has to offer. board_avr.cpp implements it for the Uno and
+// the Mega 2560, firmware/test/fake_board.h for the unit tests. Nothing here blocks.
+namespace ohmskin {
+namespace board {
+
+// ---- what it is
+extern const frames::Board KIND;
+extern const uint32_t CLOCK_HZ;
+extern const uint32_t REF_TOP_OHM;
+extern const uint32_t REF_BOTTOM_OHM;
+
+// Pins, converter, serial line at the default speed, clock and watchdog.
+void begin();
+// Bits of frames::ResetCause.
+uint8_t reset_cause();
+// To be called at least every 200 ms, or the board restarts.
+void feed_watchdog();
+// Microseconds since begin(); wraps. To be called at least every millisecond to keep count.
+uint32_t now_us();
+// Tells an observer whether a pass of the main loop found something to do; costs one instruction.
+void mark_pass(bool worked);
+
+// ---- scan
+// The board's slot interrupt calls scanner.step() once a slot (see core/scanner.h) from
+// start_slots() to stop_slots(), and puts pins and multiplexers where it says.
+extern Scanner scanner;
+void start_slots(const ScanPlan &plan, uint8_t adc_prescaler);
+void stop_slots();
+
+// ---- serial line, polled
+bool serial_speed_known(uint32_t baud);
+void serial_speed(uint32_t baud);
+bool serial_can_write();
+void serial_write(uint8_t octet);
+bool serial_idle();  // everything written has left
+enum class Received : uint8_t { Nothing, Byte, Damaged };
+Received serial_read(uint8_t *octet);
+
+// ---- EEPROM
+uint8_t eeprom_read(uint16_t address);
+bool eeprom_busy();
+void eeprom_write(uint16_t address, uint8_t octet);  // not while busy; takes milliseconds
+
+}  // namespace board
+}  // namespace ohmskin

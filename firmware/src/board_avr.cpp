@@ -1,0 +1,249 @@
+// SPDX-License-Identifier: Apache-2.0
+// The board contract on an ATmega328P (Uno) and an ATmega2560 (Mega), with registers alone: the
+// Arduino core's Serial, millis() and delay() would each bring an interrupt that makes the slot
+// interrupt late. It is the only interrupt there is.
+#include <avr/eeprom.h>
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <avr/wdt.h>
+
+#include "board.h"
+
+namespace ohmskin {
+namespace board {
+
+// ------------------------------------------------------------- wiring: the one table that says it
+// Sense nodes: top on A0, bottom on A1.
+const uint32_t CLOCK_HZ = F_CPU;
+const uint32_t REF_TOP_OHM = 30000;
+const uint32_t REF_BOTTOM_OHM = 30000;
+
+namespace {
+constexpr uint8_t CHANNEL_TOP = 0;
+constexpr uint8_t CHANNEL_BOTTOM = 1;
+}  // namespace
+
+#if defined(__AVR_ATmega328P__)
+const frames::Board KIND = frames::Board::Uno;
+namespace {
+// Row address D4-D7 (PD4-7), drive top D2 (PD2), drive bottom D3 (PD3), column address D8-D11
+// (PB0-3). PD0 is the serial line's RX: its pull-up stays on.
+constexpr uint8_t DRIVE_TOP = _BV(PD2);
+constexpr uint8_t DRIVE_BOTTOM = _BV(PD3);
+constexpr uint8_t RX_PULL_UP = _BV(PD0);
+inline void pins_begin() {
+    PORTD = RX_PULL_UP;
+    PORTB = 0;
+    DDRD = 0xF0 | DRIVE_TOP | DRIVE_BOTTOM;
+    DDRB = 0x0F;
+}
+inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
+    PORTD = static_cast<uint8_t>(row << 4 | drive | RX_PULL_UP);
+    PORTB = column;
+}
+}  // namespace
+#elif defined(__AVR_ATmega2560__)
+const frames::Board KIND = frames::Board::Megaatmega2560;
+namespace {
+// Row address D22-D25 (PA0-3), column address D37-D34 (PC0-3), drive top D49 (PL0), drive bottom D48
+// (PL1).
+constexpr uint8_t DRIVE_TOP = _BV(PL0);
+constexpr uint8_t DRIVE_BOTTOM = _BV(PL1);
+inline void pins_begin() {
+    PORTA = PORTC = PORTL = 0;
+    DDRA = DDRC = 0x0F;
+    DDRL = DRIVE_TOP | DRIVE_BOTTOM;
+    PORTE = _BV(PE0);  // pull-up of the serial line's RX
+}
+inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
+    PORTA = row;
+    PORTC = column;
+    PORTL = drive;
+}
+}  // namespace
+#else
+#error "no pin table for this chip"
+#endif
+
+// ----------------------------------------------------------------------------------- slots
+Scanner scanner;
+
+namespace {
+
+// CONFIGURATIONS as register values.
+struct Registers {
+    uint8_t drive;
+    uint8_t admux;
+};
+constexpr Registers registers_of(Configuration c) {
+    return Registers{c.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
+                     static_cast<uint8_t>(_BV(REFS0) |
+                                          (c.sense == Sense::Top ? CHANNEL_TOP : CHANNEL_BOTTOM))};
+}
+static_assert(frames::READINGS_PER_CELL == 4, "one entry a configuration below");
+constexpr Registers REGISTERS[] = {
+    registers_of(CONFIGURATIONS[0]),
+    registers_of(CONFIGURATIONS[1]),
+    registers_of(CONFIGURATIONS[2]),
+    registers_of(CONFIGURATIONS[3]),
+};
+
+// Timer 1 counts a slot. Compare B triggers the conversion; compare A interrupts just after its hold,
+// which comes 2 ADC clocks and 3 cycles of synchronisation after the trigger.
+constexpr uint16_t TRIGGER_AT = 8;
+constexpr uint16_t interrupt_at(uint8_t prescaler) {
+    return static_cast<uint16_t>(TRIGGER_AT + 2u * prescaler + 3 + 4);
+}
+// In free running the interrupt comes 1.5 ADC clocks (48 cycles) before the hold; entering it takes
+// at least a dozen of these, and the rest is waited for.
+constexpr uint8_t FREE_RUNNING_WAIT = 40;
+
+uint8_t prescaler_bits(uint8_t prescaler) {
+    uint8_t bits = 0;
+    while (prescaler >>= 1)
+        bits++;
+    return bits;
+}
+
+__attribute__((always_inline)) inline void serve_slot() {
+    const Selection next = scanner.step(ADC);
+    const Registers &registers = REGISTERS[next.reading];
+    pins_set(next.row, next.column, registers.drive);
+    ADMUX = registers.admux;
+}
+
+}  // namespace
+
+ISR(TIMER1_COMPA_vect) {
+    TIFR1 = _BV(OCF1B);  // the next trigger is the flag's next rising edge
+    serve_slot();
+}
+
+ISR(ADC_vect) {
+    __builtin_avr_delay_cycles(FREE_RUNNING_WAIT);
+    serve_slot();
+}
+
+void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
+    const uint8_t bits = prescaler_bits(adc_prescaler);
+    pins_set(0, 0, REGISTERS[0].drive);
+    ADMUX = REGISTERS[0].admux;
+    if (plan.free_running) {
+        ADCSRB = 0;
+        ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | _BV(ADIE) | bits);
+        ADCSRA |= _BV(ADSC);
+        return;
+    }
+    ADCSRB = _BV(ADTS2) | _BV(ADTS0);  // auto trigger by timer 1, compare B
+    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | bits);
+    TCCR1A = 0;
+    TCCR1B = _BV(WGM13) | _BV(WGM12);  // clear at ICR1, which can be written in such a mode only
+    ICR1 = plan.slot_cycles - 1;
+    OCR1B = TRIGGER_AT;
+    OCR1A = interrupt_at(adc_prescaler);
+    TCNT1 = 0;
+    TIFR1 = _BV(OCF1A) | _BV(OCF1B);
+    TIMSK1 = _BV(OCIE1A);
+    TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);
+}
+
+void stop_slots() {
+    TCCR1B = 0;
+    TIMSK1 = 0;
+    // The converter stays on, because its first conversion after that takes twice as long.
+    ADCSRA = static_cast<uint8_t>((ADCSRA & ~(_BV(ADATE) | _BV(ADIE))) | _BV(ADIF));
+    pins_set(0, 0, 0);  // no current through the skin
+}
+
+// ------------------------------------------------------------------- reset, clock, watchdog
+namespace {
+uint8_t reset_cause_bits;
+uint32_t overflows_us;
+
+void clock_begin() {
+    TIMSK0 = 0;  // the Arduino core counts milliseconds in this interrupt
+    TCCR0A = 0;
+    TCCR0B = _BV(CS01) | _BV(CS00);  // clock / 64: 4 us a count, 1024 us a turn
+    TCNT0 = 0;
+    TIFR0 = _BV(TOV0);
+}
+
+void converter_begin() {
+    DIDR0 = _BV(CHANNEL_TOP) | _BV(CHANNEL_BOTTOM);
+    ADMUX = REGISTERS[0].admux;
+    // A conversion nobody reads: the first one after switching on takes 25 ADC clocks.
+    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(32));
+    while (ADCSRA & _BV(ADSC)) {
+    }
+}
+}  // namespace
+
+void begin() {
+    reset_cause_bits = MCUSR & (_BV(PORF) | _BV(EXTRF) | _BV(BORF) | _BV(WDRF));
+    MCUSR = 0;
+    wdt_enable(WDTO_250MS);
+    pins_begin();
+    clock_begin();
+    converter_begin();
+    serial_speed(frames::BAUD_DEFAULT);
+}
+
+uint8_t reset_cause() { return reset_cause_bits; }
+
+void feed_watchdog() { wdt_reset(); }
+
+uint32_t now_us() {
+    uint8_t count = TCNT0;
+    if (TIFR0 & _BV(TOV0)) {
+        TIFR0 = _BV(TOV0);
+        overflows_us += 1024;
+        count = TCNT0;
+    }
+    return overflows_us + count * 4u;
+}
+
+void mark_pass(bool worked) { GPIOR0 = worked; }
+
+// ----------------------------------------------------------------------------- serial line
+bool serial_speed_known(uint32_t baud) {
+    return baud == frames::BAUD_DEFAULT || baud == frames::BAUD_FAST;
+}
+
+void serial_speed(uint32_t baud) {
+    UCSR0B = 0;
+    UCSR0A = _BV(U2X0);
+    UBRR0 = static_cast<uint16_t>(CLOCK_HZ / 8 / baud - 1);
+    UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
+    UCSR0B = _BV(RXEN0) | _BV(TXEN0);
+}
+
+bool serial_can_write() { return UCSR0A & _BV(UDRE0); }
+
+void serial_write(uint8_t octet) {
+    UCSR0A = _BV(U2X0) | _BV(TXC0);  // writing the flag clears it
+    UDR0 = octet;
+}
+
+bool serial_idle() { return UCSR0A & _BV(TXC0); }
+
+Received serial_read(uint8_t *octet) {
+    const uint8_t status = UCSR0A;
+    if (!(status & _BV(RXC0)))
+        return Received::Nothing;
+    *octet = UDR0;
+    return (status & (_BV(FE0) | _BV(DOR0))) ? Received::Damaged : Received::Byte;
+}
+
+// ---------------------------------------------------------------------------------- EEPROM
+uint8_t eeprom_read(uint16_t address) {
+    return eeprom_read_byte(reinterpret_cast<const uint8_t *>(address));
+}
+
+bool eeprom_busy() { return EECR & _BV(EEPE); }
+
+void eeprom_write(uint16_t address, uint8_t octet) {
+    eeprom_write_byte(reinterpret_cast<uint8_t *>(address), octet);
+}
+
+}  // namespace board
+}  // namespace ohmskin

@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+#include <stdint.h>
+
+#include "core/frame_reader.h"
+#include "core/frame_writer.h"
+#include "core/scan_plan.h"
+#include "core/self_test.h"
+#include "core/settings.h"
+
+namespace ohmskin {
+
+// The board as the host sees it: answers commands, and turns the scanner's codes into scan frames.
+// All of it runs in the main loop, in short passes; only Scanner::step() runs in an interrupt.
+class Device {
+  public:
+    void begin();
+    // One pass; true when there was something to do.
+    bool poll();
+
+  private:
+    enum class Mode : uint8_t { Idle, Scanning, Stopping, SelfTesting };
+
+    // ---- serial line
+    bool serve_line();
+    void send_pending();
+    void watch_baud();
+
+    // ---- commands
+    void execute();
+    frames::Result configure(const ScanRequest &request);
+    frames::Result set_baud(const uint8_t *payload);
+    void start();
+    void begin_slots(const ScanRequest &request, const ScanPlan &plan);
+    void finish_slots();
+    bool poll_save();
+    void send_hello();
+
+    // ---- scan frames
+    bool take_code();
+    void begin_scan();
+    void drop_open_scan();
+    void put_code(uint16_t code);
+    void count_scan();
+    void account_for_lost_scans();
+    uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const;
+
+    // ---- answers, which wait until no scan frame is open
+    void answer(frames::Result result);
+    void defer();
+    void resolve(frames::Type command, frames::Result result);
+
+    struct Ack {
+        uint8_t command;
+        uint8_t sequence;
+        frames::Result result;
+        bool ready;
+    };
+    static constexpr uint8_t ACKS_MAX = 4;
+
+    FrameWriter writer_;
+    FrameReader reader_;
+    Settings settings_;
+    SettingsWriter settings_writer_;
+    SelfTest self_test_;
+    ScanPlan plan_;
+    Mode mode_ = Mode::Idle;
+
+    frames::Settings settings_source_ = frames::Settings::DefaultsBlank;
+    bool hello_pending_ = false;
+    bool report_pending_ = false;
+    Ack acks_[ACKS_MAX];
+    uint8_t ack_count_ = 0;
+
+    // The scan in progress.
+    uint16_t codes_left_ = 0;  // of the scan whose frame is open; 0: none is
+    uint8_t phase_ = 0;        // codes since the last whole byte, 0..3
+    uint8_t carry_ = 0;        // bits of the last code that do not fill a byte yet
+    uint32_t scan_number_ = 0;
+    uint32_t scan_time_us_ = 0;
+    uint8_t scan_time_rest_ = 0;  // clock cycles beyond scan_time_us_
+    uint16_t dropped_ = 0;
+    uint8_t lost_seen_ = 0;
+    uint16_t ring_limit_ = 0;  // ring use up to which a scan may begin and is sure to fit
+
+    // The line's speed.
+    uint32_t baud_ = frames::BAUD_DEFAULT;
+    uint32_t baud_next_ = 0;  // to be taken once the ack has left; 0: none
+    bool baud_confirmed_ = true;
+    uint32_t baud_changed_us_ = 0;
+};
+
+}  // namespace ohmskin

@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/frame_reader.h"
+
+#include "core/crc16.h"
+
+namespace ohmskin {
+
+bool FrameReader::feed(uint8_t octet) {
+    if (octet == frames::DELIMITER)
+        return finish();
+    if (left_ != 0) {
+        left_--;
+        store(octet);
+        return false;
+    }
+    // A new block begins; the one before it stood for a zero, unless it was full or the first.
+    if (code_ != 0 && code_ != 0xFF)
+        store(0);
+    code_ = octet;
+    left_ = static_cast<uint8_t>(octet - 1);
+    return false;
+}
+
+void FrameReader::store(uint8_t octet) {
+    if (size_ == CONTENT_MAX) {
+        damaged_ = true;
+        return;
+    }
+    content_[size_++] = octet;
+}
+
+bool FrameReader::finish() {
+    const bool empty = code_ == 0 && !damaged_;
+    bool valid = !damaged_ && left_ == 0 && size_ >= 4;
+    if (valid) {
+        uint16_t crc = frames::CRC_INITIAL;
+        for (uint8_t i = 0; i < size_ - 2; i++)
+            crc = crc16_update(crc, content_[i]);
+        valid = content_[size_ - 2] == static_cast<uint8_t>(crc) &&
+                content_[size_ - 1] == static_cast<uint8_t>(crc >> 8);
+    }
+    // A delimiter alone is how a host flushes the line: not an error.
+    if (!valid && !empty)
+        errors_++;
+    frame_size_ = valid ? size_ : 4;
+    size_ = code_ = left_ = 0;
+    damaged_ = false;
+    return valid;
+}
+
+}  // namespace ohmskin

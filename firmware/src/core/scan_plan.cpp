@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/scan_plan.h"
+
+namespace ohmskin {
+
+using frames::Result;
+
+namespace {
+
+bool known_prescaler(uint8_t prescaler) {
+    return prescaler == static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz) ||
+           prescaler == static_cast<uint8_t>(frames::AdcPrescaler::Clock250khz) ||
+           prescaler == static_cast<uint8_t>(frames::AdcPrescaler::Clock125khz);
+}
+
+Result check_limits(const ScanRequest &request) {
+    if (request.rows < 1 || request.rows > frames::ROWS_MAX)
+        return Result::BadRows;
+    if (request.columns < 1 || request.columns > frames::COLUMNS_MAX)
+        return Result::BadColumns;
+    if (request.rate_mhz != 0 && (request.rate_mhz < frames::RATE_MHZ_MIN ||
+                                  request.rate_mhz > frames::RATE_MHZ_MAX))
+        return Result::BadRate;
+    if (request.settle_us > frames::SETTLE_US_MAX)
+        return Result::BadSettle;
+    if (!known_prescaler(request.adc_prescaler))
+        return Result::BadPrescaler;
+    return Result::Ok;
+}
+
+// clock_hz * 1000 / rate_mhz, rounded, without 64-bit arithmetic: the remainder is below
+// rate_mhz_max, so a thousand times it still fits.
+uint32_t period_cycles(uint32_t clock_hz, uint32_t rate_mhz) {
+    static_assert(frames::RATE_MHZ_MAX <= 0xFFFFFFFF / 1000 - 1000, "remainder * 1000 overflows");
+    const uint32_t whole = clock_hz / rate_mhz * 1000;
+    const uint32_t rest = clock_hz % rate_mhz * 1000;
+    return whole + (rest + rate_mhz / 2) / rate_mhz;
+}
+
+uint32_t difference(uint32_t a, uint32_t b) { return a > b ? a - b : b - a; }
+
+// Divides the period into slots of equal whole cycles. One idle slot more or less shifts the rounding
+// error: from `first` in direction `step` the first number of slots that keeps the period to 200 ppm
+// is taken, else the best of a few.
+void divide(uint32_t period, uint16_t first, int8_t step, uint16_t least, uint16_t slot_min,
+            ScanPlan *plan) {
+    constexpr uint8_t TRIES = 12;
+    uint32_t best = 0xFFFFFFFF;
+    uint16_t slots = first;
+    for (uint8_t i = 0; i < TRIES && slots >= least; i++, slots = static_cast<uint16_t>(slots + step)) {
+        const uint32_t slot = (period + slots / 2) / slots;
+        if (slot < slot_min)
+            continue;
+        const uint32_t error = difference(slot * slots, period);
+        if (error < best) {
+            best = error;
+            plan->slot_cycles = static_cast<uint16_t>(slot);
+            plan->slots_per_scan = slots;
+        }
+        if (error <= period / 5000)
+            break;
+    }
+}
+
+}  // namespace
+
+Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan) {
+    const Result limits = check_limits(request);
+    if (limits != Result::Ok)
+        return limits;
+
+    const uint16_t readings = readings_in(request.rows, request.columns);
+    const uint16_t cycles_per_us = static_cast<uint16_t>(clock_hz / 1000000);
+    uint16_t slot_min = timing::triggered_slot_min(request.adc_prescaler);
+    const uint16_t settled =
+        static_cast<uint16_t>(request.settle_us * cycles_per_us + timing::SELECT_CYCLES_MAX);
+    if (request.settle_us != 0 && settled > slot_min)
+        slot_min = settled;
+
+    ScanPlan result = {slot_min, readings, 0, false};
+    if (request.rate_mhz == 0) {
+        // Only the default prescaler leaves the interrupt time to wait for the hold by itself.
+        if (request.settle_us == 0 &&
+            request.adc_prescaler == static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz)) {
+            result.free_running = true;
+            result.slot_cycles = timing::free_running_slot(request.adc_prescaler);
+        }
+        *plan = result;
+        return Result::Ok;
+    }
+
+    const uint32_t period = period_cycles(clock_hz, request.rate_mhz);
+    if (period < static_cast<uint32_t>(slot_min) * readings)
+        return Result::TooFast;
+    if (request.settle_us != 0) {
+        const uint16_t most = static_cast<uint16_t>(period / slot_min);
+        divide(period, most, -1, readings, slot_min, &result);
+    } else {
+        uint16_t fewest = static_cast<uint16_t>((period - 1) / timing::SLOT_CYCLES_MAX + 1);
+        if (fewest < readings)
+            fewest = readings;
+        divide(period, fewest, 1, fewest, slot_min, &result);
+    }
+    result.idle_slots = static_cast<uint16_t>(result.slots_per_scan - readings);
+    *plan = result;
+    return Result::Ok;
+}
+
+}  // namespace ohmskin
