@@ -31,7 +31,7 @@ def crc16(octets: bytes) -> int:
 
 
 def wire(content: bytes) -> bytes:
-    return bytes(cobs.encode(content + struct.pack("<H", crc16(content)))) + b"\0"
+    return b"\0" + bytes(cobs.encode(content + struct.pack("<H", crc16(content)))) + b"\0"
 
 
 def pack10(codes: list[int]) -> bytes:
@@ -148,7 +148,7 @@ def all_damaged(good: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
     flipped = bytearray(scan_wire)
     flipped[100] ^= 0x10
     pointer = bytearray(scan_wire)
-    pointer[0] += 1
+    pointer[1] += 1
     wrong_crc = bytes(cobs.encode(bytes([0x83, 7]) + b"\x00\x00")) + b"\0"
     cases = [
         ("one bit flipped", bytes(flipped)),
@@ -156,7 +156,7 @@ def all_damaged(good: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
         ("a byte lost", scan_wire[:50] + scan_wire[51:]),
         ("the end lost", scan_wire[:-40] + b"\0"),
         ("the start lost", scan_wire[40:]),
-        ("two frames whose delimiter was lost", start_wire[:-1] + scan_wire),
+        ("two frames whose delimiters were lost", start_wire[:-1] + scan_wire[1:]),
         ("COBS block longer than the frame", b"\x20\x01\x02\0"),
         ("only a CRC", bytes(cobs.encode(struct.pack("<H", crc16(b"")))) + b"\0"),
         ("shorter than a CRC", b"\x02\x81\0"),

@@ -191,7 +191,6 @@ void Device::execute() {
         plan_scan(SelfTest::request(), board::CLOCK_HZ, &plan);
         self_test_.begin();
         begin_slots(SelfTest::request(), plan);
-        board::scanner.stop_after_scan();
         mode_ = Mode::SelfTesting;
         return defer();
     }
@@ -338,6 +337,7 @@ bool Device::take_code() {
         return false;
     if (mode_ == Mode::SelfTesting) {
         self_test_.take(code & ~Scanner::FIRST);
+        board::scanner.stop_after_scan();  // one scan is enough
         return true;
     }
     if (code & Scanner::FIRST)

@@ -19,6 +19,12 @@ void FrameWriter::close_block() {
     length_ = 0;
 }
 
+void FrameWriter::delimit() {
+    ring_[write_] = frames::DELIMITER;
+    write_ = (write_ + 1) & MASK;
+    published_ = write_;
+}
+
 void FrameWriter::encode(uint8_t octet) {
     if (length_ == 0)
         open_block();
@@ -35,6 +41,7 @@ void FrameWriter::encode(uint8_t octet) {
 }
 
 void FrameWriter::begin(frames::Type type) {
+    delimit();
     crc_ = frames::CRC_INITIAL;
     put(static_cast<uint8_t>(type));
     put(sequence_++);
@@ -57,17 +64,13 @@ void FrameWriter::end() {
     encode(static_cast<uint8_t>(crc >> 8));
     if (length_ != 0)
         close_block();
-    ring_[write_] = frames::DELIMITER;
-    write_ = (write_ + 1) & MASK;
-    published_ = write_;
+    delimit();
 }
 
 void FrameWriter::abandon() {
     write_ = published_;
     length_ = 0;
-    ring_[write_] = frames::DELIMITER;
-    write_ = (write_ + 1) & MASK;
-    published_ = write_;
+    delimit();
 }
 
 }  // namespace ohmskin

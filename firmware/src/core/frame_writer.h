@@ -15,7 +15,7 @@ class FrameWriter {
   public:
     static constexpr uint16_t SIZE = 512;         // a power of two
     static constexpr uint16_t LONGEST_BLOCK = 255;
-    static constexpr uint8_t OVERHEAD = 2 + 2 + 1;  // type, sequence; CRC; delimiter
+    static constexpr uint8_t OVERHEAD = 2 + 2 + 2;  // type, sequence; CRC; two delimiters
 
     // Bytes on the line for a frame of `payload` bytes, at most.
     static constexpr uint16_t line_bytes(uint16_t payload) {
@@ -42,6 +42,7 @@ class FrameWriter {
   private:
     static constexpr uint16_t MASK = SIZE - 1;
 
+    void delimit();
     void encode(uint8_t octet);
     void open_block();
     void close_block();

@@ -28,7 +28,7 @@ class Scanner {
         sequence_.begin(rows, columns);
         idle_slots_ = idle_slots;
         idle_left_ = LEAD_IN;
-        done_ = held_ = selected_ = 0;
+        held_ = selected_ = 0;
         write_ = read_ = 0;
         lost_scans_ = 0;
         stopping_ = parked_ = false;
@@ -36,9 +36,8 @@ class Scanner {
 
     // Once a slot, from the interrupt.
     Selection step(uint16_t code) {
-        if (done_ & READING)
-            push((done_ & STARTS_SCAN) ? static_cast<uint16_t>(code | FIRST) : code);
-        done_ = held_;
+        if (held_ & READING)
+            push((held_ & STARTS_SCAN) ? static_cast<uint16_t>(code | FIRST) : code);
         held_ = selected_;
         advance();
         return sequence_.at();
@@ -64,7 +63,7 @@ class Scanner {
   private:
     static constexpr uint8_t QUEUE_SIZE = 32;
     static constexpr uint8_t QUEUE_MASK = QUEUE_SIZE - 1;
-    static constexpr uint16_t LEAD_IN = 2;  // slots until pins have settled and the pipeline is full
+    static constexpr uint16_t LEAD_IN = 1;  // slots until the first selection has settled
 
     // Kinds of slot.
     static constexpr uint8_t READING = 1;
@@ -74,9 +73,7 @@ class Scanner {
         if (idle_left_ != 0) {
             selected_ = 0;
             if (stopping_) {
-                // Two idle slots later the last reading's code has been pushed.
-                if (done_ == 0 && held_ == 0)
-                    parked_ = true;
+                parked_ = held_ == 0;  // else the last reading's code is still to come
                 return;
             }
             if (--idle_left_ == 0)
@@ -111,8 +108,7 @@ class Scanner {
     volatile uint8_t lost_scans_ = 0;
     volatile bool stopping_ = false;
     volatile bool parked_ = false;
-    uint8_t done_ = 0;      // kind of the slot whose code arrives with step()
-    uint8_t held_ = 0;      // kind of the slot that is being converted
+    uint8_t held_ = 0;      // kind of the slot held last: its code arrives with the next step()
     uint8_t selected_ = 0;  // kind of the slot that the pins are set for
     uint16_t idle_slots_ = 0;
     uint16_t idle_left_ = 0;

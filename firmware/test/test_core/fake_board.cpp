@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "fake_board.h"
+
+namespace fake {
+State state;
+}
+
+namespace ohmskin {
+namespace board {
+
+using fake::state;
+
+const frames::Board KIND = frames::Board::Emulated;
+const uint32_t CLOCK_HZ = 16000000;
+const uint32_t REF_TOP_OHM = 30000;
+const uint32_t REF_BOTTOM_OHM = 29000;
+Scanner scanner;
+
+void begin() {}
+uint8_t reset_cause() { return static_cast<uint8_t>(frames::ResetCause::External); }
+void feed_watchdog() {}
+uint32_t now_us() { return state.now_us; }
+void mark_pass(bool) {}
+
+void start_slots(const ScanPlan &plan, uint8_t) {
+    state.plan = plan;
+    state.slots_running = true;
+}
+void stop_slots() { state.slots_running = false; }
+
+bool serial_speed_known(uint32_t baud) {
+    return baud == frames::BAUD_DEFAULT || baud == frames::BAUD_FAST;
+}
+void serial_speed(uint32_t baud) { state.baud = baud; }
+bool serial_can_write() { return !state.line_stuck && state.sent_size < sizeof state.sent; }
+void serial_write(uint8_t octet) { state.sent[state.sent_size++] = octet; }
+bool serial_idle() { return true; }
+Received serial_read(uint8_t *octet) {
+    if (state.received_at == state.received_size)
+        return Received::Nothing;
+    *octet = state.received[state.received_at++];
+    if (!state.damage_next)
+        return Received::Byte;
+    state.damage_next = false;
+    return Received::Damaged;
+}
+
+uint8_t eeprom_read(uint16_t address) { return state.eeprom[address]; }
+bool eeprom_busy() { return state.eeprom_busy_polls && state.eeprom_busy_polls--; }
+void eeprom_write(uint16_t address, uint8_t octet) {
+    if (!state.eeprom_worn_out)
+        state.eeprom[address] = octet;
+    state.eeprom_busy_polls = 3;
+}
+
+}  // namespace board
+}  // namespace ohmskin

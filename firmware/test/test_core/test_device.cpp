@@ -1,0 +1,412 @@
+// SPDX-License-Identifier: Apache-2.0
+// The device on a fake board: every command's answer, settings, self-test, and whole scans.
+#ifndef __AVR_ATmega328P__  // 2 KiB of RAM do not hold the device, its board and its host
+#include "../check.h"
+#include "fake_board.h"
+
+#include "core/device.h"
+#include "core/frame_writer.h"
+
+using namespace ohmskin;
+using frames::Result;
+using frames::Type;
+
+namespace {
+
+struct Frame {
+    uint8_t type, sequence;
+    uint8_t payload[400];
+    uint16_t size;
+};
+
+// Decodes what the board has sent since the last call, without the code under test.
+class Host {
+  public:
+    explicit Host(Device &device) : device_(device) {}
+
+    // Sends a command and lets the device work.
+    void send(Type type, const void *payload = nullptr, uint8_t size = 0) {
+        FrameWriter writer;
+        for (uint8_t i = 0; i < sequence_; i++) {  // the writer counts from 0
+            writer.begin(type);
+            writer.end();
+            while (writer.has_byte())
+                writer.next_byte();
+        }
+        writer.begin(type);
+        if (size)
+            writer.put(payload, size);
+        writer.end();
+        uint8_t wire[32], n = 0;
+        while (writer.has_byte())
+            wire[n++] = writer.next_byte();
+        fake::receive(wire, n);
+        work();
+    }
+
+    void work(uint16_t passes = 400) {
+        while (passes--)
+            device_.poll();
+    }
+
+    // The next frame sent; false when there is none.
+    bool next(Frame *frame) {
+        uint8_t decoded[400];
+        uint16_t n = 0;
+        while (at_ < fake::state.sent_size && fake::state.sent[at_] == 0)
+            at_++;
+        if (!memchr(fake::state.sent + at_, 0, fake::state.sent_size - at_))
+            return false;
+        while (at_ < fake::state.sent_size) {
+            const uint8_t code = fake::state.sent[at_++];
+            if (code == 0)
+                break;
+            for (uint8_t i = 1; i < code; i++)
+                decoded[n++] = fake::state.sent[at_++];
+            if (code != 255)
+                decoded[n++] = 0;
+        }
+        if (n < 5)
+            return false;
+        n--;  // the zero that no block stood for
+        frame->type = decoded[0];
+        frame->sequence = decoded[1];
+        frame->size = static_cast<uint16_t>(n - 4);
+        memcpy(frame->payload, decoded + 2, frame->size);
+        return true;
+    }
+
+    Result answer_to(Type type, const void *payload = nullptr, uint8_t size = 0) {
+        send(type, payload, size);
+        return answer(type);
+    }
+
+    Result answer(Type type) {
+        Frame frame;
+        while (next(&frame))
+            if (frame.type == static_cast<uint8_t>(Type::Ack)) {
+                CHECK_EQ(static_cast<uint8_t>(type), frame.payload[0]);
+                return static_cast<Result>(frame.payload[2]);
+            }
+        return static_cast<Result>(0xEE);
+    }
+
+    frames::Hello hello() {
+        send(Type::GetHello);
+        Frame frame;
+        frames::Hello hello;
+        memset(&hello, 0, sizeof hello);
+        while (next(&frame))
+            if (frame.type == static_cast<uint8_t>(Type::Hello))
+                memcpy(&hello, frame.payload, sizeof hello);
+        rewind();
+        return hello;
+    }
+
+    // Room for more: what was sent has been read.
+    void rewind() { fake::state.sent_size = at_ = 0; }
+
+  private:
+    Device &device_;
+    uint8_t sequence_ = 0;
+    uint16_t at_ = 0;
+};
+
+struct Bench {
+    Bench() : host(device) {
+        fake::reset();
+        boot();
+    }
+    void boot() {
+        device = Device();
+        device.begin();
+        host.work();
+        host.rewind();
+    }
+    // Runs slots like the hardware: a pass of the main loop or more after each.
+    void slots(uint16_t count, uint16_t (*code_of)(const Selection &)) {
+        while (count--) {
+            const uint16_t code = result;
+            result = code_of(selected);
+            selected = board::scanner.step(code);
+            host.work(4);
+        }
+        host.work();
+    }
+    Device device;
+    Host host;
+    Selection selected = {0, 0, 0};
+    uint16_t result = 0;
+};
+
+// A Uno has no room for two of them, so all tests share one.
+Bench &fresh() {
+    static Bench bench;
+    fake::reset();
+    bench.selected = Selection{0, 0, 0};
+    bench.boot();
+    return bench;
+}
+
+uint16_t ramp(const Selection &s) { return static_cast<uint16_t>(s.row * 40 + s.column * 4 + s.reading); }
+
+bool same(const frames::Hello &a, const frames::Hello &b) { return memcmp(&a, &b, sizeof a) == 0; }
+
+}  // namespace
+
+TEST(boot_sends_hello_with_defaults_from_a_blank_eeprom) {
+    fresh();
+    static Device device;
+    fake::reset();
+    device = Device();
+    device.begin();
+    Host host(device);
+    host.work();
+    Frame frame;
+    if (!CHECK(host.next(&frame)))
+        return;
+    CHECK_EQ(Type::Hello, static_cast<Type>(frame.type));
+    frames::Hello hello;
+    memcpy(&hello, frame.payload, sizeof hello);
+    CHECK_EQ(sizeof hello, frame.size);
+    CHECK_EQ(frames::LAYOUT_CRC, hello.layout_crc);
+    CHECK_EQ(frames::Settings::DefaultsBlank, static_cast<frames::Settings>(hello.settings));
+    CHECK_EQ(8, hello.rows);
+    CHECK_EQ(90000, hello.rate_asked_mhz);
+    CHECK_EQ(4, hello.readings_per_cell);
+    CHECK_EQ(29000, hello.ref_bottom_ohm);
+    CHECK(!host.next(&frame));
+}
+
+TEST(configure_changes_all_or_nothing) {
+    Host &host = fresh().host;
+    const frames::Configure good = {4, 6, 120000, 0, 64};
+    CHECK_EQ(Result::Ok, host.answer_to(Type::Configure, &good, sizeof good));
+    const frames::Hello before = host.hello();
+    CHECK_EQ(4, before.rows);
+    CHECK_EQ(6, before.columns);
+    CHECK_EQ(64, before.adc_prescaler);
+    const struct {
+        frames::Configure request;
+        Result result;
+    } bad[] = {
+        {{0, 6, 120000, 0, 64}, Result::BadRows},      {{17, 6, 120000, 0, 64}, Result::BadRows},
+        {{4, 0, 120000, 0, 64}, Result::BadColumns},   {{4, 17, 120000, 0, 64}, Result::BadColumns},
+        {{4, 6, 999, 0, 64}, Result::BadRate},         {{4, 6, 2000001, 0, 64}, Result::BadRate},
+        {{4, 6, 120000, 3001, 64}, Result::BadSettle}, {{4, 6, 120000, 0, 31}, Result::BadPrescaler},
+        {{16, 16, 90000, 0, 32}, Result::TooFast},
+    };
+    for (const auto &b : bad) {
+        CHECK_EQ(b.result, host.answer_to(Type::Configure, &b.request, sizeof b.request));
+        host.rewind();
+        CHECK(same(before, host.hello()));
+    }
+    CHECK_EQ(Result::BadLength, host.answer_to(Type::Configure, &good, sizeof good - 1));
+    host.rewind();
+    CHECK_EQ(Result::BadLength, host.answer_to(Type::Start, &good, 1));
+    host.rewind();
+    CHECK_EQ(Result::UnknownCommand, host.answer_to(static_cast<Type>(0xA0)));
+    host.rewind();
+    CHECK(same(before, host.hello()));
+}
+
+TEST(a_scan_frame_holds_every_code_in_order) {
+    Bench &bench = fresh();
+    const frames::Configure size = {3, 1, 90000, 0, 32};  // 12 codes: 15 bytes
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &size, sizeof size));
+    fake::state.now_us = 5000;
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
+    CHECK(fake::state.slots_running);
+    bench.host.rewind();
+    bench.slots(1 + 2 * 12 + fake::state.plan.idle_slots + 1, ramp);
+    const uint32_t period_us = fake::state.plan.scan_cycles() / 16;
+    for (uint8_t scan = 0; scan < 2; scan++) {
+        Frame frame;
+        if (!CHECK(bench.host.next(&frame)))
+            return;
+        CHECK_EQ(Type::Scan, static_cast<Type>(frame.type));
+        frames::Scan header;
+        memcpy(&header, frame.payload, sizeof header);
+        CHECK_EQ(sizeof header + 15, frame.size);
+        CHECK_EQ(scan, header.scan);
+        CHECK_EQ(5000 + scan * period_us, header.time_us);
+        CHECK_EQ(0, header.dropped);
+        CHECK_EQ(3, header.rows);
+        for (uint8_t i = 0; i < 12; i++) {
+            const uint8_t *octets = frame.payload + sizeof header + i * 10 / 8;
+            const uint16_t code = ((octets[0] | octets[1] << 8) >> i * 10 % 8) & 0x3FF;
+            CHECK_EQ(i / 4 * 40 + i % 4, code);
+        }
+    }
+}
+
+TEST(stop_is_answered_after_the_last_whole_scan) {
+    Bench &bench = fresh();
+    const frames::Configure size = {1, 2, 90000, 0, 32};
+    bench.host.answer_to(Type::Configure, &size, sizeof size);
+    bench.host.answer_to(Type::Start);
+    bench.host.rewind();
+    bench.slots(4, ramp);
+    bench.host.send(Type::Stop);
+    bench.host.send(Type::Start);
+    bench.slots(12, ramp);
+    Frame frame;
+    const Type order[] = {Type::Scan, Type::Ack, Type::Ack};
+    for (Type type : order) {
+        if (!CHECK(bench.host.next(&frame)))
+            return;
+        CHECK_EQ(type, static_cast<Type>(frame.type));
+    }
+    CHECK(!bench.host.next(&frame));
+    CHECK(!fake::state.slots_running);
+}
+
+TEST(commands_that_would_tear_a_scan_are_refused) {
+    Bench &bench = fresh();
+    const frames::Configure size = {1, 1, 90000, 0, 32};
+    bench.host.answer_to(Type::Configure, &size, sizeof size);
+    bench.host.answer_to(Type::Start);
+    const frames::SetBaud baud = {frames::BAUD_FAST};
+    CHECK_EQ(Result::Scanning, bench.host.answer_to(Type::Configure, &size, sizeof size));
+    CHECK_EQ(Result::Scanning, bench.host.answer_to(Type::LoadDefaults));
+    CHECK_EQ(Result::Scanning, bench.host.answer_to(Type::SelfTest));
+    CHECK_EQ(Result::Scanning, bench.host.answer_to(Type::SetBaud, &baud, sizeof baud));
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
+}
+
+TEST(a_line_that_takes_nothing_drops_whole_scans_and_counts_them) {
+    Bench &bench = fresh();
+    const frames::Configure size = {4, 4, 90000, 0, 32};
+    bench.host.answer_to(Type::Configure, &size, sizeof size);
+    bench.host.answer_to(Type::Start);
+    bench.host.rewind();
+    fake::state.line_stuck = true;
+    const uint16_t slots = 64 + fake::state.plan.idle_slots;
+    bench.slots(20 * slots, ramp);
+    fake::state.line_stuck = false;
+    bench.slots(3 * slots, ramp);
+    Frame frame;
+    uint32_t last = 0;
+    uint16_t dropped = 0, scans = 0;
+    while (bench.host.next(&frame)) {
+        frames::Scan header;
+        memcpy(&header, frame.payload, sizeof header);
+        CHECK_EQ(sizeof header + 80, frame.size);
+        if (scans++)
+            CHECK_EQ(header.dropped - dropped, header.scan - last - 1);
+        last = header.scan;
+        dropped = header.dropped;
+    }
+    CHECK(dropped > 10);
+    CHECK(scans >= 4);
+}
+
+TEST(settings_survive_a_restart_and_damage_is_named) {
+    Bench &bench = fresh();
+    const frames::Configure size = {5, 7, 60000, 0, 32};
+    const frames::SetUnitId id = {0xABCD1234};
+    bench.host.answer_to(Type::Configure, &size, sizeof size);
+    bench.host.answer_to(Type::SetUnitId, &id, sizeof id);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Save));
+    bench.host.rewind();
+    bench.boot();
+    frames::Hello hello = bench.host.hello();
+    CHECK_EQ(frames::Settings::Stored, static_cast<frames::Settings>(hello.settings));
+    CHECK_EQ(0xABCD1234, hello.unit_id);
+    CHECK_EQ(7, hello.columns);
+    for (uint8_t i = 0; i < SettingsWriter::RECORD_SIZE; i++) {
+        fake::state.eeprom[i] ^= 0x10;
+        bench.boot();
+        hello = bench.host.hello();
+        CHECK_EQ(frames::Settings::DefaultsDamaged, static_cast<frames::Settings>(hello.settings));
+        CHECK_EQ(0, hello.unit_id);
+        CHECK_EQ(8, hello.rows);
+        fake::state.eeprom[i] ^= 0x10;
+    }
+}
+
+TEST(load_defaults_keeps_the_eeprom) {
+    Bench &bench = fresh();
+    const frames::Configure size = {5, 7, 60000, 0, 32};
+    bench.host.answer_to(Type::Configure, &size, sizeof size);
+    bench.host.answer_to(Type::Save);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::LoadDefaults));
+    bench.host.rewind();
+    CHECK_EQ(8, bench.host.hello().rows);
+    bench.boot();
+    CHECK_EQ(5, bench.host.hello().rows);
+}
+
+TEST(a_worn_out_eeprom_is_reported) {
+    Bench &bench = fresh();
+    fake::state.eeprom_worn_out = true;
+    CHECK_EQ(Result::EepromFailed, bench.host.answer_to(Type::Save));
+}
+
+TEST(an_unconfirmed_speed_falls_back) {
+    Bench &bench = fresh();
+    const frames::SetBaud wrong = {115200}, fast = {frames::BAUD_FAST};
+    CHECK_EQ(Result::BadBaud, bench.host.answer_to(Type::SetBaud, &wrong, sizeof wrong));
+    CHECK_EQ(0, fake::state.baud);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::SetBaud, &fast, sizeof fast));
+    CHECK_EQ(frames::BAUD_FAST, fake::state.baud);
+    fake::state.now_us += frames::BAUD_CONFIRM_MS * 1000UL + 1;
+    bench.host.work();
+    CHECK_EQ(frames::BAUD_DEFAULT, fake::state.baud);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::SetBaud, &fast, sizeof fast));
+    bench.host.answer_to(Type::GetHello);
+    fake::state.now_us += frames::BAUD_CONFIRM_MS * 5000UL;
+    bench.host.work();
+    CHECK_EQ(frames::BAUD_FAST, fake::state.baud);
+}
+
+namespace {
+// Nodes as a skin of 1 MOhm cells and 30 kOhm resistors reads, and as faults make them.
+uint16_t sound(const Selection &s) { return (s.reading & 1) ? 30 : 993; }
+uint16_t bottom_low(const Selection &s) { return s.reading == 0 ? 993 : s.reading == 3 ? 29 : 0; }
+uint16_t top_high(const Selection &s) { return (s.reading & 1) == 0 ? 1023 : s.reading == 3 ? 1023 : 30; }
+uint16_t no_top_resistor(const Selection &s) { return s.reading < 2 ? 0 : 1020; }
+uint16_t all_pressed(const Selection &s) { return (s.reading & 1) ? 500 : 523; }
+}  // namespace
+
+TEST(self_test_names_what_no_skin_can_cause) {
+    using frames::Finding;
+    const struct {
+        uint16_t (*skin)(const Selection &);
+        uint16_t findings;
+    } cases[] = {
+        {sound, 0},
+        {all_pressed, 0},
+        {bottom_low, static_cast<uint16_t>(Finding::BottomStuckLow)},
+        {top_high, static_cast<uint16_t>(Finding::TopStuckHigh)},
+        {no_top_resistor, static_cast<uint16_t>(Finding::TopReferenceMissing)},
+    };
+    for (const auto &c : cases) {
+        Bench &bench = fresh();
+        bench.host.send(Type::SelfTest);
+        CHECK(fake::state.slots_running);
+        bench.slots(1 + 1024 + 4, c.skin);
+        CHECK(!fake::state.slots_running);
+        Frame frame;
+        if (!CHECK(bench.host.next(&frame)))
+            return;
+        CHECK_EQ(Type::SelfTestReport, static_cast<Type>(frame.type));
+        frames::SelfTestReport report;
+        memcpy(&report, frame.payload, sizeof report);
+        CHECK_EQ(c.findings, report.findings);
+        CHECK_EQ(c.skin(Selection{0, 0, 2}), report.code_max[2]);
+        CHECK_EQ(Result::Ok, bench.host.answer(Type::SelfTest));
+    }
+}
+
+TEST(scans_that_never_fit_the_line_are_refused) {
+    Bench &bench = fresh();
+    // 16x16 in a burst of 27 ms needs 50 kB/s and more ring than there is at half that speed; at
+    // 500 kbaud it just fits, and so does everything smaller.
+    const frames::Configure largest = {16, 16, 0, 0, 32};
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &largest, sizeof largest));
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
+    CHECK(fake::state.plan.free_running);
+}
+
+#endif

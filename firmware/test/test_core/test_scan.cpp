@@ -1,0 +1,182 @@
+// SPDX-License-Identifier: Apache-2.0
+// The plan of a scan, its order, and the scanner's pipeline.
+#include "../check.h"
+
+#include "core/scan_plan.h"
+#include "core/scanner.h"
+
+using namespace ohmskin;
+using frames::Result;
+
+namespace {
+
+constexpr uint32_t CLOCK_HZ = 16000000;
+
+ScanRequest request(uint8_t rows, uint8_t columns, uint32_t rate_mhz, uint16_t settle_us = 0,
+                    uint8_t prescaler = 32) {
+    return ScanRequest{rows, columns, rate_mhz, settle_us, prescaler};
+}
+
+// The code a fake skin gives for a selection, unique up to 16x16 within 10 bits of each cell's part.
+uint16_t code_of(const Selection &s) {
+    return static_cast<uint16_t>((s.row * 16 + s.column) << 2 | s.reading);
+}
+
+// Runs slots the way the hardware does: what step() returns is converted two calls later.
+struct Pipeline {
+    Selection held = {0, 0, 0};
+    Selection selected = {0, 0, 0};
+    uint16_t result = 0x3FF;
+
+    void slot(Scanner &scanner) {
+        const uint16_t code = result;
+        result = code_of(held = selected);
+        selected = scanner.step(code);
+    }
+};
+
+}  // namespace
+
+TEST(ninety_hertz_is_kept_to_50_mhz_and_leaves_35_us_to_settle) {
+    ScanPlan plan;
+    CHECK_EQ(Result::Ok, plan_scan(request(8, 8, 90000), CLOCK_HZ, &plan));
+    CHECK(!plan.free_running);
+    CHECK_EQ(plan.slots_per_scan - 256, plan.idle_slots);
+    const uint32_t mhz = static_cast<uint32_t>(1000.0 * CLOCK_HZ / plan.scan_cycles());
+    CHECK(mhz >= 89950 && mhz <= 90050);
+    CHECK(settle_us(plan, CLOCK_HZ) >= 35);
+}
+
+TEST(every_rate_that_fits_is_kept) {
+    const uint8_t sizes[][2] = {{1, 1}, {2, 2}, {3, 5}, {8, 8}, {16, 16}};
+    for (const auto &size : sizes)
+        for (uint32_t rate = 1000; rate <= 2000000; rate = rate * 5 / 4 + 7) {
+            ScanPlan plan;
+            const ScanRequest r = request(size[0], size[1], rate);
+            const uint16_t readings = readings_in(size[0], size[1]);
+            const double period = 1000.0 * CLOCK_HZ / rate;
+            const bool fits = period >= 436.0 * readings + 1;
+            const Result result = plan_scan(r, CLOCK_HZ, &plan);
+            if (!fits) {
+                CHECK(result == Result::TooFast || period >= 436.0 * readings - 1);
+                continue;
+            }
+            CHECK_EQ(Result::Ok, result);
+            CHECK(plan.slot_cycles >= 436 && plan.slots_per_scan >= readings);
+            const double off = plan.scan_cycles() / period - 1;
+            CHECK(off < 0.0012 && off > -0.0012);
+        }
+}
+
+TEST(rate_zero_is_the_converters_own_pace) {
+    ScanPlan plan;
+    CHECK_EQ(Result::Ok, plan_scan(request(8, 8, 0), CLOCK_HZ, &plan));
+    CHECK(plan.free_running);
+    CHECK_EQ(416, plan.slot_cycles);
+    CHECK_EQ(256, plan.slots_per_scan);
+    CHECK_EQ(Result::Ok, plan_scan(request(8, 8, 0, 0, 128), CLOCK_HZ, &plan));
+    CHECK(!plan.free_running);
+    CHECK_EQ(1732, plan.slot_cycles);
+}
+
+TEST(a_settle_time_is_kept_and_the_rest_of_the_period_is_idle) {
+    ScanPlan plan;
+    CHECK_EQ(Result::Ok, plan_scan(request(4, 4, 90000, 30), CLOCK_HZ, &plan));
+    CHECK(settle_us(plan, CLOCK_HZ) >= 30 && settle_us(plan, CLOCK_HZ) <= 33);
+    CHECK(plan.idle_slots > 64);
+    CHECK_EQ(Result::TooFast, plan_scan(request(8, 8, 90000, 40), CLOCK_HZ, &plan));
+}
+
+TEST(what_is_out_of_range_is_refused_by_name) {
+    ScanPlan plan;
+    CHECK_EQ(Result::BadRows, plan_scan(request(0, 8, 90000), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadRows, plan_scan(request(17, 8, 90000), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadColumns, plan_scan(request(8, 0, 90000), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadColumns, plan_scan(request(8, 17, 90000), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadRate, plan_scan(request(8, 8, 999), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadRate, plan_scan(request(8, 8, 2000001), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadSettle, plan_scan(request(8, 8, 90000, 3001), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadPrescaler, plan_scan(request(8, 8, 90000, 0, 16), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::BadPrescaler, plan_scan(request(8, 8, 90000, 0, 33), CLOCK_HZ, &plan));
+    CHECK_EQ(Result::TooFast, plan_scan(request(8, 8, 150000), CLOCK_HZ, &plan));
+}
+
+TEST(rows_run_fastest) {
+    ScanSequence sequence;
+    sequence.begin(2, 3);
+    for (uint8_t column = 0; column < 3; column++)
+        for (uint8_t row = 0; row < 2; row++)
+            for (uint8_t reading = 0; reading < frames::READINGS_PER_CELL; reading++) {
+                CHECK_EQ(row, sequence.at().row);
+                CHECK_EQ(column, sequence.at().column);
+                CHECK_EQ(reading, sequence.at().reading);
+                const bool last = column == 2 && row == 1 && reading == 3;
+                CHECK_EQ(last, sequence.next());
+            }
+    CHECK_EQ(0, sequence.at().column);
+}
+
+TEST(every_code_is_of_the_cell_it_is_counted_for) {
+    const uint8_t sizes[][2] = {{1, 1}, {3, 2}, {16, 16}};
+    const uint16_t idle_counts[] = {0, 1, 2, 7};
+    for (const auto &size : sizes)
+        for (uint16_t idle : idle_counts) {
+            Scanner scanner;
+            Pipeline pipeline;
+            scanner.begin(size[0], size[1], idle);
+            ScanSequence expected;
+            expected.begin(size[0], size[1]);
+            bool first = true;
+            uint16_t taken = 0, slots = 0;
+            const uint16_t readings = readings_in(size[0], size[1]);
+            const uint16_t scans = 3;
+            for (; taken < scans * readings && slots < 4 * scans * readings + 100; slots++) {
+                pipeline.slot(scanner);
+                uint16_t code;
+                while (scanner.take(&code)) {
+                    CHECK_EQ(first, (code & Scanner::FIRST) != 0);
+                    CHECK_EQ(code_of(expected.at()), code & 0x3FF);
+                    first = expected.next();
+                    taken++;
+                }
+            }
+            // One slot of lead-in, one until the last conversion is done.
+            CHECK_EQ(1 + scans * readings + (scans - 1) * idle + 1, slots);
+        }
+}
+
+TEST(a_stop_ends_with_a_whole_scan) {
+    const uint16_t idle_counts[] = {0, 1, 5};
+    for (uint16_t idle : idle_counts)
+        for (uint16_t stop_at = 0; stop_at < 40; stop_at++) {
+            Scanner scanner;
+            Pipeline pipeline;
+            scanner.begin(2, 1, idle);
+            uint16_t taken = 0, code;
+            for (uint16_t slot = 0; !scanner.parked(); slot++) {
+                if (slot == stop_at)
+                    scanner.stop_after_scan();
+                if (!CHECK(slot < 100))
+                    break;
+                pipeline.slot(scanner);
+                while (scanner.take(&code))
+                    taken++;
+            }
+            CHECK_EQ(0, taken % 8);
+            pipeline.slot(scanner);
+            CHECK(!scanner.take(&code));
+        }
+}
+
+TEST(a_full_queue_loses_codes_but_not_count_of_scans) {
+    Scanner scanner;
+    Pipeline pipeline;
+    scanner.begin(1, 1, 0);  // a scan every 4 slots; the queue holds 31 codes
+    for (uint16_t slot = 0; slot < 2 + 31 + 41; slot++)
+        pipeline.slot(scanner);
+    uint16_t code, starts = 0;
+    while (scanner.take(&code))
+        starts += (code & Scanner::FIRST) != 0;
+    CHECK_EQ(8, starts);
+    CHECK_EQ(10, scanner.lost_scans());  // 18 scans began: one every 4 of 72 codes
+}
