@@ -20,10 +20,10 @@ extern const uint32_t REF_BOTTOM_OHM;
 void begin();
 // Bits of frames::ResetCause.
 uint8_t reset_cause();
-// To be called at least every 200 ms, or the board restarts.
-void feed_watchdog();
-// Microseconds since begin(); wraps. To be called at least every millisecond to keep count.
-uint32_t now_us();
+// Once a pass of the main loop: keeps now_us() counting, which needs it every millisecond, and the
+// watchdog quiet, which restarts the board after 250 ms without.
+void keep_alive();
+uint32_t now_us();  // since begin(); wraps
 // Tells an observer whether a pass of the main loop found something to do; costs one instruction.
 void mark_pass(bool worked);
 
@@ -34,14 +34,14 @@ extern Scanner scanner;
 void start_slots(const ScanPlan &plan, uint8_t adc_prescaler);
 void stop_slots();
 
-// ---- serial line, polled
+// ---- serial line
 bool serial_speed_known(uint32_t baud);
 void serial_speed(uint32_t baud);
 bool serial_can_write();
 void serial_write(uint8_t octet);
 bool serial_idle();  // everything written has left
-enum class Received : uint8_t { Nothing, Byte, Damaged };
-Received serial_read(uint8_t *octet);
+bool serial_has_byte();
+bool serial_read(uint8_t *octet);  // false: the line failed (framing error, overrun)
 
 // ---- EEPROM
 uint8_t eeprom_read(uint16_t address);

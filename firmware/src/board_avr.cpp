@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The board contract on an ATmega328P (Uno) and an ATmega2560 (Mega), with registers alone: the
 // Arduino core's Serial, millis() and delay() would each bring an interrupt that makes the slot
-// interrupt late. It is the only interrupt there is.
+// interrupt late. Besides that there is one other interrupt, a short one, for bytes received.
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -38,7 +38,8 @@ inline void pins_begin() {
     DDRB = 0x0F;
 }
 inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
-    PORTD = static_cast<uint8_t>(row << 4 | drive | RX_PULL_UP);
+    row = static_cast<uint8_t>(row << 4);  // a swap of nibbles, as a statement of its own
+    PORTD = row | drive | RX_PULL_UP;
     PORTB = column;
 }
 }  // namespace
@@ -94,10 +95,6 @@ constexpr uint16_t TRIGGER_AT = 8;
 constexpr uint16_t interrupt_at(uint8_t prescaler) {
     return static_cast<uint16_t>(TRIGGER_AT + 2u * prescaler + 3 + 4);
 }
-// In free running the interrupt comes 1.5 ADC clocks (48 cycles) before the hold; entering it takes
-// at least a dozen of these, and the rest is waited for.
-constexpr uint8_t FREE_RUNNING_WAIT = 40;
-
 uint8_t prescaler_bits(uint8_t prescaler) {
     uint8_t bits = 0;
     while (prescaler >>= 1)
@@ -105,29 +102,31 @@ uint8_t prescaler_bits(uint8_t prescaler) {
     return bits;
 }
 
-__attribute__((always_inline)) inline void serve_slot() {
-    const Selection next = scanner.step(ADC);
-    const Registers &registers = REGISTERS[next.reading];
-    pins_set(next.row, next.column, registers.drive);
+inline void select(const Selection &selection) {
+    const Registers &registers = REGISTERS[selection.reading];
+    pins_set(selection.row, selection.column, registers.drive);
     ADMUX = registers.admux;
 }
+
 
 }  // namespace
 
 ISR(TIMER1_COMPA_vect) {
     TIFR1 = _BV(OCF1B);  // the next trigger is the flag's next rising edge
-    serve_slot();
+    select(scanner.selection());
+    scanner.step(ADC);
 }
 
+// Free running: this comes 1.5 ADC clocks (48 cycles) before the hold, so the pins are set last.
 ISR(ADC_vect) {
-    __builtin_avr_delay_cycles(FREE_RUNNING_WAIT);
-    serve_slot();
+    const Selection next = scanner.selection();
+    scanner.step(ADC);
+    select(next);
 }
 
 void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
     const uint8_t bits = prescaler_bits(adc_prescaler);
-    pins_set(0, 0, REGISTERS[0].drive);
-    ADMUX = REGISTERS[0].admux;
+    select(scanner.selection());
     if (plan.free_running) {
         ADCSRB = 0;
         ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | _BV(ADIE) | bits);
@@ -190,13 +189,18 @@ void begin() {
 
 uint8_t reset_cause() { return reset_cause_bits; }
 
-void feed_watchdog() { wdt_reset(); }
-
-uint32_t now_us() {
-    uint8_t count = TCNT0;
+void keep_alive() {
+    wdt_reset();
     if (TIFR0 & _BV(TOV0)) {
         TIFR0 = _BV(TOV0);
         overflows_us += 1024;
+    }
+}
+
+uint32_t now_us() {
+    uint8_t count = TCNT0;
+    if (TIFR0 & _BV(TOV0)) {  // it may have turned just before the count was read
+        keep_alive();
         count = TCNT0;
     }
     return overflows_us + count * 4u;
@@ -214,7 +218,7 @@ void serial_speed(uint32_t baud) {
     UCSR0A = _BV(U2X0);
     UBRR0 = static_cast<uint16_t>(CLOCK_HZ / 8 / baud - 1);
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
-    UCSR0B = _BV(RXEN0) | _BV(TXEN0);
+    UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
 }
 
 bool serial_can_write() { return UCSR0A & _BV(UDRE0); }
@@ -226,12 +230,42 @@ void serial_write(uint8_t octet) {
 
 bool serial_idle() { return UCSR0A & _BV(TXC0); }
 
-Received serial_read(uint8_t *octet) {
-    const uint8_t status = UCSR0A;
-    if (!(status & _BV(RXC0)))
-        return Received::Nothing;
-    *octet = UDR0;
-    return (status & (_BV(FE0) | _BV(DOR0))) ? Received::Damaged : Received::Byte;
+// Reception has an interrupt, because at 1 Mbaud the chip's own three bytes are full after 30 us. It
+// takes 4 us, once a byte of a command, by which a slot interrupt may come late: pins then settle that
+// much shorter, and no reading is lost.
+namespace {
+constexpr uint8_t RECEIVED_SIZE = 32;  // more than the longest command
+uint8_t received[RECEIVED_SIZE];
+volatile uint8_t received_write, received_read;
+volatile bool received_damage;
+}  // namespace
+
+#if defined(USART0_RX_vect)
+ISR(USART0_RX_vect) {
+#else
+ISR(USART_RX_vect) {
+#endif
+    const uint8_t status = UCSR0A;  // describes the byte that reading UDR0 takes away
+    const uint8_t octet = UDR0;
+    const uint8_t at = received_write;
+    const uint8_t next = (at + 1) & (RECEIVED_SIZE - 1);
+    if ((status & (_BV(FE0) | _BV(DOR0))) || next == received_read)
+        received_damage = true;
+    if (next == received_read)
+        return;
+    received[at] = octet;
+    received_write = next;
+}
+
+bool serial_has_byte() { return received_write != received_read; }
+
+bool serial_read(uint8_t *octet) {
+    const uint8_t at = received_read;
+    *octet = received[at];
+    received_read = (at + 1) & (RECEIVED_SIZE - 1);
+    const bool sound = !received_damage;
+    received_damage = false;
+    return sound;
 }
 
 // ---------------------------------------------------------------------------------- EEPROM

@@ -11,4 +11,8 @@ void setup() {
     device.begin();
 }
 
-void loop() { ohmskin::board::mark_pass(device.poll()); }
+// Never returns: what the Arduino core does between two calls would only cost time.
+void loop() {
+    for (;;)
+        ohmskin::board::mark_pass(device.poll());
+}

@@ -6,16 +6,24 @@
 
 namespace ohmskin {
 
-static_assert(frames::CRC_POLYNOMIAL == 0x1021, "crc16_update holds this polynomial");
+static_assert(frames::CRC_POLYNOMIAL == 0x1021, "Crc16::add() holds this polynomial");
 
-// CRC-16/IBM-3740 of one more byte. Works on two 8-bit halves because an AVR has no 16-bit shifts;
-// 18 instructions there, and no table.
-inline uint16_t crc16_update(uint16_t crc, uint8_t octet) {
-    uint8_t x = static_cast<uint8_t>((crc >> 8) ^ octet);
-    x ^= x >> 4;
-    const uint8_t high = static_cast<uint8_t>(crc) ^ static_cast<uint8_t>(x << 4) ^ (x >> 3);
-    const uint8_t low = x ^ static_cast<uint8_t>(x << 5);
-    return static_cast<uint16_t>(high << 8 | low);
-}
+// CRC-16/IBM-3740, a byte at a time and without a table. Its two halves are kept apart because an AVR
+// shifts bytes: 16 instructions a byte.
+class Crc16 {
+  public:
+    void add(uint8_t octet) {
+        uint8_t x = high_ ^ octet;
+        x ^= x >> 4;
+        high_ = low_ ^ static_cast<uint8_t>(x << 4) ^ (x >> 3);
+        low_ = x ^ static_cast<uint8_t>(x << 5);
+    }
+    uint8_t low() const { return low_; }
+    uint8_t high() const { return high_; }
+
+  private:
+    uint8_t low_ = frames::CRC_INITIAL & 0xFF;
+    uint8_t high_ = frames::CRC_INITIAL >> 8;
+};
 
 }  // namespace ohmskin

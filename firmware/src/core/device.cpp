@@ -18,6 +18,9 @@ constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
 constexpr uint16_t ANSWERS_SPACE = FrameWriter::line_bytes(sizeof(frames::Hello)) +
                                    FrameWriter::line_bytes(sizeof(frames::Ack));
 
+// What the last cell of a frame may take: its bytes, a block's length, CRC, delimiter.
+constexpr uint16_t CELL_SPACE = 5 + 2 + 2 + 1;
+
 uint16_t scan_payload(uint8_t rows, uint8_t columns) {
     return static_cast<uint16_t>(
         sizeof(frames::Scan) + (readings_in(rows, columns) * uint32_t{frames::ADC_BITS} + 7) / 8);
@@ -32,45 +35,59 @@ uint16_t cycles_per_byte(uint32_t baud) {
 void Device::begin() {
     settings_source_ = load_settings(&settings_);
     plan_scan(settings_.request, board::CLOCK_HZ, &plan_);
-    hello_pending_ = true;
+    hello_pending_ = attention_ = true;
 }
 
 bool Device::poll() {
-    board::feed_watchdog();
-    board::now_us();
-    bool worked = serve_line();
-    worked |= take_code();
-    worked |= serve_line();
-    worked |= poll_save();
-    if (mode_ != Mode::Idle && board::scanner.parked())
+    board::keep_alive();
+    bool worked = transmit();
+    if (board::serial_has_byte()) {
+        receive();
+        worked = true;
+    }
+    if (board::scanner.has_cell()) {
+        take_cell();
+        worked = true;
+    }
+    if (attention_ || board::scanner.parked())
+        worked |= attend();
+    return worked;
+}
+
+// What is not there most of the time.
+bool Device::attend() {
+    bool worked = false;
+    if (!settings_writer_.idle())
+        worked = poll_save();
+    if (mode_ != Mode::Idle && board::scanner.parked() && !board::scanner.has_cell())
         finish_slots();
-    if (codes_left_ == 0 && (hello_pending_ || report_pending_ || ack_count_ != 0))
+    if (cells_left_ == 0)
         send_pending();
     watch_baud();
+    attention_ = hello_pending_ || report_pending_ || ack_count_ != 0 || baud_next_ != 0 ||
+                 !baud_confirmed_ || !settings_writer_.idle();
     return worked;
 }
 
 // ------------------------------------------------------------------------------- serial line
 
-bool Device::serve_line() {
+bool Device::transmit() {
     bool worked = false;
-    if (writer_.has_byte() && board::serial_can_write()) {
+    while (writer_.has_byte() && board::serial_can_write()) {
         board::serial_write(writer_.next_byte());
         worked = true;
     }
+    return worked;
+}
+
+void Device::receive() {
     uint8_t octet;
-    switch (board::serial_read(&octet)) {
-    case board::Received::Nothing:
-        return worked;
-    case board::Received::Damaged:
+    if (!board::serial_read(&octet))
         reader_.line_error();
-        break;
-    case board::Received::Byte:
-        break;
-    }
-    if (reader_.feed(octet))
+    if (reader_.feed(octet)) {
+        attention_ = true;
         execute();
-    return true;
+    }
 }
 
 void Device::send_pending() {
@@ -236,7 +253,7 @@ void Device::start() {
 
 void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
     lost_seen_ = 0;
-    codes_left_ = 0;
+    cells_left_ = 0;
     board::scanner.begin(request.rows, request.columns, plan.idle_slots);
     scan_time_us_ = board::now_us();
     scan_time_rest_ = 0;
@@ -244,11 +261,8 @@ void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
 }
 
 void Device::finish_slots() {
-    // The codes of the last scan are still in the queue until take_code() finds none.
-    if (take_code())
-        return;
     board::stop_slots();
-    if (codes_left_ != 0)
+    if (cells_left_ != 0)
         drop_open_scan();
     if (mode_ == Mode::SelfTesting) {
         report_pending_ = true;
@@ -331,24 +345,27 @@ void Device::resolve(Type command, Result result) {
 
 // ------------------------------------------------------------------------------- scan frames
 
-bool Device::take_code() {
-    uint16_t code;
-    if (!board::scanner.take(&code))
-        return false;
+void Device::take_cell() {
+    Scanner &scanner = board::scanner;
     if (mode_ == Mode::SelfTesting) {
-        self_test_.take(code & ~Scanner::FIRST);
-        board::scanner.stop_after_scan();  // one scan is enough
-        return true;
+        self_test_.take(scanner.cell());
+        scanner.stop_after_scan();  // one scan is enough
+    } else {
+        if (scanner.starts_scan())
+            begin_scan();
+        if (cells_left_ != 0 && writer_.space() < CELL_SPACE)
+            drop_open_scan();
+        if (cells_left_ != 0) {
+            put_cell(scanner.cell());
+            if (--cells_left_ == 0)
+                writer_.end();
+        }
     }
-    if (code & Scanner::FIRST)
-        begin_scan();
-    if (codes_left_ != 0)
-        put_code(code & ~Scanner::FIRST);
-    return true;
+    scanner.release_cell();
 }
 
 void Device::begin_scan() {
-    if (codes_left_ != 0)
+    if (cells_left_ != 0)
         drop_open_scan();
     account_for_lost_scans();
     if (hello_pending_ || report_pending_ || ack_count_ != 0)
@@ -359,19 +376,18 @@ void Device::begin_scan() {
                                      reader_.errors(), rows, columns};
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
-        codes_left_ = readings_in(rows, columns);
-        phase_ = carry_ = 0;
+        cells_left_ = static_cast<uint16_t>(rows * columns);
     } else {
         dropped_++;
     }
     count_scan();
 }
 
-// Codes are missing because the main loop was late. That cannot happen within the limits of
-// plan_scan(), but if it does, the scan is lost as a whole.
+// The main loop was too late for the slots or for the line. That does not happen within the limits of
+// plan_scan() and ring_limit(), but if it does, the scan is lost as a whole.
 void Device::drop_open_scan() {
     writer_.abandon();
-    codes_left_ = 0;
+    cells_left_ = 0;
     dropped_++;
 }
 
@@ -393,33 +409,20 @@ void Device::count_scan() {
     scan_time_rest_ = static_cast<uint8_t>(cycles % cycles_per_us);
 }
 
-// 10-bit codes, least significant bit first: 4 codes make 5 bytes.
-void Device::put_code(uint16_t code) {
-    static_assert(frames::ADC_BITS == 10, "the shifts below");
-    const uint8_t low = static_cast<uint8_t>(code), high = static_cast<uint8_t>(code >> 8);
-    switch (phase_) {
-    case 0:
-        writer_.put(low);
-        carry_ = high;
-        break;
-    case 1:
-        writer_.put(static_cast<uint8_t>(carry_ | low << 2));
-        carry_ = static_cast<uint8_t>(low >> 6 | high << 2);
-        break;
-    case 2:
-        writer_.put(static_cast<uint8_t>(carry_ | low << 4));
-        carry_ = static_cast<uint8_t>(low >> 4 | high << 4);
-        break;
-    default:
-        writer_.put(static_cast<uint8_t>(carry_ | low << 6));
-        writer_.put(static_cast<uint8_t>(low >> 2 | high << 6));
-    }
-    phase_ = (phase_ + 1) & 3;
-    if (--codes_left_ != 0)
-        return;
-    if (phase_ != 0)
-        writer_.put(carry_);
-    writer_.end();
+// Codes of 10 bits, least significant bit first: a cell's four make five bytes.
+void Device::put_cell(const uint16_t *code) {
+    static_assert(frames::ADC_BITS == 10 && frames::READINGS_PER_CELL == 4, "the shifts below");
+    const uint8_t octets[] = {
+        static_cast<uint8_t>(code[0]),
+        static_cast<uint8_t>((code[0] & Scanner::CODE) >> 8 | static_cast<uint8_t>(code[1]) << 2),
+        static_cast<uint8_t>(code[1] >> 6 | static_cast<uint8_t>(code[2]) << 4),
+        static_cast<uint8_t>(code[2] >> 4 | static_cast<uint8_t>(code[3]) << 6),
+        static_cast<uint8_t>(code[3] >> 2),
+    };
+    // At 500 kbaud the chip's two bytes leave within 640 cycles, and a cell's work takes longer.
+    writer_.put(octets, 3);
+    transmit();
+    writer_.put(octets + 3, 2);
 }
 
 // A scan's bytes come in at a known pace and leave at a known pace, so the most the ring can hold

@@ -2,9 +2,11 @@
 #pragma once
 #include <stdint.h>
 
+#include "core/attributes.h"
 #include "core/frame_reader.h"
 #include "core/frame_writer.h"
 #include "core/scan_plan.h"
+#include "core/scanner.h"
 #include "core/self_test.h"
 #include "core/settings.h"
 
@@ -14,41 +16,44 @@ namespace ohmskin {
 // All of it runs in the main loop, in short passes; only Scanner::step() runs in an interrupt.
 class Device {
   public:
-    void begin();
+    OHMSKIN_RARE void begin();
     // One pass; true when there was something to do.
     bool poll();
 
   private:
+    OHMSKIN_RARE bool attend();
+
     enum class Mode : uint8_t { Idle, Scanning, Stopping, SelfTesting };
 
     // ---- serial line
-    bool serve_line();
-    void send_pending();
-    void watch_baud();
+    OHMSKIN_APART bool transmit();
+    OHMSKIN_RARE void receive();
+    OHMSKIN_RARE void send_pending();
+    OHMSKIN_RARE void watch_baud();
 
     // ---- commands
-    void execute();
-    frames::Result configure(const ScanRequest &request);
-    frames::Result set_baud(const uint8_t *payload);
-    void start();
-    void begin_slots(const ScanRequest &request, const ScanPlan &plan);
-    void finish_slots();
-    bool poll_save();
-    void send_hello();
+    OHMSKIN_RARE void execute();
+    OHMSKIN_RARE frames::Result configure(const ScanRequest &request);
+    OHMSKIN_RARE frames::Result set_baud(const uint8_t *payload);
+    OHMSKIN_RARE void start();
+    OHMSKIN_RARE void begin_slots(const ScanRequest &request, const ScanPlan &plan);
+    OHMSKIN_RARE void finish_slots();
+    OHMSKIN_RARE bool poll_save();
+    OHMSKIN_RARE void send_hello();
 
     // ---- scan frames
-    bool take_code();
-    void begin_scan();
-    void drop_open_scan();
-    void put_code(uint16_t code);
-    void count_scan();
-    void account_for_lost_scans();
-    uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const;
+    OHMSKIN_APART void take_cell();
+    OHMSKIN_RARE void begin_scan();
+    OHMSKIN_RARE void drop_open_scan();
+    void put_cell(const uint16_t *code);
+    OHMSKIN_RARE void count_scan();
+    OHMSKIN_RARE void account_for_lost_scans();
+    OHMSKIN_RARE uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const;
 
     // ---- answers, which wait until no scan frame is open
-    void answer(frames::Result result);
-    void defer();
-    void resolve(frames::Type command, frames::Result result);
+    OHMSKIN_RARE void answer(frames::Result result);
+    OHMSKIN_RARE void defer();
+    OHMSKIN_RARE void resolve(frames::Type command, frames::Result result);
 
     struct Ack {
         uint8_t command;
@@ -65,6 +70,7 @@ class Device {
     SelfTest self_test_;
     ScanPlan plan_;
     Mode mode_ = Mode::Idle;
+    bool attention_ = true;  // something below is waiting
 
     frames::Settings settings_source_ = frames::Settings::DefaultsBlank;
     bool hello_pending_ = false;
@@ -73,9 +79,7 @@ class Device {
     uint8_t ack_count_ = 0;
 
     // The scan in progress.
-    uint16_t codes_left_ = 0;  // of the scan whose frame is open; 0: none is
-    uint8_t phase_ = 0;        // codes since the last whole byte, 0..3
-    uint8_t carry_ = 0;        // bits of the last code that do not fill a byte yet
+    uint16_t cells_left_ = 0;  // of the scan whose frame is open; 0: none is
     uint32_t scan_number_ = 0;
     uint32_t scan_time_us_ = 0;
     uint8_t scan_time_rest_ = 0;  // clock cycles beyond scan_time_us_

@@ -33,11 +33,10 @@ bool FrameReader::finish() {
     const bool empty = code_ == 0 && !damaged_;
     bool valid = !damaged_ && left_ == 0 && size_ >= 4;
     if (valid) {
-        uint16_t crc = frames::CRC_INITIAL;
+        Crc16 crc;
         for (uint8_t i = 0; i < size_ - 2; i++)
-            crc = crc16_update(crc, content_[i]);
-        valid = content_[size_ - 2] == static_cast<uint8_t>(crc) &&
-                content_[size_ - 1] == static_cast<uint8_t>(crc >> 8);
+            crc.add(content_[i]);
+        valid = content_[size_ - 2] == crc.low() && content_[size_ - 1] == crc.high();
     }
     // A delimiter alone is how a host flushes the line: not an error.
     if (!valid && !empty)

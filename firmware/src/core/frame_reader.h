@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "core/attributes.h"
 #include "frames.h"
 
 namespace ohmskin {
@@ -14,7 +15,7 @@ class FrameReader {
 
     // Feeds one byte from the line; true when it completes a valid frame, which stays readable until
     // the next call.
-    bool feed(uint8_t octet);
+    OHMSKIN_RARE bool feed(uint8_t octet);
 
     // The line itself reported an error (framing, overrun): what is being received is damaged.
     void line_error() { damaged_ = true; }

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/frame_writer.h"
 
-#include "core/crc16.h"
-
 namespace ohmskin {
 
 constexpr uint16_t FrameWriter::SIZE;
@@ -42,26 +40,44 @@ void FrameWriter::encode(uint8_t octet) {
 
 void FrameWriter::begin(frames::Type type) {
     delimit();
-    crc_ = frames::CRC_INITIAL;
+    crc_ = Crc16();
     put(static_cast<uint8_t>(type));
     put(sequence_++);
 }
 
 void FrameWriter::put(uint8_t octet) {
-    crc_ = crc16_update(crc_, octet);
+    crc_.add(octet);
     encode(octet);
 }
 
+// The path every code takes: put() of each byte, with the state in registers meanwhile.
 void FrameWriter::put(const void *octets, uint8_t size) {
     const uint8_t *octet = static_cast<const uint8_t *>(octets);
-    while (size--)
-        put(*octet++);
+    Crc16 crc = crc_;
+    uint16_t write = write_;
+    uint8_t length = length_;
+    for (; size != 0; size--, octet++) {
+        crc.add(*octet);
+        if (*octet != 0 && length != 0 && length != LONGEST_BLOCK - 1) {
+            ring_[write] = *octet;
+            write = (write + 1) & MASK;
+            length++;
+            continue;
+        }
+        write_ = write;
+        length_ = length;
+        encode(*octet);
+        write = write_;
+        length = length_;
+    }
+    crc_ = crc;
+    write_ = write;
+    length_ = length;
 }
 
 void FrameWriter::end() {
-    const uint16_t crc = crc_;
-    encode(static_cast<uint8_t>(crc));
-    encode(static_cast<uint8_t>(crc >> 8));
+    encode(crc_.low());
+    encode(crc_.high());
     if (length_ != 0)
         close_block();
     delimit();

@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "core/crc16.h"
 #include "frames.h"
 
 namespace ohmskin {
@@ -54,7 +55,7 @@ class FrameWriter {
     uint16_t block_ = 0;      // where the open block's length goes
     uint8_t length_ = 0;      // of the open block, its own byte included; 0: none is open
     uint8_t sequence_ = 0;
-    uint16_t crc_ = 0;
+    Crc16 crc_;
 };
 
 }  // namespace ohmskin

@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "core/attributes.h"
 #include "frames.h"
 
 namespace ohmskin {
@@ -35,7 +36,7 @@ constexpr uint16_t SLOT_CYCLES_MAX = 60000;
 
 // The plan for a request, or why there is none. With settle_us 0 the slots fill the period;
 // otherwise they are as short as the settle time allows and the rest of the period is idle.
-frames::Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan);
+OHMSKIN_RARE frames::Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan);
 
 inline uint16_t readings_in(uint8_t rows, uint8_t columns) {
     return static_cast<uint16_t>(rows * columns * frames::READINGS_PER_CELL);

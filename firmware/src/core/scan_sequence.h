@@ -43,9 +43,15 @@ class ScanSequence {
 
     // Steps to the next reading; true when that is the first of a scan again.
     bool next() {
-        if (++at_.reading < frames::READINGS_PER_CELL)
+        const uint8_t reading = static_cast<uint8_t>(at_.reading + 1);
+        at_.reading = reading < frames::READINGS_PER_CELL ? reading : 0;
+        if (at_.reading != 0)
             return false;
-        at_.reading = 0;
+        return next_cell();
+    }
+
+  private:
+    bool next_cell() {
         if (++at_.row < rows_)
             return false;
         at_.row = 0;
@@ -55,7 +61,6 @@ class ScanSequence {
         return true;
     }
 
-  private:
     Selection at_ = {0, 0, 0};
     uint8_t rows_ = 1;
     uint8_t columns_ = 1;

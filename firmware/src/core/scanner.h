@@ -8,49 +8,56 @@ namespace ohmskin {
 
 // The interrupt's half of the scan. Time goes in slots of equal length, one conversion each:
 //
-//     slot        k-1          k           k+1
-//     converter   ..done(k-1)  hold(k)     hold(k+1)
-//     step()                   ^ code of k-1 goes in, selection of k+1 comes out
+//     slot        k-1          k            k+1          k+2
+//     converter   done(k-1)    hold(k)      hold(k+1)    hold(k+2)
+//     interrupt                | pins to k+1: selection()
+//                              | step(code of k-1): selection() is that of k+2
 //
-// step() is called once a slot, just after the sample of slot k is held. The code it is given is that
-// of slot k-1; what it returns is where pins and multiplexers have to stand for slot k+1, so they
-// settle while slot k is converted. Slots beyond the last reading of a scan are idle: they fill up
-// the scan's period.
+// The interrupt comes once a slot, just after the sample of slot k is held. It sets pins and
+// multiplexers to selection(), so they settle while slot k is converted, and calls step(). Slots beyond
+// the last reading of a scan are idle: they fill up the scan's period.
 //
-// Codes reach the main loop through a queue with one writer and one reader and 8-bit indices, which
-// an AVR reads and writes in one instruction: no interrupt is ever held off.
+// Codes reach the main loop a cell at a time, through a queue with one writer and one reader and 8-bit
+// indices, which an AVR reads and writes in one instruction: no interrupt is ever held off.
 class Scanner {
   public:
-    static constexpr uint16_t FIRST = 0x8000;  // marks the code that starts a scan
+    static constexpr uint8_t CELL = frames::READINGS_PER_CELL;
+
+    static constexpr uint16_t CODE = 0x03FF;
+    static_assert(CODE == (1u << frames::ADC_BITS) - 1, "the rest of a word is for FIRST");
 
     // Before the slots start: geometry, and how many idle slots follow a scan.
     void begin(uint8_t rows, uint8_t columns, uint16_t idle_slots) {
         sequence_.begin(rows, columns);
         idle_slots_ = idle_slots;
         idle_left_ = LEAD_IN;
-        held_ = selected_ = 0;
+        idling_ = true;
+        kinds_ = 0;
         write_ = read_ = 0;
         lost_scans_ = 0;
+        skipping_ = true;
         stopping_ = parked_ = false;
     }
 
     // Once a slot, from the interrupt.
-    Selection step(uint16_t code) {
-        if (held_ & READING)
-            push((held_ & STARTS_SCAN) ? static_cast<uint16_t>(code | FIRST) : code);
-        held_ = selected_;
-        advance();
-        return sequence_.at();
+    const Selection &selection() const { return sequence_.at(); }
+    void step(uint16_t code) {
+        const uint8_t kinds = kinds_;
+        const uint8_t held = kinds & HELD;
+        if (held != 0)
+            push(code, held);
+        kinds_ = static_cast<uint8_t>(kinds << KIND_BITS | next_kind());
     }
 
     // ---- main loop's side
-    bool take(uint16_t *code) {
-        const uint8_t at = read_;
-        if (at == write_)
-            return false;
-        *code = queue_[at];
-        read_ = static_cast<uint8_t>((at + 1) & QUEUE_MASK);
-        return true;
+    bool has_cell() const { return static_cast<uint8_t>((write_ - read_) & QUEUE_MASK) >= CELL; }
+
+    // The oldest cell's CELL codes, until release_cell(); to be masked with CODE.
+    const uint16_t *cell() const { return queue_ + read_; }
+    bool starts_scan() const { return queue_[read_] & FIRST; }
+    void release_cell() {
+        __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the codes have been read by now
+        read_ = static_cast<uint8_t>((read_ + CELL) & QUEUE_MASK);
     }
 
     // Scans whose very start was lost since begin() because the main loop was late.
@@ -61,55 +68,75 @@ class Scanner {
     bool parked() const { return parked_; }
 
   private:
-    static constexpr uint8_t QUEUE_SIZE = 32;
+    static constexpr uint16_t FIRST = 0x8000;    // in a code: the scan's first
+    static constexpr uint8_t QUEUE_SIZE = 8 * CELL;  // whole cells, so that none wraps
     static constexpr uint8_t QUEUE_MASK = QUEUE_SIZE - 1;
+    static_assert((QUEUE_SIZE & QUEUE_MASK) == 0, "indices are masked");
     static constexpr uint16_t LEAD_IN = 1;  // slots until the first selection has settled
 
-    // Kinds of slot.
-    static constexpr uint8_t READING = 1;
-    static constexpr uint8_t STARTS_SCAN = 2;
+    // Kinds of slot. kinds_ holds those of the last three, the newest in the lowest bits: of the slot
+    // selection() is for, the slot the pins are set for, and the slot held last, whose code arrives
+    // with the next step().
+    static constexpr uint8_t KIND_BITS = 2;
+    static constexpr uint8_t IDLE = 0, READING = 1, STARTS_CELL = 2, STARTS_SCAN = 3;
+    static constexpr uint8_t HELD_SHIFT = 2 * KIND_BITS;
+    static constexpr uint8_t HELD = 3 << HELD_SHIFT;
 
-    void advance() {
-        if (idle_left_ != 0) {
-            selected_ = 0;
-            if (stopping_) {
-                parked_ = held_ == 0;  // else the last reading's code is still to come
-                return;
-            }
-            if (--idle_left_ == 0)
-                selected_ = READING | STARTS_SCAN;
-            return;
-        }
-        if (!sequence_.next()) {
-            selected_ = READING;
-        } else if (idle_slots_ == 0 && !stopping_) {
-            selected_ = READING | STARTS_SCAN;
-        } else {
-            idle_left_ = idle_slots_ ? idle_slots_ : 1;
-            selected_ = 0;
-        }
+    uint8_t next_kind() {
+        if (idling_)
+            return idle();
+        if (!sequence_.next())
+            return sequence_.at().reading == 0 ? STARTS_CELL : READING;
+        if (idle_slots_ == 0 && !stopping_)
+            return STARTS_SCAN;
+        idle_left_ = idle_slots_ ? idle_slots_ : 1;
+        idling_ = true;
+        return IDLE;
     }
 
-    void push(uint16_t code) {
+    uint8_t idle() {
+        if (stopping_) {
+            parked_ = (kinds_ & ~HELD) == 0;  // else codes are still to come
+            return IDLE;
+        }
+        if (--idle_left_ != 0)
+            return IDLE;
+        idling_ = false;
+        return STARTS_SCAN;
+    }
+
+    // Room is made sure of for a whole cell at its first code. Where there is none, the rest of the
+    // scan is left out, so that the main loop sees a scan cut short and never one with a hole.
+    void push(uint16_t code, uint8_t held) {
         const uint8_t at = write_;
-        const uint8_t next = static_cast<uint8_t>((at + 1) & QUEUE_MASK);
-        if (next == read_) {
-            if (code & FIRST)
-                lost_scans_ = static_cast<uint8_t>(lost_scans_ + 1);
-            return;
+        if (held != READING << HELD_SHIFT) {
+            const bool starts_scan = held == STARTS_SCAN << HELD_SHIFT;
+            if (starts_scan) {
+                code |= FIRST;
+                skipping_ = false;
+            }
+            if (!skipping_ && static_cast<uint8_t>((at + CELL) & QUEUE_MASK) == read_) {
+                skipping_ = true;
+                if (starts_scan)
+                    lost_scans_ = static_cast<uint8_t>(lost_scans_ + 1);
+            }
         }
+        if (skipping_)
+            return;
         queue_[at] = code;
-        write_ = next;
+        __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the code is there before write_ says so
+        write_ = static_cast<uint8_t>((at + 1) & QUEUE_MASK);
     }
 
-    volatile uint16_t queue_[QUEUE_SIZE];
+    uint16_t queue_[QUEUE_SIZE];  // not volatile: write_ and read_ say who may touch what
     volatile uint8_t write_ = 0;
     volatile uint8_t read_ = 0;
     volatile uint8_t lost_scans_ = 0;
     volatile bool stopping_ = false;
     volatile bool parked_ = false;
-    uint8_t held_ = 0;      // kind of the slot held last: its code arrives with the next step()
-    uint8_t selected_ = 0;  // kind of the slot that the pins are set for
+    bool skipping_ = true;  // until the next scan starts
+    bool idling_ = true;
+    uint8_t kinds_ = 0;
     uint16_t idle_slots_ = 0;
     uint16_t idle_left_ = 0;
     ScanSequence sequence_;

@@ -33,16 +33,16 @@ void SelfTest::begin() {
         min_[i] = FULL_SCALE;
         max_[i] = 0;
     }
-    reading_ = 0;
 }
 
-void SelfTest::take(uint16_t code) {
-    if (code < min_[reading_])
-        min_[reading_] = code;
-    if (code > max_[reading_])
-        max_[reading_] = code;
-    if (++reading_ == frames::READINGS_PER_CELL)
-        reading_ = 0;
+void SelfTest::take(const uint16_t *cell) {
+    for (uint8_t i = 0; i < frames::READINGS_PER_CELL; i++) {
+        const uint16_t code = cell[i] & Scanner::CODE;
+        if (code < min_[i])
+            min_[i] = code;
+        if (code > max_[i])
+            max_[i] = code;
+    }
 }
 
 frames::SelfTestReport SelfTest::report() const {

@@ -3,6 +3,7 @@
 #include <stdint.h>
 
 #include "core/scan_plan.h"
+#include "core/scanner.h"
 
 namespace ohmskin {
 
@@ -11,9 +12,9 @@ namespace ohmskin {
 // pin is low, whatever the skin does: current only ever flows through both resistors in series.
 class SelfTest {
   public:
-    void begin();
-    void take(uint16_t code);  // codes in scan order
-    frames::SelfTestReport report() const;
+    OHMSKIN_RARE void begin();
+    void take(const uint16_t *cell);
+    OHMSKIN_RARE frames::SelfTestReport report() const;
 
     // How all multiplexer inputs are scanned: slow enough for any skin's wiring to settle.
     static ScanRequest request() {
@@ -23,7 +24,6 @@ class SelfTest {
   private:
     uint16_t min_[frames::READINGS_PER_CELL];
     uint16_t max_[frames::READINGS_PER_CELL];
-    uint8_t reading_;
 };
 
 }  // namespace ohmskin

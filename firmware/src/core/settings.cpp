@@ -12,20 +12,11 @@ namespace {
 
 constexpr uint8_t RECORD_SIZE = SettingsWriter::RECORD_SIZE;
 
-uint16_t record_crc(const uint8_t *record) {
-    uint16_t crc = frames::CRC_INITIAL;
+Crc16 record_crc(const uint8_t *record) {
+    Crc16 crc;
     for (uint8_t i = 0; i < RECORD_SIZE - 2; i++)
-        crc = crc16_update(crc, record[i]);
+        crc.add(record[i]);
     return crc;
-}
-
-void put_u16(uint8_t *octets, uint16_t value) {
-    octets[0] = static_cast<uint8_t>(value);
-    octets[1] = static_cast<uint8_t>(value >> 8);
-}
-
-uint16_t get_u16(const uint8_t *octets) {
-    return static_cast<uint16_t>(octets[0] | octets[1] << 8);
 }
 
 }  // namespace
@@ -40,8 +31,11 @@ frames::Settings load_settings(Settings *settings) {
     *settings = DEFAULT_SETTINGS;
     if (blank)
         return frames::Settings::DefaultsBlank;
-    if (get_u16(record + RECORD_SIZE - 2) != record_crc(record) ||
-        get_u16(record) != frames::LAYOUT_CRC)
+    const Crc16 crc = record_crc(record);
+    uint16_t layout;
+    memcpy(&layout, record, sizeof layout);
+    if (record[RECORD_SIZE - 2] != crc.low() || record[RECORD_SIZE - 1] != crc.high() ||
+        layout != frames::LAYOUT_CRC)
         return frames::Settings::DefaultsDamaged;
     Settings stored;
     memcpy(&stored, record + 2, sizeof stored);
@@ -53,9 +47,12 @@ frames::Settings load_settings(Settings *settings) {
 }
 
 void SettingsWriter::begin(const Settings &settings) {
-    put_u16(record_, frames::LAYOUT_CRC);
+    const uint16_t layout = frames::LAYOUT_CRC;
+    memcpy(record_, &layout, sizeof layout);
     memcpy(record_ + 2, &settings, sizeof settings);
-    put_u16(record_ + RECORD_SIZE - 2, record_crc(record_));
+    const Crc16 crc = record_crc(record_);
+    record_[RECORD_SIZE - 2] = crc.low();
+    record_[RECORD_SIZE - 1] = crc.high();
     at_ = 0;
     state_ = State::Writing;
 }

@@ -16,16 +16,16 @@ constexpr Settings DEFAULT_SETTINGS = {0, {8, 8, 90000, 0, 32}};
 
 // Loads settings from EEPROM; a record that is blank, torn, of another layout or cannot be scanned
 // yields the defaults, and the result says which.
-frames::Settings load_settings(Settings *settings);
+OHMSKIN_RARE frames::Settings load_settings(Settings *settings);
 
 // Writes settings to EEPROM one byte at a time without waiting, so that the scan goes on.
 class SettingsWriter {
   public:
     enum class State : uint8_t { Idle, Writing, Done, Failed };
 
-    void begin(const Settings &settings);
+    OHMSKIN_RARE void begin(const Settings &settings);
     // Writes the next byte when the EEPROM is free. Done and Failed are returned once.
-    State poll();
+    OHMSKIN_RARE State poll();
     bool idle() const { return state_ == State::Idle; }
 
     // Layout of the record: the protocol's layout CRC, the settings, a CRC over both.

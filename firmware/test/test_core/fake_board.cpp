@@ -18,7 +18,7 @@ Scanner scanner;
 
 void begin() {}
 uint8_t reset_cause() { return static_cast<uint8_t>(frames::ResetCause::External); }
-void feed_watchdog() {}
+void keep_alive() {}
 uint32_t now_us() { return state.now_us; }
 void mark_pass(bool) {}
 
@@ -35,14 +35,12 @@ void serial_speed(uint32_t baud) { state.baud = baud; }
 bool serial_can_write() { return !state.line_stuck && state.sent_size < sizeof state.sent; }
 void serial_write(uint8_t octet) { state.sent[state.sent_size++] = octet; }
 bool serial_idle() { return true; }
-Received serial_read(uint8_t *octet) {
-    if (state.received_at == state.received_size)
-        return Received::Nothing;
+bool serial_has_byte() { return state.received_at != state.received_size; }
+bool serial_read(uint8_t *octet) {
     *octet = state.received[state.received_at++];
-    if (!state.damage_next)
-        return Received::Byte;
+    const bool sound = !state.damage_next;
     state.damage_next = false;
-    return Received::Damaged;
+    return sound;
 }
 
 uint8_t eeprom_read(uint16_t address) { return state.eeprom[address]; }

@@ -127,15 +127,16 @@ struct Bench {
     void slots(uint16_t count, uint16_t (*code_of)(const Selection &)) {
         while (count--) {
             const uint16_t code = result;
-            result = code_of(selected);
-            selected = board::scanner.step(code);
-            host.work(4);
+            result = code_of(pins);
+            pins = board::scanner.selection();
+            board::scanner.step(code);
+            host.work(2);
         }
         host.work();
     }
     Device device;
     Host host;
-    Selection selected = {0, 0, 0};
+    Selection pins = {0, 0, 0};
     uint16_t result = 0;
 };
 
@@ -143,7 +144,7 @@ struct Bench {
 Bench &fresh() {
     static Bench bench;
     fake::reset();
-    bench.selected = Selection{0, 0, 0};
+    bench.pins = Selection{0, 0, 0};
     bench.boot();
     return bench;
 }
@@ -218,7 +219,7 @@ TEST(a_scan_frame_holds_every_code_in_order) {
     CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
     CHECK(fake::state.slots_running);
     bench.host.rewind();
-    bench.slots(1 + 2 * 12 + fake::state.plan.idle_slots + 1, ramp);
+    bench.slots(2 + 2 * 12 + fake::state.plan.idle_slots + 1, ramp);
     const uint32_t period_us = fake::state.plan.scan_cycles() / 16;
     for (uint8_t scan = 0; scan < 2; scan++) {
         Frame frame;
@@ -246,7 +247,7 @@ TEST(stop_is_answered_after_the_last_whole_scan) {
     bench.host.answer_to(Type::Configure, &size, sizeof size);
     bench.host.answer_to(Type::Start);
     bench.host.rewind();
-    bench.slots(4, ramp);
+    bench.slots(8, ramp);
     bench.host.send(Type::Stop);
     bench.host.send(Type::Start);
     bench.slots(12, ramp);
