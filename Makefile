@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+#
+# On a fresh Debian or Ubuntu machine, `make demo` and `make test` need nothing before them: they
+# install what is missing (tools/setup.sh says what) and keep Python packages in .venv.
+#
+#   PYTHON=/path/to/python3     the Python to make .venv with, 3.11 or newer
+#   OHMSKIN_PIO_ONLINE=1        let PlatformIO download its own packages (tools/platformio_offline)
+
+BIN := .venv/bin
+HOST_STAMP := .venv/.stamp-host
+STAMP := .venv/.stamp
+
+export PLATFORMIO_SETTING_ENABLE_TELEMETRY := no
+export PLATFORMIO_DISABLE_UPGRADE_CHECK := true
+ifneq ($(OHMSKIN_PIO_ONLINE),1)
+export PLATFORMIO_CORE_DIR := $(CURDIR)/.pio/core
+PIO_STAMP := .pio/core/.stamp
+$(PIO_STAMP): $(STAMP) $(shell find tools/platformio_offline -name '*.py' -o -name '*.json')
+	$(BIN)/python tools/platformio_offline/seed.py .pio/core
+	@touch $@
+endif
+
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help setup setup-host demo test check format firmware test-firmware check-firmware sim \
+        test-host bench-firmware bench-host clean distclean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: setup-host ## estimate touches on an emulated skin: no board, no compiler needed
+	$(BIN)/ohmskin demo
+
+test: setup check test-firmware firmware sim check-firmware test-host ## build, check and test everything
+
+setup: $(STAMP) $(PIO_STAMP) ## install what development needs (apt packages, .venv, PlatformIO)
+
+setup-host: $(HOST_STAMP) ## install what the host alone needs (.venv)
+
+$(HOST_STAMP): pyproject.toml
+	tools/setup.sh host
+
+$(STAMP): pyproject.toml
+	tools/setup.sh all
+
+check: setup ## formatting, lint, types, generated files
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/clang-format --dry-run -Werror $(C_FILES)
+	$(BIN)/python protocol/generate.py --check
+
+format: setup ## put Python and C++ sources into the common format
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+	$(BIN)/clang-format -i $(C_FILES)
+
+firmware: setup ## build the firmware for both boards
+	$(BIN)/pio run
+
+test-firmware: setup ## unit tests of the firmware: on this machine and in simulated AVRs
+	$(BIN)/pio test -e native -e uno_sim -e mega_sim
+
+check-firmware: setup ## cppcheck
+	$(BIN)/pio check -e uno --fail-on-defect low --fail-on-defect medium --fail-on-defect high
+
+sim: setup ## build the simulator that runs the firmware on an emulated skin
+	$(MAKE) -C firmware/sim
+
+test-host: setup firmware sim ## pytest
+	$(BIN)/pytest
+
+bench-firmware: setup firmware sim ## measure the firmware in the simulator
+	$(ONE_THREAD) $(BIN)/python benchmarks/bench_firmware.py
+
+bench-host: setup-host ## measure the estimators, on one thread
+	$(ONE_THREAD) $(BIN)/python benchmarks/bench_host.py
+
+clean: ## remove what was built
+	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name .venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
+	$(MAKE) -C firmware/sim clean
+
+distclean: clean ## remove .venv and PlatformIO's packages too
+	rm -rf .venv .pio
