@@ -1,0 +1,277 @@
+/* SPDX-License-Identifier: GPL-3.0-or-later
+ * Part of ohmskin's skinsim, a separate program that links libsimavr (GPL-3.0-or-later).
+ */
+/* The core: loading, running, resets, and the register hooks of the peripherals modelled here. */
+#include "skinsim.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <simavr/avr_extint.h>
+#include <simavr/avr_timer.h>
+#include <simavr/avr_uart.h>
+#include <simavr/sim_core.h>
+#include <simavr/sim_cycle_timers.h>
+#include <simavr/sim_elf.h>
+#include <simavr/sim_interrupts.h>
+
+enum { MCUSR_ = 0x54, PORF_ = 1, EXTRF_ = 2, WDRF_ = 8, CHAINED_MAX = 12 };
+
+avr_t *cpu;
+static avr_run_t run_instructions;
+static instant stop_at;
+static uint8_t external_interrupts;
+
+/* ---- register hooks */
+
+static uint16_t opcode(void) {
+    return (uint16_t)(cpu->flash[cpu->pc] | cpu->flash[cpu->pc + 1] << 8);
+}
+
+/* OUT takes effect at the end of its only cycle, STS, ST, SBI and CBI of their second. */
+instant cpu_write_instant(void) { return cpu->cycle + ((opcode() & 0xF800) == 0xB800 ? 1 : 2); }
+
+/* IN, SBIC, SBIS, SBI and CBI read in their first cycle, LDS and LD in their second. */
+instant cpu_read_instant(void) {
+    const bool in = (opcode() & 0xF800) == 0xB000, bit = (opcode() & 0xFC00) == 0x9800;
+    return cpu->cycle + (in || bit ? 0 : 1);
+}
+
+uint8_t cpu_written_bits(uint8_t value) {
+    const bool sbi = (opcode() & 0xFF00) == 0x9A00;
+    return sbi ? (uint8_t)(1 << (opcode() & 7)) : value;
+}
+
+void cpu_on_read(uint16_t address, avr_io_read_t hook, void *param) {
+    cpu->io[AVR_DATA_TO_IO(address)].r.c = hook;
+    cpu->io[AVR_DATA_TO_IO(address)].r.param = param;
+}
+
+void cpu_on_write(uint16_t address, avr_io_write_t hook, void *param) {
+    cpu->io[AVR_DATA_TO_IO(address)].w.c = hook;
+    cpu->io[AVR_DATA_TO_IO(address)].w.param = param;
+}
+
+static struct chained {
+    avr_io_write_t hook;
+    void *param;
+    bool strobe;
+    void (*after)(instant when);
+} chained[CHAINED_MAX];
+static size_t chained_count;
+
+static void write_chained(avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
+    const struct chained *c = param;
+    const instant when = cpu_write_instant();
+    events_until(when);
+    c->hook(avr, address, c->strobe ? cpu_written_bits(value) : value, c->param);
+    c->after(when);
+}
+
+void cpu_after_write(uint16_t address, bool strobe, void (*after)(instant when)) {
+    if (chained_count == CHAINED_MAX)
+        abort(); /* the board table grew: enlarge CHAINED_MAX */
+    struct chained *c = &chained[chained_count++];
+    c->hook = cpu->io[AVR_DATA_TO_IO(address)].w.c;
+    c->param = cpu->io[AVR_DATA_TO_IO(address)].w.param;
+    c->strobe = strobe;
+    c->after = after;
+    cpu_on_write(address, write_chained, c);
+}
+
+void *cpu_find_io(const char *kind, char name) {
+    for (avr_io_t *io = cpu->io_port; io; io = io->next) {
+        if (strcmp(io->kind, kind))
+            continue;
+        if (!name || (!strcmp(kind, "uart") && ((avr_uart_t *)io)->name == name) ||
+            (!strcmp(kind, "timer") && ((avr_timer_t *)io)->name == name))
+            return io;
+    }
+    fprintf(stderr, "skinsim: libsimavr models no %s %c of this chip\n", kind, name ? name : ' ');
+    exit(1);
+}
+
+/* ---- interrupts */
+
+/* simavr leaves a cleared interrupt in its queue of 64, which then fills up while interrupts are
+ * off, and one raised into a full queue is lost for good. */
+void cpu_clear_interrupt(avr_int_vector_t *vector) {
+    avr_int_pending_t *queue = &cpu->interrupts.pending;
+    uint16_t kept = queue->read;
+    for (uint16_t i = queue->read; i != queue->write; i = (i + 1) % avr_int_pending_fifo_size)
+        if (queue->buffer[i] != vector) {
+            queue->buffer[kept] = queue->buffer[i];
+            kept = (kept + 1) % avr_int_pending_fifo_size;
+        }
+    queue->write = kept;
+    avr_clear_interrupt(cpu, vector);
+}
+
+void cpu_level_interrupt(avr_int_vector_t *vector, bool active) {
+    if (active && avr_regbit_get(cpu, vector->enable))
+        avr_raise_interrupt(cpu, vector);
+    else if (vector->pending)
+        cpu_clear_interrupt(vector);
+}
+
+void cpu_retry_interrupt(avr_int_vector_t *vector) {
+    if (avr_regbit_get(cpu, vector->raised) && avr_regbit_get(cpu, vector->enable))
+        avr_raise_interrupt(cpu, vector);
+}
+
+/* simavr enters an interrupt in no time; the hardware takes 4 cycles, 5 with a 3-byte PC. RETI
+ * takes as long, and simavr does count that. */
+static void on_interrupt(struct avr_irq_t *irq, uint32_t running, void *param) {
+    (void)irq;
+    const avr_int_vector_t *vector = param;
+    const unsigned cycles = cpu->address_size + 2u;
+    if (running) {
+        stats_interrupt_entered(vector->vector, cpu->cycle);
+        cpu->cycle += cycles;
+        cpu->run_cycle_count = cpu->run_cycle_count > cycles ? cpu->run_cycle_count - cycles : 1;
+    } else {
+        stats_interrupt_left(vector->vector, cpu->cycle + cycles);
+        uart_level();
+        eeprom_level();
+    }
+}
+
+/* simavr's own waits for the wall clock. */
+static void on_sleep(avr_t *avr, avr_cycle_count_t how_long) { (void)avr, (void)how_long; }
+
+/* ---- resets */
+
+static avr_cycle_count_t on_stop(avr_t *avr, avr_cycle_count_t when, void *param) {
+    (void)avr, (void)when, (void)param;
+    return 0;
+}
+
+/* Without it the core would run up to 1000 cycles beyond. */
+static void arm_stop(void) {
+    if (stop_at > cpu->cycle)
+        avr_cycle_timer_register(cpu, stop_at - cpu->cycle, on_stop, NULL);
+}
+
+static void on_reset(avr_io_t *io) {
+    (void)io;
+    events_reset();
+    arm_stop();
+    skin_reset();
+    adc_reset();
+    timer_reset();
+    uart_reset();
+    eeprom_reset();
+    stats_cpu_reset();
+}
+
+/* Reset flags accumulate in MCUSR until the firmware clears them; simavr clears all registers. */
+static void reset_with(uint8_t flag, avr_run_t reset) {
+    const uint8_t flags = cpu->data[MCUSR_] | flag;
+    reset(cpu);
+    cpu->run = run_instructions;
+    cpu->data[MCUSR_] = flags;
+    for (uint8_t i = 0; i < external_interrupts;
+         i++) /* a low INTn pin is polled every cycle otherwise */
+        avr_extint_set_strict_lvl_trig(cpu, i, 0);
+}
+
+void cpu_external_reset(void) { reset_with(EXTRF_, avr_reset); }
+
+/* ---- running */
+
+bool cpu_alive(void) { return cpu->state == cpu_Running || cpu->state == cpu_Sleeping; }
+
+const char *cpu_state_name(void) {
+    return cpu_alive() ? "running" : cpu->state == cpu_Done ? "done" : "crashed";
+}
+
+void cpu_run_until(instant target) {
+    stop_at = target;
+    arm_stop();
+    while (cpu->cycle < target) {
+        cpu->run(cpu);
+        /* After SEI and RETI the hardware runs one more instruction; simavr counts down from -2. */
+        if (cpu->interrupt_state == -1)
+            cpu->interrupt_state = (int8_t)avr_has_pending_interrupts(cpu);
+        if (cpu->run != run_instructions) /* simavr's watchdog wants its reset */
+            reset_with(WDRF_, cpu->run);
+        if (!cpu_alive())
+            return;
+    }
+}
+
+static void log_errors(struct avr_t *avr, const int level, const char *format, va_list arguments) {
+    (void)avr;
+    if (level <= LOG_ERROR)
+        vfprintf(stderr, format, arguments);
+}
+
+static bool fits(const char *what, uint32_t base, uint32_t size, uint32_t end) {
+    if (base <= end && size <= end - base)
+        return true;
+    fprintf(stderr, "skinsim: the ELF's %s does not fit this chip\n", what);
+    return false;
+}
+
+/* simavr notices an access beyond the memories, says crashed, and then makes the access. */
+static bool enlarge_memories(void) {
+    enum { DATA_SPACE = 1 << 16, FLASH_SPACE = 1 << 24, SLACK = 16 };
+    uint8_t *data = calloc(1, DATA_SPACE + SLACK), *flash = calloc(1, FLASH_SPACE + SLACK);
+    if (!data || !flash)
+        return false;
+    memcpy(data, cpu->data, cpu->ramend + 1u);
+    memcpy(flash, cpu->flash, cpu->flashend + 1u);
+    free(cpu->data);
+    free(cpu->flash);
+    cpu->data = data;
+    cpu->flash = flash;
+    return true;
+}
+
+bool cpu_start(const struct board *board, const char *elf_path) {
+    const char *mcu = board->mcu;
+    static elf_firmware_t firmware;
+    static avr_io_t resets = {.kind = "skinsim", .reset = on_reset};
+
+    avr_global_logger_set(log_errors);
+    if (elf_read_firmware(elf_path, &firmware) || !firmware.flash) {
+        fprintf(stderr, "skinsim: cannot load '%s' as an AVR ELF file\n", elf_path);
+        return false;
+    }
+    cpu = avr_make_mcu_by_name(mcu);
+    if (!cpu) {
+        fprintf(stderr, "skinsim: libsimavr does not know %s\n", mcu);
+        return false;
+    }
+    if (avr_init(cpu) || !enlarge_memories()) {
+        fprintf(stderr, "skinsim: out of memory\n");
+        return false;
+    }
+    if (!fits("program", firmware.flashbase, firmware.flashsize, cpu->flashend + 1) ||
+        !fits("EEPROM section", 0, firmware.eesize, cpu->e2end + 1u))
+        return false;
+    firmware.frequency = CPU_HZ;
+    strcpy(firmware.mmcu, mcu);
+    avr_load_firmware(cpu, &firmware);
+    cpu->log = LOG_ERROR;
+    cpu->gdb_port = 0;
+    cpu->sleep = on_sleep;
+    cpu->run_cycle_limit = CPU_HZ;
+    run_instructions = cpu->run;
+    external_interrupts = strcmp(mcu, "atmega2560") ? 2 : 8;
+    for (int i = 0; i < cpu->interrupts.vector_count; i++) {
+        avr_int_vector_t *vector = cpu->interrupts.vector[i];
+        avr_irq_register_notify(&vector->irq[AVR_INT_IRQ_RUNNING], on_interrupt, vector);
+    }
+    adc_start();
+    timer_start();
+    uart_start();
+    eeprom_start();
+    skin_start(board);
+    avr_register_io(cpu, &resets);
+    reset_with(PORF_, avr_reset);
+    cpu->data[MCUSR_] = PORF_;
+    stats_start();
+    return true;
+}

@@ -1,0 +1,51 @@
+/* SPDX-License-Identifier: GPL-3.0-or-later
+ * Part of ohmskin's skinsim, a separate program that links libsimavr (GPL-3.0-or-later).
+ */
+/* skinsim: runs an unchanged AVR firmware with a tactile skin attached. */
+#include "skinsim.h"
+
+#include <getopt.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <unistd.h>
+
+static int usage(void) {
+    fprintf(stderr, "usage: skinsim --board uno|megaatmega2560 [--pty] ELF\n");
+    return 2;
+}
+
+int main(int argc, char **argv) {
+    static const struct option OPTIONS[] = {
+        {"board", required_argument, NULL, 'b'}, {"pty", no_argument, NULL, 'p'}, {0}};
+    const struct board *board = NULL;
+    bool pty = false;
+    for (int option; (option = getopt_long(argc, argv, "", OPTIONS, NULL)) != -1;) {
+        if (option == 'b')
+            board = skin_find_board(optarg);
+        else if (option == 'p')
+            pty = true;
+        else
+            return usage();
+        if (!board && option == 'b')
+            return usage();
+    }
+    if (!board || optind != argc - 1)
+        return usage();
+
+    /* libsimavr prints on stdout; only replies may go there. */
+    const int replies = dup(STDOUT_FILENO);
+    if (replies < 0 || dup2(STDERR_FILENO, STDOUT_FILENO) < 0) {
+        perror("skinsim");
+        return 1;
+    }
+    signal(SIGPIPE, SIG_IGN);
+    control_start(STDIN_FILENO, replies);
+    if (!cpu_start(board, argv[optind]))
+        return 1;
+    if (pty)
+        return pty_run();
+    while (control_serve_one(false) == CONTROL_OK)
+        ;
+    return 0;
+}

@@ -1,0 +1,175 @@
+/* SPDX-License-Identifier: GPL-3.0-or-later
+ * Part of ohmskin's skinsim, a separate program that links libsimavr (GPL-3.0-or-later).
+ */
+/* What the parts of skinsim know of each other. One process simulates one board, so each part
+ * keeps its state to itself, in one static struct.
+ *
+ * Time: an `instant` counts CPU cycles since power-on and never goes back, whatever is reset.
+ */
+#ifndef SKINSIM_H
+#define SKINSIM_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include <simavr/sim_avr.h>
+
+#define CPU_HZ 16000000u
+#define NEVER UINT64_MAX
+
+typedef uint64_t instant;
+
+/* ---- cpu.c: the core, register hooks, resets */
+
+extern avr_t *cpu;
+struct board;
+/* Loads the program, starts every part below and powers the board on. Says on stderr why not. */
+bool cpu_start(const struct board *board, const char *elf_path);
+/* Runs to the first instruction boundary at or after `target`, or to a crash or a final sleep. */
+void cpu_run_until(instant target);
+bool cpu_alive(void);
+const char *cpu_state_name(void);
+void cpu_external_reset(void);
+/* When the register access being executed takes effect; only valid inside a register hook. */
+instant cpu_write_instant(void);
+instant cpu_read_instant(void);
+/* The bits that the store being executed writes: SBI touches one bit alone in the hardware, while
+ * simavr reads the register, sets the bit and writes all eight. */
+uint8_t cpu_written_bits(uint8_t value);
+/* These replace simavr's own hook of the register. */
+void cpu_on_read(uint16_t address, avr_io_read_t hook, void *param);
+void cpu_on_write(uint16_t address, avr_io_write_t hook, void *param);
+/* Calls `after` when simavr's own write hook of this register has run. In a `strobe` register
+ * writing ones does something and zeros do nothing. */
+void cpu_after_write(uint16_t address, bool strobe, void (*after)(instant when));
+void *cpu_find_io(const char *kind, char name);
+void cpu_clear_interrupt(avr_int_vector_t *vector);
+/* Level-triggered interrupt: pending for as long as `active`. */
+void cpu_level_interrupt(avr_int_vector_t *vector, bool active);
+/* Edge-triggered interrupt whose flag may have been set while it was disabled. */
+void cpu_retry_interrupt(avr_int_vector_t *vector);
+
+/* ---- events.c: one queue in exact order of time for everything that is modelled here */
+
+enum event {
+    EVENT_TIMER0,
+    EVENT_TIMER1,
+    EVENT_ADC,
+    EVENT_UART_TX,
+    EVENT_UART_RX,
+    EVENT_EEPROM,
+    EVENTS
+};
+typedef void (*event_handler)(instant due);
+void events_handle(enum event event, event_handler handler);
+void events_set(enum event event, instant due);
+/* Runs everything due up to and including `when`. Each register hook calls it first. */
+void events_until(instant when);
+void events_reset(void);
+
+/* ---- skin.c: pins and table to node voltages */
+
+enum { SKIN_ROWS = 16, SKIN_COLUMNS = 16, SKIN_CONFIGURATIONS = 4 };
+enum { NODE_TOP, NODE_BOTTOM, NODES };
+/* Configurations A to D as in the table, then what no table entry describes. */
+enum { CONFIG_A, CONFIG_B, CONFIG_C, CONFIG_D, CONFIG_NO_CURRENT, CONFIG_UNDRIVEN, CONFIG_OTHER };
+
+struct board {
+    const char *name, *mcu;
+    uint16_t row_port, column_port, drive_port; /* data-space addresses of PORTx */
+    uint8_t row_shift, column_shift, drive_top_bit, drive_bottom_bit;
+};
+const struct board *skin_find_board(const char *name);
+void skin_start(const struct board *board);
+void skin_reset(void);
+void skin_set_table(const double *ratio);
+void skin_set_tau_us(double tau_us);
+double skin_ratio(unsigned node, instant when);
+struct skin_pins {
+    uint8_t row, column, configuration;
+};
+struct skin_pins skin_pins(unsigned node);
+
+/* ---- adc.c */
+
+enum adc_trigger {
+    ADC_TRIGGER_FREE = 0,
+    ADC_TRIGGER_TIMER1_B = 5,
+    ADC_TRIGGER_TIMER1_OVERFLOW = 6
+};
+void adc_start(void);
+void adc_reset(void);
+/* A rising edge of the flag that is this trigger source. */
+void adc_trigger_edge(enum adc_trigger source, instant when);
+
+/* ---- timer.c: timers 0 and 1 */
+
+void timer_start(void);
+void timer_reset(void);
+bool timer1_flag(unsigned bit);
+
+/* ---- uart.c */
+
+void uart_start(void);
+void uart_reset(void);
+void uart_level(void);
+void uart_set_host_baud(uint32_t baud); /* 0: whatever the device uses */
+bool uart_host_write(const uint8_t *bytes, size_t count);
+size_t uart_host_queue(void); /* bytes that the line has not carried yet */
+/* Bytes the device has sent and nobody has drained. */
+const uint8_t *uart_sent(size_t *count);
+void uart_drain(size_t count);
+
+/* ---- eeprom.c */
+
+void eeprom_start(void);
+void eeprom_reset(void);
+void eeprom_level(void);
+uint8_t *eeprom_content(size_t *size);
+
+/* ---- stats.c: counters, hold log, idle marker */
+
+enum { VECTORS = 64 };
+struct load {
+    uint64_t count, cycles, cycles_max;
+};
+struct gap {
+    uint64_t count, cycles, min, max;
+};
+struct stats {
+    uint64_t conversions, lost_results, undriven, reference_not_avcc, unmodelled_triggers,
+        unmodelled_timer_modes;
+    uint64_t tx_bytes, tx_ignored, tx_undrained_lost, rx_bytes, rx_overruns, rx_ignored,
+        rx_framing_errors;
+    uint64_t pty_dropped, late_slices, hold_log_dropped;
+    struct gap settle, after_hold, trigger;
+    struct load interrupts, vector[VECTORS];
+    uint64_t idle_cycles, passes;
+};
+extern struct stats stats;
+
+void stats_start(void);
+void stats_reset(void);
+void stats_cpu_reset(void);
+void stats_pins_changed(instant when);
+void stats_channel_changed(instant when);
+void stats_hold(instant when, unsigned channel, uint16_t code);
+void stats_conversion_started(instant when);
+void stats_interrupt_entered(uint8_t vector, instant when);
+void stats_interrupt_left(uint8_t vector, instant when);
+char *stats_json(void); /* the caller frees it */
+
+void hold_log_enable(bool enable);
+const uint8_t *hold_log_records(size_t *bytes);
+void hold_log_clear(void);
+
+/* ---- control.c and pty.c: the outside world */
+
+enum control_result { CONTROL_OK, CONTROL_END };
+void control_start(int in_fd, int out_fd);
+enum control_result control_serve_one(bool real_time);
+bool control_reply(uint8_t op, const void *payload, size_t length);
+int pty_run(void);
+
+#endif
