@@ -39,9 +39,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
+from ohmskin.protocol import ADC_BITS, ENUMS
+
 Float = NDArray[np.float64]
 
-CONFIGURATIONS: Final = ("A", "B", "C", "D")
+CONFIGURATIONS: Final = tuple(ENUMS["reading"].values)
 READINGS_PER_CELL: Final = len(CONFIGURATIONS)
 # Every configuration reads y = offset + sign * R * I, R the reference resistor of the sensed layer.
 READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
@@ -49,7 +51,7 @@ READING_SIGN: Final[Float] = np.array([-1.0, 1.0, -1.0, 1.0])
 READING_SENSES_TOP: Final[NDArray[np.bool_]] = np.array([True, False, False, True])
 
 DEFAULT_REF_OHM: Final = 30_000.0
-DEFAULT_ADC_BITS: Final = 10
+DEFAULT_ADC_BITS: Final = ADC_BITS
 # Readings called exact come from a circuit solver or an average: nine digits are trusted.
 EXACT_RATIO_STD: Final = 1e-9
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames from bytes and bytes from frames; no port, no thread, no clock.
 
-    encode   type, sequence, payload  ->  0x00 COBS(type sequence payload crc16) 0x00
-    Decoder  bytes as they come       ->  whole, valid frames, and counts of what was not
+encode   type, sequence, payload  ->  0x00 COBS(type sequence payload crc16) 0x00
+Decoder  bytes as they come       ->  whole, valid frames, and counts of what was not
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def unpack_codes(packed: bytes, rows: int, columns: int) -> NDArray[np.uint16]:
         octets = np.pad(octets, (0, groups * _GROUP_BYTES - len(octets)))
     words[:, :_GROUP_BYTES] = octets.reshape(groups, _GROUP_BYTES)
     spread = (words.view("<u8") >> _SHIFTS) & np.uint64(_CODE_MASK)
-    codes = spread.astype(np.uint16).reshape(-1)[:count]
+    codes: NDArray[np.uint16] = spread.astype(np.uint16).reshape(-1)[:count]
     return codes.reshape(columns, rows, READINGS_PER_CELL).transpose(1, 0, 2)
 
 
@@ -224,5 +224,5 @@ def pack_codes(codes: NDArray[np.uint16]) -> bytes:
     flat = codes.transpose(1, 0, 2).reshape(-1).astype(np.uint64)
     flat = np.pad(flat, (0, -len(flat) % _GROUP_CODES))
     words = (flat.reshape(-1, _GROUP_CODES) << _SHIFTS).sum(axis=1, dtype=np.uint64)
-    octets = words.astype("<u8").view(np.uint8).reshape(-1, 8)[:, :_GROUP_BYTES]
+    octets: NDArray[np.uint8] = words.astype("<u8").view(np.uint8).reshape(-1, 8)[:, :_GROUP_BYTES]
     return octets.tobytes()[: codes_size(rows, columns)]

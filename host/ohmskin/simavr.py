@@ -230,6 +230,15 @@ class SkinSim:
         """Pull the reset pin, as a USB bridge does when a port opens: sets EXTRF in MCUSR."""
         self._request("X")
 
+    def jump(self, address: int) -> None:
+        """Go on at this byte address of the flash, as if a fault had changed the program counter.
+
+        Raises ValueError for a negative or odd address, SimulationError beyond the flash.
+        """
+        if address < 0 or address % 2:
+            raise ValueError(f"address is {address}: must be even and not negative")
+        self._request("J", struct.pack("<I", address))
+
     def _request(self, op: str, payload: bytes = b"") -> bytes:
         pipe = self._process.stdin
         if pipe is None or pipe.closed:

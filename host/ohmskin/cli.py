@@ -1,0 +1,368 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: ``ohmskin --help``. An error is one line that says what to do, exit code 2."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
+
+import ohmskin
+from ohmskin import demo as demonstration
+from ohmskin import show
+from ohmskin.device import Device
+from ohmskin.errors import OhmskinError, PortError
+from ohmskin.estimators import METHODS, Estimator, SkinKnowledge, make_estimator
+from ohmskin.faults import FAULTS
+from ohmskin.link import serial_ports
+from ohmskin.messages import Scan
+from ohmskin.ports import emulated
+from ohmskin.protocol import ENUMS
+from ohmskin.pty_server import PtyServer
+from ohmskin.readings import estimate_file, load_readings, save_arrays
+from ohmskin.scenes import SCENES
+from ohmskin.simavr_link import BOARDS
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Reads resistive tactile skins: boards, scans, and the conductance of every cell.",
+    epilog="PORT is a serial port (/dev/ttyACM0, COM3) or a URL: emulator://8x8?scene=ghost, "
+    "simavr://uno?scene=ghost.",
+)
+_out = Console()
+_DISPLAY_EVERY_S = 0.1
+_WIDTH = 160
+
+Port = Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")]
+
+
+def main() -> None:
+    """Run the command line; the process's exit code says how it went."""
+    try:
+        app(prog_name="ohmskin", standalone_mode=False)
+    except (OhmskinError, ValueError, OSError) as exc:
+        _fail(str(exc))
+    except typer.Abort:
+        sys.exit(130)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as exc:
+        if not hasattr(exc, "format_message"):
+            raise
+        _fail(exc.format_message())  # a wrong use of the command line
+
+
+def _fail(text: str) -> None:
+    print(f"ohmskin: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+    sys.exit(2)
+
+
+# ------------------------------------------------------------------------------------- boards
+
+
+@app.command()
+def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")] = False) -> None:
+    """List the serial ports of this machine, and the kinds of ports that need no board."""
+    found = serial_ports()
+    if as_json:
+        print(json.dumps([asdict(port) for port in found]))  # noqa: T201
+        return
+    table = Table(box=None)
+    for heading in ("port", "board", "description"):
+        table.add_column(heading)
+    for port in found:
+        table.add_row(port.path, port.board or "?", port.description)
+    _out.print(table if found else "no serial ports: is the board plugged in?")
+    _out.print("without a board: emulator://8x8?scene=ghost, simavr://uno?scene=ghost")
+
+
+@app.command()
+def info(
+    port: Port,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    self_test: Annotated[
+        bool, typer.Option("--self-test", help="also test sense nodes and reference resistors")
+    ] = False,
+) -> None:
+    """Say what board is at PORT and how it scans."""
+    with ohmskin.open(port, start=False) as skin:
+        facts: dict[str, Any] = {**asdict(skin.info), "rate_hz": round(skin.info.rate_hz, 4)}
+        if self_test:
+            facts.update(asdict(skin.self_test()))
+    if as_json:
+        print(json.dumps(facts))  # noqa: T201
+        return
+    table = Table(box=None, show_header=False)
+    for name, value in facts.items():
+        table.add_row(name, _text(name, value))
+    _out.print(table)
+    for finding in facts.get("findings", ()):
+        _out.print(f"[red]{finding}[/]: {ENUMS['finding'].docs[finding]}")
+    if facts.get("findings"):
+        raise SystemExit(1)
+
+
+def _text(name: str, value: object) -> str:
+    if name == "layout_crc":
+        return f"0x{value:04X}"
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value)) or "none"
+    return str(value)
+
+
+@app.command()
+def configure(
+    port: Port,
+    rows: Annotated[int | None, typer.Option(help="rows to scan, 1 to 16")] = None,
+    columns: Annotated[int | None, typer.Option(help="columns to scan, 1 to 16")] = None,
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate", help="scans a second; 0: as fast as possible")
+    ] = None,
+    settle_us: Annotated[
+        int | None,
+        typer.Option("--settle", help="least settle time [us]; 0: as long as the rate allows"),
+    ] = None,
+    adc_prescaler: Annotated[
+        str | None, typer.Option("--adc", help=" | ".join(ENUMS["adc_prescaler"].values))
+    ] = None,
+    unit_id: Annotated[int | None, typer.Option(help="name this skin")] = None,
+    defaults: Annotated[bool, typer.Option(help="return to the defaults first")] = False,
+    save: Annotated[bool, typer.Option(help="keep it in the board's EEPROM")] = False,
+) -> None:
+    """Change how the board scans; what is not given stays. Lasts until its reset, or --save."""
+    with ohmskin.open(port, start=False) as skin:
+        if defaults:
+            skin.load_defaults()
+        now = skin.configure(
+            rows=rows,
+            columns=columns,
+            rate_hz=rate_hz,
+            settle_us=settle_us,
+            adc_prescaler=adc_prescaler,
+        )
+        if unit_id is not None:
+            skin.set_unit_id(unit_id)
+        if save:
+            skin.save()
+    _out.print(
+        f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, settle time {now.settle_us} us or more"
+        f"{', saved' if save else ', until its next reset'}"
+    )
+
+
+@app.command()
+def flash(
+    board: Annotated[str, typer.Argument(help=" | ".join(BOARDS))] = "",
+    port: Annotated[str, typer.Option(help="serial port of the board")] = "",
+) -> None:
+    """Build the firmware and write it to a board (needs a checkout and PlatformIO)."""
+    known = [p for p in serial_ports() if p.board and port in ("", p.path)]
+    if not board and len(known) == 1:
+        board, port = known[0].board, known[0].path
+    if board not in BOARDS:
+        raise PortError(f"say which board to flash: ohmskin flash {' | '.join(BOARDS)}")
+    root = Path(__file__).parents[2]
+    if not (root / "platformio.ini").is_file():
+        raise OhmskinError("the firmware is not here: run this in a checkout of the repository")
+    pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
+    if pio is None:
+        raise OhmskinError("PlatformIO is not installed: pip install 'ohmskin[flash]'")
+    command = [pio, "run", "-d", str(root), "-e", board, "-t", "upload"]
+    _out.print(f"flashing {board}{f' at {port}' if port else ''}")
+    if subprocess.run([*command, *(["--upload-port", port] if port else [])]).returncode:
+        raise OhmskinError(f"flashing {board} failed: its last lines above say why")
+    if port:
+        with ohmskin.open(port, start=False) as skin:
+            _out.print(f"{port}: {skin.info.board}, firmware {skin.info.version}, answers")
+
+
+# -------------------------------------------------------------------------------------- scans
+
+
+@app.command()
+def stream(
+    port: Port,
+    method: Annotated[
+        str, typer.Option(help=f"estimator: {' | '.join(METHODS)}; none: readings alone")
+    ] = "matrix",
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object a scan")] = False,
+    scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
+    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+) -> None:
+    """Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it."""
+    if method != "none" and method not in METHODS:
+        raise ValueError(f"no method '{method}': there are none, {', '.join(METHODS)}")
+    with ohmskin.open(port) as skin:
+        estimator = None if method == "none" else _estimator(skin, method)
+        with suppress(KeyboardInterrupt):
+            if as_json:
+                _print_scans(skin, estimator, scans, seconds)
+            else:
+                _show_scans(skin, estimator, scans, seconds)
+        lost = skin.stats
+    if lost.missed or lost.line.damaged or lost.restarts:
+        text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
+        text += f"{lost.line.damaged} damaged frames, {lost.restarts} restarts"
+        print(text, file=sys.stderr)  # noqa: T201
+
+
+def _estimator(skin: Device, method: str) -> Estimator:
+    board = skin.info
+    return make_estimator(
+        method,
+        SkinKnowledge(
+            board.rows,
+            board.columns,
+            ref_top_ohm=board.ref_top_ohm,
+            ref_bottom_ohm=board.ref_bottom_ohm,
+            adc_bits=board.adc_bits,
+        ),
+    )
+
+
+def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
+    end_s = time.monotonic() + seconds if seconds else float("inf")
+    for number, scan in enumerate(scans, start=1):
+        yield scan
+        if number == count or time.monotonic() >= end_s:
+            return
+
+
+def _print_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
+    for scan in _limited(iter(skin), count, seconds):
+        line: dict[str, Any] = {
+            "scan": scan.number,
+            "time_us": scan.time_us,
+            "host_time_s": round(scan.host_time_s, 6),
+            "missed": scan.missed,
+            "ratio": scan.ratio.tolist(),
+        }
+        if estimator is not None:
+            estimate = estimator.estimate(scan.ratio)
+            line["method"] = estimator.name
+            line["cell_siemens"] = estimate.cell_siemens.tolist()
+            line["cell_siemens_std"] = estimate.cell_siemens_std.tolist()
+            line["converged"] = estimate.converged
+        try:
+            print(json.dumps(line), flush=True)  # noqa: T201
+        except BrokenPipeError:
+            sys.stderr.close()  # the reader, such as `head`, has had enough
+            return
+
+
+def _show_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
+    rate_hz, shown_s = 0.0, 0.0
+    first: Scan | None = None
+    with Live(console=_out, auto_refresh=False) as live:
+        for scan in _limited(iter(skin), count, seconds):
+            if first is None or scan.time_us < first.time_us:
+                first = scan  # or the board has restarted
+            elif scan.time_us > first.time_us:
+                rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
+            # A terminal shows ten pictures a second; every scan is counted all the same.
+            if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
+                shown_s = scan.host_time_s
+                live.update(_picture(skin, estimator, scan, rate_hz), refresh=True)
+
+
+def _picture(skin: Device, estimator: Estimator | None, scan: Scan, rate_hz: float) -> Group:
+    stats = skin.stats
+    caption = (
+        f"scan {scan.number}  {rate_hz:.1f} Hz  missed {stats.missed}  "
+        f"damaged {stats.line.damaged}  restarts {stats.restarts}"
+    )
+    if estimator is None:
+        title = f"{skin.name}: reading B in thousandths of Vdd"
+        return Group(Text(title), show.cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
+    estimate = estimator.estimate(scan.ratio)
+    if not estimate.converged:
+        caption += f"  not converged: {estimate.message}"
+    title = f"{skin.name}: cell conductance by '{estimator.name}' [microsiemens]"
+    return Group(Text(title), show.cells_table(estimate.cell_siemens, ""), Text(caption))
+
+
+@app.command()
+def estimate(
+    readings: Annotated[Path, typer.Argument(help="readings file (.npz)")],
+    method: Annotated[str, typer.Option(help=" | ".join(METHODS))],
+    out: Annotated[Path, typer.Option(help="file to write (.npz)")],
+    cold: Annotated[bool, typer.Option(help="start every frame afresh")] = False,
+) -> None:
+    """Estimate every cell of every frame of a readings file."""
+    given = load_readings(readings)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(method, total=len(given.ratio))
+
+        def show_progress(done: int, _: int) -> None:
+            progress.update(task, completed=done)
+
+        answers = estimate_file(given, method, cold=cold, progress=show_progress)
+    save_arrays(out, answers)
+    frames = len(answers["converged"])
+    _out.print(
+        f"{out}: {frames} frames, {int(answers['converged'].sum())} converged, "
+        f"median {1e3 * float(np.median(answers['seconds'])):.2f} ms a frame"
+    )
+
+
+# ---------------------------------------------------------------------------- without a board
+
+
+@app.command(
+    epilog=f"Scenes: {'; '.join(f'{k}: {v}' for k, v in SCENES.items())}. "
+    f"Faults: {'; '.join(f'{k}: {v}' for k, v in FAULTS.items())}."
+)
+def emulate(
+    url: Annotated[str, typer.Argument(help="emulator://8x8?scene=ghost&seed=1")] = (
+        "emulator://8x8?scene=ghost"
+    ),
+    link: Annotated[
+        Path | None, typer.Option(help="also make this symbolic link to the pseudo-terminal")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+) -> None:
+    """Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C ends it."""
+    board, _, faults = emulated(url)
+    with ExitStack() as stack:
+        server = stack.enter_context(PtyServer(board, faults))
+        if link is not None:
+            if link.is_symlink():
+                link.unlink()
+            link.symlink_to(server.path)
+            stack.callback(link.unlink, missing_ok=True)
+        print(server.path, flush=True)  # noqa: T201
+        with suppress(KeyboardInterrupt):
+            server.serve(seconds or float("inf"))
+
+
+@app.command()
+def demo(
+    seconds: Annotated[float, typer.Option(help="how long to scan")] = 3.0,
+    port: Annotated[str, typer.Option(help="an emulator:// URL")] = demonstration.URL,
+    picture: Annotated[Path, typer.Option(help="PNG to write")] = Path("ohmskin-demo.png"),
+) -> None:
+    """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
+    result = demonstration.run(port, seconds)
+    # Three tables stand side by side where nothing says how wide the output is.
+    wide = Console(width=_WIDTH) if not _out.is_terminal else _out
+    demonstration.report(result, wide)
+    show.save_picture(picture, result.panels, result.title)
+    _out.print(f"picture: {picture}")

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can go wrong between a program and a board. Every text says what to do."""
+
+from __future__ import annotations
+
+
+class OhmskinError(Exception):
+    """Any of the errors below. Bad arguments are `ValueError` instead."""
+
+
+class PortError(OhmskinError):
+    """A port that cannot be opened: unknown, busy, not permitted, a wrong URL."""
+
+
+class DeviceLost(OhmskinError):
+    """The board has gone, or no longer says anything."""
+
+
+class DeviceSilent(OhmskinError):
+    """The port is open, but no skin board answers at it."""
+
+
+class ProtocolMismatch(OhmskinError):
+    """The board was built from another protocol definition."""
+
+
+class CommandRefused(OhmskinError):
+    """The board refused a command, and nothing has changed.
+
+    `command`: its name. `result`: name of the reason in ``frames.toml``.
+    """
+
+    def __init__(self, command: str, result: str, reason: str) -> None:
+        super().__init__(f"the board refused '{command}': {result}: {reason}")
+        self.command = command
+        self.result = result
