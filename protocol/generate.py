@@ -154,6 +154,7 @@ def vectors_header() -> str:
     out = [
         "// SPDX-License-Identifier: Apache-2.0",
         "// Written by protocol/generate.py from protocol/vectors.json; do not edit.",
+        "// clang-format off",
         "#pragma once",
         "#include <stdint.h>",
         "#ifdef __AVR__",

@@ -5,8 +5,8 @@
 #include "core/scan_plan.h"
 #include "core/scanner.h"
 
-// The whole hardware contract: what a board has to offer. board_avr.cpp implements it for the Uno and
-// the Mega 2560, firmware/test/fake_board.h for the unit tests. Nothing here blocks.
+// The whole hardware contract: what a board has to offer. board_avr.cpp implements it for the Uno
+// and the Mega 2560, firmware/test/fake_board.h for the unit tests. Nothing here blocks.
 namespace ohmskin {
 namespace board {
 

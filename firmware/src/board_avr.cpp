@@ -46,8 +46,8 @@ inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
 #elif defined(__AVR_ATmega2560__)
 const frames::Board KIND = frames::Board::Megaatmega2560;
 namespace {
-// Row address D22-D25 (PA0-3), column address D37-D34 (PC0-3), drive top D49 (PL0), drive bottom D48
-// (PL1).
+// Row address D22-D25 (PA0-3), column address D37-D34 (PC0-3), drive top D49 (PL0), drive bottom
+// D48 (PL1).
 constexpr uint8_t DRIVE_TOP = _BV(PL0);
 constexpr uint8_t DRIVE_BOTTOM = _BV(PL1);
 inline void pins_begin() {
@@ -77,9 +77,9 @@ struct Registers {
     uint8_t admux;
 };
 constexpr Registers registers_of(Configuration c) {
-    return Registers{c.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
-                     static_cast<uint8_t>(_BV(REFS0) |
-                                          (c.sense == Sense::Top ? CHANNEL_TOP : CHANNEL_BOTTOM))};
+    return Registers{
+        c.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
+        static_cast<uint8_t>(_BV(REFS0) | (c.sense == Sense::Top ? CHANNEL_TOP : CHANNEL_BOTTOM))};
 }
 static_assert(frames::READINGS_PER_CELL == 4, "one entry a configuration below");
 constexpr Registers REGISTERS[] = {
@@ -89,8 +89,8 @@ constexpr Registers REGISTERS[] = {
     registers_of(CONFIGURATIONS[3]),
 };
 
-// Timer 1 counts a slot. Compare B triggers the conversion; compare A interrupts just after its hold,
-// which comes 2 ADC clocks and 3 cycles of synchronisation after the trigger.
+// Timer 1 counts a slot. Compare B triggers the conversion; compare A interrupts just after its
+// hold, which comes 2 ADC clocks and 3 cycles of synchronisation after the trigger.
 constexpr uint16_t TRIGGER_AT = 8;
 constexpr uint16_t interrupt_at(uint8_t prescaler) {
     return static_cast<uint16_t>(TRIGGER_AT + 2u * prescaler + 3 + 4);
@@ -107,7 +107,6 @@ inline void select(const Selection &selection) {
     pins_set(selection.row, selection.column, registers.drive);
     ADMUX = registers.admux;
 }
-
 
 }  // namespace
 
@@ -230,9 +229,9 @@ void serial_write(uint8_t octet) {
 
 bool serial_idle() { return UCSR0A & _BV(TXC0); }
 
-// Reception has an interrupt, because at 1 Mbaud the chip's own three bytes are full after 30 us. It
-// takes 4 us, once a byte of a command, by which a slot interrupt may come late: pins then settle that
-// much shorter, and no reading is lost.
+// Reception has an interrupt, because at 1 Mbaud the chip's own three bytes are full after 30 us.
+// It takes 4 us, once a byte of a command, by which a slot interrupt may come late: pins then
+// settle that much shorter, and no reading is lost.
 namespace {
 constexpr uint8_t RECEIVED_SIZE = 32;  // more than the longest command
 uint8_t received[RECEIVED_SIZE];

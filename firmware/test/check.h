@@ -25,7 +25,7 @@
 #include <avr/sleep.h>
 #include <util/delay.h>
 #define CHECK_FLASH PROGMEM
-#define CHECK_TEXT(text) "" // 2 KiB of RAM have no room for it: the line number must do
+#define CHECK_TEXT(text) ""  // 2 KiB of RAM have no room for it: the line number must do
 #else
 #define CHECK_FLASH
 #define CHECK_TEXT(text) text ": "
@@ -57,13 +57,13 @@ struct Test {
 
 struct Link {
     explicit Link(const Test &test);
-    const Test &test; // in flash on an AVR
+    const Test &test;  // in flash on an AVR
     Link *next;
 };
 
 struct State {
     Link *first, *last;
-    const char *name; // of the running test
+    const char *name;  // of the running test
     int failed_checks;
 };
 
@@ -79,7 +79,7 @@ inline Link::Link(const Test &test_in_flash) : test(test_in_flash), next(nullptr
 }
 
 inline bool begin_failure(const char *file, int line, const char *text) {
-    if (++state().failed_checks > 5) // of one test: more would be the same again
+    if (++state().failed_checks > 5)  // of one test: more would be the same again
         return false;
     printf("%s:%d:%s:FAIL: %s", file, line, state().name, text);
     return true;
@@ -95,7 +95,7 @@ template <class T> long number(T value) {
     static_assert(sizeof(T) <= sizeof(long), "compare it in parts");
     return static_cast<long>(value);
 }
-long number(double) = delete; // compare real numbers with CHECK and a tolerance
+long number(double) = delete;  // compare real numbers with CHECK and a tolerance
 long number(float) = delete;
 
 inline bool equal(long want, long got, const char *text, const char *file, int line) {
@@ -133,20 +133,20 @@ inline void begin() {
 }
 
 inline void end() {
-    _delay_ms(1); // the last two bytes leave
+    _delay_ms(1);  // the last two bytes leave
     cli();
     sleep_enable();
-    sleep_cpu(); // for ever; simavr quits here
+    sleep_cpu();  // for ever; simavr quits here
 }
 
 inline void read(Test &copy, const Test &test) { memcpy_P(&copy, &test, sizeof copy); }
 #else
-inline void begin() { setvbuf(stdout, nullptr, _IOLBF, BUFSIZ); } // a crash loses no line
+inline void begin() { setvbuf(stdout, nullptr, _IOLBF, BUFSIZ); }  // a crash loses no line
 inline void end() {}
 inline void read(Test &copy, const Test &test) { copy = test; }
 #endif
 
-} // namespace check
+}  // namespace check
 
 // Weak, so that every file of a test may include this header. The failures are in the output:
 // an exit code other than 0 would say that the tests did not end.

@@ -8,8 +8,8 @@ namespace ohmskin {
 
 static_assert(frames::CRC_POLYNOMIAL == 0x1021, "Crc16::add() holds this polynomial");
 
-// CRC-16/IBM-3740, a byte at a time and without a table. Its two halves are kept apart because an AVR
-// shifts bytes: 16 instructions a byte.
+// CRC-16/IBM-3740, a byte at a time and without a table. Its two halves are kept apart because an
+// AVR shifts bytes: 16 instructions a byte.
 class Crc16 {
   public:
     void add(uint8_t octet) {

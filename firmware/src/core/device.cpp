@@ -15,15 +15,15 @@ namespace {
 
 constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
 // What Hello, a report and the acks may take between two scans.
-constexpr uint16_t ANSWERS_SPACE = FrameWriter::line_bytes(sizeof(frames::Hello)) +
-                                   FrameWriter::line_bytes(sizeof(frames::Ack));
+constexpr uint16_t ANSWERS_SPACE =
+    FrameWriter::line_bytes(sizeof(frames::Hello)) + FrameWriter::line_bytes(sizeof(frames::Ack));
 
 // What the last cell of a frame may take: its bytes, a block's length, CRC, delimiter.
 constexpr uint16_t CELL_SPACE = 5 + 2 + 2 + 1;
 
 uint16_t scan_payload(uint8_t rows, uint8_t columns) {
-    return static_cast<uint16_t>(
-        sizeof(frames::Scan) + (readings_in(rows, columns) * uint32_t{frames::ADC_BITS} + 7) / 8);
+    return static_cast<uint16_t>(sizeof(frames::Scan) +
+                                 (readings_in(rows, columns) * uint32_t{frames::ADC_BITS} + 7) / 8);
 }
 
 uint16_t cycles_per_byte(uint32_t baud) {
@@ -372,8 +372,8 @@ void Device::begin_scan() {
         send_pending();
     const uint8_t rows = settings_.request.rows, columns = settings_.request.columns;
     if (writer_.used() <= ring_limit_) {
-        const frames::Scan header = {scan_number_, scan_time_us_,       dropped_,
-                                     reader_.errors(), rows, columns};
+        const frames::Scan header = {scan_number_,     scan_time_us_, dropped_,
+                                     reader_.errors(), rows,          columns};
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
         cells_left_ = static_cast<uint16_t>(rows * columns);
@@ -383,8 +383,8 @@ void Device::begin_scan() {
     count_scan();
 }
 
-// The main loop was too late for the slots or for the line. That does not happen within the limits of
-// plan_scan() and ring_limit(), but if it does, the scan is lost as a whole.
+// The main loop was too late for the slots or for the line. That does not happen within the limits
+// of plan_scan() and ring_limit(), but if it does, the scan is lost as a whole.
 void Device::drop_open_scan() {
     writer_.abandon();
     cells_left_ = 0;
@@ -428,8 +428,7 @@ void Device::put_cell(const uint16_t *code) {
 // A scan's bytes come in at a known pace and leave at a known pace, so the most the ring can hold
 // during a scan is known when it begins: max(used, one open block) + what comes in faster than it
 // leaves. A scan begins only where that fits, hence none is ever torn. 0: it never fits.
-uint16_t Device::ring_limit(const ScanRequest &request, const ScanPlan &plan,
-                            uint32_t baud) const {
+uint16_t Device::ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const {
     const uint16_t frame = FrameWriter::line_bytes(scan_payload(request.rows, request.columns));
     const uint32_t duration =
         static_cast<uint32_t>(plan.slot_cycles) * readings_in(request.rows, request.columns);

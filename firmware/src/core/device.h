@@ -48,7 +48,8 @@ class Device {
     void put_cell(const uint16_t *code);
     OHMSKIN_RARE void count_scan();
     OHMSKIN_RARE void account_for_lost_scans();
-    OHMSKIN_RARE uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const;
+    OHMSKIN_RARE uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan,
+                                     uint32_t baud) const;
 
     // ---- answers, which wait until no scan frame is open
     OHMSKIN_RARE void answer(frames::Result result);
@@ -63,19 +64,19 @@ class Device {
     };
     static constexpr uint8_t ACKS_MAX = 4;
 
-    FrameWriter writer_;
-    FrameReader reader_;
-    Settings settings_;
-    SettingsWriter settings_writer_;
-    SelfTest self_test_;
-    ScanPlan plan_;
+    FrameWriter writer_{};
+    FrameReader reader_{};
+    Settings settings_ = DEFAULT_SETTINGS;
+    SettingsWriter settings_writer_{};
+    SelfTest self_test_{};
+    ScanPlan plan_{};
     Mode mode_ = Mode::Idle;
     bool attention_ = true;  // something below is waiting
 
     frames::Settings settings_source_ = frames::Settings::DefaultsBlank;
     bool hello_pending_ = false;
     bool report_pending_ = false;
-    Ack acks_[ACKS_MAX];
+    Ack acks_[ACKS_MAX] = {};
     uint8_t ack_count_ = 0;
 
     // The scan in progress.

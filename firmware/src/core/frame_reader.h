@@ -7,14 +7,14 @@
 
 namespace ohmskin {
 
-// Commands, decoded byte by byte. A damaged, overlong or foreign frame is counted and forgotten; the
-// next delimiter starts afresh.
+// Commands, decoded byte by byte. A damaged, overlong or foreign frame is counted and forgotten;
+// the next delimiter starts afresh.
 class FrameReader {
   public:
     static constexpr uint8_t PAYLOAD_MAX = 16;
 
-    // Feeds one byte from the line; true when it completes a valid frame, which stays readable until
-    // the next call.
+    // Feeds one byte from the line; true when it completes a valid frame, which stays readable
+    // until the next call.
     OHMSKIN_RARE bool feed(uint8_t octet);
 
     // The line itself reported an error (framing, overrun): what is being received is damaged.
@@ -33,7 +33,7 @@ class FrameReader {
     bool finish();
     void store(uint8_t octet);
 
-    uint8_t content_[CONTENT_MAX];
+    uint8_t content_[CONTENT_MAX] = {};
     uint8_t size_ = 0;        // decoded so far
     uint8_t frame_size_ = 4;  // of the last valid frame, CRC included
     uint8_t code_ = 0;        // length byte of the open COBS block; 0: none yet

@@ -9,12 +9,12 @@ namespace ohmskin {
 
 // Frames, as they are written byte by byte, straight into the ring the serial line is fed from.
 //
-// A COBS block starts with its length, so a block leaves for the line only when it is complete: at a
-// zero byte, after 254 others, or at the frame's end. Nothing larger is ever held back, which is
+// A COBS block starts with its length, so a block leaves for the line only when it is complete: at
+// a zero byte, after 254 others, or at the frame's end. Nothing larger is ever held back, which is
 // what lets a 16x16 scan of 1.3 kB stream through a 512-byte ring.
 class FrameWriter {
   public:
-    static constexpr uint16_t SIZE = 512;         // a power of two
+    static constexpr uint16_t SIZE = 512;  // a power of two
     static constexpr uint16_t LONGEST_BLOCK = 255;
     static constexpr uint8_t OVERHEAD = 2 + 2 + 2;  // type, sequence; CRC; two delimiters
 
@@ -48,7 +48,7 @@ class FrameWriter {
     void open_block();
     void close_block();
 
-    uint8_t ring_[SIZE];
+    uint8_t ring_[SIZE] = {};
     uint16_t read_ = 0;       // next byte for the line
     uint16_t published_ = 0;  // end of what may leave
     uint16_t write_ = 0;      // end of what is encoded

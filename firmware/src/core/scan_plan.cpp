@@ -18,8 +18,8 @@ Result check_limits(const ScanRequest &request) {
         return Result::BadRows;
     if (request.columns < 1 || request.columns > frames::COLUMNS_MAX)
         return Result::BadColumns;
-    if (request.rate_mhz != 0 && (request.rate_mhz < frames::RATE_MHZ_MIN ||
-                                  request.rate_mhz > frames::RATE_MHZ_MAX))
+    if (request.rate_mhz != 0 &&
+        (request.rate_mhz < frames::RATE_MHZ_MIN || request.rate_mhz > frames::RATE_MHZ_MAX))
         return Result::BadRate;
     if (request.settle_us > frames::SETTLE_US_MAX)
         return Result::BadSettle;
@@ -39,15 +39,16 @@ uint32_t period_cycles(uint32_t clock_hz, uint32_t rate_mhz) {
 
 uint32_t difference(uint32_t a, uint32_t b) { return a > b ? a - b : b - a; }
 
-// Divides the period into slots of equal whole cycles. One idle slot more or less shifts the rounding
-// error: from `first` in direction `step` the first number of slots that keeps the period to 200 ppm
-// is taken, else the best of a few.
+// Divides the period into slots of equal whole cycles. One idle slot more or less shifts the
+// rounding error: from `first` in direction `step` the first number of slots that keeps the period
+// to 200 ppm is taken, else the best of a few.
 void divide(uint32_t period, uint16_t first, int8_t step, uint16_t least, uint16_t slot_min,
             ScanPlan *plan) {
     constexpr uint8_t TRIES = 12;
     uint32_t best = 0xFFFFFFFF;
     uint16_t slots = first;
-    for (uint8_t i = 0; i < TRIES && slots >= least; i++, slots = static_cast<uint16_t>(slots + step)) {
+    for (uint8_t i = 0; i < TRIES && slots >= least;
+         i++, slots = static_cast<uint16_t>(slots + step)) {
         const uint32_t slot = (period + slots / 2) / slots;
         if (slot < slot_min)
             continue;

@@ -19,8 +19,8 @@ struct ScanPlan {
     uint32_t scan_cycles() const { return static_cast<uint32_t>(slot_cycles) * slots_per_scan; }
 };
 
-// Clock cycles of the converter and the slot interrupt (ATmega328P and 2560 data sheets, "Prescaling
-// and Conversion Timing").
+// Clock cycles of the converter and the slot interrupt (ATmega328P and 2560 data sheets,
+// "Prescaling and Conversion Timing").
 namespace timing {
 // Conversion that the converter starts by itself after another: 13 ADC clocks.
 constexpr uint16_t free_running_slot(uint8_t prescaler) { return 13u * prescaler; }
@@ -36,7 +36,8 @@ constexpr uint16_t SLOT_CYCLES_MAX = 60000;
 
 // The plan for a request, or why there is none. With settle_us 0 the slots fill the period;
 // otherwise they are as short as the settle time allows and the rest of the period is idle.
-OHMSKIN_RARE frames::Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan);
+OHMSKIN_RARE frames::Result plan_scan(const ScanRequest &request, uint32_t clock_hz,
+                                      ScanPlan *plan);
 
 inline uint16_t readings_in(uint8_t rows, uint8_t columns) {
     return static_cast<uint16_t>(rows * columns * frames::READINGS_PER_CELL);

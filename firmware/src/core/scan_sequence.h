@@ -31,7 +31,8 @@ struct Selection {
     uint8_t reading;  // index into CONFIGURATIONS
 };
 
-// The order of a scan: readings of a cell, then rows, then columns. Inlined into the slot interrupt.
+// The order of a scan: readings of a cell, then rows, then columns. Inlined into the slot
+// interrupt.
 class ScanSequence {
   public:
     void begin(uint8_t rows, uint8_t columns) {

@@ -14,11 +14,11 @@ namespace ohmskin {
 //                              | step(code of k-1): selection() is that of k+2
 //
 // The interrupt comes once a slot, just after the sample of slot k is held. It sets pins and
-// multiplexers to selection(), so they settle while slot k is converted, and calls step(). Slots beyond
-// the last reading of a scan are idle: they fill up the scan's period.
+// multiplexers to selection(), so they settle while slot k is converted, and calls step(). Slots
+// beyond the last reading of a scan are idle: they fill up the scan's period.
 //
-// Codes reach the main loop a cell at a time, through a queue with one writer and one reader and 8-bit
-// indices, which an AVR reads and writes in one instruction: no interrupt is ever held off.
+// Codes reach the main loop a cell at a time, through a queue with one writer and one reader and
+// 8-bit indices, which an AVR reads and writes in one instruction: no interrupt is ever held off.
 class Scanner {
   public:
     static constexpr uint8_t CELL = frames::READINGS_PER_CELL;
@@ -68,15 +68,15 @@ class Scanner {
     bool parked() const { return parked_; }
 
   private:
-    static constexpr uint16_t FIRST = 0x8000;    // in a code: the scan's first
+    static constexpr uint16_t FIRST = 0x8000;        // in a code: the scan's first
     static constexpr uint8_t QUEUE_SIZE = 8 * CELL;  // whole cells, so that none wraps
     static constexpr uint8_t QUEUE_MASK = QUEUE_SIZE - 1;
     static_assert((QUEUE_SIZE & QUEUE_MASK) == 0, "indices are masked");
     static constexpr uint16_t LEAD_IN = 1;  // slots until the first selection has settled
 
-    // Kinds of slot. kinds_ holds those of the last three, the newest in the lowest bits: of the slot
-    // selection() is for, the slot the pins are set for, and the slot held last, whose code arrives
-    // with the next step().
+    // Kinds of slot. kinds_ holds those of the last three, the newest in the lowest bits: of the
+    // slot selection() is for, the slot the pins are set for, and the slot held last, whose code
+    // arrives with the next step().
     static constexpr uint8_t KIND_BITS = 2;
     static constexpr uint8_t IDLE = 0, READING = 1, STARTS_CELL = 2, STARTS_SCAN = 3;
     static constexpr uint8_t HELD_SHIFT = 2 * KIND_BITS;
@@ -110,14 +110,14 @@ class Scanner {
     void push(uint16_t code, uint8_t held) {
         const uint8_t at = write_;
         if (held != READING << HELD_SHIFT) {
-            const bool starts_scan = held == STARTS_SCAN << HELD_SHIFT;
-            if (starts_scan) {
+            const bool first_cell = held == STARTS_SCAN << HELD_SHIFT;
+            if (first_cell) {
                 code |= FIRST;
                 skipping_ = false;
             }
             if (!skipping_ && static_cast<uint8_t>((at + CELL) & QUEUE_MASK) == read_) {
                 skipping_ = true;
-                if (starts_scan)
+                if (first_cell)
                     lost_scans_ = static_cast<uint8_t>(lost_scans_ + 1);
             }
         }
@@ -128,7 +128,7 @@ class Scanner {
         write_ = static_cast<uint8_t>((at + 1) & QUEUE_MASK);
     }
 
-    uint16_t queue_[QUEUE_SIZE];  // not volatile: write_ and read_ say who may touch what
+    uint16_t queue_[QUEUE_SIZE] = {};  // not volatile: write_ and read_ say who may touch what
     volatile uint8_t write_ = 0;
     volatile uint8_t read_ = 0;
     volatile uint8_t lost_scans_ = 0;

@@ -10,9 +10,9 @@ constexpr uint16_t FULL_SCALE = (1u << frames::ADC_BITS) - 1;
 constexpr uint16_t HALF_LOW = FULL_SCALE / 2 - FULL_SCALE / 16;
 constexpr uint16_t HALF_HIGH = FULL_SCALE / 2 + FULL_SCALE / 16;
 
-// What a node's readings show, with its pin high (`own`) and low (`other`), over all inputs. A short
-// to a rail shows at every input; a node without its resistor floats wherever the skin does not hold
-// it, so that one impossible reading is enough.
+// What a node's readings show, with its pin high (`own`) and low (`other`), over all inputs. A
+// short to a rail shows at every input; a node without its resistor floats wherever the skin does
+// not hold it, so that one impossible reading is enough.
 uint16_t judge(uint16_t own_max, uint16_t own_min, uint16_t other_max, uint16_t other_min,
                frames::Finding stuck_low, frames::Finding stuck_high, frames::Finding missing) {
     if (own_max < HALF_LOW && other_max < HALF_LOW)
@@ -51,11 +51,11 @@ frames::SelfTestReport SelfTest::report() const {
     const uint8_t a = index(Reading::A), b = index(Reading::B);
     const uint8_t c = index(Reading::C), d = index(Reading::D);
     frames::SelfTestReport report;
-    report.findings = static_cast<uint16_t>(
-        judge(max_[a], min_[a], max_[d], min_[d], Finding::TopStuckLow, Finding::TopStuckHigh,
-              Finding::TopReferenceMissing) |
-        judge(max_[c], min_[c], max_[b], min_[b], Finding::BottomStuckLow,
-              Finding::BottomStuckHigh, Finding::BottomReferenceMissing));
+    report.findings =
+        static_cast<uint16_t>(judge(max_[a], min_[a], max_[d], min_[d], Finding::TopStuckLow,
+                                    Finding::TopStuckHigh, Finding::TopReferenceMissing) |
+                              judge(max_[c], min_[c], max_[b], min_[b], Finding::BottomStuckLow,
+                                    Finding::BottomStuckHigh, Finding::BottomReferenceMissing));
     for (uint8_t i = 0; i < frames::READINGS_PER_CELL; i++) {
         report.code_min[i] = min_[i];
         report.code_max[i] = max_[i];

@@ -22,8 +22,8 @@ class SelfTest {
     }
 
   private:
-    uint16_t min_[frames::READINGS_PER_CELL];
-    uint16_t max_[frames::READINGS_PER_CELL];
+    uint16_t min_[frames::READINGS_PER_CELL] = {};
+    uint16_t max_[frames::READINGS_PER_CELL] = {};
 };
 
 }  // namespace ohmskin

@@ -32,7 +32,7 @@ class SettingsWriter {
     static constexpr uint8_t RECORD_SIZE = 2 + sizeof(Settings) + 2;
 
   private:
-    uint8_t record_[RECORD_SIZE];
+    uint8_t record_[RECORD_SIZE] = {};
     uint8_t at_ = 0;
     State state_ = State::Idle;
 };

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A board for unit tests: time, line and EEPROM under the test's control, and a skin whose code says
-// where it was read.
+// A board for unit tests: time, line and EEPROM under the test's control, and a skin whose code
+// says where it was read.
 #pragma once
 #include <stdint.h>
 #include <string.h>
@@ -18,7 +18,7 @@ struct State {
     bool eeprom_worn_out;   // writes change nothing
     uint8_t received[64];   // bytes on their way to the board
     uint8_t received_size, received_at;
-    bool damage_next;       // the line reports an error with the next byte
+    bool damage_next;  // the line reports an error with the next byte
     uint32_t baud;
     // What the board has written, oldest first.
     uint8_t sent[2000];

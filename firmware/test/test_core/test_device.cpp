@@ -149,7 +149,9 @@ Bench &fresh() {
     return bench;
 }
 
-uint16_t ramp(const Selection &s) { return static_cast<uint16_t>(s.row * 40 + s.column * 4 + s.reading); }
+uint16_t ramp(const Selection &s) {
+    return static_cast<uint16_t>(s.row * 40 + s.column * 4 + s.reading);
+}
 
 bool same(const frames::Hello &a, const frames::Hello &b) { return memcmp(&a, &b, sizeof a) == 0; }
 
@@ -191,10 +193,14 @@ TEST(configure_changes_all_or_nothing) {
         frames::Configure request;
         Result result;
     } bad[] = {
-        {{0, 6, 120000, 0, 64}, Result::BadRows},      {{17, 6, 120000, 0, 64}, Result::BadRows},
-        {{4, 0, 120000, 0, 64}, Result::BadColumns},   {{4, 17, 120000, 0, 64}, Result::BadColumns},
-        {{4, 6, 999, 0, 64}, Result::BadRate},         {{4, 6, 2000001, 0, 64}, Result::BadRate},
-        {{4, 6, 120000, 3001, 64}, Result::BadSettle}, {{4, 6, 120000, 0, 31}, Result::BadPrescaler},
+        {{0, 6, 120000, 0, 64}, Result::BadRows},
+        {{17, 6, 120000, 0, 64}, Result::BadRows},
+        {{4, 0, 120000, 0, 64}, Result::BadColumns},
+        {{4, 17, 120000, 0, 64}, Result::BadColumns},
+        {{4, 6, 999, 0, 64}, Result::BadRate},
+        {{4, 6, 2000001, 0, 64}, Result::BadRate},
+        {{4, 6, 120000, 3001, 64}, Result::BadSettle},
+        {{4, 6, 120000, 0, 31}, Result::BadPrescaler},
         {{16, 16, 90000, 0, 32}, Result::TooFast},
     };
     for (const auto &b : bad) {
@@ -365,7 +371,9 @@ namespace {
 // Nodes as a skin of 1 MOhm cells and 30 kOhm resistors reads, and as faults make them.
 uint16_t sound(const Selection &s) { return (s.reading & 1) ? 30 : 993; }
 uint16_t bottom_low(const Selection &s) { return s.reading == 0 ? 993 : s.reading == 3 ? 29 : 0; }
-uint16_t top_high(const Selection &s) { return (s.reading & 1) == 0 ? 1023 : s.reading == 3 ? 1023 : 30; }
+uint16_t top_high(const Selection &s) {
+    return (s.reading & 1) == 0 ? 1023 : s.reading == 3 ? 1023 : 30;
+}
 uint16_t no_top_resistor(const Selection &s) { return s.reading < 2 ? 0 : 1020; }
 uint16_t all_pressed(const Selection &s) { return (s.reading & 1) ? 500 : 523; }
 }  // namespace

@@ -17,7 +17,8 @@ ScanRequest request(uint8_t rows, uint8_t columns, uint32_t rate_mhz, uint16_t s
     return ScanRequest{rows, columns, rate_mhz, settle_us, prescaler};
 }
 
-// The code a fake skin gives for a selection, unique up to 16x16 within 10 bits of each cell's part.
+// The code a fake skin gives for a selection, unique up to 16x16 within 10 bits of each cell's
+// part.
 uint16_t code_of(const Selection &s) {
     return static_cast<uint16_t>((s.row * 16 + s.column) << 2 | s.reading);
 }
