@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print one reading of every scan: python every_scan.py PORT [SCANS]"""
+
+import sys
+
+import ohmskin
+
+port, scans = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 0
+with ohmskin.open(port) as skin:
+    for count, scan in enumerate(skin, start=1):
+        print(scan.number, scan.missed, scan.ratio[0, 0])
+        if count == scans:
+            break
