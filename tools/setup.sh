@@ -79,7 +79,7 @@ pip_install() { # requirement
 case ${1:-} in
 host)
     make_venv
-    pip_install .
+    pip_install '.[plot]'
     touch .venv/.stamp-host
     ;;
 all)

@@ -364,5 +364,9 @@ def demo(
     # Three tables stand side by side where nothing says how wide the output is.
     wide = Console(width=_WIDTH) if not _out.is_terminal else _out
     demonstration.report(result, wide)
-    show.save_picture(picture, result.panels, result.title)
-    _out.print(f"picture: {picture}")
+    try:
+        show.save_picture(picture, result.panels, result.title)
+    except OhmskinError as exc:
+        _out.print(f"no picture: {exc}")
+    else:
+        _out.print(f"picture: {picture}")
