@@ -40,10 +40,10 @@ setup: $(STAMP) $(PIO_STAMP) ## install what development needs (apt packages, .v
 
 setup-host: $(HOST_STAMP) ## install what the host alone needs (.venv)
 
-$(HOST_STAMP): pyproject.toml
+$(HOST_STAMP): pyproject.toml tools/setup.sh
 	tools/setup.sh host
 
-$(STAMP): pyproject.toml
+$(STAMP): pyproject.toml tools/setup.sh
 	tools/setup.sh all
 
 check: setup ## formatting, lint, types, generated files

@@ -367,6 +367,6 @@ def demo(
     try:
         show.save_picture(picture, result.panels, result.title)
     except OhmskinError as exc:
-        _out.print(f"no picture: {exc}")
+        _out.print(f"no picture: {exc}", markup=False)
     else:
         _out.print(f"picture: {picture}")

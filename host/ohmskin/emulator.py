@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin import framing, protocol
-from ohmskin.circuit import Float, quantise
+from ohmskin.circuit import READING_OFFSET, Float, quantise
 from ohmskin.errors import DeviceLost
 from ohmskin.faults import Faults
 from ohmskin.link import READ_TIMEOUT_S
@@ -122,7 +122,7 @@ class EmulatedBoard:
         """What the converter reads, shape (rows, columns, 4); lines beyond the skin are open."""
         rows, columns = self._settings["rows"], self._settings["columns"]
         ratio = np.empty((rows, columns, protocol.READINGS_PER_CELL))
-        ratio[:] = (1.0, 0.0, 1.0, 0.0)
+        ratio[:] = READING_OFFSET  # no current flows
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s)[: have[0], : have[1]]
         if self._noise_ratio:
