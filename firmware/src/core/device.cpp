@@ -47,8 +47,9 @@ bool Device::poll() {
     }
     if (board::scanner.has_cell()) {
         take_cell();
-        worked = true;
+        return true;
     }
+    // Cells cannot wait, the rest can.
     if (attention_ || board::scanner.parked())
         worked |= attend();
     return worked;
@@ -64,8 +65,10 @@ bool Device::attend() {
     if (cells_left_ == 0)
         send_pending();
     watch_baud();
-    attention_ = hello_pending_ || report_pending_ || ack_count_ != 0 || baud_next_ != 0 ||
-                 !baud_confirmed_ || !settings_writer_.idle();
+    // Answers that wait for the end of a frame are sent there, by begin_scan().
+    const bool answers = hello_pending_ || report_pending_ || ack_count_ != 0;
+    attention_ = (answers && cells_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
+                 !settings_writer_.idle();
     return worked;
 }
 
@@ -357,8 +360,10 @@ void Device::take_cell() {
             drop_open_scan();
         if (cells_left_ != 0) {
             put_cell(scanner.cell());
-            if (--cells_left_ == 0)
+            if (--cells_left_ == 0) {
                 writer_.end();
+                attention_ = true;
+            }
         }
     }
     scanner.release_cell();
@@ -433,7 +438,7 @@ uint16_t Device::ring_limit(const ScanRequest &request, const ScanPlan &plan, ui
     const uint32_t duration =
         static_cast<uint32_t>(plan.slot_cycles) * readings_in(request.rows, request.columns);
     uint32_t leaves = duration / cycles_per_byte(baud);
-    leaves -= leaves / 32;  // the main loop may be a little late for the line
+    leaves -= leaves / 8;  // what the main loop keeps up with where slots are shortest
     const uint32_t excess = frame > leaves ? frame - leaves : 0;
     const uint16_t most = FrameWriter::SIZE - 1 - ANSWERS_SPACE;
     if (excess + FrameWriter::LONGEST_BLOCK > most)

@@ -5,52 +5,21 @@ namespace ohmskin {
 
 constexpr uint16_t FrameWriter::SIZE;
 
-void FrameWriter::open_block() {
-    block_ = write_;
-    write_ = (write_ + 1) & MASK;
-    length_ = 1;
-}
-
-void FrameWriter::close_block() {
-    ring_[block_] = length_;
-    published_ = write_;
-    length_ = 0;
-}
-
 void FrameWriter::delimit() {
     ring_[write_] = frames::DELIMITER;
     write_ = (write_ + 1) & MASK;
     published_ = write_;
 }
 
-void FrameWriter::encode(uint8_t octet) {
-    if (length_ == 0)
-        open_block();
-    if (octet == 0) {
-        close_block();
-        open_block();
-        return;
-    }
-    ring_[write_] = octet;
-    write_ = (write_ + 1) & MASK;
-    // A full block stands for its bytes alone, without a zero; the next opens when a byte comes.
-    if (++length_ == LONGEST_BLOCK)
-        close_block();
-}
-
 void FrameWriter::begin(frames::Type type) {
     delimit();
     crc_ = Crc16();
-    put(static_cast<uint8_t>(type));
-    put(sequence_++);
+    const uint8_t octets[] = {static_cast<uint8_t>(type), sequence_++};
+    put(octets, sizeof octets);
 }
 
-void FrameWriter::put(uint8_t octet) {
-    crc_.add(octet);
-    encode(octet);
-}
-
-// The path every code takes: put() of each byte, with the state in registers meanwhile.
+// The path every code takes: the state is in registers meanwhile. A full block of 254 bytes stands
+// for no zero; the next opens when a byte comes.
 void FrameWriter::put(const void *octets, uint8_t size) {
     const uint8_t *octet = static_cast<const uint8_t *>(octets);
     Crc16 crc = crc_;
@@ -58,17 +27,26 @@ void FrameWriter::put(const void *octets, uint8_t size) {
     uint8_t length = length_;
     for (; size != 0; size--, octet++) {
         crc.add(*octet);
-        if (*octet != 0 && length != 0 && length != LONGEST_BLOCK - 1) {
+        if (length == 0) {
+            block_ = write;
+            write = (write + 1) & MASK;
+            length = 1;
+        }
+        if (*octet != 0) {
             ring_[write] = *octet;
             write = (write + 1) & MASK;
-            length++;
-            continue;
+            if (++length != LONGEST_BLOCK)
+                continue;
+            ring_[block_] = length;
+            published_ = write;
+            length = 0;
+        } else {
+            ring_[block_] = length;
+            published_ = write;
+            block_ = write;
+            write = (write + 1) & MASK;
+            length = 1;
         }
-        write_ = write;
-        length_ = length;
-        encode(*octet);
-        write = write_;
-        length = length_;
     }
     crc_ = crc;
     write_ = write;
@@ -76,10 +54,12 @@ void FrameWriter::put(const void *octets, uint8_t size) {
 }
 
 void FrameWriter::end() {
-    encode(crc_.low());
-    encode(crc_.high());
-    if (length_ != 0)
-        close_block();
+    const uint8_t octets[] = {crc_.low(), crc_.high()};
+    put(octets, sizeof octets);
+    if (length_ != 0) {
+        ring_[block_] = length_;
+        length_ = 0;
+    }
     delimit();
 }
 

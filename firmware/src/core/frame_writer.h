@@ -24,7 +24,6 @@ class FrameWriter {
     }
 
     void begin(frames::Type type);
-    void put(uint8_t octet);
     void put(const void *octets, uint8_t size);
     void end();
     // Ends a frame that cannot be completed so that the host rejects it and stays in step.
@@ -44,9 +43,6 @@ class FrameWriter {
     static constexpr uint16_t MASK = SIZE - 1;
 
     void delimit();
-    void encode(uint8_t octet);
-    void open_block();
-    void close_block();
 
     uint8_t ring_[SIZE] = {};
     uint16_t read_ = 0;       // next byte for the line

@@ -86,6 +86,13 @@ Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan) 
             result.free_running = true;
             result.slot_cycles = timing::free_running_slot(request.adc_prescaler);
         }
+        // Small skins: the main loop keeps up with rate_mhz_max, as with any other rate.
+        const uint32_t shortest = period_cycles(clock_hz, frames::RATE_MHZ_MAX);
+        const uint16_t slots =
+            static_cast<uint16_t>((shortest + result.slot_cycles - 1) / result.slot_cycles);
+        if (slots > readings)
+            result.slots_per_scan = slots;
+        result.idle_slots = static_cast<uint16_t>(result.slots_per_scan - readings);
         *plan = result;
         return Result::Ok;
     }

@@ -21,7 +21,8 @@ bool writes(FrameWriter &writer, const vectors::Vector &v) {
     uint16_t out = 0;
     bool same = true;
     for (uint16_t i = 2; i < v.content_size; i++) {
-        writer.put(at(v.content, i));
+        const uint8_t octet = at(v.content, i);
+        writer.put(&octet, 1);
         while (writer.has_byte())
             same = writer.next_byte() == at(v.wire, out++) && same;
     }
@@ -132,8 +133,8 @@ TEST(an_abandoned_frame_ends_and_is_not_valid) {
     FrameWriter writer;
     FrameReader reader;
     writer.begin(frames::Type::Ack);
-    writer.put(0);
-    writer.put(1);
+    const uint8_t octets[] = {0, 1};
+    writer.put(octets, sizeof octets);
     writer.abandon();
     bool any = false;
     uint8_t last = 1;
@@ -157,7 +158,8 @@ TEST(line_bytes_is_an_upper_bound) {
         writer.begin(frames::Type::Scan);
         uint16_t out = 0;
         for (uint16_t i = 0; i < payload; i++) {
-            writer.put(0xFF);
+            const uint8_t octet = 0xFF;
+            writer.put(&octet, 1);
             for (; writer.has_byte(); out++)
                 writer.next_byte();
         }
