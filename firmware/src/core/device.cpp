@@ -185,8 +185,7 @@ void Device::execute() {
     case Type::Start:
         if (mode_ == Mode::Stopping)
             return answer(Result::Busy);
-        start();
-        return answer(Result::Ok);
+        return answer(start());
     case Type::Stop:
         if (mode_ == Mode::Idle)
             return answer(Result::Ok);
@@ -244,14 +243,18 @@ Result Device::set_baud(const uint8_t *payload) {
     return Result::Ok;
 }
 
-void Device::start() {
+Result Device::start() {
     if (mode_ == Mode::Scanning)
-        return;
+        return Result::Ok;
+    // Settings may have been made and saved at a faster line.
+    ring_limit_ = ring_limit(settings_.request, plan_, baud_);
+    if (ring_limit_ == 0)
+        return Result::LineTooSlow;
     scan_number_ = 0;
     dropped_ = 0;
-    ring_limit_ = ring_limit(settings_.request, plan_, baud_);
     begin_slots(settings_.request, plan_);
     mode_ = Mode::Scanning;
+    return Result::Ok;
 }
 
 void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {

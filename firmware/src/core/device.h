@@ -35,7 +35,7 @@ class Device {
     OHMSKIN_RARE void execute();
     OHMSKIN_RARE frames::Result configure(const ScanRequest &request);
     OHMSKIN_RARE frames::Result set_baud(const uint8_t *payload);
-    OHMSKIN_RARE void start();
+    OHMSKIN_RARE frames::Result start();
     OHMSKIN_RARE void begin_slots(const ScanRequest &request, const ScanPlan &plan);
     OHMSKIN_RARE void finish_slots();
     OHMSKIN_RARE bool poll_save();
