@@ -301,6 +301,18 @@ def test_settle_and_change_after_hold_gaps(build: Build) -> None:
     assert stats["settle_cycles_min"] == 886 - 491
 
 
+def test_settling_of_pins_and_of_the_channel_are_told_apart(build: Build) -> None:
+    program = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA5) + sts(ADCSRA, 0xE5)  # holds at 470, 886, ...
+    program += "ldi r16, 0x10\n out 0x0B, r16\n"  # row 1 at 11
+    program += "ldi r24, 160\n 2: dec r24\n brne 2b\n"  # to 491
+    program += sts(ADMUX, 0x41) + FOREVER  # at 494; in effect 1 ADC clock before the end, at 806
+    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
+        sim.run_cycles(1000)
+        stats = sim.stats()
+    assert stats["channel_settle_cycles_min"] == 886 - 806
+    assert stats["settle_cycles_min"] == 470 - 11
+
+
 # ---- timers ------------------------------------------------------------------------------------
 
 
@@ -590,6 +602,18 @@ def test_idle_time_between_markers(build: Build) -> None:
     assert stats["cpu_percent"] == pytest.approx(100 * 302 / 402, abs=0.05)
 
 
+def test_jump_goes_on_at_the_address(build: Build) -> None:
+    program = sts(0xC0, 2) + sts(0xC1, 8) + FOREVER + sts(0xC6, 65) + FOREVER
+    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
+        assert sim.run(0.001) == b""
+        sim.jump(2 * (3 + 3 + 1))
+        assert sim.run(0.001) == b"A"
+        with pytest.raises(ValueError, match="even"):
+            sim.jump(3)
+        with pytest.raises(SimulationError, match="no such instruction"):
+            sim.jump(1 << 15)
+
+
 # ---- the bridge --------------------------------------------------------------------------------
 
 
@@ -644,6 +668,8 @@ def test_bad_requests_are_refused(build: Build) -> None:
         request(b"e", b"\xff\xffx"),
         request(b"e", b"x"),
         request(b"S", b"x"),
+        request(b"J", b"\x01\x00\x00\x00"),
+        request(b"J", b"\x00\x00\xff\x00"),
     ]
     for requests in bad:
         assert [op for op, _ in exchange(requests + good, elf)] == ["!", "S"], requests[:20]

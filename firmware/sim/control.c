@@ -163,7 +163,7 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
                {'U', 8, 8, false}, {'S', 0, 0, false},
                {'Z', 0, 0, false}, {'L', 1, 1, false},
                {'E', 0, 0, false}, {'e', 2, 2 + 4096, false},
-               {'X', 0, 0, false}};
+               {'X', 0, 0, false}, {'J', 4, 4, false}};
     size_t i = 0;
     while (i < sizeof OPS / sizeof *OPS && OPS[i].op != op)
         i++;
@@ -174,6 +174,7 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
     if (real_time && OPS[i].lock_step_only)
         return refuse("this op needs lock-step, without --pty");
     uint64_t cycles;
+    uint32_t address;
     switch (op) {
     case 'R':
         memcpy(&cycles, payload, sizeof cycles);
@@ -198,6 +199,9 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         return read_eeprom();
     case 'e':
         return write_eeprom(length);
+    case 'J':
+        memcpy(&address, payload, sizeof address);
+        return cpu_jump(address) ? control_reply('J', NULL, 0) : refuse("J: no such instruction");
     default:
         cpu_external_reset();
         return control_reply('X', NULL, 0);

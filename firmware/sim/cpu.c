@@ -178,6 +178,13 @@ static void reset_with(uint8_t flag, avr_run_t reset) {
 
 void cpu_external_reset(void) { reset_with(EXTRF_, avr_reset); }
 
+bool cpu_jump(uint32_t address) {
+    if (address % 2 || address > cpu->flashend)
+        return false;
+    cpu->pc = address;
+    return true;
+}
+
 /* ---- running */
 
 bool cpu_alive(void) { return cpu->state == cpu_Running || cpu->state == cpu_Sleeping; }

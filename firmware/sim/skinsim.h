@@ -31,6 +31,8 @@ void cpu_run_until(instant target);
 bool cpu_alive(void);
 const char *cpu_state_name(void);
 void cpu_external_reset(void);
+/* False, and nothing happens, where `address` is no instruction of this chip's flash. */
+bool cpu_jump(uint32_t address);
 /* When the register access being executed takes effect; only valid inside a register hook. */
 instant cpu_write_instant(void);
 instant cpu_read_instant(void);
@@ -143,7 +145,7 @@ struct stats {
     uint64_t tx_bytes, tx_ignored, tx_undrained_lost, rx_bytes, rx_overruns, rx_ignored,
         rx_framing_errors;
     uint64_t pty_dropped, late_slices, hold_log_dropped;
-    struct gap settle, after_hold, trigger;
+    struct gap settle, channel_settle, after_hold, trigger;
     struct load interrupts, vector[VECTORS];
     uint64_t idle_cycles, passes;
 };

@@ -23,8 +23,8 @@ struct __attribute__((packed)) hold_record {
 static struct {
     instant since; /* start of the window of the resettable counters */
     uint64_t resets;
-    instant last_change, last_hold, last_start;
-    bool changed, held, started; /* the three above are valid */
+    instant last_change, last_channel_change, last_hold, last_start;
+    bool changed, channel_changed, held, started; /* the four above are valid */
     struct {
         uint8_t vector;
         instant entered;
@@ -66,8 +66,8 @@ void stats_pins_changed(instant when) {
 }
 
 void stats_channel_changed(instant when) {
-    state.last_change = when;
-    state.changed = true;
+    state.last_channel_change = when;
+    state.channel_changed = true;
 }
 
 void stats_hold(instant when, unsigned channel, uint16_t code) {
@@ -77,6 +77,8 @@ void stats_hold(instant when, unsigned channel, uint16_t code) {
         stats.undriven++;
     if (state.changed && when >= state.last_change)
         add_gap(&stats.settle, when - state.last_change);
+    if (state.channel_changed && when >= state.last_channel_change)
+        add_gap(&stats.channel_settle, when - state.last_channel_change);
     state.last_hold = when;
     state.held = true;
     if (!state.log_enabled)
@@ -178,7 +180,8 @@ void stats_reset(void) {
 void stats_cpu_reset(void) {
     state.resets++;
     state.depth = 0;
-    state.marked = state.held = state.started = state.changed = false;
+    state.marked = state.held = state.started = false;
+    state.changed = state.channel_changed = false;
 }
 
 /* ---- text */
@@ -228,6 +231,7 @@ char *stats_json(void) {
     COUNT(passes);
 #undef COUNT
     print_gap(out, "settle_cycles", &stats.settle);
+    print_gap(out, "channel_settle_cycles", &stats.channel_settle);
     print_gap(out, "change_after_hold_cycles", &stats.after_hold);
     print_gap(out, "trigger_gap_cycles", &stats.trigger);
     fprintf(out, "\"cpu_percent\": %.4f, ",

@@ -89,11 +89,12 @@ constexpr Registers REGISTERS[] = {
     registers_of(CONFIGURATIONS[3]),
 };
 
-// Timer 1 counts a slot. Compare B triggers the conversion; compare A interrupts just after its
-// hold, which comes 2 ADC clocks and 3 cycles of synchronisation after the trigger.
+// Timer 1 counts a slot. Compare B triggers the conversion, whose sample is held 2 ADC clocks and 3
+// cycles of synchronisation later. Compare A interrupts a little before that, so that the pins,
+// which change 59 cycles or more into the interrupt, do so some 40 cycles after the hold.
 constexpr uint16_t TRIGGER_AT = 8;
 constexpr uint16_t interrupt_at(uint8_t prescaler) {
-    return static_cast<uint16_t>(TRIGGER_AT + 2u * prescaler + 3 + 4);
+    return static_cast<uint16_t>(TRIGGER_AT + 2u * prescaler + 3 - 20);
 }
 uint8_t prescaler_bits(uint8_t prescaler) {
     uint8_t bits = 0;

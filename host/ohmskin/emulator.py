@@ -13,6 +13,7 @@ firmware itself.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -33,16 +34,22 @@ VERSION = (0, 1, 0)
 CLOCK_HZ = 16_000_000
 _CONSTANTS = protocol.CONSTANTS
 _PRESCALERS = protocol.ENUMS["adc_prescaler"].values
+_REASONS = protocol.ENUMS["result"].docs
 _DEFAULT_PRESCALER = "clock_500khz"
 DEFAULT_RATE_HZ = 90.0
 # From the hold of a reading to the change of pins, at most (firmware/src/core/scan_plan.h).
-_SELECT_CYCLES = 110
+_SELECT_CYCLES = 120
+_SELECT_CYCLES_FREE_RUNNING = 180
+_SLOT_CYCLES_MAX = 60_000
 
 
 class EmulatedBoard:
     """A board whose skin reads `ratio_at(seconds)`, shape (rows, columns, 4).
 
+    rate_hz: at boot; None: 90, or as fast as the converter runs where that is slower.
     noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed: of the noise.
+
+    :raises ValueError: a board cannot do that.
     """
 
     def __init__(
@@ -51,7 +58,7 @@ class EmulatedBoard:
         rows: int,
         columns: int,
         *,
-        rate_hz: float = DEFAULT_RATE_HZ,
+        rate_hz: float | None = None,
         noise_lsb: float = 0.0,
         seed: int = 0,
         unit_id: int = 0,
@@ -59,6 +66,8 @@ class EmulatedBoard:
         ref_bottom_ohm: int = 30_000,
         layout_crc: int = protocol.LAYOUT_CRC,
     ) -> None:
+        if not 0 <= noise_lsb < float("inf"):
+            raise ValueError(f"noise must be 0 or more, not {noise_lsb}")
         self._ratio_at = ratio_at
         self._skin_shape = (rows, columns)
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
@@ -69,10 +78,16 @@ class EmulatedBoard:
             "unit_id": unit_id,
             "rows": rows,
             "columns": columns,
-            "rate_mhz": round(rate_hz * 1000),
+            "rate_mhz": protocol.rate_mhz(DEFAULT_RATE_HZ if rate_hz is None else rate_hz),
             "settle_us": 0,
             "adc_prescaler": _DEFAULT_PRESCALER,
         }
+        try:
+            self._checked(self._defaults)
+        except _Refused as refusal:
+            if rate_hz is not None:
+                raise ValueError(f"{refusal}: {_REASONS[str(refusal)]}") from None
+            self._defaults["rate_mhz"] = 0
         self._stored: dict[str, Any] | None = None
         self.now_s = 0.0
         self._boot("power_on")
@@ -197,19 +212,22 @@ class EmulatedBoard:
         slot = 13 * prescaler + prescaler // 2 + 4
         if settle:
             slot = max(slot, settle * CLOCK_HZ // 1_000_000 + _SELECT_CYCLES)
+        select = _SELECT_CYCLES
         if not rate:
             if not settle and wanted["adc_prescaler"] == _DEFAULT_PRESCALER:
-                slot = 13 * prescaler
-            period = slot * readings
+                slot, select = 13 * prescaler, _SELECT_CYCLES_FREE_RUNNING
+            shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
+            period = slot * max(readings, math.ceil(shortest / slot))
         else:
             period = round(CLOCK_HZ * 1000 / rate)
             if period < slot * readings:
                 raise _Refused("too_fast")
-            if not settle:
-                slot = period // readings
+            # Equal slots fill the period: as short as the settle time lets them be, or long ones.
+            slots = period // slot if settle else max(readings, -(-period // _SLOT_CYCLES_MAX))
+            slot = period // slots
         return {
             "scan_cycles": period,
-            "settle_us": (slot - _SELECT_CYCLES) * 1_000_000 // CLOCK_HZ,
+            "settle_us": (slot - select) * 1_000_000 // CLOCK_HZ,
         }
 
     # ------------------------------------------------------------------------------- sending

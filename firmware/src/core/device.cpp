@@ -160,6 +160,11 @@ void Device::execute() {
         {Type::SetBaud, sizeof(frames::SetBaud), false},
     };
     baud_confirmed_ = true;
+    if (ack_count_ == ACKS_MAX) {
+        // A host that does not wait for its answers: what cannot be answered is not carried out.
+        reader_.count_error();
+        return;
+    }
     const Command *command = nullptr;
     for (const Command &candidate : COMMANDS)
         if (static_cast<uint8_t>(candidate.type) == reader_.type())
@@ -258,10 +263,10 @@ Result Device::start() {
 }
 
 void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
-    lost_seen_ = 0;
     cells_left_ = 0;
     board::scanner.begin(request.rows, request.columns, plan.idle_slots);
-    scan_time_us_ = board::now_us();
+    const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
+    scan_time_us_ = board::now_us() + Scanner::FIRST_SLOT * plan.slot_cycles / cycles_per_us;
     scan_time_rest_ = 0;
     board::start_slots(plan, request.adc_prescaler);
 }
@@ -328,11 +333,6 @@ void Device::send_hello() {
 // ----------------------------------------------------------------------------------- answers
 
 void Device::answer(Result result) {
-    if (ack_count_ == ACKS_MAX) {
-        // A host that does not wait for its answers: the command was carried out, but not answered.
-        reader_.count_error();
-        return;
-    }
     acks_[ack_count_++] = Ack{reader_.type(), reader_.sequence(), result, true};
 }
 
@@ -401,9 +401,8 @@ void Device::drop_open_scan() {
 
 // Scan numbers and times go on for scans that never reached the queue.
 void Device::account_for_lost_scans() {
-    const uint8_t lost = board::scanner.lost_scans();
-    while (lost_seen_ != lost) {
-        lost_seen_++;
+    const uint8_t number = board::scanner.scan_number();
+    while (static_cast<uint8_t>((number - scan_number_) & (Scanner::SCAN_NUMBERS - 1)) != 0) {
         dropped_++;
         count_scan();
     }

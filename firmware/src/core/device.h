@@ -85,7 +85,6 @@ class Device {
     uint32_t scan_time_us_ = 0;
     uint8_t scan_time_rest_ = 0;  // clock cycles beyond scan_time_us_
     uint16_t dropped_ = 0;
-    uint8_t lost_seen_ = 0;
     uint16_t ring_limit_ = 0;  // ring use up to which a scan may begin and is sure to fit
 
     // The line's speed.

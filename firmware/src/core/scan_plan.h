@@ -29,8 +29,10 @@ constexpr uint16_t free_running_slot(uint8_t prescaler) { return 13u * prescaler
 constexpr uint16_t triggered_slot_min(uint8_t prescaler) {
     return static_cast<uint16_t>(13u * prescaler + prescaler / 2 + 4);
 }
-// Hold to the change of pins in the interrupt, at most. Measured, with room: see bench-firmware.
-constexpr uint16_t SELECT_CYCLES_MAX = 110;
+// Hold to the change of pins in the interrupt, at most, with a byte received in the same moment:
+// measured in the simulator, with room (tests/test_firmware_scan.py).
+constexpr uint16_t SELECT_CYCLES_MAX = 120;
+constexpr uint16_t SELECT_CYCLES_MAX_FREE_RUNNING = 180;
 constexpr uint16_t SLOT_CYCLES_MAX = 60000;
 }  // namespace timing
 
@@ -45,7 +47,9 @@ inline uint16_t readings_in(uint8_t rows, uint8_t columns) {
 
 // Settle time that a plan keeps, at least.
 inline uint16_t settle_us(const ScanPlan &plan, uint32_t clock_hz) {
-    return static_cast<uint16_t>((plan.slot_cycles - timing::SELECT_CYCLES_MAX) /
+    const uint16_t select =
+        plan.free_running ? timing::SELECT_CYCLES_MAX_FREE_RUNNING : timing::SELECT_CYCLES_MAX;
+    return static_cast<uint16_t>((plan.slot_cycles - select) /
                                  static_cast<uint16_t>(clock_hz / 1000000));
 }
 

@@ -24,7 +24,10 @@ class Scanner {
     static constexpr uint8_t CELL = frames::READINGS_PER_CELL;
 
     static constexpr uint16_t CODE = 0x03FF;
-    static_assert(CODE == (1u << frames::ADC_BITS) - 1, "the rest of a word is for FIRST");
+    static constexpr uint8_t SCAN_NUMBERS = 32;
+    static_assert(CODE == (1u << frames::ADC_BITS) - 1, "above it: the scan's number, and FIRST");
+    // From begin() to the slot of the first reading.
+    static constexpr uint8_t FIRST_SLOT = 2;
 
     // Before the slots start: geometry, and how many idle slots follow a scan.
     void begin(uint8_t rows, uint8_t columns, uint16_t idle_slots) {
@@ -34,7 +37,7 @@ class Scanner {
         idling_ = true;
         kinds_ = 0;
         write_ = read_ = 0;
-        lost_scans_ = 0;
+        scan_ = 0;
         skipping_ = true;
         stopping_ = parked_ = false;
     }
@@ -55,21 +58,21 @@ class Scanner {
     // The oldest cell's CELL codes, until release_cell(); to be masked with CODE.
     const uint16_t *cell() const { return queue_ + read_; }
     bool starts_scan() const { return queue_[read_] & FIRST; }
+    // Of the scan that this cell starts, modulo SCAN_NUMBERS: gaps tell of scans whose very start
+    // was lost because the main loop was late.
+    uint8_t scan_number() const { return (queue_[read_] >> frames::ADC_BITS) & (SCAN_NUMBERS - 1); }
     void release_cell() {
         __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the codes have been read by now
         read_ = static_cast<uint8_t>((read_ + CELL) & QUEUE_MASK);
     }
-
-    // Scans whose very start was lost since begin() because the main loop was late.
-    uint8_t lost_scans() const { return lost_scans_; }
 
     void stop_after_scan() { stopping_ = true; }
     // The last scan is over, and every code of it is in the queue.
     bool parked() const { return parked_; }
 
   private:
-    static constexpr uint16_t FIRST = 0x8000;        // in a code: the scan's first
-    static constexpr uint8_t QUEUE_SIZE = 8 * CELL;  // whole cells, so that none wraps
+    static constexpr uint16_t FIRST = 0x8000;         // in a code: the scan's first
+    static constexpr uint8_t QUEUE_SIZE = 16 * CELL;  // whole cells, so that none wraps
     static constexpr uint8_t QUEUE_MASK = QUEUE_SIZE - 1;
     static_assert((QUEUE_SIZE & QUEUE_MASK) == 0, "indices are masked");
     static constexpr uint16_t LEAD_IN = 1;  // slots until the first selection has settled
@@ -112,14 +115,11 @@ class Scanner {
         if (held != READING << HELD_SHIFT) {
             const bool first_cell = held == STARTS_SCAN << HELD_SHIFT;
             if (first_cell) {
-                code |= FIRST;
+                code |= FIRST | (scan_++ & (SCAN_NUMBERS - 1)) << frames::ADC_BITS;
                 skipping_ = false;
             }
-            if (!skipping_ && static_cast<uint8_t>((at + CELL) & QUEUE_MASK) == read_) {
+            if (!skipping_ && static_cast<uint8_t>((at + CELL) & QUEUE_MASK) == read_)
                 skipping_ = true;
-                if (first_cell)
-                    lost_scans_ = static_cast<uint8_t>(lost_scans_ + 1);
-            }
         }
         if (skipping_)
             return;
@@ -131,12 +131,12 @@ class Scanner {
     uint16_t queue_[QUEUE_SIZE] = {};  // not volatile: write_ and read_ say who may touch what
     volatile uint8_t write_ = 0;
     volatile uint8_t read_ = 0;
-    volatile uint8_t lost_scans_ = 0;
     volatile bool stopping_ = false;
     volatile bool parked_ = false;
     bool skipping_ = true;  // until the next scan starts
     bool idling_ = true;
     uint8_t kinds_ = 0;
+    uint8_t scan_ = 0;
     uint16_t idle_slots_ = 0;
     uint16_t idle_left_ = 0;
     ScanSequence sequence_;

@@ -10,18 +10,20 @@ constexpr uint16_t FULL_SCALE = (1u << frames::ADC_BITS) - 1;
 constexpr uint16_t HALF_LOW = FULL_SCALE / 2 - FULL_SCALE / 16;
 constexpr uint16_t HALF_HIGH = FULL_SCALE / 2 + FULL_SCALE / 16;
 
-// What a node's readings show, with its pin high (`own`) and low (`other`), over all inputs. A
-// short to a rail shows at every input; a node without its resistor floats wherever the skin does
-// not hold it, so that one impossible reading is enough.
-uint16_t judge(uint16_t own_max, uint16_t own_min, uint16_t other_max, uint16_t other_min,
-               frames::Finding stuck_low, frames::Finding stuck_high, frames::Finding missing) {
-    if (own_max < HALF_LOW && other_max < HALF_LOW)
-        return static_cast<uint16_t>(stuck_low);
-    if (own_min > HALF_HIGH && other_min > HALF_HIGH)
-        return static_cast<uint16_t>(stuck_high);
-    if (own_min < HALF_LOW || other_max > HALF_HIGH)
-        return static_cast<uint16_t>(missing);
-    return 0;
+// What a node reads over all inputs, with its own pin high and with the other one high.
+struct Node {
+    uint16_t own_min, own_max, other_min, other_max;
+
+    // A short to a rail shows at every input.
+    bool stuck_low() const { return own_max < HALF_LOW && other_max < HALF_LOW; }
+    bool stuck_high() const { return own_min > HALF_HIGH && other_min > HALF_HIGH; }
+    // A node without its resistor floats wherever the skin does not hold it, so that one impossible
+    // reading is enough.
+    bool floats() const { return own_min < HALF_LOW || other_max > HALF_HIGH; }
+};
+
+uint16_t bit_if(bool condition, frames::Finding finding) {
+    return condition ? static_cast<uint16_t>(finding) : 0;
 }
 
 uint8_t index(frames::Reading reading) { return static_cast<uint8_t>(reading); }
@@ -50,12 +52,18 @@ frames::SelfTestReport SelfTest::report() const {
     using frames::Reading;
     const uint8_t a = index(Reading::A), b = index(Reading::B);
     const uint8_t c = index(Reading::C), d = index(Reading::D);
+    const Node top = {min_[a], max_[a], min_[d], max_[d]};
+    const Node bottom = {min_[c], max_[c], min_[b], max_[b]};
     frames::SelfTestReport report;
-    report.findings =
-        static_cast<uint16_t>(judge(max_[a], min_[a], max_[d], min_[d], Finding::TopStuckLow,
-                                    Finding::TopStuckHigh, Finding::TopReferenceMissing) |
-                              judge(max_[c], min_[c], max_[b], min_[b], Finding::BottomStuckLow,
-                                    Finding::BottomStuckHigh, Finding::BottomReferenceMissing));
+    report.findings = static_cast<uint16_t>(bit_if(top.stuck_low(), Finding::TopStuckLow) |
+                                            bit_if(top.stuck_high(), Finding::TopStuckHigh) |
+                                            bit_if(bottom.stuck_low(), Finding::BottomStuckLow) |
+                                            bit_if(bottom.stuck_high(), Finding::BottomStuckHigh));
+    // A rail at one node pulls the other across half of Vdd through a pressed cell.
+    if (report.findings == 0)
+        report.findings =
+            static_cast<uint16_t>(bit_if(top.floats(), Finding::TopReferenceMissing) |
+                                  bit_if(bottom.floats(), Finding::BottomReferenceMissing));
     for (uint8_t i = 0; i < frames::READINGS_PER_CELL; i++) {
         report.code_min[i] = min_[i];
         report.code_max[i] = max_[i];

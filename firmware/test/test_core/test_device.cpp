@@ -236,7 +236,7 @@ TEST(a_scan_frame_holds_every_code_in_order) {
         memcpy(&header, frame.payload, sizeof header);
         CHECK_EQ(sizeof header + 15, frame.size);
         CHECK_EQ(scan, header.scan);
-        CHECK_EQ(5000 + scan * period_us, header.time_us);
+        CHECK_EQ(5000 + 2 * fake::state.plan.slot_cycles / 16 + scan * period_us, header.time_us);
         CHECK_EQ(0, header.dropped);
         CHECK_EQ(3, header.rows);
         for (uint8_t i = 0; i < 12; i++) {

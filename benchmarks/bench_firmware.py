@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the built firmware in the AVR simulator, cycle by cycle; nothing here depends on this
+machine's speed, and two runs give the same numbers.
+
+    make bench-firmware
+
+Prints a table of bars and, as the last line, one JSON object with an entry for each board. The exit
+code is 1 when a bar is missed. What is measured how:
+
+scan_hz, jitter_us    from the instants at which the converter holds the first reading of a scan,
+                      at the 90 Hz setting, 8x8. Jitter is the largest deviation from a grid of
+                      the period that `hello` reports, over the whole run.
+max_scan_hz           rate 0, 8x8, 1 Mbaud: scans that reached the host whole, per simulated second.
+scan_hz_16x16         the same with 16x16.
+wrong, readings       readings that differ from the exact code of the skin's table at the instant of
+                      the hold, in the runs at 90 Hz (wrong_90hz, ...) and rate 0 (wrong_max, ...),
+                      and their sums.
+settle_us_min         from the last change of the address or drive pins to the hold, at 90 Hz.
+cpu_percent           cycles in which the main loop found nothing to do are idle; the rest is load,
+                      interrupts included. cpu_percent_max and settle_us_min_max: at rate 0.
+lost_scans, ...       of all runs together.
+flash_bytes           avr-size, text + data.
+ram_bytes             avr-size, data + bss; the stack comes on top.
+
+During the runs the host asks for `hello` about once every ten scans, and the skin changes as often,
+each time to 1024 random codes, a third each at the lower and upper edge of their step.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ohmskin import protocol
+from ohmskin.lockstep import BOARDS, Rig, elf_of
+from ohmskin.simavr import CPU_HZ
+
+READINGS_WANTED = 1_000_000
+
+
+# ------------------------------------------------------------------------------- measurements
+
+
+def _measure_run(
+    rig: Rig, rng: np.random.Generator, readings: int, progress: str
+) -> dict[str, Any]:
+    """Figures of the scan in progress over at least `readings` readings."""
+    period = rig.hello()["scan_cycles"]
+    rig.run_cycles(3 * period)
+    size = rig.scans[0].codes.size
+    rig.sim.reset_stats()
+    damaged, answers, asked = rig.damaged, len(rig.frames("ack")), 0
+    told = time.monotonic()
+    while len(rig.scans) * size < readings:
+        rig.randomize(rng)
+        rig.send("get_hello")
+        asked += 1
+        rig.run_cycles(int(rng.integers(5 * period, 15 * period)))
+        rig.take_holds()
+        if time.monotonic() - told > 5:
+            told = time.monotonic()
+            done = 100 * len(rig.scans) * size / readings
+            print(f"{rig.board}: {progress}, {done:.0f} %", file=sys.stderr, flush=True)
+    stats = rig.sim.stats()
+    rig.must("stop")
+    check = rig.check()
+    answers = len(rig.frames("ack")) - 1 - answers  # but stop's
+    starts = check.start_cycles
+    grid = starts[0] + period * np.arange(len(starts))
+    made = rig.scans[-1].header["scan"] + 1
+    return {
+        "made_hz": CPU_HZ * (len(starts) - 1) / float(starts[-1] - starts[0]),
+        "delivered_hz": CPU_HZ * (len(rig.scans) - 1) / float(starts[made - 1] - starts[0]),
+        "jitter_us": float(np.abs(starts - grid).max()) / (CPU_HZ / 1e6),
+        "wrong": check.wrong,
+        "readings": check.readings,
+        "settle_us_min": stats["settle_cycles_min"] / (CPU_HZ / 1e6),
+        "cpu_percent": stats["cpu_percent"],
+        "lost": made - len(rig.scans),
+        "damaged": rig.damaged - damaged,
+        "unanswered": asked - answers,
+    }
+
+
+def _sizes(elf: Path) -> tuple[int, int]:
+    """Bytes of flash, and of RAM without the stack."""
+    program = shutil.which("avr-size")
+    if program is None:
+        raise FileNotFoundError("avr-size is missing: install binutils-avr")
+    done = subprocess.run([program, elf], capture_output=True, text=True, check=True)
+    text, data, bss = map(int, done.stdout.splitlines()[1].split()[:3])
+    return text + data, data + bss
+
+
+def measure(board: str) -> dict[str, Any]:
+    """All figures of one board, as the JSON line has them."""
+    rng = np.random.default_rng(BOARDS.index(board))
+    with Rig(board) as rig:
+        rig.run(0.05)
+        rig.randomize(rng)
+        rig.start_scan()
+        normal = _measure_run(rig, rng, READINGS_WANTED, "90 Hz")
+        rig.must("set_baud", baud=protocol.CONSTANTS["baud_fast"])
+        rig.run(0.01)
+        rig.start_scan(rate_mhz=0)
+        fastest = _measure_run(rig, rng, READINGS_WANTED, "free running")
+        rig.start_scan(rate_mhz=0, rows=16, columns=16)
+        large = _measure_run(rig, rng, READINGS_WANTED // 5, "free running, 16x16")
+    flash, ram = _sizes(elf_of(board))
+    runs = (normal, fastest, large)
+    return {
+        "scan_hz": round(normal["made_hz"], 4),
+        "jitter_us": round(normal["jitter_us"], 3),
+        "max_scan_hz": round(fastest["delivered_hz"], 3),
+        "scan_hz_16x16": round(large["delivered_hz"], 3),
+        "wrong": normal["wrong"] + fastest["wrong"],
+        "readings": normal["readings"] + fastest["readings"],
+        "wrong_90hz": normal["wrong"],
+        "readings_90hz": normal["readings"],
+        "wrong_max": fastest["wrong"],
+        "readings_max": fastest["readings"],
+        "wrong_16x16": large["wrong"],
+        "readings_16x16": large["readings"],
+        "settle_us_min": round(normal["settle_us_min"], 3),
+        "settle_us_min_max": round(fastest["settle_us_min"], 3),
+        "cpu_percent": round(normal["cpu_percent"], 2),
+        "cpu_percent_max": round(fastest["cpu_percent"], 2),
+        "lost_scans": sum(run["lost"] for run in runs),
+        "damaged_frames": sum(run["damaged"] for run in runs),
+        "unanswered_commands": sum(run["unanswered"] for run in runs),
+        "flash_bytes": flash,
+        "ram_bytes": ram,
+    }
+
+
+# ------------------------------------------------------------------------------------- bars
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What a figure has to be, for the boards that have this bar."""
+
+    figure: str
+    wanted: str
+    met: Callable[[float], bool]
+    boards: tuple[str, ...] = BOARDS
+
+
+BARS = (
+    Bar("scan_hz", "90.00 ± 0.05", lambda x: abs(x - 90) <= 0.05),
+    Bar("jitter_us", "<= 2", lambda x: x <= 2),
+    Bar("max_scan_hz", ">= 147", lambda x: x >= 147),
+    Bar("scan_hz_16x16", ">= 30", lambda x: x >= 30, ("uno",)),
+    Bar("scan_hz_16x16", ">= 36", lambda x: x >= 36, ("megaatmega2560",)),
+    Bar("wrong", "0", lambda x: x == 0),
+    Bar("wrong_16x16", "0", lambda x: x == 0),
+    Bar("readings_90hz", ">= 1,000,000", lambda x: x >= READINGS_WANTED),
+    Bar("readings_max", ">= 1,000,000", lambda x: x >= READINGS_WANTED),
+    Bar("settle_us_min", ">= 35", lambda x: x >= 35),
+    Bar("lost_scans", "0", lambda x: x == 0),
+    Bar("damaged_frames", "0", lambda x: x == 0),
+    Bar("unanswered_commands", "0", lambda x: x == 0),
+    Bar("flash_bytes", "<= 10240", lambda x: x <= 10240, ("uno",)),
+    Bar("ram_bytes", "<= 1228", lambda x: x <= 1228, ("uno",)),
+)
+
+
+def report(figures: dict[str, dict[str, Any]]) -> bool:
+    """Print the bars; true when all are met."""
+    all_met = True
+    print(f"{'board':16}{'figure':22}{'measured':>12}  {'bar':14}")
+    for board, measured in figures.items():
+        for bar in BARS:
+            if board in bar.boards:
+                met = bar.met(measured[bar.figure])
+                all_met = all_met and met
+                verdict = "pass" if met else "FAIL"
+                print(
+                    f"{board:16}{bar.figure:22}{measured[bar.figure]:>12}  {bar.wanted:14}{verdict}"
+                )
+    return all_met
+
+
+def main() -> int:
+    with ProcessPoolExecutor(len(BOARDS)) as pool:
+        figures = dict(zip(BOARDS, pool.map(measure, BOARDS), strict=True))
+    all_met = report(figures)
+    print(json.dumps(figures))
+    return 0 if all_met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

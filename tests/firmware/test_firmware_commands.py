@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands to the built firmware: every one answered, what is refused changes nothing."""
+
+from __future__ import annotations
+
+import pytest
+from firmware_helpers import (
+    BAUD_DEFAULT,
+    BAUD_FAST,
+    COMMANDS,
+    OTHER_SCAN,
+    VECTORS,
+    reset,
+)
+
+from ohmskin import framing, protocol
+from ohmskin.lockstep import DEFAULT_SCAN, Rig
+from ohmskin.simavr import CPU_HZ
+
+pytestmark = pytest.mark.simavr
+
+
+def test_boot_hello(rig: Rig) -> None:
+    (only,) = rig.log
+    assert only[0] == "hello"
+    hello = only[1]
+    assert hello["layout_crc"] == protocol.LAYOUT_CRC
+    assert hello["board"] == rig.board
+    assert hello["settings"] == "defaults_blank"
+    assert hello["reset_cause"] == ("power_on",)
+    assert hello["baud"] == BAUD_DEFAULT
+    assert hello["clock_hz"] == CPU_HZ
+    assert (hello["rows"], hello["columns"]) == (8, 8)
+    assert (hello["rate_asked_mhz"], hello["adc_prescaler"]) == (90_000, "clock_500khz")
+    assert (hello["unit_id"], hello["scanning"]) == (0, 0)
+    assert rig.damaged == 0
+    assert reset(rig)["reset_cause"] == ("external",)
+    assert rig.hello() == hello | {"reset_cause": ("external",)}
+
+
+def test_golden_commands_are_acknowledged(rig: Rig) -> None:
+    sent = 0
+    for vector in VECTORS["valid"]:
+        content = bytes.fromhex(vector["content"])
+        if protocol.FRAMES_BY_ID[content[0]].sender != "host":
+            continue
+        sent += 1
+        rig.sim.write(bytes.fromhex(vector["wire"]))
+        rig.run(0.05)
+        # The vector of `configure` asks for more than the converter can do.
+        result = "too_fast" if vector["name"] == "configure" else "ok"
+        ack = {"command": content[0], "command_sequence": content[1], "result": result}
+        assert rig.frames("ack")[-1] == ack, vector["name"]
+    assert sent >= 6
+    assert len(rig.frames("ack")) == sent
+    assert rig.damaged == 0
+
+
+def test_golden_damaged_frames_are_not_answered(rig: Rig) -> None:
+    for vector in VECTORS["damaged"]:
+        rig.sim.write(bytes.fromhex(vector["wire"]))
+        rig.run(0.01)
+        assert rig.frames("ack") == [], vector["name"]
+    assert rig.command("get_hello") == "ok"
+    rig.start_scan()
+    rig.run(0.05)
+    assert len(VECTORS["damaged"]) - 1 <= rig.scans[-1].header["rx_errors"]
+    assert rig.damaged == 0
+
+
+BAD_SCANS = [
+    ({"rows": 0}, "bad_rows"),
+    ({"rows": 17}, "bad_rows"),
+    ({"rows": 255}, "bad_rows"),
+    ({"columns": 0}, "bad_columns"),
+    ({"columns": 17}, "bad_columns"),
+    ({"rate_mhz": 1}, "bad_rate"),
+    ({"rate_mhz": protocol.CONSTANTS["rate_mhz_min"] - 1}, "bad_rate"),
+    ({"rate_mhz": protocol.CONSTANTS["rate_mhz_max"] + 1}, "bad_rate"),
+    ({"rate_mhz": 0xFFFFFFFF}, "bad_rate"),
+    ({"settle_us": protocol.CONSTANTS["settle_us_max"] + 1}, "bad_settle"),
+    ({"settle_us": 0xFFFF}, "bad_settle"),
+    ({"adc_prescaler": 0}, "bad_prescaler"),
+    ({"adc_prescaler": 16}, "bad_prescaler"),
+    ({"adc_prescaler": 255}, "bad_prescaler"),
+    ({"rows": 16, "columns": 16}, "too_fast"),
+    ({"settle_us": 100}, "too_fast"),
+    ({"adc_prescaler": "clock_250khz"}, "too_fast"),
+    ({"rate_mhz": 200_000}, "too_fast"),
+]
+
+
+def test_bad_commands_are_refused_by_name_and_change_nothing(rig: Rig) -> None:
+    rig.must("configure", **OTHER_SCAN)
+    rig.must("set_unit_id", unit_id=77)
+    before = rig.hello()
+    for scan, result in BAD_SCANS:
+        assert rig.command("configure", **(DEFAULT_SCAN | scan)) == result, scan
+    for baud in (0, 115_200, 2_000_000, 0xFFFFFFFF):
+        assert rig.command("set_baud", baud=baud) == "bad_baud"
+    assert rig.hello() == before
+
+    for command in COMMANDS:
+        frame = protocol.FRAMES[command]
+        sequence = 200 + COMMANDS.index(command)
+        for payload in {bytes(frame.struct.size + 1), bytes(max(0, frame.struct.size - 1)), b"1"}:
+            if len(payload) == frame.struct.size:
+                continue
+            rig.sim.write(framing.encode(frame.id, sequence, payload))
+            assert rig.result_of(sequence) == "bad_length", command
+    for unknown in (0x00, 0x01, 0x7F, 0x80, 0x8A, 0xFF):
+        rig.sim.write(framing.encode(unknown, unknown & 0x7F, b""))
+        assert rig.result_of(unknown & 0x7F) == "unknown_command"
+    assert rig.hello() == before
+
+    rig.must("start")
+    for command, fields in (
+        ("configure", DEFAULT_SCAN),
+        ("load_defaults", {}),
+        ("self_test", {}),
+        ("set_baud", {"baud": BAUD_FAST}),
+    ):
+        assert rig.command(command, **fields) == "scanning"
+    assert rig.hello() == before | {"scanning": 1}
+    rig.must("stop")
+    assert rig.hello() == before
+    assert rig.damaged == 0
+
+
+def test_set_baud_lasts_until_reset(rig: Rig) -> None:
+    rig.sim.set_baud(BAUD_DEFAULT)
+    rig.must("set_baud", baud=BAUD_FAST)
+    rig.sim.set_baud(BAUD_FAST)
+    rig.run(0.9)
+    assert rig.hello()["baud"] == BAUD_FAST
+    rig.run(1.2)
+    assert rig.hello()["baud"] == BAUD_FAST
+    rig.sim.set_baud(BAUD_DEFAULT)
+    assert reset(rig)["baud"] == BAUD_DEFAULT
+    assert rig.hello()["baud"] == BAUD_DEFAULT
+    assert rig.damaged == 0
+
+
+def test_unconfirmed_baud_falls_back_after_a_second(rig: Rig) -> None:
+    rig.sim.set_baud(BAUD_DEFAULT)
+    rig.must("set_baud", baud=BAUD_FAST)
+    confirm_s = protocol.CONSTANTS["baud_confirm_ms"] / 1000
+    rig.run(confirm_s / 2)
+    with pytest.raises(TimeoutError):  # the host's speed is not the board's
+        rig.command("get_hello", limit_s=0.1)
+    rig.run(confirm_s / 2)
+    assert rig.hello()["baud"] == BAUD_DEFAULT
