@@ -231,7 +231,7 @@ void serial_write(uint8_t octet) {
 bool serial_idle() { return UCSR0A & _BV(TXC0); }
 
 // Reception has an interrupt, because at 1 Mbaud the chip's own three bytes are full after 30 us.
-// It takes 4 us, once a byte of a command, by which a slot interrupt may come late: pins then
+// It takes 5 us, once a byte of a command, by which a slot interrupt may come late: pins then
 // settle that much shorter, and no reading is lost.
 namespace {
 constexpr uint8_t RECEIVED_SIZE = 32;  // more than the longest command
