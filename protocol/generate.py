@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write frames.h, FRAMES.md and the C++ copy of the golden vectors from their definitions.
 
-    python protocol/generate.py            write the files
-    python protocol/generate.py --check    change nothing, exit 1 when one is stale
+python protocol/generate.py            write the files
+python protocol/generate.py --check    change nothing, exit 1 when one is stale
 """
 
 from __future__ import annotations
@@ -65,9 +65,7 @@ def header() -> str:
         width = _c_type(max(enum.values.values()))
         out += ["", f"// {DEFINITION['enums'][enum.name]['doc']}"]
         out.append(f"enum class {_camel(enum.name)} : {width} {{")
-        out += [
-            f"    {_camel(n)} = {v},  // {enum.docs[n]}" for n, v in enum.values.items()
-        ]
+        out += [f"    {_camel(n)} = {v},  // {enum.docs[n]}" for n, v in enum.values.items()]
         out.append("};")
     out += ["", "enum class Type : uint8_t {"]
     out += [f"    {_camel(f.name)} = {_hex(f.id)}," for f in FRAMES.values()]
@@ -190,11 +188,7 @@ def vectors_header() -> str:
 
 
 def _array(name: str, octets: bytes) -> str:
-    return (
-        f"const uint8_t {name}[] PROGMEM = {{"
-        + ", ".join(f"0x{o:02X}" for o in octets)
-        + "};"
-    )
+    return f"const uint8_t {name}[] PROGMEM = {{" + ", ".join(f"0x{o:02X}" for o in octets) + "};"
 
 
 OUTPUTS = {
