@@ -43,7 +43,7 @@ from ohmskin.protocol import ADC_BITS, ENUMS
 
 Float = NDArray[np.float64]
 
-CONFIGURATIONS: Final = tuple(ENUMS["reading"].values)
+CONFIGURATIONS: Final = tuple(name.upper() for name in ENUMS["reading"].values)
 READINGS_PER_CELL: Final = len(CONFIGURATIONS)
 # Every configuration reads y = offset + sign * R * I, R the reference resistor of the sensed layer.
 READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
@@ -126,12 +126,12 @@ def check_references(ref_top_ohm: float, ref_bottom_ohm: float) -> None:
             raise ValueError(f"{name} must be positive and finite, not {ohm}")
 
 
-def wire_coupling_ohm(skin: Skin) -> Float:
+def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
     """K [ohm], shape (RC, RC): K[e, f] is the wire shared by the paths to cells e and f."""
-    rows, columns = skin.shape
+    rows, columns = top_wire_ohm.shape
     i, j = np.arange(rows), np.arange(columns)
-    top_to_cell = np.cumsum(skin.top_wire_ohm, axis=1)
-    bottom_to_cell = np.cumsum(skin.bottom_wire_ohm, axis=0)
+    top_to_cell = np.cumsum(top_wire_ohm, axis=1)
+    bottom_to_cell = np.cumsum(bottom_wire_ohm, axis=0)
     coupling = np.zeros((rows, columns, rows, columns))
     same_row = np.einsum("ijik->ijk", coupling)
     same_row += top_to_cell[:, np.minimum(j[:, None], j[None, :])]
@@ -140,28 +140,37 @@ def wire_coupling_ohm(skin: Skin) -> Float:
     return coupling.reshape(rows * columns, rows * columns)
 
 
-def electrode_admittance(skin: Skin) -> Float:
-    """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
-    rows, columns = skin.shape
-    root = np.sqrt(skin.cell_siemens.ravel())
-    system = wire_coupling_ohm(skin)
-    system *= root[:, None]
-    system *= root[None, :]
+def _factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tuple[Float, Float]:
+    """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C)."""
+    rows, columns = root.shape
+    system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm)
+    system *= root.reshape(-1, 1)
+    system *= root.reshape(1, -1)
     system[np.diag_indices_from(system)] += 1.0
-    factor = scipy.linalg.cholesky(system, lower=True, overwrite_a=True, check_finite=False)
+    factor: Float = scipy.linalg.cholesky(system, lower=True, overwrite_a=True, check_finite=False)
     driven = np.zeros((rows, columns, rows + columns))
-    cell_root = root.reshape(rows, columns)
-    driven[np.arange(rows), :, np.arange(rows)] = cell_root
-    driven[:, np.arange(columns), rows + np.arange(columns)] = -cell_root
+    driven[np.arange(rows), :, np.arange(rows)] = root
+    driven[:, np.arange(columns), rows + np.arange(columns)] = -root
     half: Float = scipy.linalg.solve_triangular(
         factor, driven.reshape(rows * columns, -1), lower=True, check_finite=False
     )
-    admittance = half.T @ half
-    # No current leaves the skin: a diagonal made from its row keeps small conductances that
-    # rounding of the large ones would drown.
+    return factor, half
+
+
+def _admittance(half: Float) -> Float:
+    """Y = half^T half. No current leaves the skin: a diagonal made from its row keeps small
+    conductances that rounding of the large ones would drown.
+    """
+    admittance: Float = half.T @ half
     np.fill_diagonal(admittance, 0.0)
     np.fill_diagonal(admittance, -admittance.sum(axis=1))
     return admittance
+
+
+def electrode_admittance(skin: Skin) -> Float:
+    """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
+    root = np.sqrt(skin.cell_siemens)
+    return _admittance(_factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
 
 
 def port_resistance_ohm(skin: Skin) -> Float:
@@ -184,6 +193,57 @@ def port_resistance_ohm(skin: Skin) -> Float:
     resistance = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
     connected = part[:rows, None] == part[None, rows:]
     return np.where(connected, np.maximum(resistance, 0.0), np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Port resistances and how each resistance of the skin moves them.
+
+    port_ohm: rho, shape (RC,), ports in row-major order. by_cell, by_top, by_bottom: shape
+    (RC, RC), port by resistor, d rho / d log r [ohm].
+    """
+
+    port_ohm: Float
+    by_cell: Float
+    by_top: Float
+    by_bottom: Float
+
+
+def port_sensitivity(
+    cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float
+) -> Sensitivity:
+    """rho of every port and d rho / d log r_e = r_e i_e^2, i_e the current in e per port current.
+
+    The adjoint of a resistive network is the network itself (Tellegen): the currents that give rho
+    give its derivative as well, so one factorisation of RC unknowns and R+C right-hand sides are
+    enough for all RC x 3RC derivatives. Cells must conduct (g > 0): (R, C) [S]; wires (R, C) [ohm].
+    """
+    rows, columns = cell_siemens.shape
+    cells = rows * columns
+    root = np.sqrt(cell_siemens)
+    factor, half = _factorised(root, top_wire_ohm, bottom_wire_ohm)
+    admittance = _admittance(half)
+    ground = np.argmax(np.diagonal(admittance))
+    admittance[ground, ground] *= 2
+    impedance = np.linalg.inv(admittance)
+    # Electrode potentials for unit current into row i and out of column j, port by port.
+    potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(-1, cells)
+    diagonal = np.diagonal(impedance)
+    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    per_potential = scipy.linalg.solve_triangular(
+        factor, half, lower=True, trans=1, check_finite=False
+    )
+    per_potential *= root.reshape(-1, 1)
+    current = (per_potential @ potential).T.reshape(cells, rows, columns)
+    # A wire segment carries what the cells behind it draw.
+    top = np.cumsum(current[:, :, ::-1], axis=2)[:, :, ::-1]
+    bottom = np.cumsum(current[:, ::-1, :], axis=1)[:, ::-1, :]
+    return Sensitivity(
+        port_ohm.ravel(),
+        (current * current / cell_siemens).reshape(cells, cells),
+        (top * top * top_wire_ohm).reshape(cells, cells),
+        (bottom * bottom * bottom_wire_ohm).reshape(cells, cells),
+    )
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from ohmskin.estimators.base import Estimate, Estimator, SkinKnowledge
+from ohmskin.estimators.joint import JointEstimator
 from ohmskin.estimators.matrix import MatrixEstimator
 from ohmskin.estimators.ohm import OhmEstimator
 
 METHODS: dict[str, type[Estimator]] = {
-    method.name: method for method in (OhmEstimator, MatrixEstimator)
+    method.name: method for method in (OhmEstimator, MatrixEstimator, JointEstimator)
 }
 
 
