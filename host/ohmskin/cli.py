@@ -57,7 +57,9 @@ Port = Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' l
 def main() -> None:
     """Run the command line; the process's exit code says how it went."""
     try:
-        app(prog_name="ohmskin", standalone_mode=False)
+        # Typer returns the code of an Exit, such as 130 for Ctrl-C.
+        if code := app(prog_name="ohmskin", standalone_mode=False):
+            sys.exit(code)
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(str(exc))
     except typer.Abort:
@@ -67,7 +69,9 @@ def main() -> None:
     except Exception as exc:
         if not hasattr(exc, "format_message"):
             raise
-        _fail(exc.format_message())  # a wrong use of the command line
+        if text := exc.format_message():  # a wrong use of the command line
+            _fail(text)
+        sys.exit(2)  # no command at all: the help is the answer
 
 
 def _fail(text: str) -> None:
@@ -308,7 +312,8 @@ def estimate(
 ) -> None:
     """Estimate every cell of every frame of a readings file."""
     given = load_readings(readings)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    errors = Console(stderr=True)
+    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task(method, total=len(given.ratio))
 
         def show_progress(done: int, _: int) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -69,7 +70,8 @@ class Device:
         self._report: SelfTestReport | None = None
         self._newest: Scan | None = None
         self._newest_taken = False
-        self._queues: list[_Queue] = []
+        # Weak: an iterator that is dropped unused takes its queue along.
+        self._queues: weakref.WeakSet[_Queue] = weakref.WeakSet()
         self._failure: OhmskinError | None = None
         self._closing = False
         self._want_scans = False
@@ -102,7 +104,7 @@ class Device:
         self.start()
         queue = _Queue()
         with self._changed:
-            self._queues.append(queue)
+            self._queues.add(queue)
         return self._scans(queue)
 
     def _scans(self, queue: _Queue) -> Iterator[Scan]:
@@ -114,7 +116,7 @@ class Device:
                 yield scan
         finally:
             with self._changed:
-                self._queues.remove(queue)
+                self._queues.discard(queue)
 
     def latest(self, timeout_s: float | None = None) -> Scan:
         """The newest scan, each one once: waits for the next if this one was given out already.
@@ -189,13 +191,20 @@ class Device:
         wanted: dict[str, protocol.Value] = {
             "rows": info.rows if rows is None else rows,
             "columns": info.columns if columns is None else columns,
-            "rate_mhz": info.rate_asked_mhz if rate_hz is None else round(rate_hz * 1000),
+            "rate_mhz": info.rate_asked_mhz if rate_hz is None else protocol.rate_mhz(rate_hz),
             "settle_us": info.settle_asked_us if settle_us is None else settle_us,
             "adc_prescaler": info.adc_prescaler if adc_prescaler is None else adc_prescaler,
         }
         with self._paused():
-            self._command("configure", **wanted)
-            return self._refresh()
+            for _ in range(_COMMAND_TRIES):
+                self._command("configure", **wanted)
+                kept = self._refresh()
+                # A board that was reset in between keeps something else.
+                if (kept.rows, kept.columns, kept.rate_asked_mhz, kept.settle_asked_us) == tuple(
+                    wanted[name] for name in ("rows", "columns", "rate_mhz", "settle_us")
+                ):
+                    break
+            return kept
 
     def set_unit_id(self, unit_id: int) -> None:
         """Name this skin; `save` makes the name last."""
@@ -237,6 +246,8 @@ class Device:
         self._reader.join()
         self._link.close()
         with self._changed:
+            self._want_scans = False
+            self._newest = None
             self._failure = self._failure or DeviceLost(f"{self.name} was closed")
             self._changed.notify_all()
 
@@ -307,7 +318,13 @@ class Device:
             settle_us=before.settle_asked_us,
             adc_prescaler=before.adc_prescaler,
         )
-        self._hello = replace(before, baud=restarted.baud, reset_cause=restarted.reset_cause)
+        self._hello = replace(
+            before,
+            unit_id=restarted.unit_id,
+            baud=restarted.baud,
+            settings=restarted.settings,
+            reset_cause=restarted.reset_cause,
+        )
         self._send("start")
 
     # ------------------------------------------------------------------------------ plumbing

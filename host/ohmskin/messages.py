@@ -153,6 +153,7 @@ class BoardDecoder:
         self.stats = BoardStats(line=self._frames.stats)
         self._number: int | None = None  # of the last scan; None: unknown, -1: none since start
         self._time_us = 0
+        self._host_time_s: float | None = None  # of the last scan
         self._dropped = 0
 
     def feed(self, chunk: bytes, host_time_s: float) -> list[Message]:
@@ -200,7 +201,7 @@ class BoardDecoder:
             # The first scan since a start; numbers that go back tell of one nobody has seen.
             missed = 0 if self._number is None else number
             self._dropped = dropped if self._number is None else 0
-            self._time_us = values["time_us"]
+            self._time_us = self._time_at_start(values["time_us"], host_time_s)
         else:
             missed = step - 1
             self._time_us += (values["time_us"] - self._time_us) % _COUNTER_SPAN
@@ -210,7 +211,19 @@ class BoardDecoder:
         stats.dropped_by_board += (dropped - self._dropped) % _DROPPED_SPAN
         stats.board_rx_errors = values["rx_errors"]
         self._number, self._dropped = number, dropped
+        self._host_time_s = host_time_s
         return Scan(codes, number, self._time_us, host_time_s, missed)
+
+    def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
+        """Goes on, with its wraps, for a board that was only stopped; small after a reset."""
+        if self._host_time_s is None:
+            return counter_us
+        elapsed_us = (host_time_s - self._host_time_s) * 1e6
+        expected_us = self._time_us + elapsed_us
+        time_us = counter_us + _COUNTER_SPAN * round((expected_us - counter_us) / _COUNTER_SPAN)
+        # A resonator may be 0.5 % off.
+        near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + 0.005 * elapsed_us
+        return time_us if near else counter_us
 
     def snapshot(self) -> BoardStats:
         """The counts now, as a copy."""

@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl
 from ohmskin import protocol
 from ohmskin.circuit import Float
 from ohmskin.device import Device
-from ohmskin.emulator import EmulatedBoard, EmulatorLink
+from ohmskin.emulator import DEFAULT_RATE_HZ, EmulatedBoard, EmulatorLink
 from ohmskin.errors import PortError
 from ohmskin.faults import FAULTS, Faults
 from ohmskin.link import Link, SerialLink
@@ -26,7 +26,7 @@ from ohmskin.readings import load_readings
 from ohmskin.scenes import Scene
 from ohmskin.simavr_link import SimavrLink
 
-_SCENE_KEYS = ("scene", "seed", "rows", "columns")
+_SCENE_KEYS = ("scene", "seed")
 _EMULATOR_KEYS = (*_SCENE_KEYS, "readings", "rate", "noise", "unit", "foreign", *FAULTS)
 _DEFAULT_NOISE_LSB = 0.3
 
@@ -54,7 +54,8 @@ def open_link(url: str) -> tuple[Link, int | None]:
     scheme, separator, rest = url.partition("://")
     if not separator:
         path, _, query = url.partition("?")
-        return SerialLink(path), _baud(_options(url, query, ("baud",)))
+        baud = _baud(_options(url, query, ("baud",)))
+        return SerialLink(path), baud
     place, _, query = rest.partition("?")
     if scheme == "emulator":
         return EmulatorLink(*emulated(url)), None
@@ -82,7 +83,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
             ratio_at,
             rows,
             columns,
-            rate_hz=float(options.pop("rate", "90")),
+            rate_hz=float(options.pop("rate")) if "rate" in options else None,
             noise_lsb=float(options.pop("noise", str(_DEFAULT_NOISE_LSB))),
             seed=seed,
             unit_id=int(options.pop("unit", "0")),
@@ -101,8 +102,10 @@ def _skin(
     if path is None:
         scene = _scene(place, options, seed)
         return scene.ratio, scene.rows, scene.columns
+    if "scene" in options:
+        raise ValueError("say either scene or readings")
     ratio = load_readings(path).ratio
-    rate_hz = float(options.get("rate", "90"))
+    rate_hz = float(options.setdefault("rate", str(DEFAULT_RATE_HZ)))
     # Half a scan on, because a scan begins a rounding error before its frame's time.
     return lambda time_s: ratio[int(time_s * rate_hz + 0.5) % len(ratio)], *ratio.shape[1:3]
 
@@ -119,7 +122,7 @@ def _scene(place: str, options: dict[str, str], seed: int) -> Scene:
 
 
 def _simavr(url: str, place: str, query: str) -> tuple[Link, int | None]:
-    options = _options(url, query, (*_SCENE_KEYS, "elf", "baud", "tau_us"))
+    options = _options(url, query, (*_SCENE_KEYS, "rows", "columns", "elf", "baud", "tau_us"))
     try:
         seed = int(options.pop("seed", "0"))
         size = f"{options.pop('rows', '8')}x{options.pop('columns', '8')}"

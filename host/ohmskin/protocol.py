@@ -96,7 +96,11 @@ class Frame:
             raise ValueError(f"{self.name}: missing or unknown field: {odd}")
         flat: list[int] = []
         for f in self.fields:
-            flat.extend(_integers(f, values[f.name]))
+            integers = _integers(f, values[f.name])
+            most = (1 << 8 * struct.calcsize(_STRUCT_CODES[f.type])) - 1
+            if not all(0 <= n <= most for n in integers):
+                raise ValueError(f"{f.name} is {values[f.name]}: must be from 0 to {most}")
+            flat.extend(integers)
         try:
             return self.struct.pack(*flat)
         except struct.error as exc:
@@ -185,6 +189,16 @@ _CODE_MASK = (1 << ADC_BITS) - 1
 _GROUP_CODES = 4
 _GROUP_BYTES = _GROUP_CODES * ADC_BITS // 8
 _SHIFTS = np.arange(_GROUP_CODES, dtype=np.uint64) * np.uint64(ADC_BITS)
+
+
+def rate_mhz(rate_hz: float) -> int:
+    """A scan rate in the unit of the link [mHz].
+
+    :raises ValueError: it is not finite, or so small that it would become 0: as fast as possible.
+    """
+    if not abs(rate_hz) < float("inf") or (rate_hz and not round(rate_hz * 1000)):
+        raise ValueError(f"no board scans {rate_hz} times a second")
+    return round(rate_hz * 1000)
 
 
 def codes_size(rows: int, columns: int) -> int:

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the host: decoding, latency and load. No estimator runs here.
+
+    make bench-host
+
+Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
+missed. What is measured how:
+
+decode_scans_per_s     8x8 scans of random codes, bytes in, `scan.ratio` arrays out, on one core;
+                       the median of a few runs. The bytes come in chunks of 4096.
+decode_scans_per_s_zeros
+                       the same where all codes are zero: every byte of the tail is a COBS block.
+latency_ms_p50, _p99   from just before another process writes the bytes of a scan, the last one
+                       included, to a pseudo-terminal, until `latest()` has returned it in this
+                       one. Both read CLOCK_MONOTONIC. 90 scans a second.
+cpu_percent_at_90hz    of one core: user and system time of this process while it iterates over the
+                       scans that another process writes to a pseudo-terminal, each at once.
+cpu_percent_at_90hz_simavr
+                       the same while the firmware in the AVR simulator, another process again,
+                       sends byte by byte. null where firmware or simulator are not built.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import statistics
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import ohmskin
+from ohmskin import framing, protocol
+from ohmskin.emulator import EmulatedBoard
+from ohmskin.errors import PortError
+from ohmskin.messages import BoardDecoder, Scan
+
+RATE_HZ = 90
+DECODED_SCANS = 3000
+DECODE_RUNS = 5
+CHUNK_BYTES = 4096
+LATENCY_SCANS = 400
+CPU_SECONDS = 12.0
+SERVE_SECONDS = "60"  # at most: this process ends it sooner
+
+# ------------------------------------------------------------------- the board, another process
+
+
+def serve(seconds: float) -> None:
+    """Serve an emulated board: print its port, then, when stdin closes, when it wrote each scan."""
+    ratio = np.random.default_rng(0).random((8, 8, 4))
+    board = EmulatedBoard(lambda _: ratio, 8, 8, rate_hz=RATE_HZ)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    print(os.ttyname(slave), flush=True)
+    begin_s = time.monotonic()
+    written: list[tuple[float, bytes]] = []
+    while (now_s := time.monotonic() - begin_s) < seconds:
+        octets = board.advance(now_s)
+        if octets:
+            written.append((time.monotonic(), octets))
+            os.write(master, octets)
+        due = board.next_scan_s
+        wait_s = 0.2 if due is None else max(0.0, due - (time.monotonic() - begin_s))
+        ready = select.select([master, sys.stdin], [], [], wait_s)[0]
+        if sys.stdin in ready:
+            break
+        if master in ready:
+            board.receive(os.read(master, CHUNK_BYTES))
+    decoder = BoardDecoder()
+    times_s = {
+        message.number: host_time_s
+        for host_time_s, octets in written
+        for message in decoder.feed(octets, host_time_s)
+        if isinstance(message, Scan)
+    }
+    print(json.dumps(times_s))
+
+
+class Served:
+    """A board in another process. `path`: its port. `written_s`: afterwards, times by scan."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__, "--serve", SERVE_SECONDS],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stdout is not None
+        self.path = self._process.stdout.readline().strip()
+        self.written_s: dict[int, float] = {}
+
+    def end(self) -> None:
+        out, _ = self._process.communicate(timeout=20)
+        self.written_s = {int(number): time_s for number, time_s in json.loads(out).items()}
+
+
+@contextmanager
+def served() -> Iterator[Served]:
+    board = Served()
+    try:
+        yield board
+    finally:
+        board.end()
+
+
+# -------------------------------------------------------------------------------- measurements
+
+
+def decode_rate(codes: Callable[[int], np.ndarray]) -> float:
+    """Scans a second through `BoardDecoder.feed` and `ratio`."""
+    kind = protocol.FRAMES["scan"]
+    stream = bytearray()
+    for number in range(DECODED_SCANS):
+        header = kind.pack(
+            scan=number, time_us=11_111 * number, dropped=0, rx_errors=0, rows=8, columns=8
+        )
+        tail = protocol.pack_codes(codes(number))
+        stream += framing.encode(kind.id, number, header + tail)
+    chunks = [bytes(stream[i : i + CHUNK_BYTES]) for i in range(0, len(stream), CHUNK_BYTES)]
+    rates = []
+    for _ in range(DECODE_RUNS):
+        decoder, count, total = BoardDecoder(), 0, 0.0
+        begin_s = time.perf_counter()
+        for chunk in chunks:
+            for message in decoder.feed(chunk, 0.0):
+                assert isinstance(message, Scan)
+                total += message.ratio[0, 0, 0]
+                count += 1
+        rates.append(count / (time.perf_counter() - begin_s))
+        assert count == DECODED_SCANS
+        assert total > 0
+    return statistics.median(rates)
+
+
+def latencies_ms() -> np.ndarray:
+    """Of every scan that `latest` gave out."""
+    returned_s: dict[int, float] = {}
+    with served() as board, ohmskin.open(board.path) as skin:
+        for _ in range(LATENCY_SCANS):
+            scan = skin.latest()
+            returned_s[scan.number] = time.monotonic()
+    return np.array([1e3 * (at_s - board.written_s[n]) for n, at_s in returned_s.items()])
+
+
+def reader_cpu_percent(skin: ohmskin.Device) -> float:
+    """CPU time of this process per wall time while it reads every scan."""
+    scans = iter(skin)
+    for _ in range(RATE_HZ):  # what is done once is not load
+        next(scans)
+    before, begin_s = os.times(), time.monotonic()
+    count = missed = 0
+    for scan in scans:
+        count += 1
+        missed += scan.missed
+        if time.monotonic() - begin_s >= CPU_SECONDS:
+            break
+    after, end_s = os.times(), time.monotonic()
+    rate_hz = count / (end_s - begin_s)
+    if missed or abs(rate_hz - RATE_HZ) > 1:
+        print(f"{skin.name}: {rate_hz:.2f} scans a second, {missed} missed", file=sys.stderr)
+    used_s = (after.user - before.user) + (after.system - before.system)
+    return 100 * used_s / (end_s - begin_s)
+
+
+def measure() -> dict[str, Any]:
+    """All figures, as the JSON line has them."""
+    random = np.random.default_rng(0)
+    blocks = random.integers(0, 1024, (64, 8, 8, 4), dtype=np.uint16)
+    zeros = np.zeros((8, 8, 4), dtype=np.uint16)
+    rate = decode_rate(lambda number: blocks[number % len(blocks)])
+    rate_zeros = decode_rate(lambda _: zeros)
+    latency = latencies_ms()
+    with served() as board, ohmskin.open(board.path) as skin:
+        cpu = reader_cpu_percent(skin)
+    try:
+        with ohmskin.open("simavr://uno") as skin:
+            cpu_simavr = round(reader_cpu_percent(skin), 2)
+    except PortError as exc:
+        print(exc, file=sys.stderr)
+        cpu_simavr = None
+    return {
+        "decode_scans_per_s": round(rate),
+        "decode_scans_per_s_zeros": round(rate_zeros),
+        "latency_ms_p50": round(float(np.percentile(latency, 50)), 3),
+        "latency_ms_p99": round(float(np.percentile(latency, 99)), 3),
+        "cpu_percent_at_90hz": round(cpu, 2),
+        "cpu_percent_at_90hz_simavr": cpu_simavr,
+    }
+
+
+# ---------------------------------------------------------------------------------------- bars
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What a figure has to be."""
+
+    figure: str
+    wanted: str
+    met: Callable[[float], bool]
+
+
+BARS = (
+    Bar("decode_scans_per_s", ">= 10,000", lambda x: x >= 10_000),
+    Bar("latency_ms_p50", "<= 2", lambda x: x <= 2),
+    Bar("latency_ms_p99", "<= 10", lambda x: x <= 10),
+    Bar("cpu_percent_at_90hz", "<= 8", lambda x: x <= 8),
+)
+
+
+def report(figures: dict[str, Any]) -> bool:
+    """Print all figures and their bars; true when all are met."""
+    bars = {bar.figure: bar for bar in BARS}
+    all_met = True
+    print(f"{'figure':30}{'measured':>12}  {'bar':14}")
+    for name, value in figures.items():
+        bar = bars.get(name)
+        met = bar is None or bar.met(value)
+        all_met = all_met and met
+        wanted, verdict = ("", "") if bar is None else (bar.wanted, "pass" if met else "FAIL")
+        print(f"{name:30}{'-' if value is None else value:>12}  {wanted:14}{verdict}".rstrip())
+    return all_met
+
+
+def main() -> int:
+    if sys.argv[1:2] == ["--serve"]:
+        serve(float(sys.argv[2]))
+        return 0
+    figures = measure()
+    all_met = report(figures)
+    print(json.dumps(figures))
+    return 0 if all_met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

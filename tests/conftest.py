@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What several test files share: ports to open, the command line as a process, and what leaks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+import ohmskin
+from ohmskin.ports import emulated
+from ohmskin.pty_server import PtyServer
+from ohmskin.simavr import default_program
+
+ROOT = Path(__file__).resolve().parents[1]
+OPEN_FILES = Path("/proc/self/fd")
+
+# The same examples in every run, and no deadline: the machine may be busy.
+settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)
+settings.load_profile("repeatable")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("simavr") and not (
+        default_program().exists() and (ROOT / ".pio/build/uno/firmware.elf").exists()
+    ):
+        pytest.skip("needs 'make firmware sim'")
+
+
+@pytest.fixture
+def nothing_left() -> Iterator[None]:
+    """Fails a test that leaves a thread or an open file behind."""
+    threads, files = set(threading.enumerate()), _open_files()
+    yield
+    assert set(threading.enumerate()) <= threads
+    assert _open_files() == files
+
+
+def _open_files() -> int:
+    return len(list(OPEN_FILES.iterdir())) if OPEN_FILES.exists() else 0
+
+
+@pytest.fixture
+def pty_board() -> Iterator[Callable[[str], PtyServer]]:
+    """A function that serves an ``emulator://`` URL at a pseudo-terminal; `close` ends it early."""
+    with ExitStack() as stack:
+
+        def serve(url: str) -> PtyServer:
+            board, _, faults = emulated(url)
+            server = PtyServer(board, faults)
+            done = threading.Event()
+
+            def work() -> None:
+                while not done.is_set():
+                    server.serve(0.05)
+
+            thread = threading.Thread(target=work, name=f"serve {url}")
+            thread.start()
+            close_files = server.close
+
+            def close() -> None:
+                if not done.is_set():
+                    done.set()
+                    thread.join()
+                    close_files()
+
+            server.close = close  # type: ignore[method-assign]
+            stack.callback(close)
+            return server
+
+        yield serve
+
+
+Command = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def command() -> Iterator[Command]:
+    """A function that starts ``ohmskin ARGUMENTS`` as a process of its own."""
+    host = str(Path(ohmskin.__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": host, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"}
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", "from ohmskin.cli import main; main()", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
