@@ -205,7 +205,7 @@ def test_stream_shows_a_table(run: Callable[..., Done], method: str) -> None:
 
 
 def test_stream_says_what_was_lost(run: Callable[..., Done]) -> None:
-    done = run("stream", f"{EMULATED}&drop=0.3&rate=300", "--json", "--scans", "40")
+    done = run("stream", f"{EMULATED}&drop=0.3&rate=100", "--json", "--scans", "80")
     assert done.code == 0
     lines = [json.loads(line) for line in done.out.splitlines()]
     assert sum(line["missed"] for line in lines) > 0
