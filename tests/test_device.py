@@ -302,6 +302,14 @@ def test_a_port_can_be_opened_again(pty_board: Callable[[str], PtyServer]) -> No
             skin.set_unit_id(round_number + 1)
 
 
+def test_close_stops_the_board(pty_board: Callable[[str], PtyServer]) -> None:
+    server = pty_board("emulator://4x4")
+    with ohmskin.open(server.path) as skin:
+        skin.latest()
+        assert server._board.next_scan_s is not None
+    until(lambda: server._board.next_scan_s is None)
+
+
 def test_a_board_left_scanning_is_taken_over(pty_board: Callable[[str], PtyServer]) -> None:
     from ohmskin.link import SerialLink
 
@@ -337,22 +345,23 @@ def test_a_moving_scene_moves_in_the_simulator_too() -> None:
 # --------------------------------------------------------------------------------- one backend
 
 
-def test_a_slow_iterator_is_told_what_it_lost(
-    fast: ohmskin.Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("fault", ["", "&drop=0.2"])
+def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_module, "QUEUE_SCANS", 16)
-    slow, quick = iter(fast), iter(fast)
-    before = next(slow)
-    taken = 0
-    while fast.stats.overflowed < 50:
-        taken += len(take(quick, 1))
-    later = take(slow, 40)
+    with ohmskin.open(f"emulator://1x1?rate=1000{fault}") as skin:
+        slow, quick = iter(skin), iter(skin)
+        before = next(slow)
+        taken = 0
+        while skin.stats.overflowed < 50:
+            taken += len(take(quick, 1))
+        later = take(slow, 40)
+        lost_on_the_line = skin.stats.missed
     for scan in later:
         assert scan.missed == scan.number - before.number - 1
         before = scan
     assert later[0].missed >= 50
     assert taken > 50
-    assert fast.stats.missed == 0
+    assert (lost_on_the_line > 0) == bool(fault)
 
 
 def test_an_iterator_never_used_costs_nothing(

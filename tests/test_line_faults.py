@@ -9,6 +9,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from ohmskin.simavr_link import SimavrLink
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
+ADC = "clock_250khz"
 BAD_LINES = ["drop=0.1", "bitflip=1e-4", "garbage=0.3", "drop=0.02&bitflip=5e-5&garbage=0.1"]
 
 
@@ -106,17 +108,18 @@ def test_every_scan_that_was_made_is_received_or_missed() -> None:
 def test_a_reset_board_goes_on_as_it_was_configured() -> None:
     with ohmskin.open("emulator://8x8?rate=90&reset=0.7") as skin:
         skin.set_unit_id(7)
-        skin.configure(rows=5, columns=4, rate_hz=130, settle_us=30, adc_prescaler="clock_250khz")
+        skin.configure(rows=5, columns=4, rate_hz=130, settle_us=30, adc_prescaler=ADC)
         shapes = set()
         for scan in skin:
             shapes.add(scan.codes.shape)
             if skin.stats.restarts >= 3 and scan.number > 5:
                 break
+        skin.set_unit_id(8)  # asks the board what it keeps
         info, stats = skin.info, skin.stats
     print(f"resets every 0.7 s: {stats}")
     assert shapes == {(5, 4, 4)}
     assert (info.rows, info.columns, info.rate_asked_mhz) == (5, 4, 130_000)
-    assert (info.settle_asked_us, info.adc_prescaler) == (30, "clock_250khz")
+    assert (info.settle_asked_us, info.adc_prescaler) == (30, ADC)
     assert info.reset_cause == ("external",)
     assert stats.line.damaged == 0
 
@@ -128,7 +131,7 @@ def test_a_reset_of_the_firmware(baud: int) -> None:
     link, _ = open_link("simavr://uno")
     assert isinstance(link, SimavrLink)
     with ohmskin.Device(link, baud=baud) as skin:
-        skin.configure(rows=3, columns=7, rate_hz=150)
+        kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
         scans = iter(skin)
         for _ in range(20):
             assert next(scans).codes.shape == (3, 7, 4)
@@ -142,9 +145,10 @@ def test_a_reset_of_the_firmware(baud: int) -> None:
         assert skin.stats.restarts == 1
         assert skin.info.reset_cause == ("external",)
         assert skin.info.baud == 500_000
-        assert skin.info.rate_asked_mhz == 150_000
-        skin.set_unit_id(5)
-        assert (skin.info.unit_id, skin.info.rows) == (5, 3)
+        skin.set_unit_id(5)  # asks the board what it keeps
+        assert skin.info == replace(
+            kept, unit_id=5, baud=500_000, reset_cause=("external",), scanning=1
+        )
 
 
 def test_a_reset_board_says_its_name_anew() -> None:
