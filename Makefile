@@ -76,7 +76,7 @@ test-host: setup firmware sim ## pytest
 bench-firmware: setup firmware sim ## measure the firmware in the simulator
 	$(ONE_THREAD) $(BIN)/python benchmarks/bench_firmware.py
 
-bench-host: setup-host ## measure the estimators, on one thread
+bench-host: setup-host ## measure decoding, latency and load of the host
 	$(ONE_THREAD) $(BIN)/python benchmarks/bench_host.py
 
 clean: ## remove what was built

@@ -18,6 +18,7 @@ import ohmskin
 from ohmskin import device as device_module
 from ohmskin import framing, protocol
 from ohmskin.circuit import quantise
+from ohmskin.device import Device
 from ohmskin.emulator import EmulatorLink
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import SerialLink
@@ -183,6 +184,16 @@ def test_a_reset_right_after_configure_does_not_undo_it() -> None:
         assert link.resets_due == 0
         assert skin.info.rate_asked_mhz == 77_000
         assert skin.latest().codes.shape == (2, 4, 4)
+
+
+def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
+    board, name, _ = emulated("emulator://4x4")
+    with Device(EmulatorLink(board, name), start=False) as skin:
+        skin.configure(rows=2, columns=3, rate_hz=77)
+        board.reset()
+        skin.start()
+        assert skin.latest().codes.shape == (2, 3, 4)
+        assert skin.info.rate_asked_mhz == 77_000
 
 
 def test_a_stall_of_two_seconds() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -354,6 +355,7 @@ def emulate(
             link.symlink_to(server.path)
             stack.callback(link.unlink, missing_ok=True)
         print(server.path, flush=True)  # noqa: T201
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # the link goes then, too
         with suppress(KeyboardInterrupt):
             server.serve(seconds or float("inf"))
 

@@ -75,6 +75,7 @@ class Device:
         self._failure: OhmskinError | None = None
         self._closing = False
         self._want_scans = False
+        self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
         self._overflowed = 0
         self._restarts = 0
         self._sequence = 0
@@ -157,11 +158,18 @@ class Device:
     def start(self) -> None:
         """Start scanning. Does nothing when the board scans already."""
         with self._commands:
-            if not self._want_scans:
+            if self._want_scans:
+                return
+            for _ in range(_COMMAND_TRIES):
+                self._restore()
                 with self._changed:
                     self._newest = None  # it may be of another configuration
                 self._command("start")
-                self._want_scans = True
+                # The hello of a reset that came in between was read before this ack.
+                if self._as_wanted():
+                    break
+                self._command("stop")
+            self._want_scans = True
 
     def stop(self) -> None:
         """Stop scanning, after a whole scan."""
@@ -187,24 +195,21 @@ class Device:
         :raises ValueError: a value that no board could be sent.
         :raises CommandRefused: a value out of range, or too much for the rate; nothing changes.
         """
-        info = self.info
-        wanted: dict[str, protocol.Value] = {
-            "rows": info.rows if rows is None else rows,
-            "columns": info.columns if columns is None else columns,
-            "rate_mhz": info.rate_asked_mhz if rate_hz is None else protocol.rate_mhz(rate_hz),
-            "settle_us": info.settle_asked_us if settle_us is None else settle_us,
-            "adc_prescaler": info.adc_prescaler if adc_prescaler is None else adc_prescaler,
+        given = {
+            "rows": rows,
+            "columns": columns,
+            "rate_mhz": None if rate_hz is None else protocol.rate_mhz(rate_hz),
+            "settle_us": settle_us,
+            "adc_prescaler": adc_prescaler,
         }
         with self._paused():
-            for _ in range(_COMMAND_TRIES):
-                self._command("configure", **wanted)
-                kept = self._refresh()
-                # A board that was reset in between keeps something else.
-                if (kept.rows, kept.columns, kept.rate_asked_mhz, kept.settle_asked_us) == tuple(
-                    wanted[name] for name in ("rows", "columns", "rate_mhz", "settle_us")
-                ):
-                    break
-            return kept
+            wanted = _configuration(self.info)
+            wanted.update({name: value for name, value in given.items() if value is not None})
+            self._command("configure", **wanted)
+            self._wanted = wanted
+            self._refresh()
+            self._restore()
+            return self.info
 
     def set_unit_id(self, unit_id: int) -> None:
         """Name this skin; `save` makes the name last."""
@@ -222,6 +227,7 @@ class Device:
         """Return to the built-in configuration; the EEPROM keeps what it holds until `save`."""
         with self._paused():
             self._command("load_defaults")
+            self._wanted = None
             return self._refresh()
 
     def self_test(self) -> SelfTestReport:
@@ -308,16 +314,20 @@ class Device:
             case Hello() | ForeignHello():
                 self._hello = message
 
+    def _as_wanted(self) -> bool:
+        return self._wanted is None or _configuration(self.info) == self._wanted
+
+    def _restore(self) -> None:
+        """A board that was reset while it stood still has forgotten how to scan."""
+        for _ in range(_COMMAND_TRIES):
+            if self._as_wanted() or self._wanted is None:
+                return
+            self._command("configure", **self._wanted)
+            self._refresh()
+
     def _resume(self, restarted: Hello) -> None:
         before = self.info
-        self._send(
-            "configure",
-            rows=before.rows,
-            columns=before.columns,
-            rate_mhz=before.rate_asked_mhz,
-            settle_us=before.settle_asked_us,
-            adc_prescaler=before.adc_prescaler,
-        )
+        self._send("configure", **_configuration(before))
         self._hello = replace(
             before,
             unit_id=restarted.unit_id,
@@ -437,6 +447,17 @@ class Device:
         if self._failure is not None:
             raise self._failure
         raise DeviceLost(f"{self.name} has said nothing for {limit_s:.1f} s: unplug and plug it")
+
+
+def _configuration(board: Hello) -> dict[str, protocol.Value]:
+    """What `configure` would have to say for a board to scan as this one does."""
+    return {
+        "rows": board.rows,
+        "columns": board.columns,
+        "rate_mhz": board.rate_asked_mhz,
+        "settle_us": board.settle_asked_us,
+        "adc_prescaler": board.adc_prescaler,
+    }
 
 
 class _Queue:
