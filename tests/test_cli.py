@@ -21,8 +21,7 @@ import pytest
 import serial
 
 import ohmskin
-from ohmskin import cli
-from ohmskin import device as device_module
+from ohmskin import cli, session
 from ohmskin.circuit import quantise, ratio_from_codes
 from ohmskin.estimators import METHODS
 from ohmskin.protocol import LAYOUT_CRC
@@ -420,7 +419,7 @@ def test_an_error_of_a_process_is_one_line(what: str, command: Command) -> None:
 
 
 def test_a_silent_port(run: Callable[..., Done], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
     assert_one_line(run("info", "emulator://4x4?silent=1"), "silent", "ohmskin flash")
 
 

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin import device as device_module
-from ohmskin import protocol
+from ohmskin import device, framing, protocol, session
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
 from ohmskin.messages import Scan
 from ohmskin.pty_server import PtyServer
@@ -316,7 +315,7 @@ def test_a_board_left_scanning_is_taken_over(pty_board: Callable[[str], PtyServe
     path = pty_board("emulator://4x4").path
     left = SerialLink(path)
     start = protocol.FRAMES["start"]
-    left.write(ohmskin.device.framing.encode(start.id, 0, b""))
+    left.write(framing.encode(start.id, 0, b""))
     time.sleep(0.2)
     left.close()
     with ohmskin.open(path) as skin:
@@ -347,7 +346,7 @@ def test_a_moving_scene_moves_in_the_simulator_too() -> None:
 
 @pytest.mark.parametrize("fault", ["", "&drop=0.2"])
 def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(session, "QUEUE_SCANS", 16)
     with ohmskin.open(f"emulator://1x1?rate=1000{fault}") as skin:
         slow, quick = iter(skin), iter(skin)
         before = next(slow)
@@ -367,7 +366,7 @@ def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.Mo
 def test_an_iterator_never_used_costs_nothing(
     fast: ohmskin.Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_module, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(session, "QUEUE_SCANS", 16)
     unused = iter(fast)
     until(lambda: fast.stats.overflowed > 0)  # while somebody may still use it
     del unused
@@ -394,7 +393,7 @@ def test_latest_waits_no_longer_than_told() -> None:
 
 
 def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "SILENCE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.1)
     with ohmskin.open("emulator://1x1?rate=2") as skin:
         assert [scan.number for scan in take(iter(skin), 2)] == [0, 1]
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin import device as device_module
-from ohmskin import framing, protocol
+from ohmskin import device, framing, protocol, session
 from ohmskin.circuit import quantise
 from ohmskin.device import Device
 from ohmskin.emulator import EmulatorLink
@@ -243,8 +242,8 @@ def test_a_serial_port_that_goes_away(use: str, pty_board: Callable[[str], PtySe
 
 
 def test_a_board_that_stops_talking(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "SILENCE_TIMEOUT_S", 0.3)
-    monkeypatch.setattr(device_module, "_COMMAND_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.1)
     with ohmskin.open("emulator://2x2?stall=600") as skin:
         with pytest.raises(DeviceLost, match=r"said nothing for 0\.3 s"):
             list(skin)
@@ -255,14 +254,14 @@ def test_a_board_that_stops_talking(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_silent_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.5)
     with pytest.raises(DeviceSilent, match=r"is silent: .*ohmskin flash"):
         ohmskin.open("emulator://2x2?silent=1")
 
 
 def test_a_port_with_other_things_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of a board with another sketch, which prints lines for ever."""
-    monkeypatch.setattr(device_module, "CONNECT_TIMEOUT_S", 0.7)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.7)
     master, slave = os.openpty()
     tty.setraw(slave)
     done = threading.Event()
@@ -327,8 +326,8 @@ def test_a_board_that_is_reset_by_the_opening_of_its_port() -> None:
 
 
 def test_a_lost_answer_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "_COMMAND_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(device_module, "_HELLO_EVERY_S", 0.05)
+    monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(session, "_HELLO_EVERY_S", 0.05)
     for seed in range(5):
         with ohmskin.open(f"emulator://2x2?rate=200&drop=0.15&seed={seed}", start=False) as skin:
             for unit_id in range(10):
@@ -350,7 +349,7 @@ def test_refusals_on_a_bad_line_stay_refusals() -> None:
 
 
 def test_no_thread_or_file_is_left_when_opening_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module, "CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
     master, slave = os.openpty()  # nobody answers there
     try:
         urls = [
