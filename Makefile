@@ -71,7 +71,7 @@ sim: setup ## build the simulator that runs the firmware on an emulated skin
 	$(MAKE) -C firmware/sim
 
 test-host: setup firmware sim ## pytest
-	$(BIN)/pytest
+	$(ONE_THREAD) $(BIN)/pytest
 
 bench-firmware: setup firmware sim ## measure the firmware in the simulator
 	$(ONE_THREAD) $(BIN)/python benchmarks/bench_firmware.py
