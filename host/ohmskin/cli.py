@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -191,8 +192,11 @@ def flash(
     if pio is None:
         raise OhmskinError("PlatformIO is not installed: pip install 'ohmskin[flash]'")
     command = [pio, "run", "-d", str(root), "-e", board, "-t", "upload"]
+    command += ["--upload-port", port] if port else []
+    packages = root / ".pio" / "core"  # where `make setup` puts them
+    environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
     _out.print(f"flashing {board}{f' at {port}' if port else ''}")
-    if subprocess.run([*command, *(["--upload-port", port] if port else [])]).returncode:
+    if subprocess.run(command, env=environment | os.environ).returncode:
         raise OhmskinError(f"flashing {board} failed: its last lines above say why")
     if port:
         with ohmskin.open(port, start=False) as skin:
