@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ohmskin.circuit import Skin, quantise, ratio_from_codes, ratio_from_current, readings
-from ohmskin.estimators import METHODS, SkinKnowledge, make_estimator
+from ohmskin.estimators import SkinKnowledge, make_estimator
 from ohmskin.estimators.matrix import solve_ports
 
 DATA = Path(__file__).parent / "data"
@@ -31,6 +31,8 @@ def ten_bits(ratio: np.ndarray) -> np.ndarray:
 
 # The methods that neglect the wires: what is said of all of them holds where there are none.
 WIRE_FREE = ("ohm", "matrix")
+# Those of any size; the paper's are tested in test_paper.py.
+METHODS = (*WIRE_FREE, "joint")
 
 
 def random_ohm(random: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:

@@ -7,9 +7,17 @@ from ohmskin.estimators.base import Estimate, Estimator, SkinKnowledge
 from ohmskin.estimators.joint import JointEstimator
 from ohmskin.estimators.matrix import MatrixEstimator
 from ohmskin.estimators.ohm import OhmEstimator
+from ohmskin.estimators.paper import LsqEstimator, RegularizedEstimator
 
 METHODS: dict[str, type[Estimator]] = {
-    method.name: method for method in (OhmEstimator, MatrixEstimator, JointEstimator)
+    method.name: method
+    for method in (
+        OhmEstimator,
+        MatrixEstimator,
+        LsqEstimator,
+        RegularizedEstimator,
+        JointEstimator,
+    )
 }
 
 

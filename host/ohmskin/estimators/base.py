@@ -93,6 +93,7 @@ class Estimate:
 
     cell_siemens_std: rounding is uniform, not normal: about 58 % of cells lie within one standard
     deviation and 98 % within two. It covers the readings' noise, not what the method neglects.
+    NaN where the method gives none.
     cell_siemens, cell_siemens_std, touched, top_wire_ohm, bottom_wire_ohm: shape (R, C), wires NaN
     where the method does not estimate them. chi2: sum of squared residuals of all readings over
     the variance of one, divided by their number (about 1 or less when the model holds).
@@ -143,7 +144,8 @@ class Estimator(ABC):
     def _solve(self, ratio: Float) -> Solution:
         """Answer for checked readings (R, C, 4), started from the previous frame if there is one.
 
-        Must return finite values with an honest standard deviation, or set `message`.
+        Must return finite values with an honest standard deviation (NaN: none is known), or set
+        `message`.
         """
 
     # Not abstract: a method that keeps nothing from frame to frame has nothing to forget.
@@ -156,7 +158,7 @@ class Estimator(ABC):
         A cell is touched when g - g_rest > max(0.5e-6 S, 5 sqrt(std^2 + std_rest^2)). g_rest is
         this method's own answer to `rest_ratio`; without one it is the median over the cells of
         this frame, which supposes that less than half of them are touched (one cell alone then
-        never is).
+        never is). A standard deviation of NaN counts as none.
         Raises ValueError for another shape, or for a reading that is no number in 0..1.
         """
         known = self.knowledge
@@ -188,7 +190,7 @@ class Estimator(ABC):
         else:
             rise = found.cell_siemens - self._rest.cell_siemens
             rise_std = np.hypot(found.cell_siemens_std, self._rest.cell_siemens_std)
-        return np.asarray(rise > np.maximum(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
+        return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
 
     def _port_current(self, ratio: Float) -> tuple[Float, Float]:
         """The readings of each cell as one current per Vdd and its standard deviation [S], (R, C).
