@@ -181,14 +181,11 @@ def test_a_warm_start_takes_fewer_iterations_than_a_cold_one(
 def test_a_press_is_followed_and_a_jump_starts_afresh(method: type[PaperEstimator]) -> None:
     knowledge = SkinKnowledge(2, 2, adc_bits=10)
     estimator = method(knowledge)
-    iterations = []
     for cell_ohm in (1e6, 8e5, 6e5, 5e5, 4e5):
         found = estimator.estimate(ten_bits(readings(a_skin(2, 2, cell_ohm))))
         assert found.converged, found.message
         # One code of 10 bits is 6 % of 1 megohm.
         assert found.cell_ohm[1, 1] == pytest.approx(cell_ohm, rel=0.15)
-        iterations.append(found.iterations)
-    assert max(iterations[1:]) < iterations[0]
     frame = ten_bits(readings(a_skin(2, 2, 3e3)))
     found = estimator.estimate(frame)
     afresh = method(knowledge).estimate(frame)
