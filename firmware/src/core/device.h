@@ -41,7 +41,7 @@ class Device {
     OHMSKIN_RARE bool poll_save();
     OHMSKIN_RARE void send_hello();
 
-    // ---- scan frames
+    // ---- scan frames (device_scan.cpp)
     OHMSKIN_APART void take_cell();
     OHMSKIN_RARE void begin_scan();
     OHMSKIN_RARE void drop_open_scan();

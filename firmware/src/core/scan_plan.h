@@ -30,7 +30,7 @@ constexpr uint16_t triggered_slot_min(uint8_t prescaler) {
     return static_cast<uint16_t>(13u * prescaler + prescaler / 2 + 4);
 }
 // Hold to the change of pins in the interrupt, at most, with a byte received in the same moment:
-// measured in the simulator, with room (tests/test_firmware_scan.py).
+// measured in the simulator, with room (tests/firmware/test_firmware_scan.py).
 constexpr uint16_t SELECT_CYCLES_MAX = 120;
 constexpr uint16_t SELECT_CYCLES_MAX_FREE_RUNNING = 180;
 constexpr uint16_t SLOT_CYCLES_MAX = 60000;
