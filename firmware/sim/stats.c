@@ -18,6 +18,7 @@ struct __attribute__((packed)) hold_record {
     uint64_t cycle;
     uint8_t row, column, configuration, channel;
     uint16_t code;
+    uint32_t settle; /* cycles since row, column or drive changed; UINT32_MAX: never, or longer */
 };
 
 static struct {
@@ -81,6 +82,9 @@ void stats_hold(instant when, unsigned channel, uint16_t code) {
         add_gap(&stats.channel_settle, when - state.last_channel_change);
     state.last_hold = when;
     state.held = true;
+    uint32_t settle = UINT32_MAX;
+    if (state.changed && when >= state.last_change && when - state.last_change < UINT32_MAX)
+        settle = (uint32_t)(when - state.last_change);
     if (!state.log_enabled)
         return;
     if (state.log_count == HOLD_LOG_MAX) {
@@ -102,7 +106,8 @@ void stats_hold(instant when, unsigned channel, uint16_t code) {
                                                         .column = pins.column,
                                                         .configuration = pins.configuration,
                                                         .channel = (uint8_t)channel,
-                                                        .code = code};
+                                                        .code = code,
+                                                        .settle = settle};
 }
 
 void stats_conversion_started(instant when) {

@@ -32,6 +32,7 @@ TABLE_CONFIGURATIONS: Final = 4
 CONFIGURATION_NAMES: Final = ("A", "B", "C", "D", "no current", "undriven", "other channel")
 
 #: One record of the hold log. `cycle`: CPU cycles since power-on at the instant of the hold.
+#: `settle_cycles`: since row, column or drive pins last changed; 2**32 - 1: never, or longer ago.
 HOLD_DTYPE: Final = np.dtype(
     [
         ("cycle", "<u8"),
@@ -40,6 +41,7 @@ HOLD_DTYPE: Final = np.dtype(
         ("configuration", "u1"),
         ("channel", "u1"),
         ("code", "<u2"),
+        ("settle_cycles", "<u4"),
     ]
 )
 

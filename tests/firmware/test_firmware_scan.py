@@ -200,6 +200,24 @@ def test_no_load_damages_a_frame(rig: Rig, ratio: float | None) -> None:
         assert last["scan"] + 1 == len(rig.scans) + last["dropped"]
 
 
+def test_settle_time_before_each_hold(rig: Rig) -> None:
+    """Pins change before A and C, a slot earlier for B and D, and not in idle slots."""
+    rig.start_scan()
+    slots_per_scan = 258
+    slot_cycles = rig.hello()["scan_cycles"] // slots_per_scan
+    rig.sim.reset_stats()
+    rig.run(0.2)
+    log = rig.holds()[-10 * slots_per_scan :]
+    slots, since_change = np.divmod(log["settle_cycles"].astype(np.int64), slot_cycles)
+    assert since_change.min() == rig.sim.stats()["settle_cycles_min"]
+    assert np.ptp(since_change) <= 8  # the longest instruction that an interrupt waits for
+    first_cell = (log["row"] == 0) & (log["column"] == 0)
+    within = ~first_cell
+    np.testing.assert_array_equal(slots[within], log["configuration"][within] % 2)
+    # The idle slots already stand at the first reading of the next scan.
+    assert set(slots[first_cell]) == {0, 1, 2, 3}
+
+
 @pytest.mark.parametrize("rate_mhz", [90_000, 0])
 def test_pins_change_after_the_hold_and_not_before(rig: Rig, rate_mhz: int) -> None:
     """An ADC clock is 32 cycles; the data sheet leaves some of one open."""
