@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -32,6 +33,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         default_program().exists() and (ROOT / ".pio/build/uno/firmware.elf").exists()
     ):
         pytest.skip("needs 'make firmware sim'")
+    if item.get_closest_marker("ngspice") and not shutil.which("ngspice"):
+        reason = "needs ngspice, which 'make setup' installs (apt package ngspice)"
+        if os.environ.get("CI") == "true":
+            pytest.fail(reason, pytrace=False)
+        pytest.skip(reason)
 
 
 @pytest.fixture

@@ -3,12 +3,13 @@
 #
 # Usage: tools/setup.sh host|all        (run by `make`, from the repository's root)
 #
-# host: .venv with the ohmskin package. all: also the AVR tools from apt and the development tools.
+# host: .venv with the ohmskin package.
+# all: also the AVR tools and ngspice from apt, and the development tools.
 # Installs only what is missing, and says what.
 set -euo pipefail
 
-AVR_PACKAGES=(gcc-avr binutils-avr avr-libc arduino-core-avr avrdude cppcheck
-              simavr libsimavr-dev libelf-dev gcc g++ make)
+APT_PACKAGES=(gcc-avr binutils-avr avr-libc arduino-core-avr avrdude cppcheck
+              simavr libsimavr-dev libelf-dev gcc g++ make ngspice)
 
 fail() {
     printf 'setup: %s\n' "$@" >&2
@@ -83,7 +84,7 @@ host)
     touch .venv/.stamp-host
     ;;
 all)
-    [[ -n ${OHMSKIN_SKIP_APT:-} ]] || apt_install "${AVR_PACKAGES[@]}"
+    [[ -n ${OHMSKIN_SKIP_APT:-} ]] || apt_install "${APT_PACKAGES[@]}"
     make_venv
     pip_install '.[dev]'
     touch .venv/.stamp-host .venv/.stamp
