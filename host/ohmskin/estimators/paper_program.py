@@ -77,6 +77,9 @@ _IPOPT: Final[dict[str, Any]] = {
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
 }
+# What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
+# without callbacks: numbers that are none end as Invalid_Number_Detected.
+_INTERRUPTED: Final = ("User_Requested_Stop", "NonIpopt_Exception_Thrown")
 _IPOPT_START: Final[dict[Start, dict[str, Any]]] = {
     Start.CIRCUIT: {"bound_mult_init_val": 1e-6},
     Start.STEP_3: {},
@@ -156,6 +159,8 @@ class Program:
         parameters = np.concatenate([readings, reference_megohm, weights])
         found = solver(x0=x.ravel(), p=parameters, **arguments)
         report = solver.stats()
+        if report["return_status"] in _INTERRUPTED:
+            raise KeyboardInterrupt
         return Optimum(
             x=np.array(found["x"]).reshape(x.shape),
             bound_multipliers=np.array(found["lam_x"]).ravel(),

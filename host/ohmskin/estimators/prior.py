@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is expected of a skin's resistances before a frame is read: cells here, wires in `wires`.
+
+RC readings do not determine 3RC resistances; these numbers are what decides the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.circuit import Float
+
+# A cell whose rest readings are not known is expected around 1 MOhm. Deviations are of the log.
+REST_OHM: Final = 1e6
+UNKNOWN_REST_STD: Final = 1.0
+REST_STD: Final = 0.05  # drift since the rest readings
+TAIL: Final = 2.0  # exponent of the density of touched cells
+
+UNKNOWN_WIRE_OHM: Final = 150.0
+UNKNOWN_LAYER_STD: Final = 1.5
+LAYER_STD: Final = 0.3  # what all segments of a layer share: stretch, temperature
+SEGMENT_STD: Final = 0.1  # what each has of its own
+
+# A cell that the prior holds at rest may be touched all the same, where readings say little of it.
+TOUCHED: Final = 0.1  # log: further from rest, a cell's force is unknown
+WIDEST_LOG_STD: Final = 3.0
+UNLIMITED_STD: Final = 3.0  # what is not known of it
+HIDDEN: Final = 0.3  # log: a rise that must not go unnoticed
+DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
+
+
+@dataclass(frozen=True, eq=False)
+class CellPrior:
+    """Log resistance of the cells: normal near rest, heavy-tailed further away.
+
+    With d the distance from `expected` over `std`, -2 log p is d^2 up to d^2 = `tail`, and goes on
+    with the same slope as tail (1 + log(d^2 / tail)): the density falls as d^-tail. Cells at rest
+    are a quadratic problem, which costs no iterations; being touched is unlikely, but how hard,
+    once a cell is, costs little. expected, std: (RC,) [log ohm]. tail: inf for a normal.
+    """
+
+    expected: Float
+    std: Float
+    tail: float
+
+    def cost(self, log_ohm: Float) -> float:
+        """-2 log p, up to a constant."""
+        square = ((log_ohm - self.expected) / self.std) ** 2
+        if self.tail == np.inf:
+            return float(square.sum())
+        beyond = np.maximum(square / self.tail, 1.0)
+        return float((np.minimum(square, self.tail) + self.tail * np.log(beyond)).sum())
+
+    def variance(self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)) -> Float:
+        """Of the normal that has this prior's slope there: std^2, or beyond d^2 = tail more."""
+        away = log_ohm - self.expected[cells]
+        return np.asarray(np.maximum(self.std[cells] ** 2, away * away / self.tail))
+
+
+def siemens_std(log_siemens: Float, log_std: Float) -> Float:
+    """Standard deviation of a conductance [S] from that of its log: g (exp(4 s) - 1) / 4.
+
+    A quarter of what four deviations of the log are upwards, so that four of one are four of the
+    other: behind wires that are known less well than itself, a cell may be anything.
+    """
+    upwards = np.expm1(4 * np.minimum(log_std, WIDEST_LOG_STD)) / 4
+    return np.asarray(np.exp(log_siemens) * upwards)

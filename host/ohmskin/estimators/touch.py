@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`touch`: only the cells that the frame shows to be touched, and no more model than that.
+
+`joint` with the cells at rest and the wires taken out of the fit and into the noise: the answer of
+`touched`, where it is enough. It is not where the touches contradict the readings, where a fifth of
+the skin is touched, or where a touch may hide: those frames are `joint`'s.
+Without rest readings no cell is known to be untouched, so every frame is.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Final
+
+from ohmskin.estimators.joint import JointEstimator
+from ohmskin.estimators.touched import Touched
+
+MOST_TOUCHED: Final = 0.2  # share of the cells
+
+
+class TouchEstimator(JointEstimator):
+    """The simplest model that explains a frame. Cells at rest are reported as at rest."""
+
+    name: ClassVar[str] = "touch"
+
+    def _is_enough(self, found: Touched) -> bool:
+        few = found.cells.size <= MOST_TOUCHED * found.current.size
+        return few and not (found.doubtful or found.contradicted)
