@@ -36,9 +36,9 @@ from dataclasses import dataclass, fields
 from typing import Final, Self
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
+from ohmskin.factors import cholesky, solve_lower
 from ohmskin.protocol import ADC_BITS, ENUMS
 
 Float = NDArray[np.float64]
@@ -150,14 +150,11 @@ def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tupl
     system *= root.reshape(-1, 1)
     system *= root.reshape(1, -1)
     system[np.diag_indices_from(system)] += 1.0
-    factor: Float = scipy.linalg.cholesky(system, lower=True, overwrite_a=True, check_finite=False)
+    factor = cholesky(system)
     driven = np.zeros((rows, columns, rows + columns))
     driven[np.arange(rows), :, np.arange(rows)] = root
     driven[:, np.arange(columns), rows + np.arange(columns)] = -root
-    half: Float = scipy.linalg.solve_triangular(
-        factor, driven.reshape(rows * columns, -1), lower=True, check_finite=False
-    )
-    return factor, half
+    return factor, solve_lower(factor, driven.reshape(rows * columns, -1))
 
 
 def _admittance(half: Float) -> Float:
@@ -249,9 +246,7 @@ def port_sensitivity(
     root = np.sqrt(cell_siemens)
     factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
     impedance, port_ohm = impedance_of(half, rows)
-    per_potential = scipy.linalg.solve_triangular(
-        factor, half, lower=True, trans=1, check_finite=False
-    )
+    per_potential = solve_lower(factor, half, transposed=True)
     per_potential *= root.reshape(-1, 1)
     # Electrode potentials for unit current into row i and out of column j, port by port.
     potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(-1, cells)

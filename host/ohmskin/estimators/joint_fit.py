@@ -24,10 +24,11 @@ and the posterior covariance is P - P J^T (J P J^T + 1)^-1 J P.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import scipy.linalg
+from numpy.typing import NDArray
 
 from ohmskin.circuit import Float, port_sensitivity
 from ohmskin.estimators.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
@@ -40,6 +41,7 @@ from ohmskin.estimators.prior import (
     siemens_std,
 )
 from ohmskin.estimators.wires import LOG_LIMITS, Lesson, WireBelief
+from ohmskin.factors import cholesky, solve, solve_lower
 
 MAX_ITERATIONS: Final = 40
 MAX_STEP: Final = 1.5  # of a log resistance
@@ -59,10 +61,37 @@ MAX_HALVINGS: Final = 8
 _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
 
 
+@dataclass(eq=False)
+class _Slopes:
+    """h and J at one state, over the noise. by_cell: (RC, RC), times the cells' deviations.
+
+    heavy: (m,), the ports that wires matter to; by_wires: (m, 2RC).
+    """
+
+    modelled: Float
+    residual: Float
+    cell_std: Float
+    by_cell: Float
+    heavy: NDArray[np.intp]
+    by_wires: Float
+
+    def seen(self, belief: WireBelief) -> Float:
+        """J P J^T + 1, (RC, RC)."""
+        seen: Float = self.by_cell @ self.by_cell.T
+        by_wires = belief.seen(self.by_wires)
+        if self.heavy.size == len(seen):
+            seen += by_wires
+        else:
+            seen[np.ix_(self.heavy, self.heavy)] += by_wires
+        seen.ravel()[:: len(seen) + 1] += 1.0
+        return seen
+
+
 class JointFit:
     """One frame's fit. cell (RC,), wires (2RC,): log resistances.
 
-    wire_pull: a of wires - mean = P a, which saves an inverse of P in the cost.
+    cell_std: standard deviation of the cells' log resistances. elsewhere: another start that may
+    lead to a better optimum, if there is one. cost: -2 log of the posterior, up to a constant.
     """
 
     def __init__(
@@ -89,61 +118,66 @@ class JointFit:
         self._conclude()
 
     def _minimise(self, starts: list[Float]) -> None:
-        self._moved = 0.0
-        self._wire_pull = np.zeros_like(self._belief.mean)
         self.wires = self._belief.mean
+        # a of wires - mean = P a, which saves an inverse of P in the cost
+        self._wire_pull = np.zeros_like(self.wires)
+        self._moved = 0.0
         tried = []
         for self.cell in starts:
-            self._linearise()
-            tried.append((self._cost(), self.cell))
-        self.cost, cell = min(tried, key=lambda each: each[0])
-        if cell is not self.cell:
-            self.cell = cell
-            self._linearise()
+            self._here = self._slopes()
+            tried.append((self._cost(), self.cell, self._here))
+        self.cost, self.cell, self._here = min(tried, key=lambda each: each[0])
         for _ in range(MAX_ITERATIONS):
             self.iterations += 1
-            here = self.cell, self.wires, self._wire_pull
+            before = self.cell, self.wires, self._wire_pull
             if self._step():
                 return
-            self._linearise()
+            self._here = self._slopes()
             cost_before, self.cost = self.cost, self._cost()
             for _ in range(MAX_HALVINGS):
                 if self.cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
                     break
                 # Too far: back half the way. What is lost is one factorisation.
-                self.cell, self.wires, self._wire_pull = (
-                    0.5 * (now + before)
-                    for now, before in zip(
-                        (self.cell, self.wires, self._wire_pull), here, strict=True
-                    )
-                )
+                self.cell = 0.5 * (self.cell + before[0])
+                self.wires = 0.5 * (self.wires + before[1])
+                self._wire_pull = 0.5 * (self._wire_pull + before[2])
                 self.iterations += 1
-                self._linearise()
+                self._here = self._slopes()
                 self.cost = self._cost()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
 
-    def _linearise(self) -> None:
-        """h and its slopes at the present state, over the noise: cells times their deviation."""
+    def _slopes(self) -> _Slopes:
+        """At the present state."""
         top, bottom = np.exp(self.wires).reshape(2, *self._shape)
         circuit = port_sensitivity(np.exp(-self.cell).reshape(self._shape), top, bottom)
-        self.modelled = 1.0 / (circuit.port_ohm + self._ref_ohm)
-        slope = -self._weight * self.modelled**2
-        self._cell_std = np.sqrt(self._prior.variance(self.cell))
-        self._by_cell = circuit.by_cell
-        self._by_cell *= slope[:, None]
-        self._by_cell *= self._cell_std
-        self._residual = (self._current - self.modelled) * self._weight
+        modelled = 1.0 / (circuit.port_ohm + self._ref_ohm)
+        slope = -self._weight * modelled**2
+        cell_std = np.sqrt(self._prior.variance(self.cell))
+        by_cell = circuit.by_cell
+        by_cell *= slope[:, None]
+        by_cell *= cell_std
         # All wires in series with a port bound what they can do to it.
         path = np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)
-        move = np.abs(slope) * path.ravel()
-        self._heavy = np.flatnonzero(move > HEAVY)
-        self._by_wires = circuit.by_wires(self._heavy)
-        self._by_wires *= slope[self._heavy, None]
+        heavy = np.flatnonzero(path.ravel() * slope < -HEAVY)
+        by_wires = circuit.by_wires(heavy)
+        by_wires *= slope[heavy, None]
+        residual = (self._current - modelled) * self._weight
+        return _Slopes(modelled, residual, cell_std, by_cell, heavy, by_wires)
 
     def _cost(self) -> float:
-        """-2 log posterior, up to a constant."""
-        cost = float(self._residual @ self._residual) + self.wire_chi2
-        return cost + self._prior.cost(self.cell)
+        residual = self._here.residual
+        return float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
+
+    @property
+    def modelled(self) -> Float:
+        """Port currents of the model, (RC,) [S]."""
+        return self._here.modelled
+
+    @property
+    def misfit(self) -> float:
+        """Chi-square per port of what is left."""
+        residual = self._here.residual
+        return float(residual @ residual) / residual.size
 
     @property
     def wire_chi2(self) -> float:
@@ -157,21 +191,21 @@ class JointFit:
         return self.wire_chi2 > BENT * (1 + touches)
 
     def _step(self) -> bool:
-        """One step; True when it is so small that the linearisation still holds."""
-        by_cell, by_wires, heavy = self._by_cell, self._by_wires, self._heavy
+        """One step; True when the next would not matter."""
+        here, heavy = self._here, self._here.heavy
         away = self.cell - self._prior.expected
         off = self.wires - self._belief.mean
-        wanted = self._residual + by_cell @ (away / self._cell_std)
-        wanted[heavy] += by_wires @ off
-        self._factor = self._factored()
-        left = scipy.linalg.cho_solve((self._factor, True), wanted, check_finite=False)
-        cell_step = self._cell_std * (left @ by_cell) - away
-        pull = left[heavy] @ by_wires
+        wanted = here.residual + here.by_cell @ (away / here.cell_std)
+        wanted[heavy] += here.by_wires @ off
+        self._factored, self._factor = here, cholesky(here.seen(self._belief))
+        left = solve(self._factor, wanted)
+        cell_step = here.cell_std * (left @ here.by_cell) - away
+        pull = left[heavy] @ here.by_wires
         wire_step = self._belief.times(pull) - off
         # After this step the linearised residual is `left`.
         moved = max(
-            float(np.abs(self._residual - left).max()),
-            float(np.abs(cell_step / self._cell_std).max()),
+            float(np.abs(here.residual - left).max()),
+            float(np.abs(cell_step / here.cell_std).max()),
         )
         # Steps shrink faster than by a constant factor: the next one is at most this.
         next_one = moved * moved / self._moved if self._moved else moved
@@ -183,41 +217,15 @@ class JointFit:
         self._wire_pull = self._wire_pull + share * (pull - self._wire_pull)
         return moved < CLOSE or (moved < NEARLY and next_one < CLOSE)
 
-    def _factored(self) -> Float:
-        """Lower factor of J P J^T + 1."""
-        system: Float = self._by_cell @ self._by_cell.T
-        seen = self._belief.seen(self._by_wires)
-        self._wires_seen = np.diagonal(seen).copy()
-        if self._heavy.size == len(system):
-            system += seen
-        else:
-            system[np.ix_(self._heavy, self._heavy)] += seen
-        system.ravel()[:: len(system) + 1] += 1.0
-        factor: Float = scipy.linalg.cholesky(
-            system, lower=True, overwrite_a=True, check_finite=False
-        )
-        return factor
-
-    def _learned(self) -> Float:
-        """Share of each cell's prior variance that the readings take away, (RC,)."""
-        own = scipy.linalg.solve_triangular(
-            self._factor, self._by_cell, lower=True, check_finite=False
-        )
-        return np.asarray(np.einsum("ij,ij->j", own, own))
-
-    @property
-    def misfit(self) -> float:
-        """Chi-square per port of what is left."""
-        return float(self._residual @ self._residual) / self._residual.size
-
     def _conclude(self) -> None:
-        """cell_std (RC,), of the log resistances, and where `elsewhere` the optimum may be.
+        """cell_std and elsewhere, from the last factor that was made.
 
         A cell is called untouched when the readings ask for less than the prior asks against it.
         Where that may be a touch all the same, small for the readings but not for the cell, it is
         counted as uncertain by so much, and so is what depends on it.
         """
-        learned = self._learned()
+        at = self._factored
+        learned = _learned(self._factor, at.by_cell)
         distance = self._prior.expected - self.cell
         at_rest = distance**2 < self._prior.tail * self._prior.std**2
         # What the readings alone say of a cell: rise of its conductance over rest, and deviation.
@@ -236,12 +244,10 @@ class JointFit:
                 self.elsewhere[likeliest] = self._prior.expected[likeliest] - np.log1p(
                     rise[likeliest]
                 )
-            wider = np.where(self._hidden, np.maximum(rise, 0.0) + rise_std, self._cell_std)
-            self._by_cell *= wider / self._cell_std
-            self._cell_std = wider
-            self._factor = self._factored()
-            learned = self._learned()
-        self.cell_std: Float = self._cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
+            wider = np.where(self._hidden, np.maximum(rise, 0.0) + rise_std, at.cell_std)
+            at = replace(at, cell_std=wider, by_cell=at.by_cell * (wider / at.cell_std))
+            learned = _learned(cholesky(at.seen(self._belief)), at.by_cell)
+        self.cell_std: Float = at.cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     def siemens_std(self) -> Float:
         """Standard deviation of each cell's conductance, (RC,) [S]."""
@@ -251,15 +257,22 @@ class JointFit:
 
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings that wires matter to, for the belief."""
-        kept = np.argsort(self._wires_seen)[-MAX_LESSON:]
-        kept = kept[self._wires_seen[kept] > LESSON]
-        ports = self._heavy[kept]
-        slopes = self._by_wires[kept]
-        residual = self._residual[ports] + slopes @ (self.wires - self._belief.mean)
-        away = np.abs(self.cell - self._prior.expected)
+        here = self._here
+        seen = np.einsum("ij,ji->i", here.by_wires, self._belief.times(here.by_wires))
+        kept = np.argsort(seen)[-MAX_LESSON:]
+        kept = kept[seen[kept] > LESSON]
+        ports, slopes = here.heavy[kept], here.by_wires[kept]
+        residual = here.residual[ports] + slopes @ (self.wires - self._belief.mean)
         # A touched cell is noise without limit; one at rest is known to its drift.
+        away = np.abs(self.cell - self._prior.expected)
         std = np.where(self._hidden | (away > TOUCHED), UNLIMITED_STD, self._prior.std)
-        by_cell = self._by_cell[ports] * (std / self._cell_std)
+        by_cell = here.by_cell[ports] * (std / here.cell_std)
         noise = by_cell @ by_cell.T
         noise.ravel()[:: ports.size + 1] += 1.0
         return slopes, residual, noise
+
+
+def _learned(factor: Float, by_cell: Float) -> Float:
+    """Share of each cell's prior variance that the readings take away, (RC,)."""
+    own = solve_lower(factor, by_cell)
+    return np.asarray(np.einsum("ij,ij->j", own, own))

@@ -24,11 +24,11 @@ over the touched cells v_k = q / d. All derivatives follow: d rho / d g_e = -v_e
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from ohmskin.circuit import Float, by_wires, factorised, impedance_of
+from ohmskin.factors import solve_lower
 
 Cells = NDArray[np.intp]
 
@@ -45,9 +45,7 @@ class RestNetwork:
         impedance, self.port_ohm = impedance_of(half, rows)
         # With L of the factor, L' = L^-1 sqrt(g): cell currents x are L'^T half V of the electrode
         # potentials V, and L'^T (1 - half Z half^T) L' of voltages inserted in series with cells.
-        inverse = scipy.linalg.solve_triangular(
-            factor, np.diag(root.ravel()), lower=True, check_finite=False
-        )
+        inverse = solve_lower(factor, np.diag(root.ravel()))
         cell_ohm = 1.0 / self.cell_siemens
         potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(
             rows + columns, -1

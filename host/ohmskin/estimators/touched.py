@@ -30,7 +30,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 from scipy.linalg import lapack
 
 from ohmskin.circuit import Float, by_wires
@@ -38,6 +37,7 @@ from ohmskin.estimators.base import MAX_CELL_SIEMENS
 from ohmskin.estimators.prior import DOUBT, HIDDEN, UNLIMITED_STD, CellPrior
 from ohmskin.estimators.rest_network import Cells, RestNetwork, TouchedNetwork
 from ohmskin.estimators.wires import Lesson, WireBelief
+from ohmskin.factors import cholesky, solve, solve_lower
 
 MOST_PER_LINE: Final = 2  # touches; with more, the skin is not at rest any more
 DEMAND: Final = 4.0  # residual, in its standard deviation, that a cell is added for
@@ -245,13 +245,14 @@ class _Fit:
         wires = self._sharpened(ports)
         covariance = wires @ belief.times(wires)
         covariance.ravel()[:: ports.size + 1] += 1.0
-        factor = scipy.linalg.cholesky(covariance, lower=True, check_finite=False)
+        unit = np.sqrt(np.diagonal(covariance))
+        factor = cholesky(covariance)
         offset = wires @ (belief.mean - base.log_wires)
         for last in (False, True):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
             both = np.concatenate([slopes[:, ports], residual[None, :]])
-            whitened, _ = lapack.dtrtrs(factor, both.T, lower=1)
+            whitened = solve_lower(factor, both.T)
             free = slopes[:, light]
             own, rest = whitened[:, :-1], whitened[:, -1]
             normal, step = self._step(
@@ -266,7 +267,7 @@ class _Fit:
             if small or last:
                 break
         residual = self._residual[ports] - offset
-        left = scipy.linalg.cho_solve((factor, True), residual, check_finite=False)
+        left = solve(factor, residual)
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
         heavy_slopes = slopes[:, ports]
@@ -276,7 +277,7 @@ class _Fit:
             cells=cells,
             log_siemens=self.log_siemens,
             log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
-            doubtful=self._doubtful(ports, residual, np.sqrt(np.diagonal(covariance))),
+            doubtful=self._doubtful(ports, residual, unit),
             current=current,
             contradicted=bool(residual @ left > CONTRADICTION * (ports.size + 4)),
             steps=self.steps,

@@ -36,6 +36,7 @@ from ohmskin.estimators.prior import (
     UNKNOWN_LAYER_STD,
     UNKNOWN_WIRE_OHM,
 )
+from ohmskin.factors import cholesky, solve, solve_lower
 
 FADE: Final = 0.1  # share of the knowledge that fades with each lesson: skins bend
 # Lessons, the last few together, that ask for a change of a layer by so many standard deviations
@@ -112,21 +113,19 @@ class WireBelief:
             return
         self._learned *= np.sqrt(1 - FADE)
         spread = self.times(slopes)
-        factor = scipy.linalg.cholesky(noise + slopes @ spread, lower=True, check_finite=False)
+        factor = cholesky(noise + slopes @ spread)
         # Slope and curvature of the likelihood along a change of a whole layer.
         layers = slopes.reshape(-1, 2, self._cells).sum(axis=2)
-        pulls = scipy.linalg.cho_solve(
-            (factor, True), np.column_stack([residual, layers]), check_finite=False
-        )
+        pulls = solve(factor, np.column_stack([residual, layers]))
         self._slope = MEMORY * self._slope + layers.T @ pulls[:, 0]
         self._curvature = MEMORY * self._curvature + np.sum(layers * pulls[:, 1:], axis=0)
         if np.any(self._slope**2 > ALARM**2 * self._curvature):
             self.forget()
             spread = self.times(slopes)
-            factor = scipy.linalg.cholesky(noise + slopes @ spread, lower=True, check_finite=False)
-            pulls = scipy.linalg.cho_solve((factor, True), residual[:, None], check_finite=False)
+            factor = cholesky(noise + slopes @ spread)
+            pulls = solve(factor, residual[:, None])
         self.mean = np.clip(self.mean + spread @ pulls[:, 0], *LOG_LIMITS)
-        gain = scipy.linalg.solve_triangular(factor, spread.T, lower=True, check_finite=False)
+        gain = solve_lower(factor, spread.T)
         learned = np.concatenate([self._learned, gain.T], axis=1)
         size, turn = scipy.linalg.eigh(learned.T @ learned, check_finite=False)
         kept = np.flatnonzero(size > _LEAST_DIRECTION * SEGMENT_STD**2)[-MAX_DIRECTIONS:]
