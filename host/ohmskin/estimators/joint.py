@@ -74,7 +74,7 @@ class JointEstimator(Estimator):
             return self._simple_solution(found, ratio)
         fit = self._best_fit(prior, current, current_std, self._starts(prior, current, found))
         self._before = None if fit.message else fit.cell
-        if not fit.message:
+        if not fit.message and not fit.is_crowded:
             self._learn(fit.cell, fit.lesson)
         return self._solution(fit, ratio)
 
@@ -90,9 +90,11 @@ class JointEstimator(Estimator):
             self._learn(-log_siemens, lambda: found.lesson)
         siemens = np.exp(log_siemens).reshape(self._shape)
         top, bottom = np.exp(self._belief.mean).reshape(2, *self._shape)
+        path_ohm = (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
+        std = siemens_std(log_siemens, log_std, path_ohm + self.knowledge.ref_ohm)
         return Solution(
             cell_siemens=siemens,
-            cell_siemens_std=siemens_std(log_siemens, log_std).reshape(self._shape),
+            cell_siemens_std=std.reshape(self._shape),
             chi2=self._chi2(ratio, found.current.reshape(self._shape)),
             iterations=found.steps,
             top_wire_ohm=top,

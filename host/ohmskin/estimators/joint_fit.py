@@ -232,8 +232,7 @@ class JointFit:
         share = np.maximum(learned, 1e-9)
         rise = distance / share
         rise_std = self._prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
-        # Where most cells are touched, rest is no more likely than a touch.
-        least = rise_std if at_rest.mean() > 1 - CROWDED else -2 * rise_std
+        least = -2 * rise_std if self.is_crowded else rise_std
         self._hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > least)
         self.elsewhere: Float | None = None
         if self._hidden.any():
@@ -251,9 +250,15 @@ class JointFit:
 
     def siemens_std(self) -> Float:
         """Standard deviation of each cell's conductance, (RC,) [S]."""
-        # A hidden cell's deviation is one of its conductance, over that at rest.
-        linear = np.exp(-self.cell) * self.cell_std
-        return np.where(self._hidden, linear, siemens_std(-self.cell, self.cell_std))
+        top, bottom = np.exp(self.wires).reshape(2, *self._shape)
+        path_ohm = (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
+        return siemens_std(-self.cell, self.cell_std, path_ohm + self._ref_ohm)
+
+    @property
+    def is_crowded(self) -> bool:
+        """Whether so many cells are touched that rest is no more likely than a touch."""
+        distance = self._prior.expected - self.cell
+        return bool(np.mean(distance > TOUCHED) > CROWDED)
 
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings that wires matter to, for the belief."""

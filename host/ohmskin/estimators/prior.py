@@ -25,9 +25,9 @@ UNKNOWN_LAYER_STD: Final = 1.5
 LAYER_STD: Final = 0.3  # what all segments of a layer share: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each has of its own
 
+HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 # A cell that the prior holds at rest may be touched all the same, where readings say little of it.
 TOUCHED: Final = 0.1  # log: further from rest, a cell's force is unknown
-WIDEST_LOG_STD: Final = 3.0
 UNLIMITED_STD: Final = 3.0  # what is not known of it
 HIDDEN: Final = 0.3  # log: a rise that must not go unnoticed
 DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
@@ -61,11 +61,16 @@ class CellPrior:
         return np.asarray(np.maximum(self.std[cells] ** 2, away * away / self.tail))
 
 
-def siemens_std(log_siemens: Float, log_std: Float) -> Float:
-    """Standard deviation of a conductance [S] from that of its log: g (exp(4 s) - 1) / 4.
+def siemens_std(log_siemens: Float, log_std: Float, series_ohm: Float | float) -> Float:
+    """Standard deviation of conductances [S]: a quarter of the way up to four deviations.
 
-    A quarter of what four deviations of the log are upwards, so that four of one are four of the
-    other: behind wires that are known less well than itself, a cell may be anything.
+    log_std: of the log conductance, to first order. series_ohm: wires and references in series with
+    each cell. Errors are normal in the current u = 1 / (r + series), not in g = 1 / r: upwards,
+    behind much series resistance, a cell may be anything up to the most a touch makes of it.
     """
-    upwards = np.expm1(4 * np.minimum(log_std, WIDEST_LOG_STD)) / 4
-    return np.asarray(np.exp(log_siemens) * upwards)
+    siemens = np.exp(log_siemens)
+    cell_ohm = 1.0 / siemens
+    loop_ohm = cell_ohm + series_ohm
+    lowest_ohm = loop_ohm / (1.0 + 4.0 * log_std * cell_ohm / loop_ohm) - series_ohm
+    highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
+    return np.asarray(np.maximum(siemens * log_std, 0.25 * (highest - siemens)))

@@ -34,7 +34,7 @@ from scipy.linalg import lapack
 
 from ohmskin.circuit import Float, by_wires
 from ohmskin.estimators.base import MAX_CELL_SIEMENS
-from ohmskin.estimators.prior import DOUBT, HIDDEN, UNLIMITED_STD, CellPrior
+from ohmskin.estimators.prior import DOUBT, HIDDEN, HIGHEST_TOUCH_SIEMENS, UNLIMITED_STD, CellPrior
 from ohmskin.estimators.rest_network import Cells, RestNetwork, TouchedNetwork
 from ohmskin.estimators.wires import Lesson, WireBelief
 from ohmskin.factors import cholesky, solve, solve_lower
@@ -50,8 +50,6 @@ CLOSE: Final = 0.1  # a step below this share of every standard deviation is the
 HEAVY: Final = 0.5  # wires matter to a reading that they may move by this share of its noise
 REBUILD: Final = 0.05  # relative change of a path's wires for which the network is solved anew
 CONTRADICTION: Final = 3.0  # chi-square per reading that wires matter to
-# First guess of a touch that its own reading does not limit.
-_HIGHEST_RISE: Final = 1 / 300.0
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 _NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
@@ -223,7 +221,7 @@ class _Fit:
         # From rho = target for one cell more.
         target = np.maximum(self._target_ohm, 0.5 * base.path_ohm)
         need = port_volt**2 / np.maximum(port_ohm - target, 1e-9) - cell_volt
-        rise = np.where(asks, 1.0 / np.maximum(need, 1.0 / _HIGHEST_RISE), 0.0)
+        rise = np.where(asks, 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS), 0.0)
         map_ = rise.reshape(net.shape)
         rival = np.maximum(map_.max(axis=1, keepdims=True), map_.max(axis=0, keepdims=True))
         asked = np.flatnonzero((map_ > 0) & (map_ >= SHARE * rival))
