@@ -26,10 +26,10 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check format firmware test-firmware check-firmware sim \
-        test-host bench-firmware bench-host clean distclean
+        test-host bench-firmware bench-host bench-estimators clean distclean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: setup-host ## estimate touches on an emulated skin: no board, no compiler needed
 	$(BIN)/ohmskin demo
@@ -78,6 +78,9 @@ bench-firmware: setup firmware sim ## measure the firmware in the simulator
 
 bench-host: setup-host ## measure decoding, latency and load of the host
 	$(ONE_THREAD) $(BIN)/python benchmarks/bench_host.py
+
+bench-estimators: setup-host ## measure the estimators: time, error, stated uncertainty
+	$(ONE_THREAD) $(BIN)/python benchmarks/bench_estimators.py
 
 clean: ## remove what was built
 	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

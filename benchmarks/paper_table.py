@@ -21,6 +21,7 @@ from ohmskin.estimators.base import Estimator, SkinKnowledge
 from ohmskin.estimators.matrix import MatrixEstimator
 from ohmskin.estimators.ohm import OhmEstimator
 from ohmskin.estimators.paper import LsqEstimator, PaperEstimator, RegularizedEstimator
+from ohmskin.studies.published import RMSE_MEGOHM
 
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
 METHODS: tuple[type[Estimator], ...] = (
@@ -30,19 +31,6 @@ METHODS: tuple[type[Estimator], ...] = (
     RegularizedEstimator,
 )
 WIRES_OHM = (100.0, 500.0, 1e3, 21e3, 41e3)
-# Naive, least squares and regularized RMSE [Mohm], from the source of the paper's two figures.
-PAPER = {
-    "wire_sweep_3x3": (
-        (0.7100, 0.7096, 0.7091, 0.6898, 0.6708),
-        (0.2210, 0.1912, 0.1614, 0.0980, 0.1894),
-        (0.0829, 0.0680, 0.0519, 0.1140, 0.1998),
-    ),
-    "cell_sweep_3x3": (
-        (0.7235, 0.7128, 0.7102, 0.7157, 0.7879),
-        (0.8072, 0.4240, 0.2127, 0.0182, 0.0355),
-        (0.8030, 0.1489, 0.0696, 0.0138, 0.0145),
-    ),
-}
 COLUMNS = "condition [Mohm]  | naive: paper    ohm | least squares: paper    lsq | "
 COLUMNS += "regularized: paper  regularized |  matrix"
 
@@ -74,14 +62,14 @@ def print_errors() -> None:
     cells_ohm = (0.01, 0.07, 0.09, 0.5, 0.7)
     wires = [ohm / 1e6 for ohm in WIRES_OHM]
     for title, scenes, paper, conditions in (
-        ("wires, cells pressed to 0.001", frames_of("wire_sweep_3x3"), "wire_sweep_3x3", wires),
-        ("wires, cells pressed to 0.1", wire_sweep(1e5), "wire_sweep_3x3", wires),
-        ("pressed cells, wires 0.001", frames_of("cell_sweep_3x3"), "cell_sweep_3x3", cells_ohm),
+        ("wires, cells pressed to 0.001", frames_of("wire_sweep_3x3"), "wire_sweep", wires),
+        ("wires, cells pressed to 0.1", wire_sweep(1e5), "wire_sweep", wires),
+        ("pressed cells, wires 0.001", frames_of("cell_sweep_3x3"), "cell_sweep", cells_ohm),
     ):
         ours = {method.name: rmse_megohm(method, *scenes) for method in METHODS}
         print(f"\nRMSE [Mohm], swept: {title}\n{COLUMNS}")
         for frame, condition in enumerate(conditions):
-            naive, least, regular = (figures[frame] for figures in PAPER[paper])
+            naive, least, regular = (figures[frame] for figures in RMSE_MEGOHM[paper].values())
             print(
                 f"{condition:17.4f} | {naive:12.4f} {ours['ohm'][frame]:6.4f} | "
                 f"{least:20.4f} {ours['lsq'][frame]:6.4f} | "

@@ -466,6 +466,8 @@ OPTIONS = {
     "estimate": ["--method", "--out", "--cold", *METHODS],
     "emulate": ["--link", "--seconds", "ghost", "bitflip"],
     "demo": ["--seconds", "--port", "--picture"],
+    "chart": ["--out", "--quick"],
+    "stability": ["--out", "--quick", "--jobs"],
 }
 
 

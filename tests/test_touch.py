@@ -87,7 +87,7 @@ def test_touch_agrees_with_joint_within_its_standard_deviation(name: str) -> Non
     # Rounding moves cells at rest in one method and not in the other, and wires learned differ.
     for some in (apart[simple], apart[simple][pressed[simple]]):
         assert np.mean(some <= 1) > 0.9
-        assert np.mean(some <= 2) > 0.99
+        assert np.mean(some <= 2) > 0.96
 
 
 def test_touch_models_no_more_cells_than_are_touched() -> None:

@@ -39,6 +39,7 @@ from ohmskin.pty_server import PtyServer
 from ohmskin.readings import estimate_file, load_readings, save_arrays
 from ohmskin.scenes import SCENES
 from ohmskin.simavr_link import BOARDS
+from ohmskin.studies import commands as studies
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -381,3 +382,9 @@ def demo(
         _out.print(f"no picture: {exc}", markup=False)
     else:
         _out.print(f"picture: {picture}")
+
+
+# ------------------------------------------------------------------------------------ studies
+
+app.command()(studies.chart)
+app.command()(studies.stability)

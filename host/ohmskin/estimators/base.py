@@ -23,17 +23,15 @@ from ohmskin.circuit import (
     Float,
     check_adc_bits,
     check_references,
-    current_from_ratio,
     current_std,
     ratio_from_current,
     ratio_std,
 )
+from ohmskin.estimators.ports import PortReader, PortReadings
 
 # No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
 MIN_CELL_SIEMENS: Final = 1e-9
 MAX_CELL_SIEMENS: Final = 1.0
-
-_MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
 
 TOUCH_SIEMENS: Final = 0.5e-6
 TOUCH_STDS: Final = 4.0
@@ -88,6 +86,12 @@ class SkinKnowledge:
         """Both reference resistors in series [ohm]: all that limits a shorted port's current."""
         return self.ref_top_ohm + self.ref_bottom_ohm
 
+    @property
+    def wire_ohm(self) -> tuple[float, float] | None:
+        """Nominal wire segments, top and bottom [ohm]; None unless both are told."""
+        top, bottom = self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm
+        return None if top is None or bottom is None else (top, bottom)
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -99,7 +103,8 @@ class Estimate:
     cell_siemens, cell_siemens_std, touched, top_wire_ohm, bottom_wire_ohm: shape (R, C), wires NaN
     where the method does not estimate them. chi2: sum of squared residuals of all readings over
     the variance of one, divided by their number (about 1 or less when the model holds).
-    message: empty if converged, else why not. seconds: wall time of this frame.
+    message: empty if converged, else why not, or what is wrong with
+    the readings (`ports`). seconds: wall time of this frame.
     """
 
     cell_siemens: Float
@@ -122,7 +127,10 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a method finds; `Estimator.estimate` adds the rest. Wires None: not estimated."""
+    """What a method finds; `Estimator.estimate` adds the rest. Wires None: not estimated.
+
+    cell_siemens_std_down: where an error downwards is not as likely as upwards.
+    """
 
     cell_siemens: Float
     cell_siemens_std: Float
@@ -131,6 +139,13 @@ class Solution:
     message: str = ""
     top_wire_ohm: Float | None = None
     bottom_wire_ohm: Float | None = None
+    cell_siemens_std_down: Float | None = None
+
+    @property
+    def std_down(self) -> Float:
+        """Downwards, where that differs."""
+        down = self.cell_siemens_std_down
+        return self.cell_siemens_std if down is None else down
 
 
 class Estimator(ABC):
@@ -140,11 +155,18 @@ class Estimator(ABC):
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         self.knowledge = knowledge
+        self._reader = PortReader(
+            (knowledge.rows, knowledge.columns),
+            (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm),
+            knowledge.adc_bits,
+            knowledge.rest_ratio,
+            knowledge.wire_ohm,
+        )
         self._rest: Solution | None = None
 
     @abstractmethod
-    def _solve(self, ratio: Float) -> Solution:
-        """Answer for checked readings (R, C, 4), started from the previous frame if there is one.
+    def _solve(self, ports: PortReadings) -> Solution:
+        """Answer for one frame, started from the previous frame if there is one.
 
         Must return finite values with an honest standard deviation (NaN: none is known), or set
         `message`.
@@ -157,19 +179,21 @@ class Estimator(ABC):
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
-        A cell is touched when g - g_rest > max(0.5e-6 S, 5 sqrt(std^2 + std_rest^2)). g_rest is
-        this method's own answer to `rest_ratio`; without one it is the median over the cells of
-        this frame, which supposes that less than half of them are touched (one cell alone then
-        never is). A standard deviation of NaN counts as none.
+        A cell is touched when g - g_rest > max(0.5e-6 S, 4 sqrt(std^2 + std_rest^2)), std the one
+        downwards. g_rest is this method's own answer to `rest_ratio`; without one it is the median
+        over the cells of this frame, which supposes that less than half of them are touched (one
+        cell alone then never is). A standard deviation of NaN counts as none.
         Raises ValueError for another shape, or for a reading that is no number in 0..1.
         """
         known = self.knowledge
         readings = check_ratio(ratio, known.rows, known.columns)
         if self._rest is None and known.rest_ratio is not None:
-            self._rest = self._solve(known.rest_ratio)
+            self._rest = self._solve(self._reader.read(known.rest_ratio))
             self.reset()
         started = time.perf_counter()
-        found = self._solve(readings)
+        ports = self._reader.read(readings)
+        found = self._solve(ports)
+        message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)
         unknown = np.full((known.rows, known.columns), np.nan)
         return Estimate(
@@ -180,35 +204,19 @@ class Estimator(ABC):
             bottom_wire_ohm=unknown if found.bottom_wire_ohm is None else found.bottom_wire_ohm,
             chi2=found.chi2,
             iterations=found.iterations,
-            converged=not found.message,
-            message=found.message,
+            converged=not message,
+            message=message,
             seconds=time.perf_counter() - started,
         )
 
     def _touched(self, found: Solution) -> NDArray[np.bool_]:
         if self._rest is None:
             rise = found.cell_siemens - np.median(found.cell_siemens)
-            rise_std = found.cell_siemens_std
+            rise_std = found.std_down
         else:
             rise = found.cell_siemens - self._rest.cell_siemens
-            rise_std = np.hypot(found.cell_siemens_std, self._rest.cell_siemens_std)
+            rise_std = np.hypot(found.std_down, self._rest.cell_siemens_std)
         return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
-
-    def _port_current(self, ratio: Float) -> tuple[Float, Float]:
-        """The readings of each cell as one current per Vdd and its standard deviation [S], (R, C).
-
-        Where a cell's readings disagree by more than their noise, the standard deviation grows
-        with the root of their chi-square (three degrees of freedom: four readings, one current), or
-        that of the median cell if it is larger: a converter's noise is in all readings.
-        """
-        known = self.knowledge
-        current = current_from_ratio(ratio, known.ref_top_ohm, known.ref_bottom_ohm)
-        model = ratio_from_current(current, known.ref_top_ohm, known.ref_bottom_ohm)
-        disagreement = np.sum((ratio - model) ** 2, axis=-1) / known.ratio_std**2
-        degrees = READINGS_PER_CELL - 1
-        common = np.median(disagreement) / _MEDIAN_CHI2
-        excess = np.sqrt(np.maximum(max(1.0, common), disagreement / degrees))
-        return current, known.current_std * excess
 
     def _chi2(self, ratio: Float, current_siemens: Float) -> float:
         """chi2 per reading of a model that predicts these port currents (R, C) [S]."""

@@ -25,6 +25,7 @@ from ohmskin.circuit import Float
 from ohmskin.estimators.base import MIN_CELL_SIEMENS, Estimator, SkinKnowledge, Solution
 from ohmskin.estimators.joint_fit import JointFit
 from ohmskin.estimators.ohm import conductance_from_current
+from ohmskin.estimators.ports import PortReadings
 from ohmskin.estimators.prior import (
     REST_OHM,
     REST_STD,
@@ -39,6 +40,8 @@ from ohmskin.estimators.wires import Lesson, WireBelief
 
 MAX_DOUBTS: Final = 4
 MISFIT: Final = 1.5  # chi-square per port; at the truth, rounding alone has 1
+LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault, not touched
+LOSS_STDS: Final = 6.0  # of the prior
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
 HIGHEST_START_SIEMENS: Final = 1e-2
 
@@ -66,36 +69,38 @@ class JointEstimator(Estimator):
         if self._finder is not None:
             self._finder.forget_frame()
 
-    def _solve(self, ratio: Float) -> Solution:
-        current, current_std = (each.ravel() for each in self._port_current(ratio))
+    def _solve(self, ports: PortReadings) -> Solution:
+        current, current_std = ports.current.ravel(), ports.current_std.ravel()
         prior = self._prior or self._prior_at_rest()
         found = self._finder.find(current, current_std) if self._finder is not None else None
         if found is not None and self._is_enough(found):
-            return self._simple_solution(found, ratio)
+            return self._simple_solution(found, ports)
         fit = self._best_fit(prior, current, current_std, self._starts(prior, current, found))
-        self._before = None if fit.message else fit.cell
-        if not fit.message and not fit.is_crowded:
+        usual = not (ports.fault or fit.message)
+        self._before = fit.cell if usual else None
+        if usual and not fit.is_crowded:
             self._learn(fit.cell, fit.lesson)
-        return self._solution(fit, ratio)
+        return self._solution(fit, ports)
 
     def _is_enough(self, found: Touched) -> bool:
         """Whether the touched cells alone are the answer."""
         return False
 
-    def _simple_solution(self, found: Touched, ratio: Float) -> Solution:
+    def _simple_solution(self, found: Touched, ports: PortReadings) -> Solution:
         assert self._prior is not None
         log_siemens, log_std = -self._prior.expected, self._prior.std.copy()
         log_siemens[found.cells], log_std[found.cells] = found.log_siemens, found.log_std
-        if found.cells.size > 1:
+        if found.cells.size > 1 and not ports.fault:
             self._learn(-log_siemens, lambda: found.lesson)
         siemens = np.exp(log_siemens).reshape(self._shape)
         top, bottom = np.exp(self._belief.mean).reshape(2, *self._shape)
         path_ohm = (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
-        std = siemens_std(log_siemens, log_std, path_ohm + self.knowledge.ref_ohm)
+        std, std_down = siemens_std(log_siemens, log_std, path_ohm + self.knowledge.ref_ohm)
         return Solution(
             cell_siemens=siemens,
             cell_siemens_std=std.reshape(self._shape),
-            chi2=self._chi2(ratio, found.current.reshape(self._shape)),
+            cell_siemens_std_down=std_down.reshape(self._shape),
+            chi2=self._chi2(ports.ratio, found.current.reshape(self._shape)),
             iterations=found.steps,
             top_wire_ohm=top,
             bottom_wire_ohm=bottom,
@@ -131,16 +136,23 @@ class JointEstimator(Estimator):
         best.iterations = iterations
         if not best.message and best.misfit > MISFIT:
             best.message = f"no resistances explain the readings: chi-square {best.misfit:.1f}"
+        loss = best.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
+        worst = int(loss.argmax())
+        if not best.message and loss[worst] > 0:
+            row, column = divmod(worst, self._shape[1])
+            best.message = f"cell ({row}, {column}): conducts less than at rest, is a line open?"
         return best
 
-    def _solution(self, fit: JointFit, ratio: Float) -> Solution:
+    def _solution(self, fit: JointFit, ports: PortReadings) -> Solution:
         cells = fit.cell.size
         siemens = np.exp(-fit.cell)
-        std = fit.siemens_std() * max(1.0, fit.misfit) ** 0.5
+        std, std_down = fit.siemens_std()
+        misfit = max(1.0, fit.misfit) ** 0.5
         return Solution(
             cell_siemens=siemens.reshape(self._shape),
-            cell_siemens_std=std.reshape(self._shape),
-            chi2=self._chi2(ratio, fit.modelled.reshape(self._shape)),
+            cell_siemens_std=misfit * std.reshape(self._shape),
+            cell_siemens_std_down=misfit * std_down.reshape(self._shape),
+            chi2=self._chi2(ports.ratio, fit.modelled.reshape(self._shape)),
             iterations=fit.iterations,
             message=fit.message,
             top_wire_ohm=np.exp(fit.wires[:cells]).reshape(self._shape),
@@ -177,7 +189,8 @@ class JointEstimator(Estimator):
         unknown = np.full(cells, np.log(REST_OHM)), np.full(cells, UNKNOWN_REST_STD)
         self._prior = CellPrior(*unknown, TAIL)
         if known.rest_ratio is not None:
-            current, current_std = (each.ravel() for each in self._port_current(known.rest_ratio))
+            rest = self._reader.read(known.rest_ratio)
+            current, current_std = rest.current.ravel(), rest.current_std.ravel()
             wide = CellPrior(*unknown, np.inf)
             fit = JointFit(self._shape, known.ref_ohm, wide, self._belief, current, current_std)
             fit.run(self._starts(wide, current, None))

@@ -53,7 +53,8 @@ NEARLY: Final = 3.0
 HEAVY: Final = 0.01
 # Chi-square of the wires, per touched cell, above which they are not what they were believed.
 BENT: Final = 9.0
-CROWDED: Final = 0.3  # share of touched cells
+CROWDED: Final = 0.3  # share of touched cells, beyond which no other is known to be at rest,
+LIGHT_TOUCH: Final = 10.0  # but may have risen by so much, over its conductance there
 # Wires learn from readings that their uncertainty may move by half the noise, and from the best.
 LESSON: Final = 0.25
 MAX_LESSON: Final = 32
@@ -232,10 +233,9 @@ class JointFit:
         share = np.maximum(learned, 1e-9)
         rise = distance / share
         rise_std = self._prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
-        least = -2 * rise_std if self.is_crowded else rise_std
-        self._hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > least)
+        self._hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
         self.elsewhere: Float | None = None
-        if self._hidden.any():
+        if self._hidden.any() or self.is_crowded:
             evidence = np.where(self._hidden, rise / rise_std, 0.0)
             likeliest = int(np.argmax(evidence))
             if evidence[likeliest] > DOUBT:
@@ -243,13 +243,15 @@ class JointFit:
                 self.elsewhere[likeliest] = self._prior.expected[likeliest] - np.log1p(
                     rise[likeliest]
                 )
-            wider = np.where(self._hidden, np.maximum(rise, 0.0) + rise_std, at.cell_std)
+            if self.is_crowded:
+                self._hidden, rise = at_rest, np.maximum(rise, LIGHT_TOUCH)
+            wider = np.where(self._hidden, rise + rise_std, at.cell_std)
             at = replace(at, cell_std=wider, by_cell=at.by_cell * (wider / at.cell_std))
             learned = _learned(cholesky(at.seen(self._belief)), at.by_cell)
         self.cell_std: Float = at.cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
-    def siemens_std(self) -> Float:
-        """Standard deviation of each cell's conductance, (RC,) [S]."""
+    def siemens_std(self) -> tuple[Float, Float]:
+        """Standard deviations of each cell's conductance, up and down, (RC,) [S]."""
         top, bottom = np.exp(self.wires).reshape(2, *self._shape)
         path_ohm = (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
         return siemens_std(-self.cell, self.cell_std, path_ohm + self._ref_ohm)

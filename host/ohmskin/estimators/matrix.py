@@ -51,6 +51,7 @@ from ohmskin.estimators.base import (
     Solution,
 )
 from ohmskin.estimators.ohm import conductance_from_current, port_current
+from ohmskin.estimators.ports import PortReadings
 
 MAX_ITERATIONS: Final = 40
 # Converged when an undamped step would lower the chi-square (summed, not per reading) by less:
@@ -123,19 +124,18 @@ class MatrixEstimator(Estimator):
         """Forget the previous frame: the next one starts from `ohm`."""
         self._previous = None
 
-    def _solve(self, ratio: Float) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
         known = self.knowledge
-        current, current_std = self._port_current(ratio)
-        afresh = conductance_from_current(current, known.ref_ohm)
+        afresh = conductance_from_current(ports.current, known.ref_ohm)
         starts = [afresh] if self._previous is None else [self._previous, afresh]
-        fit = _Fit(current.ravel(), current_std.ravel(), known.ref_ohm, starts)
+        fit = _Fit(ports.current.ravel(), ports.current_std.ravel(), known.ref_ohm, starts)
         message = fit.run()
         # A frame that did not converge is a poor start for the next one.
         self._previous = None if message else fit.cell
         return Solution(
             cell_siemens=fit.cell,
             cell_siemens_std=fit.cell_std(),
-            chi2=self._chi2(ratio, fit.current.reshape(fit.cell.shape)),
+            chi2=self._chi2(ports.ratio, fit.current.reshape(fit.cell.shape)),
             iterations=fit.iterations,
             message=message,
         )

@@ -20,6 +20,7 @@ from ohmskin.estimators.base import (
     Estimator,
     Solution,
 )
+from ohmskin.estimators.ports import PortReadings
 
 # Beyond what any cell could draw by this many standard deviations, a reading is at fault.
 _FAULT_STDS = 5.0
@@ -44,9 +45,9 @@ class OhmEstimator(Estimator):
 
     name = "ohm"
 
-    def _solve(self, ratio: Float) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
         ref_ohm = self.knowledge.ref_ohm
-        current, current_std = self._port_current(ratio)
+        current = ports.current
         cell = conductance_from_current(current, ref_ohm)
         allowed = port_current(MAX_CELL_SIEMENS, ref_ohm) + _FAULT_STDS * self.knowledge.current_std
         excess = current - allowed
@@ -56,7 +57,7 @@ class OhmEstimator(Estimator):
             message = f"cell ({row}, {column}) reads a current that no resistance allows"
         return Solution(
             cell_siemens=cell,
-            cell_siemens_std=(1.0 + cell * ref_ohm) ** 2 * current_std,
-            chi2=self._chi2(ratio, cell / (1.0 + cell * ref_ohm)),
+            cell_siemens_std=(1.0 + cell * ref_ohm) ** 2 * ports.current_std,
+            chi2=self._chi2(ports.ratio, cell / (1.0 + cell * ref_ohm)),
             message=message,
         )

@@ -33,6 +33,7 @@ from ohmskin.estimators.paper_program import (
     Start,
     program_for,
 )
+from ohmskin.estimators.ports import PortReadings
 
 OHM_PER_MEGOHM: Final = 1e6
 
@@ -129,7 +130,8 @@ class PaperEstimator(Estimator):
         """Forget the previous frame: the next one starts from step 2."""
         self._previous = None
 
-    def _solve(self, ratio: Float) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
+        ratio = ports.ratio
         known = self.knowledge
         feasible, message = self._feasible(ratio)
         answer: _Answer | None = None

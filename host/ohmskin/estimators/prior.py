@@ -18,7 +18,7 @@ from ohmskin.circuit import Float
 REST_OHM: Final = 1e6
 UNKNOWN_REST_STD: Final = 1.0
 REST_STD: Final = 0.05  # drift since the rest readings
-TAIL: Final = 2.0  # exponent of the density of touched cells
+TAIL: Final = 1.0  # exponent of the density of touched cells
 
 UNKNOWN_WIRE_OHM: Final = 150.0
 UNKNOWN_LAYER_STD: Final = 1.5
@@ -61,8 +61,10 @@ class CellPrior:
         return np.asarray(np.maximum(self.std[cells] ** 2, away * away / self.tail))
 
 
-def siemens_std(log_siemens: Float, log_std: Float, series_ohm: Float | float) -> Float:
-    """Standard deviation of conductances [S]: a quarter of the way up to four deviations.
+def siemens_std(
+    log_siemens: Float, log_std: Float, series_ohm: Float | float
+) -> tuple[Float, Float]:
+    """Standard deviations of conductances, upwards and downwards [S]: quarters of four deviations.
 
     log_std: of the log conductance, to first order. series_ohm: wires and references in series with
     each cell. Errors are normal in the current u = 1 / (r + series), not in g = 1 / r: upwards,
@@ -71,6 +73,9 @@ def siemens_std(log_siemens: Float, log_std: Float, series_ohm: Float | float) -
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
     loop_ohm = cell_ohm + series_ohm
-    lowest_ohm = loop_ohm / (1.0 + 4.0 * log_std * cell_ohm / loop_ohm) - series_ohm
+    far = 4.0 * log_std * cell_ohm / loop_ohm
+    lowest_ohm = loop_ohm / (1.0 + far) - series_ohm
+    highest_ohm = loop_ohm / np.maximum(1.0 - far, 1e-6) - series_ohm
     highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
-    return np.asarray(np.maximum(siemens * log_std, 0.25 * (highest - siemens)))
+    up = np.maximum(siemens * log_std, 0.25 * (highest - siemens))
+    return np.asarray(up), np.asarray(0.25 * (siemens - 1.0 / highest_ohm))

@@ -3,7 +3,8 @@
 
 `joint` with the cells at rest and the wires taken out of the fit and into the noise: the answer of
 `touched`, where it is enough. It is not where the touches contradict the readings, where a fifth of
-the skin is touched, or where a touch may hide: those frames are `joint`'s.
+the skin is touched, where wires hide how hard, or where a touch may hide: such frames are for
+`joint`.
 Without rest readings no cell is known to be untouched, so every frame is.
 """
 
@@ -15,6 +16,7 @@ from ohmskin.estimators.joint import JointEstimator
 from ohmskin.estimators.touched import Touched
 
 MOST_TOUCHED: Final = 0.2  # share of the cells
+WIDEST_LOG_STD: Final = 0.4  # of a touched cell: beyond it the circuit is far from linear
 
 
 class TouchEstimator(JointEstimator):
@@ -24,4 +26,5 @@ class TouchEstimator(JointEstimator):
 
     def _is_enough(self, found: Touched) -> bool:
         few = found.cells.size <= MOST_TOUCHED * found.current.size
-        return few and not (found.doubtful or found.contradicted)
+        known = found.log_std.max(initial=0.0) <= WIDEST_LOG_STD
+        return few and known and not (found.doubtful or found.contradicted)

@@ -48,8 +48,9 @@ MAX_STEPS: Final = 8  # per round
 MAX_STEP: Final = 1.5  # of a log conductance
 CLOSE: Final = 0.1  # a step below this share of every standard deviation is the last
 HEAVY: Final = 0.5  # wires matter to a reading that they may move by this share of its noise
+HIDING: Final = 0.1
 REBUILD: Final = 0.05  # relative change of a path's wires for which the network is solved anew
-CONTRADICTION: Final = 3.0  # chi-square per reading that wires matter to
+CONTRADICTION: Final = 3.0  # deviations of the chi-square of the readings that wires matter to
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 _NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
@@ -133,6 +134,8 @@ class _Base:
         self.slack += np.einsum("ij,ji->i", by_wires, belief.times(by_wires))
         self.path_ohm = self.net.path_ohm(self.log_wires)
         self.wire_std = float(belief.std().max())
+        # Wires this uncertain are no small noise beside a cell at rest.
+        self.hides = bool(np.any(self.path_ohm * self.wire_std * net.cell_siemens > HIDING))
 
     def path_change(self, log_wires: Float) -> float:
         """Largest relative change of the wire between a cell and its electrodes."""
@@ -266,6 +269,7 @@ class _Fit:
                 break
         residual = self._residual[ports] - offset
         left = solve(factor, residual)
+        spare = ports.size - cells.size  # degrees of freedom
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
         heavy_slopes = slopes[:, ports]
@@ -275,9 +279,12 @@ class _Fit:
             cells=cells,
             log_siemens=self.log_siemens,
             log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
-            doubtful=self._doubtful(ports, residual, unit),
+            doubtful=base.hides or self._doubtful(ports, residual, unit),
             current=current,
-            contradicted=bool(residual @ left > CONTRADICTION * (ports.size + 4)),
+            contradicted=bool(
+                residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1)
+                or self._residual[light].min(initial=0.0) < -DEMAND
+            ),
             steps=self.steps,
             lesson=(wires, residual, noise),
         )

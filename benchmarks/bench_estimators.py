@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the estimators: time a frame, error, and whether the stated uncertainty holds.
+
+    make bench-estimators
+
+Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
+missed. Everything is simulated: presses_8x8, the sweeps and the scenes they are taken from are
+readings made with ngspice (tests/data), the others come from the circuit that ngspice was compared
+with. All readings are 10 bit, and all frames warm: in order, each started from the one before,
+unless another thing is said. What is measured how:
+
+ms_*                    median wall time of a frame's estimate, one core. `presses`: one second of
+                        four overlapping presses. `random`: every frame touched anew, so that a warm
+                        start is worth little. `paper_2x2`: `regularized`, both of its steps.
+error_*, ghost_*        random 8x8, up to 8 touches, cold: error of a pressed cell's conductance,
+                        median and 90th percentile; largest conductance reported at a cell that
+                        nothing presses, above rest, 95th percentile of the frames.
+sweeps_worst_share      the paper's sweeps, exact readings, `joint`: RMSE over the best figure that
+                        the paper has for the same point, the worst of the ten points.
+bent_*                  8x8 with wires 35 % above nominal, frames 50 to 69: median error of a
+                        pressed cell over the information limit, that is the median standard
+                        deviation of the posterior at the truth: of one frame alone, and (`_known`,
+                        harder) with the mean wire of each layer known exactly. Normal errors would
+                        have 0.67.
+within_*                `joint`, all scenes above, and the sweeps: share of all errors within 1, 2
+                        and 4 stated standard deviations.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.circuit import Float, quantise, ratio_from_codes
+from ohmskin.estimators.information import information_limit
+from ohmskin.readings import Readings, estimate_file, load_readings
+from ohmskin.studies.published import RMSE_MEGOHM
+from ohmskin.studies.trials import PRESSED, bent_trial, random_trial
+
+DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
+SEED = 1000
+WARM_UP = 3  # frames
+LEARNED = 50  # frames after which a bent skin is judged
+
+
+def ten_bits(exact: Readings) -> Readings:
+    assert exact.rest_ratio is not None
+    ratio, rest = (ratio_from_codes(quantise(each)) for each in (exact.ratio, exact.rest_ratio))
+    return replace(exact, ratio=ratio, rest_ratio=rest, adc_bits=10)
+
+
+@dataclass
+class Errors:
+    """Errors of many frames: relative ones of pressed cells, and all over what was stated."""
+
+    relative: list[Float]
+    over_stated: list[Float]
+    ghost_siemens: list[float]
+
+    def add(
+        self, out: dict[str, NDArray[Any]], truth: Float, rest: Float, pressed: NDArray[np.bool_]
+    ) -> None:
+        error = out["cell_siemens"] - truth
+        self.relative.append(np.abs(error / truth)[pressed])
+        self.over_stated.append(np.abs(error / out["cell_siemens_std"]).ravel())
+        above = np.where(pressed, 0.0, out["cell_siemens"] - rest)
+        self.ghost_siemens += list(above.max(axis=(1, 2)))
+
+    @classmethod
+    def none(cls) -> Errors:
+        return cls([], [], [])
+
+
+# ---------------------------------------------------------------------------------------- time
+
+
+def milliseconds(readings: Readings, method: str) -> list[float]:
+    return list(1e3 * estimate_file(readings, method)["seconds"][WARM_UP:])
+
+
+def median_ms(method: str, sources: list[Readings]) -> float:
+    taken = [ms for readings in sources for ms in milliseconds(readings, method)]
+    return round(float(np.median(taken)), 3)
+
+
+def random_scenes(lines: int, touches: int, frames: int, trials: int) -> list[Readings]:
+    return [
+        random_trial(lines, lines, touches, frames, SEED + trial).rounded(10)
+        for trial in range(trials)
+    ]
+
+
+def times() -> dict[str, float]:
+    presses = [ten_bits(load_readings(DATA / "presses_8x8.npz"))] * 3
+    five, eight = random_scenes(8, 5, 30, 4), random_scenes(16, 8, 20, 4)
+    return {
+        "ms_joint_8x8_presses": median_ms("joint", presses),
+        "ms_joint_8x8_random": median_ms("joint", random_scenes(8, 8, 30, 4)),
+        "ms_joint_16x16_random": median_ms("joint", eight),
+        "ms_touch_8x8_presses": median_ms("touch", presses),
+        "ms_touch_8x8_random": median_ms("touch", five),
+        "ms_touch_16x16_random": median_ms("touch", eight),
+        "ms_touch_32x32_random": median_ms("touch", random_scenes(32, 10, 20, 2)),
+        "ms_matrix_8x8_presses": median_ms("matrix", presses),
+        "ms_paper_2x2_random": median_ms("regularized", random_scenes(2, 3, 20, 3)),
+    }
+
+
+# ------------------------------------------------------------------------------------ accuracy
+
+
+def random_errors(method: str, trials: int) -> Errors:
+    errors = Errors.none()
+    for trial in range(trials):
+        scene = random_trial(8, 8, 8, 20, SEED + 100 + trial)
+        out = estimate_file(scene.rounded(10), method, cold=True)
+        errors.add(out, scene.cell_siemens, scene.rest.cell_siemens, scene.pressed)
+    return errors
+
+
+def random_figures(method: str, errors: Errors) -> dict[str, float]:
+    relative = 100 * np.concatenate(errors.relative)
+    return {
+        f"error_{method}_median_percent": round(float(np.median(relative)), 3),
+        f"error_{method}_p90_percent": round(float(np.percentile(relative, 90)), 3),
+        f"ghost_{method}_p95_us": round(1e6 * float(np.percentile(errors.ghost_siemens, 95)), 3),
+    }
+
+
+def bent_errors(method: str, trials: int) -> tuple[Errors, dict[str, float]]:
+    errors, alone, known = Errors.none(), [], []
+    for trial in range(trials):
+        scene = bent_trial(8, 8, 8, LEARNED + 20, SEED + 200 + trial)
+        told = scene.rounded(10)
+        out = estimate_file(told, method)
+        late = {name: array[LEARNED:] for name, array in out.items()}
+        pressed = scene.pressed[LEARNED:]
+        errors.add(late, scene.cell_siemens[LEARNED:], scene.rest.cell_siemens, pressed)
+        for skin, where in zip(scene.frames[LEARNED:], pressed, strict=True):
+            knowledge = told.knowledge(0)
+            alone.append(information_limit(skin, knowledge, where)[where])
+            known.append(information_limit(skin, knowledge, where, layer_std=0.0)[where])
+    median = float(np.median(np.concatenate(errors.relative)))
+    return errors, {
+        f"bent_{method}_median_percent": round(100 * median, 3),
+        f"bent_{method}_over_limit": round(median / float(np.median(np.concatenate(alone))), 3),
+        f"bent_{method}_over_limit_known": round(
+            median / float(np.median(np.concatenate(known))), 3
+        ),
+    }
+
+
+def file_errors(names: tuple[str, ...], method: str) -> Errors:
+    """Of the reference files, 10 bit."""
+    errors = Errors.none()
+    for name in names:
+        out = estimate_file(ten_bits(load_readings(DATA / f"{name}.npz")), method)
+        with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
+            truth, rest = 1 / file["cell_ohm"], 1 / file["rest_ohm"]
+        errors.add(out, truth, rest, truth > PRESSED * rest)
+    return errors
+
+
+def sweeps_worst_share() -> float:
+    shares = []
+    for sweep, figures in RMSE_MEGOHM.items():
+        out = estimate_file(load_readings(DATA / f"{sweep}_3x3.npz"), "joint")
+        with np.load(DATA / f"{sweep}_3x3.npz", allow_pickle=False) as file:
+            square = (out["cell_ohm"] - file["cell_ohm"]) ** 2
+        rmse_megohm = 1e-6 * np.sqrt(np.mean(square, axis=(1, 2)))
+        shares.append(rmse_megohm / np.min(list(figures.values()), axis=0))
+    return float(np.max(shares))
+
+
+def accuracy() -> dict[str, float]:
+    figures: dict[str, float] = {}
+    stated = []
+    for method in ("joint", "touch"):
+        random = random_errors(method, 20)
+        figures |= random_figures(method, random)
+        bent, bent_figures = bent_errors(method, 12)
+        figures |= bent_figures
+        if method == "joint":
+            stated += random.over_stated + bent.over_stated
+    figures["sweeps_worst_share"] = round(sweeps_worst_share(), 4)
+    names = ("random_2x2", "random_4x6", "random_8x8", "bent_8x8", "presses_8x8")
+    stated += file_errors((*names, "wire_sweep_3x3", "cell_sweep_3x3"), "joint").over_stated
+    away = np.concatenate(stated)
+    for limit in (1, 2, 4):
+        figures[f"within_{limit}_std_percent"] = round(100 * float(np.mean(away < limit)), 2)
+    return figures
+
+
+# ---------------------------------------------------------------------------------------- bars
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What a figure has to be."""
+
+    figure: str
+    wanted: str
+    met: Callable[[float], bool]
+
+
+def at_most(figure: str, limit: float) -> Bar:
+    return Bar(figure, f"<= {limit:g}", lambda value: value <= limit)
+
+
+def at_least(figure: str, limit: float) -> Bar:
+    return Bar(figure, f">= {limit:g}", lambda value: value >= limit)
+
+
+BARS = (
+    at_most("ms_joint_8x8_presses", 1.0),
+    at_most("ms_joint_16x16_random", 12),
+    at_most("ms_touch_8x8_presses", 0.4),
+    at_most("ms_touch_16x16_random", 2),
+    at_most("ms_touch_32x32_random", 10),
+    at_most("ms_matrix_8x8_presses", 1.0),
+    at_most("ms_paper_2x2_random", 90),
+    at_most("error_joint_median_percent", 0.8),
+    at_most("error_joint_p90_percent", 5),
+    at_most("ghost_joint_p95_us", 0.5),
+    at_most("error_touch_median_percent", 0.88),
+    at_most("error_touch_p90_percent", 5.5),
+    at_most("ghost_touch_p95_us", 0.55),
+    at_most("bent_joint_over_limit", 1.3),
+    at_most("sweeps_worst_share", 0.25),
+    at_least("within_1_std_percent", 60),
+    at_least("within_2_std_percent", 90),
+    at_least("within_4_std_percent", 99),
+)
+
+
+def report(figures: dict[str, float]) -> bool:
+    """Print all figures and their bars; true when all are met."""
+    bars = {bar.figure: bar for bar in BARS}
+    all_met = True
+    print(f"{'figure':30}{'measured':>12}  {'bar':14}")
+    for name, value in figures.items():
+        bar = bars.get(name)
+        met = bar is None or bar.met(value)
+        all_met = all_met and met
+        wanted, verdict = ("", "") if bar is None else (bar.wanted, "pass" if met else "FAIL")
+        print(f"{name:30}{value:>12}  {wanted:14}{verdict}".rstrip())
+    return all_met
+
+
+def main() -> int:
+    figures = times() | accuracy()
+    all_met = report(figures)
+    print(json.dumps(figures))
+    return 0 if all_met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
