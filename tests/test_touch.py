@@ -183,4 +183,6 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     np.testing.assert_allclose(belief.times(np.eye(12)), covariance, atol=1e-4)
     np.testing.assert_allclose(belief.std(), np.sqrt(np.diagonal(covariance)), atol=1e-3)
     some = random.normal(size=(3, 12))
-    np.testing.assert_allclose(belief.seen(some), some @ belief.times(some), rtol=1e-9)
+    seen = some @ belief.times(some)
+    np.testing.assert_allclose(np.tril(belief.seen(some)), np.tril(seen), rtol=1e-9)
+    np.testing.assert_allclose(belief.variance(some), np.diagonal(seen), rtol=1e-9)

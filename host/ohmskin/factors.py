@@ -1,24 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cholesky factors, by LAPACK directly: for matrices as small as a skin's, what scipy.linalg checks
 before it calls LAPACK takes as long again.
+
+Symmetric matrices and factors are lower triangles, in Fortran's order; what is above is anything.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 Float = NDArray[np.float64]
 
 
-def cholesky(system: Float) -> Float:
-    """L of a symmetric positive definite matrix L L^T, lower; `system` is overwritten.
+def gram(rows: Float, scale: float = 1.0, onto: Float | None = None) -> Float:
+    """scale * rows rows^T, added onto a matrix that is overwritten, if there is one."""
+    turned = rows.T  # C's order is Fortran's of the transpose: nothing is copied
+    if onto is None:
+        return np.asarray(blas.dsyrk(scale, turned, trans=1, lower=1))
+    return np.asarray(blas.dsyrk(scale, turned, trans=1, lower=1, beta=1.0, c=onto, overwrite_c=1))
 
+
+def cholesky(system: Float) -> Float:
+    """L of a positive definite matrix L L^T; `system` is overwritten.
+
+    A C-ordered matrix must be symmetric: it is its own transpose, in Fortran's order.
     Raises LinAlgError if it is not positive definite, as where it holds NaN.
     """
-    # A C-ordered matrix is its transpose in Fortran's order, and this one is its own transpose.
-    factor, failed = lapack.dpotrf(system.T, lower=1, overwrite_a=1)
+    lower = system if system.flags.f_contiguous else system.T
+    factor, failed = lapack.dpotrf(lower, lower=1, overwrite_a=1, clean=0)
     if failed:
         raise np.linalg.LinAlgError("matrix is not positive definite")
     return np.asarray(factor)

@@ -37,17 +37,17 @@ from ohmskin.circuit import Float, Skin, port_sensitivity
 from ohmskin.estimators.base import SkinKnowledge
 from ohmskin.estimators.prior import (
     LAYER_STD,
-    REST_OHM,
     REST_STD,
     SEGMENT_STD,
     UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
+    UNTOUCHED_OHM,
 )
 
 # Of a pressed cell's log conductance: nine decades within one deviation either way is no knowledge.
 PRESSED_STD: Final = 10.0
 # Where nobody says which cells are pressed: those that conduct so much more than a usual rest.
-PRESSED_SIEMENS: Final = 1.5 / REST_OHM
+PRESSED_SIEMENS: Final = 1.5 / UNTOUCHED_OHM
 
 
 def information_limit(

@@ -27,17 +27,20 @@ from ohmskin.estimators.joint_fit import JointFit
 from ohmskin.estimators.ohm import conductance_from_current
 from ohmskin.estimators.ports import PortReadings
 from ohmskin.estimators.prior import (
-    REST_OHM,
     REST_STD,
     TAIL,
     TOUCHED,
     UNKNOWN_REST_STD,
+    UNTOUCHED_OHM,
+    UNTOUCHED_STD,
     CellPrior,
+    rest_level,
     siemens_std,
 )
 from ohmskin.estimators.touched import Touched, TouchedFit
 from ohmskin.estimators.wires import Lesson, WireBelief
 
+LOWER_LEVEL: Final = 0.8  # a frame of so much less conductance shows rest better than those before
 MAX_DOUBTS: Final = 4
 MISFIT: Final = 1.5  # chi-square per port; at the truth, rounding alone has 1
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault, not touched
@@ -71,9 +74,10 @@ class JointEstimator(Estimator):
 
     def _solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
-        prior = self._prior or self._prior_at_rest()
+        prior = self._prior_of(current)
         found = self._finder.find(current, current_std) if self._finder is not None else None
-        if found is not None and self._is_enough(found):
+        known_rest = self.knowledge.rest_ratio is not None
+        if found is not None and known_rest and self._is_enough(found):
             return self._simple_solution(found, ports)
         fit = self._best_fit(prior, current, current_std, self._starts(prior, current, found))
         usual = not (ports.fault or fit.message)
@@ -94,8 +98,8 @@ class JointEstimator(Estimator):
             self._learn(-log_siemens, lambda: found.lesson)
         siemens = np.exp(log_siemens).reshape(self._shape)
         top, bottom = np.exp(self._belief.mean).reshape(2, *self._shape)
-        path_ohm = (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
-        std, std_down = siemens_std(log_siemens, log_std, path_ohm + self.knowledge.ref_ohm)
+        paths = self._belief.paths(self._belief.mean, self._shape)
+        std, std_down = siemens_std(log_siemens, log_std, *paths, self.knowledge.ref_ohm)
         return Solution(
             cell_siemens=siemens,
             cell_siemens_std=std.reshape(self._shape),
@@ -138,7 +142,8 @@ class JointEstimator(Estimator):
             best.message = f"no resistances explain the readings: chi-square {best.misfit:.1f}"
         loss = best.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
         worst = int(loss.argmax())
-        if not best.message and loss[worst] > 0:
+        known_rest = self.knowledge.rest_ratio is not None
+        if known_rest and not best.message and loss[worst] > 0:
             row, column = divmod(worst, self._shape[1])
             best.message = f"cell ({row}, {column}): conducts less than at rest, is a line open?"
         return best
@@ -165,7 +170,7 @@ class JointEstimator(Estimator):
             start = prior.expected.copy()
             if self._before is not None:
                 # Cells at rest are where rounding put them before.
-                near = np.abs(self._before - start) < TOUCHED
+                near = np.abs(prior.rise(self._before)) < TOUCHED
                 start[near] = self._before[near]
             start[found.cells] = -found.log_siemens
             return [start]
@@ -182,18 +187,35 @@ class JointEstimator(Estimator):
         self._learned_from = cell
         self._belief.learn(*lesson())
 
-    def _prior_at_rest(self) -> CellPrior:
-        """From the rest readings, if there are any: the same fit, with a prior without tails."""
-        known = self.knowledge
-        cells = known.rows * known.columns
-        unknown = np.full(cells, np.log(REST_OHM)), np.full(cells, UNKNOWN_REST_STD)
-        self._prior = CellPrior(*unknown, TAIL)
-        if known.rest_ratio is not None:
-            rest = self._reader.read(known.rest_ratio)
-            current, current_std = rest.current.ravel(), rest.current_std.ravel()
-            wide = CellPrior(*unknown, np.inf)
-            fit = JointFit(self._shape, known.ref_ohm, wide, self._belief, current, current_std)
-            fit.run(self._starts(wide, current, None))
-            self._prior = CellPrior(fit.cell, np.hypot(fit.cell_std, REST_STD), TAIL)
-            self._finder = TouchedFit(self._shape, self._prior, self._belief, known.ref_ohm)
+    def _prior_of(self, current: Float) -> CellPrior:
+        """From the rest readings; without them from the level of this frame, or of a lower one.
+
+        A level is one number for all cells: what has always been pressed is not taken for rest, as
+        it would be cell by cell.
+        """
+        if self._prior is not None and self.knowledge.rest_ratio is not None:
+            return self._prior
+        if self.knowledge.rest_ratio is not None:
+            expected, std = self._at_rest(self._reader.read(self.knowledge.rest_ratio))
+        else:
+            level = rest_level(current.reshape(self._shape), self.knowledge.ref_ohm)
+            if self._prior is not None and level > LOWER_LEVEL * np.exp(-self._prior.expected[0]):
+                return self._prior
+            expected = np.full(current.size, -np.log(level))
+            std = np.full(current.size, UNKNOWN_REST_STD)
+        self._prior = CellPrior(expected, std, TAIL)
+        self._finder = TouchedFit(self._shape, self._prior, self._belief, self.knowledge.ref_ohm)
         return self._prior
+
+    def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
+        """Log resistances of the untouched cells, and how well they are known: the same fit."""
+        cells = ports.current.size
+        wide = CellPrior(
+            np.full(cells, np.log(UNTOUCHED_OHM)), np.full(cells, UNTOUCHED_STD), np.inf
+        )
+        current, current_std = ports.current.ravel(), ports.current_std.ravel()
+        fit = JointFit(
+            self._shape, self.knowledge.ref_ohm, wide, self._belief, current, current_std
+        )
+        fit.run(self._starts(wide, current, None))
+        return fit.cell, np.hypot(fit.cell_std, REST_STD)

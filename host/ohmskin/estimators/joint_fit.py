@@ -41,7 +41,7 @@ from ohmskin.estimators.prior import (
     siemens_std,
 )
 from ohmskin.estimators.wires import LOG_LIMITS, Lesson, WireBelief
-from ohmskin.factors import cholesky, solve, solve_lower
+from ohmskin.factors import cholesky, gram, solve, solve_lower
 
 MAX_ITERATIONS: Final = 40
 MAX_STEP: Final = 1.5  # of a log resistance
@@ -77,14 +77,13 @@ class _Slopes:
     by_wires: Float
 
     def seen(self, belief: WireBelief) -> Float:
-        """J P J^T + 1, (RC, RC)."""
-        seen: Float = self.by_cell @ self.by_cell.T
-        by_wires = belief.seen(self.by_wires)
+        """J P J^T + 1, lower triangle (RC, RC)."""
+        seen = gram(self.by_cell)
         if self.heavy.size == len(seen):
-            seen += by_wires
-        else:
-            seen[np.ix_(self.heavy, self.heavy)] += by_wires
-        seen.ravel()[:: len(seen) + 1] += 1.0
+            seen = belief.seen(self.by_wires, seen)
+        elif self.heavy.size:
+            seen[np.ix_(self.heavy, self.heavy)] += belief.seen(self.by_wires)
+        np.einsum("ii->i", seen)[:] += 1.0
         return seen
 
 
@@ -188,7 +187,7 @@ class JointFit:
     @property
     def wires_contradict(self) -> bool:
         """Whether the wires moved further than was believed possible."""
-        touches = int(np.sum(self._prior.expected - self.cell > TOUCHED))
+        touches = int(np.sum(self._prior.rise(self.cell) > TOUCHED))
         return self.wire_chi2 > BENT * (1 + touches)
 
     def _step(self) -> bool:
@@ -252,27 +251,25 @@ class JointFit:
 
     def siemens_std(self) -> tuple[Float, Float]:
         """Standard deviations of each cell's conductance, up and down, (RC,) [S]."""
-        top, bottom = np.exp(self.wires).reshape(2, *self._shape)
-        path_ohm = (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
-        return siemens_std(-self.cell, self.cell_std, path_ohm + self._ref_ohm)
+        path_ohm, wire_std = self._belief.paths(self.wires, self._shape)
+        return siemens_std(-self.cell, self.cell_std, path_ohm, wire_std, self._ref_ohm)
 
     @property
     def is_crowded(self) -> bool:
         """Whether so many cells are touched that rest is no more likely than a touch."""
-        distance = self._prior.expected - self.cell
-        return bool(np.mean(distance > TOUCHED) > CROWDED)
+        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > CROWDED)
 
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings that wires matter to, for the belief."""
         here = self._here
-        seen = np.einsum("ij,ji->i", here.by_wires, self._belief.times(here.by_wires))
+        seen = self._belief.variance(here.by_wires)
         kept = np.argsort(seen)[-MAX_LESSON:]
         kept = kept[seen[kept] > LESSON]
         ports, slopes = here.heavy[kept], here.by_wires[kept]
         residual = here.residual[ports] + slopes @ (self.wires - self._belief.mean)
         # A touched cell is noise without limit; one at rest is known to its drift.
-        away = np.abs(self.cell - self._prior.expected)
-        std = np.where(self._hidden | (away > TOUCHED), UNLIMITED_STD, self._prior.std)
+        unknown = self._hidden | (np.abs(self._prior.rise(self.cell)) > TOUCHED)
+        std = np.where(unknown, UNLIMITED_STD, self._prior.std)
         by_cell = here.by_cell[ports] * (std / here.cell_std)
         noise = by_cell @ by_cell.T
         noise.ravel()[:: ports.size + 1] += 1.0

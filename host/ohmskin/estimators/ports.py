@@ -21,7 +21,7 @@ A frame is at fault, and its answer not to be relied on, where
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -101,26 +101,25 @@ class PortReader:
         current = current_from_ratio(ratio, *self._ref_ohm)
         residual = ratio - ratio_from_current(current, *self._ref_ohm)
         square = np.einsum("ijk,ijk->ij", residual, residual)
-        chi2 = square / self._ratio_std**2
-        common = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
-        std = self._current_std * np.sqrt(np.maximum(common, chi2 / _DEGREES))
-        disagreement = np.sqrt(square / _DEGREES)
-        fault = self._disagreement(disagreement) or self._rest_fault
+        middle = square.size // 2
+        typical = float(np.partition(square, middle, axis=None)[middle])
+        variance = self._ratio_std**2
+        common = max(1.0, typical / (_MEDIAN_CHI2 * variance))
+        std = self._current_std * np.sqrt(np.maximum(common, square / (_DEGREES * variance)))
+        fault = self._disagreement(square, typical) or self._rest_fault
         found = PortReadings(ratio, current, std)
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
-        return PortReadings(ratio, current, std, fault)
+        return replace(found, fault=fault) if fault else found
 
-    def _disagreement(self, disagreement: Float) -> str:
-        typical = float(np.median(disagreement))
-        if typical > DISAGREE_ALL:
-            return f"the four readings of most cells disagree, by {100 * typical:.0f} % of Vdd"
-        worst = int(disagreement.argmax())
-        most = float(disagreement.flat[worst])
-        if most > max(DISAGREE_ONE, DISAGREE_OVER_NOISE * typical):
-            return (
-                f"{_cell(worst, disagreement)}: its readings disagree by {100 * most:.0f} % of Vdd"
-            )
+    def _disagreement(self, square: Float, typical: float) -> str:
+        most = (typical / _DEGREES) ** 0.5
+        if most > DISAGREE_ALL:
+            return f"the four readings of most cells disagree, by {100 * most:.0f} % of Vdd"
+        worst = int(square.argmax())
+        one = (float(square.flat[worst]) / _DEGREES) ** 0.5
+        if one > max(DISAGREE_ONE, DISAGREE_OVER_NOISE * most):
+            return f"{_cell(worst, square)}: its readings disagree by {100 * one:.0f} % of Vdd"
         return ""
 
     def _short(self, found: PortReadings) -> str:

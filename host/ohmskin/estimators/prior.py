@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from ohmskin.circuit import Float
 
-# A cell whose rest readings are not known is expected around 1 MOhm. Deviations are of the log.
-REST_OHM: Final = 1e6
-UNKNOWN_REST_STD: Final = 1.0
+# Deviations are of the log. Untouched cells are around 1 MOhm, before they are read.
+UNTOUCHED_OHM: Final = 1e6
+UNTOUCHED_STD: Final = 1.0
+UNKNOWN_REST_STD: Final = 0.3  # of a cell whose rest readings are not known, about all cells' level
+REST_QUANTILE: Final = 0.2  # of the ports, taken for untouched ones where rest is not known
 REST_STD: Final = 0.05  # drift since the rest readings
 TAIL: Final = 1.0  # exponent of the density of touched cells
 
@@ -27,7 +29,7 @@ SEGMENT_STD: Final = 0.1  # what each has of its own
 
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 # A cell that the prior holds at rest may be touched all the same, where readings say little of it.
-TOUCHED: Final = 0.1  # log: further from rest, a cell's force is unknown
+TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
 UNLIMITED_STD: Final = 3.0  # what is not known of it
 HIDDEN: Final = 0.3  # log: a rise that must not go unnoticed
 DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
@@ -47,6 +49,10 @@ class CellPrior:
     std: Float
     tail: float
 
+    def rise(self, log_ohm: Float) -> Float:
+        """How far a cell conducts more than at rest, in deviations."""
+        return (self.expected - log_ohm) / self.std
+
     def cost(self, log_ohm: Float) -> float:
         """-2 log p, up to a constant."""
         square = ((log_ohm - self.expected) / self.std) ** 2
@@ -61,21 +67,39 @@ class CellPrior:
         return np.asarray(np.maximum(self.std[cells] ** 2, away * away / self.tail))
 
 
+def rest_level(current_siemens: Float, ref_ohm: float) -> float:
+    """Conductance of untouched cells, all alike, from port currents per Vdd (R, C) [S].
+
+    A port of R x C equal cells g, without wires, is (R + C - 1) / (R C g). Touches make every port
+    conduct more, so this goes by ports that conduct little.
+    """
+    rows, columns = current_siemens.shape
+    current = float(np.quantile(current_siemens, REST_QUANTILE))
+    port_ohm = max(1.0 / max(current, 1e-12) - ref_ohm, 1.0)
+    level = (rows + columns - 1) / (rows * columns * port_ohm)
+    return float(np.clip(level, 0.01 / UNTOUCHED_OHM, 100 / UNTOUCHED_OHM))
+
+
 def siemens_std(
-    log_siemens: Float, log_std: Float, series_ohm: Float | float
+    log_siemens: Float, log_std: Float, path_ohm: Float, wire_std: Float, ref_ohm: float
 ) -> tuple[Float, Float]:
     """Standard deviations of conductances, upwards and downwards [S]: quarters of four deviations.
 
-    log_std: of the log conductance, to first order. series_ohm: wires and references in series with
-    each cell. Errors are normal in the current u = 1 / (r + series), not in g = 1 / r: upwards,
-    behind much series resistance, a cell may be anything up to the most a touch makes of it.
+    log_std: of the log conductance, to first order. path_ohm, wire_std: wires between each cell and
+    its electrodes, and the deviation of their log. ref_ohm: both references. All (RC,).
+    Errors are normal in the current u = 1 / (r + series), not in g = 1 / r, and the wires' in their
+    log: upwards, behind much series resistance, a cell may be anything that a touch makes of it.
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
+    by_wires = np.minimum(path_ohm * wire_std * siemens, log_std)
+    wider = np.expm1(4.0 * wire_std) / (4.0 * wire_std)
+    up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * by_wires**2)
+    series_ohm = path_ohm + ref_ohm
     loop_ohm = cell_ohm + series_ohm
-    far = 4.0 * log_std * cell_ohm / loop_ohm
-    lowest_ohm = loop_ohm / (1.0 + far) - series_ohm
-    highest_ohm = loop_ohm / np.maximum(1.0 - far, 1e-6) - series_ohm
+    share = cell_ohm / loop_ohm
+    lowest_ohm = loop_ohm / (1.0 + 4.0 * up_std * share) - series_ohm
+    highest_ohm = loop_ohm / np.maximum(1.0 - 4.0 * log_std * share, 1e-6) - series_ohm
     highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
     up = np.maximum(siemens * log_std, 0.25 * (highest - siemens))
     return np.asarray(up), np.asarray(0.25 * (siemens - 1.0 / highest_ohm))

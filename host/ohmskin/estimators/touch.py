@@ -16,7 +16,7 @@ from ohmskin.estimators.joint import JointEstimator
 from ohmskin.estimators.touched import Touched
 
 MOST_TOUCHED: Final = 0.2  # share of the cells
-WIDEST_LOG_STD: Final = 0.4  # of a touched cell: beyond it the circuit is far from linear
+WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
 
 
 class TouchEstimator(JointEstimator):

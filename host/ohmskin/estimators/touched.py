@@ -131,7 +131,7 @@ class _Base:
         by_wires = net.by_wires() * (self.current**2)[:, None]
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
-        self.slack += np.einsum("ij,ji->i", by_wires, belief.times(by_wires))
+        self.slack += belief.variance(by_wires)
         self.path_ohm = self.net.path_ohm(self.log_wires)
         self.wire_std = float(belief.std().max())
         # Wires this uncertain are no small noise beside a cell at rest.
@@ -244,8 +244,8 @@ class _Fit:
         ports = np.flatnonzero(heavy)
         light = ~heavy
         wires = self._sharpened(ports)
-        covariance = wires @ belief.times(wires)
-        covariance.ravel()[:: ports.size + 1] += 1.0
+        covariance = belief.seen(wires)
+        np.einsum("ii->i", covariance)[:] += 1.0
         unit = np.sqrt(np.diagonal(covariance))
         factor = cholesky(covariance)
         offset = wires @ (belief.mean - base.log_wires)

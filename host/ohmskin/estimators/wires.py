@@ -36,7 +36,7 @@ from ohmskin.estimators.prior import (
     UNKNOWN_LAYER_STD,
     UNKNOWN_WIRE_OHM,
 )
-from ohmskin.factors import cholesky, solve, solve_lower
+from ohmskin.factors import cholesky, gram, solve, solve_lower
 
 FADE: Final = 0.1  # share of the knowledge that fades with each lesson: skins bend
 # Lessons, the last few together, that ask for a change of a layer by so many standard deviations
@@ -83,29 +83,42 @@ class WireBelief:
 
     def times(self, slopes: Float) -> Float:
         """P J^T, shape (2RC, m), or P a for a vector (2RC,)."""
-        rows = slopes.reshape(-1, 2, self._cells)
+        rows = slopes.reshape(*slopes.shape[:-1], 2, self._cells)
         product = SEGMENT_STD**2 * rows
-        product += self._layer_std**2 * rows.sum(axis=2, keepdims=True)
+        product += self._layer_std**2 * rows.sum(axis=-1, keepdims=True)
         product = product.reshape(slopes.shape)
         if self._learned.shape[1]:
             product -= (slopes @ self._learned) @ self._learned.T
         return np.asarray(product.T)
 
-    def seen(self, slopes: Float) -> Float:
-        """J P J^T, shape (m, m): what the wires' uncertainty does to m readings."""
-        layers = self._layer_std * slopes.reshape(-1, 2, self._cells).sum(axis=2)
-        seen: Float = slopes @ slopes.T
-        seen *= SEGMENT_STD**2
-        seen += layers @ layers.T
-        if self._learned.shape[1]:
-            learned = slopes @ self._learned
-            seen -= learned @ learned.T
-        return seen
+    def seen(self, slopes: Float, onto: Float | None = None) -> Float:
+        """J P J^T, what the wires' uncertainty does to m readings: lower triangle (m, m).
+
+        Added onto a matrix that is overwritten, if there is one.
+        """
+        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
+        seen = gram(slopes, SEGMENT_STD**2, onto)
+        seen = gram(layers, self._layer_std**2, seen)
+        return gram(slopes @ self._learned, -1.0, seen) if self._learned.shape[1] else seen
+
+    def variance(self, slopes: Float) -> Float:
+        """Diagonal of J P J^T, (m,)."""
+        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
+        learned = slopes @ self._learned
+        variance = SEGMENT_STD**2 * np.einsum("ij,ij->i", slopes, slopes)
+        variance += self._layer_std**2 * np.einsum("ij,ij->i", layers, layers)
+        return np.asarray(variance - np.einsum("ij,ij->i", learned, learned))
 
     def std(self) -> Float:
         """Standard deviation of each log resistance, (2RC,)."""
         variance = SEGMENT_STD**2 + self._layer_std**2 - np.sum(self._learned**2, axis=1)
         return np.asarray(np.sqrt(np.maximum(variance, 1e-12)))
+
+    def paths(self, log_wires: Float, shape: tuple[int, int]) -> tuple[Float, Float]:
+        """Wire between each cell and its electrodes [ohm], and the deviation of its log, (RC,)."""
+        top, bottom = np.exp(log_wires).reshape(2, *shape)
+        path_ohm = np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)
+        return path_ohm.ravel(), self.std().reshape(2, -1).mean(axis=0)
 
     def learn(self, slopes: Float, residual: Float, noise: Float) -> None:
         """One Kalman step. slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m)."""
@@ -115,7 +128,7 @@ class WireBelief:
         spread = self.times(slopes)
         factor = cholesky(noise + slopes @ spread)
         # Slope and curvature of the likelihood along a change of a whole layer.
-        layers = slopes.reshape(-1, 2, self._cells).sum(axis=2)
+        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
         pulls = solve(factor, np.column_stack([residual, layers]))
         self._slope = MEMORY * self._slope + layers.T @ pulls[:, 0]
         self._curvature = MEMORY * self._curvature + np.sum(layers * pulls[:, 1:], axis=0)

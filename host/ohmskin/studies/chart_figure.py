@@ -110,7 +110,7 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
     return png.getvalue()
 
 
-def _style(method: str) -> dict[str, Any]:
+def method_style(method: str) -> dict[str, Any]:
     """Colour and marker, the same in all panels: by the method's place in `METHODS`."""
     number = list(METHODS).index(method)
     return {
@@ -149,7 +149,7 @@ def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
     _points(axes, [(row, row.rmse_megohm, row.rmse_p90_megohm) for row in measured])
     for row in rows:
         if row.source == PAPER and row.rmse_megohm is not None:
-            colour = _style(row.method)["color"]
+            colour = method_style(row.method)["color"]
             axes.axhline(row.rmse_megohm, color=colour, linestyle=_PRINTED, linewidth=1.3, zorder=1)
 
 
@@ -170,7 +170,7 @@ def _points(axes: Axes, points: Sequence[tuple[Row, float | None, float | None]]
     for row, middle, tail in points:
         if row.ms is None or middle is None or tail is None:
             continue
-        style = _style(row.method)
+        style = method_style(row.method)
         # Broad and pale, for the line of the front often runs along it.
         axes.plot(
             [row.ms, row.ms],
@@ -211,7 +211,7 @@ def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
         return
     at_axis = axes.get_xaxis_transform()
     for method, time_ms in times.items():
-        style = {**_style(method), "marker": "^", "zorder": 5}
+        style = {**method_style(method), "marker": "^", "zorder": 5}
         axes.plot([time_ms], [0.025], transform=at_axis, clip_on=False, **style)
     axes.text(
         max(times.values()),
@@ -235,7 +235,9 @@ def _explain(axes: Axes, methods: set[str]) -> None:
 
     axes.set_axis_off()
     handles: list[Any] = [
-        Line2D([], [], **_style(method), label=method) for method in METHODS if method in methods
+        Line2D([], [], **method_style(method), label=method)
+        for method in METHODS
+        if method in methods
     ]
     mark: dict[str, Any] = {"color": _INK, "linestyle": ""}
     handles += [

@@ -32,7 +32,7 @@ from ohmskin.circuit import (
     readings,
 )
 from ohmskin.estimators import SkinKnowledge
-from ohmskin.studies.trials import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, skin_at_rest, touch
+from ohmskin.studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest, touch
 
 Random = np.random.Generator
 Shape = tuple[int, int]
@@ -148,12 +148,13 @@ def _touched_frames(rest: Skin, frames: int, random: Random) -> list[Skin]:
 
 
 def _wires(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
-    """x: a wire segment's resistance over a touched cell's."""
+    """x: a wire segment's resistance over a touched cell's, both but for their spread."""
     wire_ohm = (float(x) * PRESSED_OHM, float(x) * PRESSED_OHM)
     rest = skin_at_rest(*shape, random, wire_ohm=wire_ohm)
     judged = []
     for skin in _touched_frames(rest, frames, random):
-        cell = np.where(skin.cell_siemens > rest.cell_siemens, 1 / PRESSED_OHM, rest.cell_siemens)
+        pressed = np.exp(SPREAD * random.standard_normal(shape)) / PRESSED_OHM
+        cell = np.where(skin.cell_siemens > rest.cell_siemens, pressed, rest.cell_siemens)
         judged.append(Frame(converted(readings(replace(skin, cell_siemens=cell))), cell))
     return _case(judged, converted(readings(rest)), wire_ohm)
 

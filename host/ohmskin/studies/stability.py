@@ -109,7 +109,7 @@ class Plan:
     shape: Shape = (8, 8)
 
 
-FULL: Final = Plan(skins=10, frames=20, paper_skins=3, paper_shape=(3, 3))
+FULL: Final = Plan(skins=10, frames=20, paper_skins=2, paper_shape=(3, 3))
 QUICK: Final = Plan(skins=2, frames=8, paper_skins=1, paper_shape=(2, 2))
 
 
@@ -245,8 +245,8 @@ def shares(rows: Iterable[Row]) -> dict[str, dict[str, float]]:
 
 
 def summary(rows: Sequence[Row]) -> Table:
-    """Per sweep and method the three shares, for a terminal."""
-    table = Table(box=None, title="right / flagged / wrong and not flagged [% of frames]")
+    """Two of the three shares per sweep and method, for a terminal."""
+    table = Table(box=None, title="right / wrong and not flagged [% of frames]")
     methods = list(totals(rows))
     for heading in ("sweep", *methods):
         table.add_column(heading, justify="left" if heading == "sweep" else "right")
@@ -258,5 +258,5 @@ def summary(rows: Sequence[Row]) -> Table:
 
 
 def _percent(row: Row) -> str:
-    right, flagged, wrong = (100 * getattr(row, said) / row.frames for said in Verdict)
-    return f"{right:.0f} / {flagged:.0f} / {wrong:.{0 if wrong >= 10 else 1}f}"
+    right, wrong = (100 * count / row.frames for count in (row.right, row.wrong_unflagged))
+    return f"{right:.0f} / {wrong:.{0 if wrong >= 10 else 1}f}"

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ohmskin.estimators import METHODS
-from ohmskin.studies.chart_figure import _style as method_style
-from ohmskin.studies.chart_figure import require_matplotlib
+from ohmskin.studies.chart_figure import method_style, require_matplotlib
 from ohmskin.studies.conditions import SWEEPS, Sweep
 from ohmskin.studies.stability import Row, Verdict, totals
 
@@ -85,7 +84,7 @@ def _draw(upper: Axes, lower: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
                 at = shift + np.arange(len(percent))
                 axes.bar(at, percent, width, color=style["color"], zorder=3)
             else:
-                few = max(row.frames for row in found.values()) < _FEW_FRAMES
+                few = max((row.frames for row in found.values()), default=0) < _FEW_FRAMES
                 style |= {"linestyle": ":" if few else "-", "linewidth": 1.8, "markersize": 5.5}
                 at = np.array(sweep.values, dtype=float)
                 axes.plot(at, percent, clip_on=False, zorder=3 + number / 10, **style)
