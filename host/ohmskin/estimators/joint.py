@@ -69,6 +69,8 @@ class JointEstimator(Estimator):
         """Forget the frames before, and what they revealed of the wires."""
         self._before = self._learned_from = None
         self._belief.reset()
+        if self.knowledge.rest_ratio is None:
+            self._prior = self._finder = None
         if self._finder is not None:
             self._finder.forget_frame()
 

@@ -48,7 +48,7 @@ MAX_STEPS: Final = 8  # per round
 MAX_STEP: Final = 1.5  # of a log conductance
 CLOSE: Final = 0.1  # a step below this share of every standard deviation is the last
 HEAVY: Final = 0.5  # wires matter to a reading that they may move by this share of its noise
-HIDING: Final = 0.1
+HIDING: Final = 0.1  # deviation of a path's wires, over a cell at rest, beyond which wires hide it
 REBUILD: Final = 0.05  # relative change of a path's wires for which the network is solved anew
 CONTRADICTION: Final = 3.0  # deviations of the chi-square of the readings that wires matter to
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
@@ -235,8 +235,8 @@ class _Fit:
         base, cells = self._base, self.cells
         if not cells.size:
             nothing = np.zeros((0, belief.mean.size)), np.zeros(0), np.zeros((0, 0))
-            none = np.zeros(0)
-            return Touched(cells, none, none, False, self._current, False, 0, nothing)
+            none, less = np.zeros(0), bool(self._residual.min() < -DEMAND)
+            return Touched(cells, none, none, False, self._current, less, 0, nothing)
         assert self._touched is not None
         move = (self._current**2 - base.current**2) * base.path_ohm * base.wire_std
         heavy = move > HEAVY * self._std
