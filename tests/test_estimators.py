@@ -260,14 +260,22 @@ def test_ohm_does_not_converge_on_a_current_that_no_resistance_allows() -> None:
     assert "(0, 1)" in found.message
 
 
-def test_one_wrong_reading_enlarges_the_standard_deviation_of_its_cell_alone() -> None:
+def test_one_wrong_reading_is_left_out_and_two_enlarge_the_deviation_of_their_cell_alone() -> None:
     ratio = wire_free_readings(np.full((2, 2), 1e5))
     estimator = make_estimator("ohm", SkinKnowledge(2, 2, adc_bits=10))
-    good = estimator.estimate(ratio).cell_siemens_std
+    good = estimator.estimate(ratio)
     ratio[1, 0, 2] = 1.0
-    bad = estimator.estimate(ratio).cell_siemens_std
-    assert bad[1, 0] > 20 * good[1, 0]
-    np.testing.assert_allclose(np.delete(bad.ravel(), 2), np.delete(good.ravel(), 2))
+    one = estimator.estimate(ratio)
+    assert one.converged
+    np.testing.assert_allclose(one.cell_siemens, good.cell_siemens, rtol=1e-6)
+    assert one.cell_siemens_std[1, 0] > 1.5 * good.cell_siemens_std[1, 0]
+    ratio[1, 0, 1] = 0.8
+    two = estimator.estimate(ratio)
+    assert not two.converged
+    assert two.cell_siemens_std[1, 0] > 20 * good.cell_siemens_std[1, 0]
+    np.testing.assert_allclose(
+        np.delete(two.cell_siemens_std.ravel(), 2), np.delete(good.cell_siemens_std.ravel(), 2)
+    )
 
 
 def test_touched_without_rest_compares_with_the_median_cell() -> None:

@@ -88,10 +88,26 @@ def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:
     assert not reader_of(None, wires=False).read(shorted).fault
 
 
-def test_readings_of_a_cell_that_disagree_are_named(rest: Skin, touched: Skin) -> None:
+@pytest.mark.parametrize("stuck", range(4))
+@pytest.mark.parametrize("at", [0.0, 1.0])
+def test_one_stuck_reading_of_a_cell_is_left_out(
+    rest: Skin, touched: Skin, stuck: int, at: float
+) -> None:
+    reader = reader_of(ten_bits(readings(rest)))
+    ratio = ten_bits(readings(touched))
+    good = reader.read(ratio)
+    place = tuple(np.argwhere(touched.cell_siemens > rest.cell_siemens)[0])
+    ratio[(*place, stuck)] = at
+    found = reader.read(ratio)
+    assert not found.fault
+    np.testing.assert_allclose(found.current, good.current, atol=2 * good.current_std.max())
+    assert found.current_std[place] > good.current_std[place]
+
+
+def test_readings_that_disagree_are_named(rest: Skin, touched: Skin) -> None:
     ratio = ten_bits(readings(touched))
     reader = reader_of(ten_bits(readings(rest)))
-    ratio[2, 7, 1] = 0.9
+    ratio[2, 7, 1:3] = 0.9, 0.4
     assert "cell (2, 7): its readings disagree by" in reader.read(ratio).fault
     ratio[..., 0] = 0.0
     assert "readings of most cells disagree" in reader.read(ratio).fault

@@ -9,7 +9,8 @@ of this frame and of the rest readings, and s_I theirs [S].
 
 A frame is at fault, and its answer not to be relied on, where
 
-- the four readings of a cell, or of most cells, disagree by far more than noise;
+- the readings of most cells disagree by far more than noise, or those of one cell so that no three
+  of the four agree (one that is stuck is left out);
 - a current is below that at rest: lowering resistances lowers the resistance between any two
   electrodes (Rayleigh's monotonicity law), so touches do not do that, but open lines do;
 - two lines that differed at rest draw the same current from every other, and all of it more than
@@ -28,6 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.circuit import (
+    READING_OFFSET,
+    READING_SIGN,
     READINGS_PER_CELL,
     Float,
     Skin,
@@ -36,6 +39,7 @@ from ohmskin.circuit import (
     port_resistance_ohm,
     ratio_from_current,
     ratio_std,
+    reference_ohm,
 )
 from ohmskin.estimators.prior import HIGHEST_TOUCH_SIEMENS
 
@@ -45,6 +49,7 @@ _MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
 DISAGREE_ALL: Final = 0.016
 DISAGREE_ONE: Final = 0.03
 DISAGREE_OVER_NOISE: Final = 6.0
+AGREE: Final = 4.0  # deviations of a reading: three that disagree by less agree
 DROP_SHARE: Final = 0.85  # of the current at rest, below which drift is no explanation
 CLEAR_STDS: Final = 5.0
 # Joined electrodes give the same code, or differ by what the readings disagree within a cell; one
@@ -82,6 +87,7 @@ class PortReader:
     ) -> None:
         self._ref_ohm = ref_ohm
         self._loop_ohm = sum(ref_ohm)
+        self._slope = READING_SIGN * reference_ohm(*ref_ohm)
         self._ratio_std = ratio_std(adc_bits)
         self._current_std = current_std(self._ratio_std, *ref_ohm)
         self._highest_current: Float = np.full(shape, np.inf)
@@ -106,21 +112,47 @@ class PortReader:
         variance = self._ratio_std**2
         common = max(1.0, typical / (_MEDIAN_CHI2 * variance))
         std = self._current_std * np.sqrt(np.maximum(common, square / (_DEGREES * variance)))
-        fault = self._disagreement(square, typical) or self._rest_fault
+        fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
         found = PortReadings(ratio, current, std)
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
         return replace(found, fault=fault) if fault else found
 
-    def _disagreement(self, square: Float, typical: float) -> str:
+    def _disagreement(
+        self, current: Float, std: Float, ratio: Float, square: Float, typical: float
+    ) -> str:
+        """Readings that disagree; leaves out, in `current` and `std`, one that three others do not
+        agree with.
+        """
         most = (typical / _DEGREES) ** 0.5
         if most > DISAGREE_ALL:
             return f"the four readings of most cells disagree, by {100 * most:.0f} % of Vdd"
-        worst = int(square.argmax())
-        one = (float(square.flat[worst]) / _DEGREES) ** 0.5
-        if one > max(DISAGREE_ONE, DISAGREE_OVER_NOISE * most):
-            return f"{_cell(worst, square)}: its readings disagree by {100 * one:.0f} % of Vdd"
-        return ""
+        limit = max(DISAGREE_ONE, DISAGREE_OVER_NOISE * most)
+        if square.max() <= _DEGREES * limit**2:
+            return ""
+        fault = ""
+        for index in np.flatnonzero(square > _DEGREES * limit**2):
+            row, column = divmod(int(index), square.shape[1])
+            without, off = self._without_one(ratio[row, column])
+            if off < max(AGREE * self._ratio_std, DISAGREE_OVER_NOISE * most):
+                current[row, column] = without
+                std[row, column] = 2.0 * std.min()
+            else:
+                by = 100 * float(square[row, column] / _DEGREES) ** 0.5
+                fault = f"cell ({row}, {column}): its readings disagree by {by:.0f} % of Vdd"
+        return fault
+
+    def _without_one(self, ratio: Float) -> tuple[float, float]:
+        """The current of the three of four readings that agree best, and how they disagree."""
+        found = []
+        for left_out in range(READINGS_PER_CELL):
+            kept = np.arange(READINGS_PER_CELL) != left_out
+            slope = self._slope[kept]
+            current = float(slope @ (ratio - READING_OFFSET)[kept] / (slope @ slope))
+            off = (ratio - READING_OFFSET)[kept] - slope * current
+            found.append((float(off @ off / (kept.sum() - 1)) ** 0.5, current))
+        off, current = min(found)
+        return current, off
 
     def _short(self, found: PortReadings) -> str:
         """A port with less resistance than a skin can have."""
