@@ -19,7 +19,7 @@ def main(port: str, seconds: float = float("inf")) -> None:
             adc_bits=board.adc_bits,
             rest_ratio=rest,
         )
-        estimator = ohmskin.make_estimator("matrix", knowledge)
+        estimator = ohmskin.make_estimator("touch", knowledge)
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             estimate = estimator.estimate(skin.latest().ratio)

@@ -178,10 +178,10 @@ def test_stream_json_is_one_object_a_scan(run: Callable[..., Done]) -> None:
     for scan in scans:
         assert set(scan) == {
             *("scan", "time_us", "host_time_s", "missed", "ratio"),
-            *("method", "cell_siemens", "cell_siemens_std", "converged"),
+            *("method", "cell_siemens", "cell_siemens_std", "converged", "message"),
         }
         assert scan["missed"] == 0
-        assert scan["method"] == "matrix"
+        assert scan["method"] == "joint"
         assert np.shape(scan["ratio"]) == (4, 6, 4)
         assert np.shape(scan["cell_siemens"]) == (4, 6)
         assert np.abs(np.array(scan["ratio"]) - expected).max() < 3 / 1024
@@ -236,12 +236,28 @@ def test_estimate(run: Callable[..., Done], tmp_path: Path, method: str, cold: b
         shape = given["ratio"].shape[:3]
         for name in ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched"):
             assert found[name].shape == shape
-        for name in ("converged", "chi2", "iterations", "seconds"):
+        for name in ("converged", "message", "chi2", "iterations", "seconds"):
             assert found[name].shape == shape[:1]
         truth = 1 / given["cell_ohm"]
         pressed = truth > 5e-5
         error = np.abs(found["cell_siemens"] - truth)[pressed] / truth[pressed]
         assert np.median(error) < (0.6 if method == "ohm" else 0.25)
+
+
+def test_estimate_says_why_frames_are_not_converged(
+    run: Callable[..., Done], tmp_path: Path
+) -> None:
+    with np.load(DATA / "random_4x6.npz") as given:
+        arrays = dict(given)
+    arrays["ratio"][1:3, 2, :, 0] = 0.0
+    arrays["ratio"][1:3, 2, :, 3] = 0.9
+    np.savez(tmp_path / "stuck.npz", **arrays)
+    out = tmp_path / "out.npz"
+    done = run("estimate", str(tmp_path / "stuck.npz"), "--method", "ohm", "--out", str(out))
+    assert done.code == 0
+    assert done.out.count("1 of 8: cell (2, ") == 2
+    with np.load(out, allow_pickle=False) as found:
+        assert [bool(message) for message in found["message"][:4]] == [False, True, True, False]
 
 
 def test_estimate_does_not_leave_half_a_file(run: Callable[..., Done], tmp_path: Path) -> None:
@@ -326,14 +342,14 @@ def test_demo_shows_a_ghost_and_how_it_goes(run: Callable[..., Done], tmp_path: 
     picture = tmp_path / "demo.png"
     done = run("demo", "--seconds", "0.5", "--picture", str(picture))
     assert done.code == 0
-    for word in ("truth", "ohm", "matrix", "0 missed", "0 damaged"):
+    for word in ("truth", "ohm", "joint", "0 missed", "0 damaged"):
         assert word in done.out
     verdicts = {
         line.split(":")[0].strip(): line for line in done.out.splitlines() if " ms a " in line
     }
     assert "no ghost" not in verdicts["ohm"]
     assert "ghost" in verdicts["ohm"]
-    assert "no ghost" in verdicts["matrix"]
+    assert "no ghost" in verdicts["joint"]
     assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert picture.stat().st_size > 10_000
 

@@ -23,6 +23,7 @@ OUT_SHAPES = {
     "top_wire_ohm": 3,
     "bottom_wire_ohm": 3,
     "converged": 1,
+    "message": 1,
     "chi2": 1,
     "iterations": 1,
     "seconds": 1,

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
@@ -23,6 +24,7 @@ from rich.live import Live
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
+from threadpoolctl import threadpool_limits
 
 import ohmskin
 from ohmskin import demo as demonstration
@@ -51,6 +53,7 @@ app = typer.Typer(
     "simavr://uno?scene=ghost.",
 )
 _out = Console()
+_MESSAGES = 8  # of different ones that are printed for a file
 _DISPLAY_EVERY_S = 0.1
 _WIDTH = 160
 
@@ -60,8 +63,11 @@ Port = Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' l
 def main() -> None:
     """Run the command line; the process's exit code says how it went."""
     try:
-        # Typer returns the code of an Exit, such as 130 for Ctrl-C.
-        if code := app(prog_name="ohmskin", standalone_mode=False):
+        # Matrices of a skin's size are slower on several threads.
+        with threadpool_limits(limits=1):
+            # Typer returns the code of an Exit, such as 130 for Ctrl-C.
+            code = app(prog_name="ohmskin", standalone_mode=False)
+        if code:
             sys.exit(code)
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(str(exc))
@@ -212,7 +218,7 @@ def stream(
     port: Port,
     method: Annotated[
         str, typer.Option(help=f"estimator: {' | '.join(METHODS)}; none: readings alone")
-    ] = "matrix",
+    ] = "joint",
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object a scan")] = False,
     scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
     seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
@@ -271,6 +277,7 @@ def _print_scans(skin: Device, estimator: Estimator | None, count: int, seconds:
             line["cell_siemens"] = estimate.cell_siemens.tolist()
             line["cell_siemens_std"] = estimate.cell_siemens_std.tolist()
             line["converged"] = estimate.converged
+            line["message"] = estimate.message
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
         except BrokenPipeError:
@@ -332,6 +339,9 @@ def estimate(
         f"{out}: {frames} frames, {int(answers['converged'].sum())} converged, "
         f"median {1e3 * float(np.median(answers['seconds'])):.2f} ms a frame"
     )
+    for message, count in Counter(answers["message"].tolist()).most_common(_MESSAGES):
+        if message:
+            _out.print(f"  {count} of {frames}: {message}")
 
 
 # ---------------------------------------------------------------------------- without a board

@@ -22,7 +22,7 @@ from ohmskin.scenes import Scene
 from ohmskin.show import cells_table
 
 URL: Final = "emulator://8x8?scene=ghost&seed=1"
-_METHODS: Final = ("ohm", "matrix")
+_METHODS: Final = ("ohm", "joint")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ adc_bits                scalar                       absent: the readings are ex
 ======================= ============================ =========================================
 
 Out: cell_ohm, cell_siemens, cell_siemens_std, top_wire_ohm, bottom_wire_ohm (F, R, C; NaN where the
-method does not estimate them), touched (F, R, C, bool), converged (F, bool), chi2 (F, per reading),
+method does not estimate them), touched (F, R, C, bool), converged (F, bool), message (F, text: why
+a frame is not converged, or what is wrong with its readings), chi2 (F, per reading),
 iterations (F), seconds (F).
 """
 
@@ -188,7 +189,8 @@ def estimate_file(
             progress(frame + 1, frames)
     names = (
         *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched"),
-        *("top_wire_ohm", "bottom_wire_ohm", "converged", "chi2", "iterations", "seconds"),
+        *("top_wire_ohm", "bottom_wire_ohm", "converged", "message", "chi2", "iterations"),
+        "seconds",
     )
     return {name: np.array([getattr(each, name) for each in estimates]) for name in names}
 
