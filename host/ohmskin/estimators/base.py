@@ -27,7 +27,7 @@ from ohmskin.circuit import (
     ratio_from_current,
     ratio_std,
 )
-from ohmskin.estimators.ports import PortReader, PortReadings
+from ohmskin.estimators.port_readings import PortReader, PortReadings
 
 # No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
 MIN_CELL_SIEMENS: Final = 1e-9
@@ -104,7 +104,7 @@ class Estimate:
     where the method does not estimate them. chi2: sum of squared residuals of all readings over
     the variance of one, divided by their number (about 1 or less when the model holds).
     message: empty if converged, else why not, or what is wrong with
-    the readings (`ports`). seconds: wall time of this frame.
+    the readings (`port_readings`). seconds: wall time of this frame.
     """
 
     cell_siemens: Float

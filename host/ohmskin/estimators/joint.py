@@ -25,7 +25,7 @@ from ohmskin.circuit import Float
 from ohmskin.estimators.base import MIN_CELL_SIEMENS, Estimator, SkinKnowledge, Solution
 from ohmskin.estimators.joint_fit import JointFit
 from ohmskin.estimators.ohm import conductance_from_current
-from ohmskin.estimators.ports import PortReadings
+from ohmskin.estimators.port_readings import PortReadings
 from ohmskin.estimators.prior import (
     REST_STD,
     TAIL,

@@ -51,7 +51,7 @@ from ohmskin.estimators.base import (
     Solution,
 )
 from ohmskin.estimators.ohm import conductance_from_current, port_current
-from ohmskin.estimators.ports import PortReadings
+from ohmskin.estimators.port_readings import PortReadings
 
 MAX_ITERATIONS: Final = 40
 # Converged when an undamped step would lower the chi-square (summed, not per reading) by less:

@@ -20,7 +20,7 @@ from ohmskin.estimators.base import (
     Estimator,
     Solution,
 )
-from ohmskin.estimators.ports import PortReadings
+from ohmskin.estimators.port_readings import PortReadings
 
 # Beyond what any cell could draw by this many standard deviations, a reading is at fault.
 _FAULT_STDS = 5.0

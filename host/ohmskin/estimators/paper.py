@@ -33,7 +33,7 @@ from ohmskin.estimators.paper_program import (
     Start,
     program_for,
 )
-from ohmskin.estimators.ports import PortReadings
+from ohmskin.estimators.port_readings import PortReadings
 
 OHM_PER_MEGOHM: Final = 1e6
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ohmskin.circuit import Float, Skin, port_resistance_ohm, quantise, ratio_from_codes, readings
-from ohmskin.estimators.ports import PortReader
+from ohmskin.estimators.port_readings import PortReader
 from ohmskin.studies.conditions import shorted_readings
 from ohmskin.studies.trials import random_trial, skin_at_rest, touch
 
