@@ -171,13 +171,12 @@ class JointFit:
     @property
     def modelled(self) -> Float:
         """Port currents of the model, (RC,) [S]."""
-        return self._here.modelled
+        return self._current - self._residual / self._weight
 
     @property
     def misfit(self) -> float:
         """Chi-square per port of what is left."""
-        residual = self._here.residual
-        return float(residual @ residual) / residual.size
+        return float(self._residual @ self._residual) / self._residual.size
 
     @property
     def wire_chi2(self) -> float:
@@ -215,6 +214,7 @@ class JointFit:
         self.cell = np.clip(self.cell + share * cell_step, *_LOG_CELL_LIMITS)
         self.wires = np.clip(self.wires + share * wire_step, *LOG_LIMITS)
         self._wire_pull = self._wire_pull + share * (pull - self._wire_pull)
+        self._residual = left if share == 1.0 else here.residual
         return moved < CLOSE or (moved < NEARLY and next_one < CLOSE)
 
     def _conclude(self) -> None:

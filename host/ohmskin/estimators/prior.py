@@ -24,7 +24,7 @@ TAIL: Final = 1.0  # exponent of the density of touched cells
 
 UNKNOWN_WIRE_OHM: Final = 150.0
 UNKNOWN_LAYER_STD: Final = 1.5
-LAYER_STD: Final = 0.3  # what all segments of a layer share: stretch, temperature
+LAYER_STD: Final = 0.25  # what all segments of a layer share: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each has of its own
 
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
