@@ -32,13 +32,13 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import casadi_circuit  # beside this file
+import casadi_circuit  # beside this file, like bars
 import numpy as np
+from bars import at_least, at_most, report
 from numpy.typing import NDArray
 
 from ohmskin.circuit import Float, quantise, ratio_from_codes
@@ -203,24 +203,6 @@ def accuracy() -> dict[str, float]:
 
 # ---------------------------------------------------------------------------------------- bars
 
-
-@dataclass(frozen=True)
-class Bar:
-    """What a figure has to be."""
-
-    figure: str
-    wanted: str
-    met: Callable[[float], bool]
-
-
-def at_most(figure: str, limit: float) -> Bar:
-    return Bar(figure, f"<= {limit:g}", lambda value: value <= limit)
-
-
-def at_least(figure: str, limit: float) -> Bar:
-    return Bar(figure, f">= {limit:g}", lambda value: value >= limit)
-
-
 BARS = (
     at_most("ms_joint_8x8_presses", 1.0),
     at_most("ms_joint_16x16_random", 12),
@@ -243,23 +225,9 @@ BARS = (
 )
 
 
-def report(figures: Mapping[str, float | None]) -> bool:
-    """Print all figures and their bars; true when all are met."""
-    bars = {bar.figure: bar for bar in BARS}
-    all_met = True
-    print(f"{'figure':30}{'measured':>12}  {'bar':14}")
-    for name, value in figures.items():
-        bar = bars.get(name)
-        met = bar is None or (value is not None and bar.met(value))
-        all_met = all_met and met
-        wanted, verdict = ("", "") if bar is None else (bar.wanted, "pass" if met else "FAIL")
-        print(f"{name:30}{'-' if value is None else value:>12}  {wanted:14}{verdict}".rstrip())
-    return all_met
-
-
 def main() -> int:
     figures = times() | casadi_circuit.measure(8) | casadi_circuit.measure(16) | accuracy()
-    all_met = report(figures)
+    all_met = report(figures, BARS)
     print(json.dumps(figures))
     return 0 if all_met else 1
 

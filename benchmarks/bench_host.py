@@ -32,10 +32,10 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from bars import at_least, at_most, report  # beside this file
 
 import ohmskin
 from ohmskin import framing, protocol
@@ -201,35 +201,12 @@ def measure() -> dict[str, Any]:
 # ---------------------------------------------------------------------------------------- bars
 
 
-@dataclass(frozen=True)
-class Bar:
-    """What a figure has to be."""
-
-    figure: str
-    wanted: str
-    met: Callable[[float], bool]
-
-
 BARS = (
-    Bar("decode_scans_per_s", ">= 10,000", lambda x: x >= 10_000),
-    Bar("latency_ms_p50", "<= 2", lambda x: x <= 2),
-    Bar("latency_ms_p99", "<= 10", lambda x: x <= 10),
-    Bar("cpu_percent_at_90hz", "<= 8", lambda x: x <= 8),
+    at_least("decode_scans_per_s", 10_000),
+    at_most("latency_ms_p50", 2),
+    at_most("latency_ms_p99", 10),
+    at_most("cpu_percent_at_90hz", 8),
 )
-
-
-def report(figures: dict[str, Any]) -> bool:
-    """Print all figures and their bars; true when all are met."""
-    bars = {bar.figure: bar for bar in BARS}
-    all_met = True
-    print(f"{'figure':30}{'measured':>12}  {'bar':14}")
-    for name, value in figures.items():
-        bar = bars.get(name)
-        met = bar is None or bar.met(value)
-        all_met = all_met and met
-        wanted, verdict = ("", "") if bar is None else (bar.wanted, "pass" if met else "FAIL")
-        print(f"{name:30}{'-' if value is None else value:>12}  {wanted:14}{verdict}".rstrip())
-    return all_met
 
 
 def main() -> int:
@@ -237,7 +214,7 @@ def main() -> int:
         serve(float(sys.argv[2]))
         return 0
     figures = measure()
-    all_met = report(figures)
+    all_met = report(figures, BARS)
     print(json.dumps(figures))
     return 0 if all_met else 1
 

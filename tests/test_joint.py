@@ -8,9 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ohmskin.circuit import Float, Skin, port_resistance_ohm, port_sensitivity, ratio_from_codes
+from ohmskin.circuit import (
+    Float,
+    Skin,
+    current_from_ratio,
+    port_resistance_ohm,
+    port_sensitivity,
+    ratio_from_codes,
+    readings,
+)
 from ohmskin.circuit import quantise as codes_of
 from ohmskin.estimators import Estimate, SkinKnowledge, make_estimator
+from ohmskin.estimators.joint import JointEstimator
+from ohmskin.estimators.prior import LAYER_STD, SEGMENT_STD
+from ohmskin.studies.trials import skin_at_rest, touch
 
 DATA = Path(__file__).parent / "data"
 
@@ -171,3 +182,43 @@ def test_a_frame_seen_before_takes_one_iteration() -> None:
     assert away.max() < 0.2
     estimator.reset()
     assert estimator.estimate(ratio).iterations == first.iterations
+
+
+def test_the_answer_is_where_the_posterior_is_highest() -> None:
+    """Against the posterior written out with dense matrices, along each of all 3RC resistances."""
+    random = np.random.default_rng(8)
+    rest = skin_at_rest(3, 4, random)
+    touched = touch(rest, 3, random)
+    knowledge = SkinKnowledge(
+        3,
+        4,
+        adc_bits=10,
+        rest_ratio=rounded(readings(rest), 10),
+        nominal_top_wire_ohm=100.0,
+        nominal_bottom_wire_ohm=200.0,
+    )
+    estimator = JointEstimator(knowledge)
+    measured = rounded(readings(touched), 10)
+    found = estimator.estimate(measured)
+    prior = estimator._prior
+    assert prior is not None
+    layer = np.kron(np.eye(2), np.ones((12, 12)))
+    inverse = np.linalg.inv(LAYER_STD**2 * layer + SEGMENT_STD**2 * np.eye(24))
+    nominal = np.log(np.repeat([100.0, 200.0], 12))
+    current = current_from_ratio(measured, 3e4, 3e4)
+
+    def cost(log_ohm: Float) -> float:
+        cell, top, bottom = log_ohm.reshape(3, 3, 4)
+        rho = port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom)))
+        residual = (current - 1 / (rho + 6e4)) / knowledge.current_std
+        off = log_ohm[12:] - nominal
+        return float(np.sum(residual**2) + prior.cost(log_ohm[:12]) + off @ inverse @ off)
+
+    wires = np.log([found.top_wire_ohm.ravel(), found.bottom_wire_ohm.ravel()]).ravel()
+    best = np.concatenate([-np.log(found.cell_siemens.ravel()), wires])
+    lowest = cost(best)
+    for resistor in range(36):
+        for step in (-0.03, -0.003, 0.003, 0.03):
+            moved = best.copy()
+            moved[resistor] += step
+            assert cost(moved) > lowest - 0.05

@@ -66,6 +66,12 @@ def test_an_open_line_is_named(rest: Skin, touched: Skin, layer: str, line: str)
     assert line in fault
 
 
+def test_a_skin_that_drifted_asks_for_new_rest_readings(rest: Skin) -> None:
+    drifted = replace(rest, cell_siemens=0.7 * rest.cell_siemens)
+    fault = reader_of(ten_bits(readings(rest))).read(ten_bits(readings(drifted))).fault
+    assert fault == "the whole skin conducts less than at rest: take the rest readings anew"
+
+
 def test_a_line_open_since_rest_is_named(rest: Skin) -> None:
     wires = rest.top_wire_ohm.copy()
     wires[2, 0] = 1e12

@@ -169,6 +169,8 @@ class PortReader:
         std = np.hypot(found.current_std, rest.current_std)
         drop = DROP_SHARE * rest.current - found.current - CLEAR_STDS * std
         worst = int(drop.argmax())
+        if np.mean(drop > 0) > 0.5:
+            return "the whole skin conducts less than at rest: take the rest readings anew"
         if drop.flat[worst] > 0:
             return f"{_cell(worst, drop)}: conducts less than at rest, is a line open?"
         risen = found.current > RISE_SHARE * rest.current
