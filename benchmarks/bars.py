@@ -28,11 +28,11 @@ def report(figures: Mapping[str, float | None], bars: Iterable[Bar]) -> bool:
     """Print all figures (None: not measured here) and their bars; true when all are met."""
     by_figure = {bar.figure: bar for bar in bars}
     all_met = True
-    print(f"{'figure':30}{'measured':>12}  {'bar':14}")
+    print(f"{'figure':38}{'measured':>12}  {'bar':14}")
     for name, value in figures.items():
         bar = by_figure.get(name)
         met = bar is None or (value is not None and bar.met(value))
         all_met = all_met and met
         wanted, verdict = ("", "") if bar is None else (bar.wanted, "pass" if met else "FAIL")
-        print(f"{name:30}{'-' if value is None else value:>12}  {wanted:14}{verdict}".rstrip())
+        print(f"{name:38}{'-' if value is None else value:>12}  {wanted:14}{verdict}".rstrip())
     return all_met
