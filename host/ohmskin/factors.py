@@ -23,13 +23,21 @@ def gram(rows: Float, scale: float = 1.0, onto: Float | None = None) -> Float:
 
 
 def cholesky(system: Float) -> Float:
-    """L of a positive definite matrix L L^T; `system` is overwritten.
+    """L of a positive definite matrix L L^T.
 
-    A C-ordered matrix must be symmetric: it is its own transpose, in Fortran's order.
-    Raises LinAlgError if it is not positive definite, as where it holds NaN.
+    One that rounding has made indefinite gets the least share of its largest diagonal element, from
+    1e-14, that mends it. A C-ordered matrix must be symmetric: it is its own transpose, in
+    Fortran's order.
+    Raises LinAlgError if a millionth does not.
     """
     lower = system if system.flags.f_contiguous else system.T
-    factor, failed = lapack.dpotrf(lower, lower=1, overwrite_a=1, clean=0)
+    factor, failed = lapack.dpotrf(lower, lower=1, clean=0)
+    share = 1e-14
+    while failed and share < 1e-5:
+        mended = lower.copy(order="F")
+        np.einsum("ii->i", mended)[:] += share * np.diagonal(lower).max()
+        factor, failed = lapack.dpotrf(mended, lower=1, clean=0)
+        share *= 100
     if failed:
         raise np.linalg.LinAlgError("matrix is not positive definite")
     return np.asarray(factor)

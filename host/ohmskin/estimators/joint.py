@@ -220,4 +220,4 @@ class JointEstimator(Estimator):
             self._shape, self.knowledge.ref_ohm, wide, self._belief, current, current_std
         )
         fit.run(self._starts(wide, current, None))
-        return fit.cell, np.hypot(fit.cell_std, REST_STD)
+        return fit.cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
