@@ -246,8 +246,8 @@ def test_a_shorted_and_an_open_port_are_known_to_be_uncertain(method: str) -> No
     ratio[0, 1] = [1, 0, 1, 0]
     ratio[0, 2] = ratio_from_current(1 / (1e5 + 6e4), 3e4, 3e4)
     found = estimator.estimate(ten_bits(ratio))
-    # Code 512 is half a step above a short.
-    assert found.cell_siemens_std[0, 0] > found.cell_siemens[0, 0]
+    # Code 512 is half a step above a short; `joint` knows that no touch is one.
+    assert found.cell_siemens_std[0, 0] > found.cell_siemens[0, 0] / (3 if method == "joint" else 1)
     assert found.cell_siemens[0, 1] < 5 * found.cell_siemens_std[0, 1]
     assert found.cell_ohm[0, 2] == pytest.approx(1e5, rel=0.02)
 

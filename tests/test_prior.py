@@ -15,22 +15,26 @@ from ohmskin.estimators.prior import (
     siemens_std,
 )
 
+REST = np.log([1e6])
+
 
 @pytest.mark.parametrize("tail", [TAIL, 3.0, np.inf])
-def test_the_reweighted_normal_has_the_slope_of_the_prior(tail: float) -> None:
-    prior = CellPrior(np.zeros(1), np.full(1, 0.05), tail)
-    for away in (-4.0, -0.3, -0.051, -0.02, 0.0, 0.03, 0.2):
-        at = np.array([away])
+def test_the_stand_in_normal_has_the_slope_of_the_prior(tail: float) -> None:
+    prior = CellPrior(REST, np.full(1, 0.05), tail)
+    # The last three are harder than the hardest touch of 300 ohm.
+    for away in (-4.0, -0.3, -0.051, -0.02, 0.0, 0.03, 0.2, -8.2, -8.5, -9.5):
+        at = REST + away
         slope = (prior.cost(at + 1e-6) - prior.cost(at - 1e-6)) / 2e-6
-        assert slope == pytest.approx(float(2 * away / prior.variance(at)[0]), rel=1e-3, abs=1e-3)
+        mean, variance = prior.normal(at)
+        assert slope == pytest.approx(float(2 * (at - mean)[0] / variance[0]), rel=1e-3, abs=1e-3)
 
 
-def test_the_further_from_rest_the_less_a_step_costs() -> None:
-    prior = CellPrior(np.zeros(1), np.full(1, 0.05), TAIL)
-    costs = [prior.cost(np.array([-away])) for away in (0.0, 1.0, 2.0, 3.0, 4.0)]
-    steps = np.diff(costs)
+def test_the_further_from_rest_the_less_a_step_costs_up_to_the_hardest_touch() -> None:
+    prior = CellPrior(REST, np.full(1, 0.05), TAIL)
+    steps = np.diff([prior.cost(REST - away) for away in (0.0, 2.0, 4.0, 6.0, 8.0)])
     assert np.all(steps > 0)
     assert np.all(np.diff(steps) < 0)
+    assert prior.cost(REST - 10.0) - prior.cost(REST - 8.0) > 10
 
 
 def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:

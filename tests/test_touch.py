@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from ohmskin.circuit import Float, Skin, port_resistance_ohm, quantise, ratio_from_codes, readings
-from ohmskin.estimators import SkinKnowledge
+from ohmskin.estimators import SkinKnowledge, make_estimator
 from ohmskin.estimators.rest_network import RestNetwork, TouchedNetwork
 from ohmskin.estimators.wires import FADE, WireBelief
 from ohmskin.readings import estimate_file, load_readings
+from ohmskin.scenes import Scene
 from ohmskin.studies.trials import bent_trial, random_trial, skin_at_rest, touch, trial_of
 
 DATA = Path(__file__).parent / "data"
@@ -146,6 +147,37 @@ def test_a_skin_that_bends_is_followed(method: str) -> None:
     assert np.mean(away[60:][pressed[60:]] < 4) > 0.97
     assert np.mean(away[80:][pressed[80:]] < 2) > 0.9
     assert np.mean(out["top_wire_ohm"][-1]) == pytest.approx(bent.top_wire_ohm.mean(), rel=0.15)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
+    method: str, seed: int
+) -> None:
+    """Two seconds of a fingertip with soft edges, once around half the skin."""
+    scene = Scene("moving", 8, 8, seed=seed)
+    rest = scene.skin(0.0).top_wire_ohm, scene.skin(0.0).bottom_wire_ohm
+    knowledge = SkinKnowledge(
+        8,
+        8,
+        adc_bits=10,
+        rest_ratio=ten_bits(scene.rest_ratio),
+        nominal_top_wire_ohm=100.0,
+        nominal_bottom_wire_ohm=200.0,
+    )
+    estimator = make_estimator(method, knowledge)
+    errors, away, converged = [], [], []
+    for frame in range(180):
+        found = estimator.estimate(ten_bits(scene.ratio(frame / 90)))
+        error = np.abs(found.cell_siemens - scene.skin(frame / 90).cell_siemens)
+        errors.append((error / scene.skin(frame / 90).cell_siemens)[scene.touched(frame / 90)])
+        away.append(error / found.cell_siemens_std)
+        converged.append(found.converged)
+    assert np.median(np.concatenate(errors)) < 0.03
+    assert np.mean(np.array(away) < 4) > 0.99
+    assert np.mean(converged) > 0.97
+    for believed, true in zip((found.top_wire_ohm, found.bottom_wire_ohm), rest, strict=True):
+        assert np.mean(believed) == pytest.approx(np.mean(true), rel=0.3)
 
 
 def test_lessons_that_contradict_the_belief_set_it_free() -> None:

@@ -46,6 +46,7 @@ MISFIT: Final = 1.5  # chi-square per port; at the truth, rounding alone has 1
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault, not touched
 LOSS_STDS: Final = 6.0  # of the prior
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
+CLEAR: Final = 12.0  # deviations of the prior: a cell is at rest, or touched beyond doubt
 HIGHEST_START_SIEMENS: Final = 1e-2
 
 
@@ -71,8 +72,6 @@ class JointEstimator(Estimator):
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
-        if self._finder is not None:
-            self._finder.forget_frame()
 
     def _solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
@@ -182,12 +181,27 @@ class JointEstimator(Estimator):
         return [afresh] if self._before is None else [self._before, afresh]
 
     def _learn(self, cell: Float, lesson: Callable[[], Lesson]) -> None:
-        """Let the wires learn from a frame that is not much like the last one learned from."""
+        """Let the wires learn from a plain frame that is not like the last one learned from."""
+        assert self._prior is not None
+        if not self._is_plain(self._prior.rise(cell).reshape(self._shape)):
+            return
         before = self._learned_from
         if before is not None and np.abs(cell - before).max() < NEWS:
             return
         self._learned_from = cell
         self._belief.learn(*lesson())
+
+    @staticmethod
+    def _is_plain(rise: Float) -> bool:
+        """Whether cells (R, C) are at rest or touched beyond doubt, and no finger covers several.
+
+        Around a finger that covers several cells others are pressed so lightly that they pass for
+        rest, all of them in the same direction: the wires would have to explain it.
+        """
+        touched = rise > TOUCHED
+        light = touched & (rise < CLEAR)
+        beside = np.sum(touched[1:] & touched[:-1]) + np.sum(touched[:, 1:] & touched[:, :-1])
+        return not light.any() and bool(beside <= 1)
 
     def _prior_of(self, current: Float) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.

@@ -66,11 +66,14 @@ _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
 class _Slopes:
     """h and J at one state, over the noise. by_cell: (RC, RC), times the cells' deviations.
 
+    centre, cell_std: the normal that stands for the prior of the cells there.
+
     heavy: (m,), the ports that wires matter to; by_wires: (m, 2RC).
     """
 
     modelled: Float
     residual: Float
+    centre: Float
     cell_std: Float
     by_cell: Float
     heavy: NDArray[np.intp]
@@ -152,7 +155,8 @@ class JointFit:
         circuit = port_sensitivity(np.exp(-self.cell).reshape(self._shape), top, bottom)
         modelled = 1.0 / (circuit.port_ohm + self._ref_ohm)
         slope = -self._weight * modelled**2
-        cell_std = np.sqrt(self._prior.variance(self.cell))
+        centre, variance = self._prior.normal(self.cell)
+        cell_std = np.sqrt(variance)
         by_cell = circuit.by_cell
         by_cell *= slope[:, None]
         by_cell *= cell_std
@@ -162,7 +166,7 @@ class JointFit:
         by_wires = circuit.by_wires(heavy)
         by_wires *= slope[heavy, None]
         residual = (self._current - modelled) * self._weight
-        return _Slopes(modelled, residual, cell_std, by_cell, heavy, by_wires)
+        return _Slopes(modelled, residual, centre, cell_std, by_cell, heavy, by_wires)
 
     def _cost(self) -> float:
         residual = self._here.residual
@@ -192,7 +196,7 @@ class JointFit:
     def _step(self) -> bool:
         """One step; True when the next would not matter."""
         here, heavy = self._here, self._here.heavy
-        away = self.cell - self._prior.expected
+        away = self.cell - here.centre
         off = self.wires - self._belief.mean
         wanted = here.residual + here.by_cell @ (away / here.cell_std)
         wanted[heavy] += here.by_wires @ off
@@ -209,10 +213,13 @@ class JointFit:
         # Steps shrink faster than by a constant factor: the next one is at most this.
         next_one = moved * moved / self._moved if self._moved else moved
         self._moved = moved
+        # What would leave its limits goes there, and holds up nothing else.
+        cell_step = np.clip(self.cell + cell_step, *_LOG_CELL_LIMITS) - self.cell
+        wire_step = np.clip(self.wires + wire_step, *LOG_LIMITS) - self.wires
         longest = max(float(np.abs(cell_step).max()), float(np.abs(wire_step).max()))
         share = min(1.0, MAX_STEP / max(longest, MAX_STEP))
-        self.cell = np.clip(self.cell + share * cell_step, *_LOG_CELL_LIMITS)
-        self.wires = np.clip(self.wires + share * wire_step, *LOG_LIMITS)
+        self.cell = self.cell + share * cell_step
+        self.wires = self.wires + share * wire_step
         self._wire_pull = self._wire_pull + share * (pull - self._wire_pull)
         self._residual = left if share == 1.0 else here.residual
         return moved < CLOSE or (moved < NEARLY and next_one < CLOSE)

@@ -56,7 +56,7 @@ CLEAR_STDS: Final = 5.0
 # code is 3.5 deviations of rounding.
 SAME_STDS: Final = 2.5
 # Shorted lines draw so much more than at rest, or than other lines.
-RISE_SHARE: Final = 1.02
+RISE_SHARE: Final = 1.15
 PAIR_SHARE: Final = 1.15
 WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of it is pressed
 

@@ -28,6 +28,8 @@ LAYER_STD: Final = 0.25  # what all segments of a layer share: stretch, temperat
 SEGMENT_STD: Final = 0.1  # what each has of its own
 
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
+HARDEST_LOG_OHM: Final = float(np.log(300.0))
+WALL_STD: Final = 0.3  # log: how far beyond it a cell may be
 # A cell that the prior holds at rest may be touched all the same, where readings say little of it.
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
 UNLIMITED_STD: Final = 3.0  # what is not known of it
@@ -42,7 +44,8 @@ class CellPrior:
     With d the distance from `expected` over `std`, -2 log p is d^2 up to d^2 = `tail`, and goes on
     with the same slope as tail (1 + log(d^2 / tail)): the density falls as d^-tail. Cells at rest
     are a quadratic problem, which costs no iterations; being touched is unlikely, but how hard,
-    once a cell is, costs little. expected, std: (RC,) [log ohm]. tail: inf for a normal.
+    once a cell is, costs little, up to the hardest touch; beyond, it costs.
+    expected, std: (RC,) [log ohm]. tail: inf for a normal.
     """
 
     expected: Float
@@ -59,12 +62,23 @@ class CellPrior:
         if self.tail == np.inf:
             return float(square.sum())
         beyond = np.maximum(square / self.tail, 1.0)
-        return float((np.minimum(square, self.tail) + self.tail * np.log(beyond)).sum())
+        wall = np.maximum(HARDEST_LOG_OHM - log_ohm, 0.0) / WALL_STD
+        near_and_tail = np.minimum(square, self.tail) + self.tail * np.log(beyond)
+        return float((near_and_tail + wall * wall).sum())
 
-    def variance(self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)) -> Float:
-        """Of the normal that has this prior's slope there: std^2, or beyond d^2 = tail more."""
-        away = log_ohm - self.expected[cells]
-        return np.asarray(np.maximum(self.std[cells] ** 2, away * away / self.tail))
+    def normal(
+        self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
+    ) -> tuple[Float, Float]:
+        """Mean and variance of the normal that has this prior's slope there."""
+        expected = self.expected[cells]
+        away = log_ohm - expected
+        variance = np.maximum(self.std[cells] ** 2, away * away / self.tail)
+        if self.tail < np.inf and (log_ohm < HARDEST_LOG_OHM).any():
+            precision = 1.0 / variance
+            wall = np.where(log_ohm < HARDEST_LOG_OHM, WALL_STD**-2, 0.0)
+            variance = 1.0 / (precision + wall)
+            expected = (precision * expected + wall * HARDEST_LOG_OHM) * variance
+        return expected, variance
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

@@ -17,11 +17,11 @@ Jw     (m, 2RC) dI / dw / s, w the log wire resistances, at the m ports they mat
 N      (m, m)   1 + Jw P Jw^T, P the covariance of w                               1
 ====== ======== ================================================================== ==========
 
-The untouched skin is solved once (`rest_network`). A frame starts from the cells of the frame
-before. Gauss-Newton steps on x minimise |r|^2 and the prior of the cells. Where a reading then
-shows more current than the model explains, the cells that would explain most in their row and
-column are added, until no reading asks for one; a cell that falls back to rest is taken out. The
-last steps know that wires are known to P only, and weigh the readings by N^-1.
+The untouched skin is solved once (`rest_network`). A frame starts from no touched cells.
+Gauss-Newton steps on x minimise |r|^2 and the prior of the cells. Where a reading then shows more
+current than the model explains, the cells that would explain most in their row and column are
+added, until no reading asks for one; a cell that falls back to rest is taken out. The last steps
+know that wires are known to P only, and weigh the readings by N^-1.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Touched:
 
 
 class TouchedFit:
-    """Fits frame after frame of a skin (R, C); starts each from the touched cells before."""
+    """Fits the frames of a skin (R, C), each by itself."""
 
     def __init__(
         self, shape: tuple[int, int], prior: CellPrior, belief: WireBelief, ref_ohm: float
@@ -85,11 +85,6 @@ class TouchedFit:
         self._belief = belief
         self._ref_ohm = ref_ohm
         self._base: _Base | None = None
-        self.forget_frame()
-
-    def forget_frame(self) -> None:
-        """Start the next frame without touched cells."""
-        self._cells, self._log_siemens = _NO_CELLS, np.zeros(0)
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
         """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
@@ -97,7 +92,8 @@ class TouchedFit:
         if base is None or base.path_change(self._belief.mean) > REBUILD:
             self._base = base = _Base(self._shape, self._prior, self._belief, self._ref_ohm)
         fit = _Fit(base, current, current_std)
-        fit.settle(self._cells, self._log_siemens)
+        # Never from the frame before: that keeps cells in the model that no reading asks for.
+        fit.settle(_NO_CELLS, np.zeros(0))
         for _ in range(MAX_ROUNDS):
             asked, rise = fit.asked_for()
             if not asked.size:
@@ -108,9 +104,7 @@ class TouchedFit:
             fit.settle(np.concatenate([fit.cells, asked]), np.concatenate([fit.log_siemens, added]))
         else:
             return None
-        found = fit.finish(self._belief)
-        self._cells, self._log_siemens = found.cells, found.log_siemens
-        return found
+        return fit.finish(self._belief)
 
 
 class _Base:
@@ -197,8 +191,8 @@ class _Fit:
     def _step(self, normal: Float, pull: Float) -> tuple[Float, Float]:
         """Normal matrix, with the prior about rest, and the step it makes of `pull`."""
         prior, cells = self._base.prior, self.cells
-        away = self.log_siemens - self._base.rest_log[cells]
-        precision = 1.0 / prior.variance(-self.log_siemens, cells)
+        centre, variance = prior.normal(-self.log_siemens, cells)
+        away, precision = self.log_siemens + centre, 1.0 / variance
         normal.ravel()[:: cells.size + 1] += precision
         _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
         self.steps += 1
