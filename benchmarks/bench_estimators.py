@@ -29,6 +29,9 @@ bent_*                  8x8 with wires 35 % above nominal, frames 50 to 69: medi
 stretched_*             8x8, 40 random frames, then all wires half as much again, 40 frames: median
                         error of a pressed cell in the first 5 after that and in the last 20, and
                         the share of pressed cells within 4 stated standard deviations after it.
+finger_*                8x8, a fingertip with soft edges that covers some 15 cells, around the skin
+                        in 4 s at 90 Hz: time a frame, median error of a cell above 1 uS over rest,
+                        share of all cells within 4 stated standard deviations.
 within_*                `joint`, all scenes above, and the sweeps: share of all errors within 1, 2
                         and 4 stated standard deviations.
 """
@@ -47,8 +50,10 @@ from bars import at_least, at_most, report
 from numpy.typing import NDArray
 
 from ohmskin.circuit import Float, quantise, ratio_from_codes
+from ohmskin.estimators import SkinKnowledge, make_estimator
 from ohmskin.estimators.information import information_limit
 from ohmskin.readings import Readings, estimate_file, load_readings
+from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.studies.published import RMSE_MEGOHM
 from ohmskin.studies.trials import (
     PRESSED,
@@ -201,6 +206,34 @@ def stretched_figures(method: str, trials: int) -> dict[str, float]:
     }
 
 
+def finger_figures(method: str) -> dict[str, float]:
+    scene = Scene("moving", 8, 8, seed=1)
+    knowledge = SkinKnowledge(
+        8,
+        8,
+        adc_bits=10,
+        rest_ratio=ratio_from_codes(quantise(scene.rest_ratio)),
+        nominal_top_wire_ohm=TOP_WIRE_OHM,
+        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+    )
+    estimator = make_estimator(method, knowledge)
+    taken, relative, away = [], [], []
+    for time_s in np.arange(360) / 90:
+        found = estimator.estimate(ratio_from_codes(quantise(scene.ratio(time_s))))
+        truth = scene.skin(time_s).cell_siemens
+        error = np.abs(found.cell_siemens - truth)
+        taken.append(1e3 * found.seconds)
+        relative.append((error / truth)[scene.touched(time_s)])
+        away.append(error / found.cell_siemens_std)
+    return {
+        f"finger_{method}_ms": round(float(np.median(taken)), 3),
+        f"finger_{method}_percent": round(100 * float(np.median(np.concatenate(relative))), 2),
+        f"finger_{method}_within_4_std_percent": round(
+            100 * float(np.mean(np.concatenate(away) < 4)), 2
+        ),
+    }
+
+
 def file_errors(names: tuple[str, ...], method: str) -> Errors:
     """Of the reference files, 10 bit."""
     errors = Errors.none()
@@ -232,6 +265,7 @@ def accuracy() -> dict[str, float]:
         bent, bent_figures = bent_errors(method, 12)
         figures |= bent_figures
         figures |= stretched_figures(method, 12)
+        figures |= finger_figures(method)
         if method == "joint":
             stated += random.over_stated + bent.over_stated
     figures["sweeps_worst_share"] = round(sweeps_worst_share(), 4)
