@@ -18,6 +18,10 @@ cpu_percent_at_90hz    of one core: user and system time of this process while i
 cpu_percent_at_90hz_simavr
                        the same while the firmware in the AVR simulator, another process again,
                        sends byte by byte. null where firmware or simulator are not built.
+record_cpu_percent_at_90hz
+                       the first of the two again, while every scan is recorded besides.
+record_bytes_per_s     size of the file by length of the recording, of the emulated scene `moving`
+                       with 0.3 LSB of noise, 8x8 at 90 Hz.
 """
 
 from __future__ import annotations
@@ -28,10 +32,12 @@ import select
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,6 +48,7 @@ from ohmskin import framing, protocol
 from ohmskin.emulator import EmulatedBoard
 from ohmskin.errors import PortError
 from ohmskin.messages import BoardDecoder, Scan
+from ohmskin.recording import Recorder
 
 RATE_HZ = 90
 DECODED_SCANS = 3000
@@ -49,6 +56,7 @@ DECODE_RUNS = 5
 CHUNK_BYTES = 4096
 LATENCY_SCANS = 400
 CPU_SECONDS = 12.0
+RECORD_SECONDS = 10.0
 SERVE_SECONDS = "60"  # at most: this process ends it sooner
 
 # ------------------------------------------------------------------- the board, another process
@@ -152,8 +160,10 @@ def latencies_ms() -> np.ndarray:
     return np.array([1e3 * (at_s - board.written_s[n]) for n, at_s in returned_s.items()])
 
 
-def reader_cpu_percent(skin: ohmskin.Device) -> float:
-    """CPU time of this process per wall time while it reads every scan."""
+def reader_cpu_percent(
+    skin: ohmskin.Device, take: Callable[[Scan], object] = lambda scan: None
+) -> float:
+    """CPU time of this process per wall time while it reads every scan, and `take`s it."""
     scans = iter(skin)
     for _ in range(RATE_HZ):  # what is done once is not load
         next(scans)
@@ -162,6 +172,7 @@ def reader_cpu_percent(skin: ohmskin.Device) -> float:
     for scan in scans:
         count += 1
         missed += scan.missed
+        take(scan)
         if time.monotonic() - begin_s >= CPU_SECONDS:
             break
     after, end_s = os.times(), time.monotonic()
@@ -170,6 +181,33 @@ def reader_cpu_percent(skin: ohmskin.Device) -> float:
         print(f"{skin.name}: {rate_hz:.2f} scans a second, {missed} missed", file=sys.stderr)
     used_s = (after.user - before.user) + (after.system - before.system)
     return 100 * used_s / (end_s - begin_s)
+
+
+def record_cpu_percent() -> float:
+    """As `reader_cpu_percent`, of a process that records."""
+    with (
+        tempfile.TemporaryDirectory() as place,
+        served() as board,
+        ohmskin.open(board.path) as skin,
+        Recorder(Path(place) / "bench.mcap", skin.info) as recorder,
+    ):
+        return reader_cpu_percent(skin, recorder.add)
+
+
+def record_bytes_per_s() -> float:
+    """Of a scene that moves, with the noise of a converter."""
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "bench.mcap"
+        with (
+            ohmskin.open("emulator://8x8?scene=moving") as skin,
+            Recorder(path, skin.info) as recorder,
+        ):
+            scans = iter(skin)
+            first = newest = next(scans)
+            while newest.time_us - first.time_us < 1e6 * RECORD_SECONDS:
+                recorder.add(newest)
+                newest = next(scans)
+        return 1e6 * path.stat().st_size / (newest.time_us - first.time_us)
 
 
 def measure() -> dict[str, Any]:
@@ -195,6 +233,8 @@ def measure() -> dict[str, Any]:
         "latency_ms_p99": round(float(np.percentile(latency, 99)), 3),
         "cpu_percent_at_90hz": round(cpu, 2),
         "cpu_percent_at_90hz_simavr": cpu_simavr,
+        "record_cpu_percent_at_90hz": round(record_cpu_percent(), 2),
+        "record_bytes_per_s": round(record_bytes_per_s()),
     }
 
 
@@ -206,6 +246,8 @@ BARS = (
     at_most("latency_ms_p50", 2),
     at_most("latency_ms_p99", 10),
     at_most("cpu_percent_at_90hz", 8),
+    at_most("record_cpu_percent_at_90hz", 3),
+    at_most("record_bytes_per_s", 40_000),
 )
 
 

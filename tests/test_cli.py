@@ -480,6 +480,8 @@ OPTIONS = {
     "flash": ["--port"],
     "stream": ["--method", "--json", "--scans", "--seconds", "PORT", *METHODS],
     "estimate": ["--method", "--out", "--cold", *METHODS],
+    "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],
+    "export": ["--begin", "--end", ".npz", ".csv"],
     "emulate": ["--link", "--seconds", "ghost", "bitflip"],
     "demo": ["--seconds", "--port", "--picture"],
     "chart": ["--out", "--quick"],

@@ -16,6 +16,8 @@ from ohmskin.errors import (
     OhmskinError,
     PortError,
     ProtocolMismatch,
+    RecordingEnded,
+    RecordingError,
 )
 from ohmskin.estimators import METHODS, Estimate, Estimator, SkinKnowledge, make_estimator
 from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
@@ -34,6 +36,8 @@ __all__ = [
     "OhmskinError",
     "PortError",
     "ProtocolMismatch",
+    "RecordingEnded",
+    "RecordingError",
     "Scan",
     "SelfTestReport",
     "SkinKnowledge",

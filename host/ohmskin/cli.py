@@ -28,6 +28,7 @@ from threadpoolctl import threadpool_limits
 
 import ohmskin
 from ohmskin import demo as demonstration
+from ohmskin import recording_commands as recordings
 from ohmskin import show
 from ohmskin.device import Device
 from ohmskin.errors import OhmskinError, PortError
@@ -50,7 +51,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Reads resistive tactile skins: boards, scans, and the conductance of every cell.",
     epilog="PORT is a serial port (/dev/ttyACM0, COM3) or a URL: emulator://8x8?scene=ghost, "
-    "simavr://uno?scene=ghost.",
+    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1.",
 )
 _out = Console()
 _MESSAGES = 8  # of different ones that are printed for a file
@@ -104,7 +105,9 @@ def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")
     for port in found:
         table.add_row(port.path, port.board or "?", port.description)
     _out.print(table if found else "no serial ports: is the board plugged in?")
-    _out.print("without a board: emulator://8x8?scene=ghost, simavr://uno?scene=ghost")
+    _out.print(
+        "without a board: emulator://8x8?scene=ghost, simavr://uno?scene=ghost, replay://FILE.mcap"
+    )
 
 
 @app.command()
@@ -343,6 +346,9 @@ def estimate(
         if message:
             _out.print(f"  {count} of {frames}: {message}")
 
+
+app.command()(recordings.record)
+app.command()(recordings.export)
 
 # ---------------------------------------------------------------------------- without a board
 

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from ohmskin import protocol
-from ohmskin.errors import DeviceLost
+from ohmskin.errors import DeviceLost, RecordingEnded
 from ohmskin.link import Link
 from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
 from ohmskin.session import COMMAND_TRIES, ScanQueue, Session, configuration
@@ -52,6 +52,8 @@ class Device:
         An iterator that falls behind by more than `session.QUEUE_SCANS` loses the oldest scans,
         which are counted too.
 
+        Ends with the recording at a ``replay://`` port.
+
         :raises DeviceLost: the board went away, or said nothing for `SILENCE_TIMEOUT_S`.
         """
         self.start()
@@ -61,8 +63,12 @@ class Device:
         session = self._session
         while True:
             with session.changed:
-                session.wait(lambda: bool(queue.scans), self._silence_s())
+                try:
+                    session.wait(lambda: bool(queue.scans), self._silence_s())
+                except RecordingEnded:
+                    return
                 scan = queue.take()
+                session.balance()
             yield scan
 
     def latest(self, timeout_s: float | None = None) -> Scan:
@@ -75,6 +81,7 @@ class Device:
         self.start()
         session = self._session
         with session.changed:
+            session.balance()
             limit_s = self._silence_s() if timeout_s is None else timeout_s
             session.wait(lambda: session.newest is not None and not session.newest_taken, limit_s)
             session.newest_taken = True

@@ -34,3 +34,11 @@ class CommandRefused(OhmskinError):
         super().__init__(f"the board refused '{command}': {result}: {reason}")
         self.command = command
         self.result = result
+
+
+class RecordingError(OhmskinError):
+    """A recording that cannot be read, or can no longer be written."""
+
+
+class RecordingEnded(DeviceLost):
+    """The recording at a ``replay://`` port has been played to its end. Iterators end by it."""

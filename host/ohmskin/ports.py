@@ -5,6 +5,7 @@
 ``/dev/ttyACM0``, ``COM3``          a serial port; ``?baud=1000000`` for the faster line
 ``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulator`)
 ``simavr://uno?scene=ghost``        the built firmware, run by an AVR simulator in real time
+``replay://FILE.mcap?speed=1``      a recording (`ohmskin.replay`); 0: as fast as it is taken
 ==================================  ==========================================================
 """
 
@@ -23,6 +24,7 @@ from ohmskin.errors import PortError
 from ohmskin.faults import FAULTS, Faults
 from ohmskin.link import Link, SerialLink
 from ohmskin.readings import load_readings
+from ohmskin.replay import ReplayLink
 from ohmskin.scenes import Scene
 from ohmskin.simavr_link import SimavrLink
 
@@ -41,6 +43,7 @@ def open(url: str, *, start: bool = True) -> Device:
     :raises PortError: the port is unknown, busy or not permitted, or the URL is wrong.
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
+    :raises RecordingError: the recording of a ``replay://`` port cannot be read.
     """
     link, baud = open_link(url)
     return Device(link, start=start, baud=baud)
@@ -61,8 +64,15 @@ def open_link(url: str) -> tuple[Link, int | None]:
         return EmulatorLink(*emulated(url)), None
     if scheme == "simavr":
         return _simavr(url, place, query)
+    if scheme == "replay":
+        options = _options(url, query, ("speed",))
+        try:
+            return ReplayLink(place, float(options.get("speed", "1")), url), None
+        except ValueError as exc:
+            raise PortError(f"{url}: {exc}") from exc
     raise PortError(
-        f"no kind of port '{scheme}://': there are serial ports by name, emulator:// and simavr://"
+        f"no kind of port '{scheme}://': there are serial ports by name, emulator://, simavr:// "
+        "and replay://"
     )
 
 

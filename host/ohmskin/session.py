@@ -22,7 +22,7 @@ from ohmskin.errors import (
     OhmskinError,
     ProtocolMismatch,
 )
-from ohmskin.link import Link
+from ohmskin.link import Link, PausableLink
 from ohmskin.messages import (
     Ack,
     BoardDecoder,
@@ -102,7 +102,17 @@ class Session:
         queue = ScanQueue()
         with self.changed:
             self._queues.add(queue)
+            self.balance()
         return queue
+
+    def balance(self) -> None:
+        """Let a port that can wait do so while its scans are not taken. `changed` is held."""
+        if isinstance(self.link, PausableLink):
+            if self._queues:
+                behind = any(len(queue.scans) >= QUEUE_SCANS // 2 for queue in self._queues)
+            else:
+                behind = self.newest is not None and not self.newest_taken
+            self.link.pause(behind)
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
@@ -246,6 +256,8 @@ class Session:
             messages = self._decoder.feed(chunk, host_time_s)
             for message in messages:
                 self._keep(message)
+                if isinstance(message, Scan):
+                    self.balance()
             if messages:
                 self.changed.notify_all()
         return bool(messages)
