@@ -180,6 +180,25 @@ def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
         assert np.mean(believed) == pytest.approx(np.mean(true), rel=0.3)
 
 
+def test_a_jump_of_the_wires_is_noticed_and_nothing_where_there_is_none() -> None:
+    """Eight simulated skins, 40 frames each before and after all wires double."""
+    before = after = 0
+    for seed in range(8):
+        random = np.random.default_rng(100 + seed)
+        rest = skin_at_rest(8, 8, random)
+        longer = replace(
+            rest, top_wire_ohm=2 * rest.top_wire_ohm, bottom_wire_ohm=2 * rest.bottom_wire_ohm
+        )
+        frames = [touch(skin, int(random.integers(1, 9)), random) for skin in [rest] * 40]
+        frames += [touch(skin, int(random.integers(1, 9)), random) for skin in [longer] * 40]
+        said = estimate_file(trial_of(rest, frames).rounded(10), "joint")["message"]
+        noticed = np.array(["wires changed" in message for message in said])
+        before += int(noticed[:40].sum())
+        after += bool(noticed[40:].any())
+    assert before <= 1
+    assert after >= 6
+
+
 def test_lessons_that_contradict_the_belief_set_it_free() -> None:
     """Told again and again of one layer, then of one twice as high: what was learned is dropped."""
     random = np.random.default_rng(9)
@@ -188,10 +207,12 @@ def test_lessons_that_contradict_the_belief_set_it_free() -> None:
     for _ in range(20):
         belief.learn(5 * random.normal(size=(6, 32)) ** 2, random.normal(size=6), noise)
     learned = belief.std()
+    noticed = []
     for _ in range(3):
         slopes = 5 * random.normal(size=(6, 32)) ** 2
         offset = np.log(2 * np.repeat([100.0, 200.0], 16)) - belief.mean
-        belief.learn(slopes, slopes @ offset + random.normal(size=6), noise)
+        noticed.append(belief.learn(slopes, slopes @ offset + random.normal(size=6), noise))
+    assert any(noticed)
     assert belief.std().mean() > 1.2 * learned.mean()
     assert np.exp(belief.mean[:16]).mean() == pytest.approx(200.0, rel=0.1)
 

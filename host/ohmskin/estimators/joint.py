@@ -43,6 +43,7 @@ from ohmskin.estimators.wires import Lesson, WireBelief
 LOWER_LEVEL: Final = 0.8  # a frame of so much less conductance shows rest better than those before
 MAX_DOUBTS: Final = 4
 MISFIT: Final = 1.5  # chi-square per port; at the truth, rounding alone has 1
+BENT_MESSAGE: Final = "the wires changed since they were learned: they are learned anew"
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault, not touched
 LOSS_STDS: Final = 6.0  # of the prior
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
@@ -65,6 +66,7 @@ class JointEstimator(Estimator):
         self._finder: TouchedFit | None = None
         self._before: Float | None = None
         self._learned_from: Float | None = None
+        self._bent = False
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
@@ -75,6 +77,7 @@ class JointEstimator(Estimator):
 
     def _solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
+        self._bent = False
         prior = self._prior_of(current)
         found = self._finder.find(current, current_std) if self._finder is not None else None
         known_rest = self.knowledge.rest_ratio is not None
@@ -107,6 +110,7 @@ class JointEstimator(Estimator):
             cell_siemens_std_down=std_down.reshape(self._shape),
             chi2=self._chi2(ports.ratio, found.current.reshape(self._shape)),
             iterations=found.steps,
+            message=BENT_MESSAGE if self._bent else "",
             top_wire_ohm=top,
             bottom_wire_ohm=bottom,
         )
@@ -128,6 +132,7 @@ class JointEstimator(Estimator):
         best = run(starts)
         if best.wires_contradict and not self._belief.is_fresh:
             self._belief.forget()
+            self._bent = True
             best = run([best.cell])
         iterations = best.iterations
         for _ in range(MAX_DOUBTS):
@@ -160,7 +165,7 @@ class JointEstimator(Estimator):
             cell_siemens_std_down=misfit * std_down.reshape(self._shape),
             chi2=self._chi2(ports.ratio, fit.modelled.reshape(self._shape)),
             iterations=fit.iterations,
-            message=fit.message,
+            message=fit.message or (BENT_MESSAGE if self._bent else ""),
             top_wire_ohm=np.exp(fit.wires[:cells]).reshape(self._shape),
             bottom_wire_ohm=np.exp(fit.wires[cells:]).reshape(self._shape),
         )
@@ -189,7 +194,7 @@ class JointEstimator(Estimator):
         if before is not None and np.abs(cell - before).max() < NEWS:
             return
         self._learned_from = cell
-        self._belief.learn(*lesson())
+        self._bent |= self._belief.learn(*lesson())
 
     @staticmethod
     def _is_plain(rise: Float) -> bool:

@@ -42,7 +42,7 @@ FADE: Final = 0.1  # share of the knowledge that fades with each lesson: skins b
 # Lessons, the last few together, that ask for a change of a layer by so many standard deviations
 # say that the skin has been bent.
 MEMORY: Final = 0.8
-ALARM: Final = 3.0
+ALARM: Final = 1.6  # three times what they scatter by: lessons state their noise on the safe side
 MAX_DIRECTIONS: Final = 32  # columns of U; the least informative are forgotten
 _LEAST_DIRECTION: Final = 1e-3  # of SEGMENT_STD^2: not worth a column
 Lesson = tuple[Float, Float, Float]
@@ -120,10 +120,13 @@ class WireBelief:
         path_ohm = np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)
         return path_ohm.ravel(), self.std().reshape(2, -1).mean(axis=0)
 
-    def learn(self, slopes: Float, residual: Float, noise: Float) -> None:
-        """One Kalman step. slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m)."""
+    def learn(self, slopes: Float, residual: Float, noise: Float) -> bool:
+        """One Kalman step; whether lessons say that the skin was bent, so that all else is forgotten.
+
+        slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m).
+        """
         if len(residual) < 2:
-            return
+            return False
         self._learned *= np.sqrt(1 - FADE)
         spread = self.times(slopes)
         factor = cholesky(noise + slopes @ spread)
@@ -132,8 +135,10 @@ class WireBelief:
         pulls = solve(factor, np.column_stack([residual, layers]))
         self._slope = MEMORY * self._slope + layers.T @ pulls[:, 0]
         self._curvature = MEMORY * self._curvature + np.sum(layers * pulls[:, 1:], axis=0)
+        bent = False
         if np.any(self._slope**2 > ALARM**2 * self._curvature):
             self.forget()
+            bent = True
             spread = self.times(slopes)
             factor = cholesky(noise + slopes @ spread)
             pulls = solve(factor, residual[:, None])
@@ -143,3 +148,4 @@ class WireBelief:
         size, turn = scipy.linalg.eigh(learned.T @ learned, check_finite=False)
         kept = np.flatnonzero(size > _LEAST_DIRECTION * SEGMENT_STD**2)[-MAX_DIRECTIONS:]
         self._learned = learned @ turn[:, kept]
+        return bent
