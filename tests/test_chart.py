@@ -19,11 +19,10 @@ import pytest
 
 from ohmskin import cli
 from ohmskin.circuit import readings
-from ohmskin.errors import OhmskinError
 from ohmskin.estimators import METHODS
 from ohmskin.studies import chart, chart_figure, chart_table, commands, published
 from ohmskin.studies.chart import Plan, Row, Size, pareto_front
-from ohmskin.studies.files import save_files
+from ohmskin.whole_files import save_whole
 
 DATA = Path(__file__).parent / "data"
 TINY = Plan(
@@ -275,21 +274,17 @@ def test_ctrl_c_while_saving_leaves_the_old_files(
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     first.write_text("old")
-    write = Path.write_bytes
 
-    def interrupted(path: Path, content: bytes) -> int:
-        if "second" in path.name:
-            write(path, content[:1])
-            raise KeyboardInterrupt
-        return write(path, content)
+    def interrupted(descriptor: int) -> None:
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(Path, "write_bytes", interrupted)
+    monkeypatch.setattr("os.fsync", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        save_files({first: b"new", second: b"new"})
+        save_whole({first: b"new", second: b"new"})
     assert list(tmp_path.iterdir()) == [first]
     assert first.read_text() == "old"
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OhmskinError, match="no/place cannot be written: No such file"):
-        save_files({tmp_path / "no" / "place": b""})
+    with pytest.raises(ValueError, match="no/place: cannot be written: No such file"):
+        save_whole({tmp_path / "no" / "place": b""})

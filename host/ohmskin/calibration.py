@@ -27,7 +27,6 @@ import json
 import os
 from dataclasses import dataclass, fields
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +36,7 @@ from ohmskin.circuit import Float
 from ohmskin.estimators import METHODS
 from ohmskin.force import ForceModel
 from ohmskin.readings import MAX_CELLS
+from ohmskin.whole_files import whole_file
 
 FORMAT: Final = "ohmskin calibration"
 SCHEMA: Final = 1
@@ -150,19 +150,8 @@ class Calibration:
             f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
             for name, value in content.items()
         )
-        target = Path(path)
-        partial = target.with_name(f".{target.name}.{os.getpid()}.part")
-        try:
-            try:
-                with partial.open("w", encoding="utf-8") as file:
-                    file.write(f"{{\n{text}\n}}\n")
-                    file.flush()
-                    os.fsync(file.fileno())
-                os.replace(partial, target)
-            finally:
-                partial.unlink(missing_ok=True)
-        except OSError as error:
-            raise ValueError(f"{target}: cannot be written: {error.strerror or error}") from error
+        with whole_file(path) as file:
+            file.write(f"{{\n{text}\n}}\n".encode())
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Self
 
 from ohmskin import protocol
+from ohmskin.closing import Closing
 from ohmskin.errors import DeviceLost, RecordingEnded
 from ohmskin.link import Link
 from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
@@ -18,7 +17,7 @@ from ohmskin.session import COMMAND_TRIES, ScanQueue, Session, configuration
 SILENCE_TIMEOUT_S = 5.0
 
 
-class Device:
+class Device(Closing):
     """A board at a `Link`. Made by `ohmskin.open`; closes with ``with`` or `close`.
 
     Two ways to read, for two needs: iterating gives every scan, in order, and tells which are
@@ -225,14 +224,3 @@ class Device:
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
         self._session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

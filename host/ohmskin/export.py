@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import csv
-import os
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +15,7 @@ from ohmskin.circuit import ratio_from_codes
 from ohmskin.errors import RecordingError
 from ohmskin.readings import MAX_ARRAY_BYTES, save_arrays
 from ohmskin.recording import Recording
+from ohmskin.whole_files import whole_file
 
 FORMATS: Final = (".npz", ".csv")
 _READINGS: Final = "abcd"
@@ -91,21 +92,11 @@ def _save_csv(recording: Recording, out: Path) -> None:
     scans = recording.scans
     cells = np.ndindex(*scans[0].codes.shape)
     names = [f"r{row}c{column}{_READINGS[reading]}" for row, column, reading in cells]
-    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
-    try:
-        try:
-            with partial.open("w", newline="", encoding="ascii") as file:
-                table = csv.writer(file, lineterminator="\n")
-                table.writerow(["number", "time_us", "host_time_s", "missed", *names])
-                for scan in scans:
-                    table.writerow(
-                        [
-                            *(scan.number, scan.time_us, scan.host_time_s, scan.missed),
-                            *scan.codes.reshape(-1).tolist(),
-                        ]
-                    )
-            os.replace(partial, out)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as exc:
-        raise ValueError(f"{out}: cannot be written: {exc.strerror or exc}") from exc
+    with whole_file(out) as file:
+        text = TextIOWrapper(file, encoding="ascii", newline="", write_through=True)
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["number", "time_us", "host_time_s", "missed", *names])
+        for scan in scans:
+            times = (scan.number, scan.time_us, scan.host_time_s, scan.missed)
+            table.writerow([*times, *scan.codes.reshape(-1).tolist()])
+        text.detach()

@@ -6,9 +6,9 @@ from __future__ import annotations
 import os
 import select
 import time
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
+from ohmskin.closing import Closing
 from ohmskin.emulator import EmulatedBoard
 from ohmskin.errors import PortError
 from ohmskin.faults import Faults
@@ -17,7 +17,7 @@ _IDLE_S: Final = 0.2
 _READ_SIZE: Final = 4096
 
 
-class PtyServer:
+class PtyServer(Closing):
     """Serves `board` in real time at `path`; nothing but `serve` does any work.
 
     Bytes that no program takes are thrown away, as by a serial port that nobody has open.
@@ -67,14 +67,3 @@ class PtyServer:
         """Take the pseudo-terminal away."""
         os.close(self._master)
         os.close(self._slave)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

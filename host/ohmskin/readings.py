@@ -28,7 +28,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +36,7 @@ from numpy.typing import NDArray
 from ohmskin.circuit import DEFAULT_REF_OHM, READINGS_PER_CELL, Float
 from ohmskin.estimators import Estimate, SkinKnowledge, make_estimator
 from ohmskin.estimators.base import check_ratio
+from ohmskin.whole_files import whole_file
 
 MAX_ARRAY_BYTES: Final = 200_000_000
 # The estimators' matrices grow with the square: 4096 cells make 134 MB.
@@ -203,19 +203,7 @@ def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]]
     for name, array in arrays.items():
         if array.dtype.hasobject:
             raise ValueError(f"{name} holds Python objects, which no .npz of ours may")
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        try:
-            with partial.open("wb") as file:
-                with zipfile.ZipFile(file, "w") as archive:
-                    for name, array in arrays.items():
-                        with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                            np.lib.format.write_array(member, array, allow_pickle=False)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise ValueError(f"{target}: cannot be written: {error.strerror or error}") from error
+    with whole_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)

@@ -35,8 +35,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from io import RawIOBase
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final, Self, cast
+from typing import IO, Any, Final, cast
 
 import lz4.frame
 import numpy as np
@@ -48,6 +47,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from ohmskin.circuit import READINGS_PER_CELL, Float
+from ohmskin.closing import Closing
 from ohmskin.errors import RecordingError
 from ohmskin.messages import Hello, Scan
 
@@ -135,7 +135,7 @@ Recorded = Hello | Scan | Tare | Mark | ForceSample
 # ------------------------------------------------------------------------------------- writing
 
 
-class Recorder:
+class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed or the disk is full.
 
     hello: the board's, which comes first. file: for tests, written to instead of a new file `path`.
@@ -276,17 +276,6 @@ class Recorder:
                     self._fail(exc)
         finally:
             self._tail.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class _Tail:

@@ -17,11 +17,12 @@ import struct
 import subprocess
 import tempfile
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+
+from ohmskin.closing import Closing
 
 CPU_HZ: Final = 16_000_000
 TABLE_ROWS: Final = 16
@@ -61,7 +62,7 @@ def default_program() -> Path:
     return Path(__file__).resolve().parents[2] / "firmware" / "sim" / "build" / "skinsim"
 
 
-class SkinSim:
+class SkinSim(Closing):
     """A board with a skin, simulated cycle by cycle.
 
     `board`: "uno" or "megaatmega2560". `elf`: the firmware. `program`: path of `skinsim`, by
@@ -106,17 +107,6 @@ class SkinSim:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> SkinSim:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the simulator. Further calls raise SimulationError. May be called again."""

@@ -121,7 +121,7 @@ class WireBelief:
         return path_ohm.ravel(), self.std().reshape(2, -1).mean(axis=0)
 
     def learn(self, slopes: Float, residual: Float, noise: Float) -> bool:
-        """One Kalman step; whether lessons say that the skin was bent, so that all else is forgotten.
+        """One Kalman step; True if lessons say that the skin was bent: what was learned is dropped.
 
         slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m).
         """

@@ -17,7 +17,7 @@ from rich.progress import Progress
 from ohmskin.studies import chart as speed_accuracy
 from ohmskin.studies import chart_figure, chart_table, stability_figure
 from ohmskin.studies import stability as verdicts
-from ohmskin.studies.files import save_files
+from ohmskin.whole_files import save_whole
 
 
 def _machine() -> str:
@@ -63,7 +63,7 @@ def chart(
         plan = speed_accuracy.QUICK if quick else speed_accuracy.FULL
         rows = speed_accuracy.measure(plan, show_progress)
     picture, table = (folder / f"speed-accuracy.{kind}" for kind in ("png", "csv"))
-    save_files(
+    save_whole(
         {
             picture: chart_figure.picture(rows, _machine()),
             table: chart_table.csv_text(rows).encode(),
@@ -108,7 +108,7 @@ def stability(
 
         rows = verdicts.measure(tasks, jobs=jobs or -1, progress=show_progress)
     picture, table = (folder / f"stability.{kind}" for kind in ("png", "csv"))
-    save_files(
+    save_whole(
         {
             picture: stability_figure.picture(rows),
             table: verdicts.csv_text(rows).encode(),
