@@ -16,8 +16,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ohmskin.calibration import MAX_FILE_BYTES, Calibration, load_calibration
+from ohmskin.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
+from ohmskin.circuit import Skin, quantise, ratio_from_codes, readings
+from ohmskin.estimators import SkinKnowledge
 from ohmskin.force import POWER, ForceRegression
+
+
+def rest(seed: int, date: str) -> Rest:
+    """As `touch` reads a skin of that seed."""
+    cell_siemens = 1e-6 * np.exp(0.1 * np.random.default_rng(seed).standard_normal((2, 3)))
+    skin = Skin(cell_siemens, np.full((2, 3), 100.0), np.full((2, 3), 200.0))
+    ratio = ratio_from_codes(quantise(readings(skin)))
+    return Rest.of("touch", SkinKnowledge(2, 3, adc_bits=10, rest_ratio=ratio), date)
 
 
 def calibration(pressed: int = 5) -> Calibration:
@@ -34,20 +44,29 @@ def calibration(pressed: int = 5) -> Calibration:
         unit_id=7,
         date="2025-03-01T12:00:00+00:00",
         method="touch",
-        rest=1e-6 * np.exp(0.1 * random.standard_normal((2, 3))),
+        rest=rest(2, "2025-03-01T11:50:00+00:00"),
         model=found.model_,
         indenter_area_m2=1e-4,
         nominal_top_wire_ohm=100.0,
     )
 
 
+def assert_same_rest(first: Rest | None, second: Rest | None) -> None:
+    assert (first is None) == (second is None)
+    if first is not None and second is not None:
+        assert first.date == second.date
+        assert first.ratio.tobytes() == second.ratio.tobytes()
+        assert first.level.tobytes() == second.level.tobytes()
+
+
 def assert_same_bits(first: Calibration, second: Calibration) -> None:
     for field in fields(Calibration):
         one, other = getattr(first, field.name), getattr(second, field.name)
-        if field.name not in ("rest", "model"):
+        if field.name in ("rest", "tare"):
+            assert_same_rest(one, other)
+        elif field.name != "model":
             assert (type(one), one) == (type(other), other), field.name
-    pairs = [(first.rest, second.rest)]
-    pairs += [
+    pairs = [
         (getattr(first.model, field.name), getattr(second.model, field.name))
         for field in fields(first.model)
     ]
@@ -73,7 +92,7 @@ def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
     again = tmp_path / "again.json"
     loaded.save(again)
     assert again.read_bytes() == path.read_bytes()
-    level = saved.rest + 30e-6
+    level = saved.rest.level + 30e-6
     for one, other in zip(
         saved.predict(level, np.full((2, 3), 1e-7)),
         loaded.predict(level, np.full((2, 3), 1e-7)),
@@ -85,11 +104,36 @@ def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
 def test_prediction_starts_at_rest() -> None:
     of_skin = calibration()
     level_std = np.full((2, 3), 1e-7)
-    force, std = of_skin.predict(of_skin.rest, level_std)
+    force, std = of_skin.predict(of_skin.rest.level, level_std)
     assert not force.any()
     np.testing.assert_array_equal(std, of_skin.model.predict(np.zeros((2, 3)), level_std)[1])
     with pytest.raises(ValueError, match=r"^level has shape \(3, 2\), this calibration \(2, 3\)$"):
         of_skin.predict(np.zeros((3, 2)), level_std)
+
+
+def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
+    before = calibration()
+    tared = replace(before, tare=rest(3, "2025-03-02T08:00:00+00:00"))
+    path = tmp_path / "skin.json"
+    tared.save(path)
+    loaded = load_calibration(path)
+    assert_same_bits(tared, loaded)
+    assert loaded.tare is not None
+    level_std = np.full((2, 3), 1e-7)
+    assert not loaded.predict(loaded.tare.level, level_std)[0].any()
+    assert loaded.predict(loaded.rest.level, level_std)[0].any()
+    undone = replace(loaded, tare=None)
+    assert not undone.predict(before.rest.level, level_std)[0].any()
+
+
+def test_rest_is_what_the_method_reads() -> None:
+    ratio = rest(2, "2025-03-01").ratio
+    for method, tolerance in (("joint", 0.05), ("ohm", 0.7)):
+        level = Rest.of(method, SkinKnowledge(2, 3, rest_ratio=ratio), "2025-03-01").level
+        cell_siemens = 1e-6 * np.exp(0.1 * np.random.default_rng(2).standard_normal((2, 3)))
+        np.testing.assert_allclose(level, cell_siemens, rtol=tolerance)
+    with pytest.raises(ValueError, match="the readings of the untouched skin are not known"):
+        Rest.of("ohm", SkinKnowledge(2, 3), "2025-03-01")
 
 
 def test_the_file_is_complete_or_the_old_one(
@@ -130,6 +174,13 @@ def put(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
     return edit
 
 
+def put_rest(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(content: dict[str, Any]) -> None:
+        content["rest"][name] = value
+
+    return edit
+
+
 def put_cell(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
     def edit(content: dict[str, Any]) -> None:
         content[name][1][2] = value
@@ -153,10 +204,17 @@ def put_cell(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (put("rows", 2.0), "rows is not an integer"),
         (put("rows", 0), "rows and columns: not 1 to 4096 cells"),
         (put("columns", 10**18), "rows and columns: not 1 to 4096 cells"),
-        (put("columns", 4), "rest is not 2 lists of 4"),
-        (put("rest", None), "rest is not 2 lists of 3"),
-        (put_cell("rest", -1e-6), "rest of cell (1, 2) is not finite and >= 0"),
-        (put_cell("rest", None), "rest holds NoneType, not numbers"),
+        (put("columns", 4), "kind is not 2 lists of 4"),
+        (put("rest", None), "rest is not an object"),
+        (put("tare", [1]), "tare is not an object"),
+        (put("tare", {"date": "2025-03-02"}), "no field 'tare.level'"),
+        (put_rest("colour", 1), "unknown field 'rest.colour'"),
+        (put_rest("date", "today"), "rest: date is 'today', not ISO 8601"),
+        (put_rest("ratio", [0.5]), "rest.ratio is not an array of numbers of shape (2, 3, 4)"),
+        (put_rest("ratio", [[[2.0] * 4] * 3] * 2), "rest: ratio at rest of cell (0, 0), reading A"),
+        (put_rest("level", None), "rest.level is not 2 lists of 3"),
+        (put_rest("level", [[-1e-6] * 3] * 2), "rest: level at rest of cell (0, 0) is not finite"),
+        (put_rest("level", [[None] * 3] * 2), "rest.level holds NoneType, not numbers"),
         (put_cell("slope", "1"), "slope holds str, not numbers"),
         (put_cell("slope", True), "slope holds bool, not numbers"),
         (put_cell("slope", 10**400), "slope holds a number that is not finite"),

@@ -8,6 +8,9 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
+from ohmskin.calibrated_device import CalibratedDevice
+from ohmskin.calibration import Calibration, load_calibration
+from ohmskin.contacts import Contact
 from ohmskin.device import Device
 from ohmskin.errors import (
     CommandRefused,
@@ -18,20 +21,26 @@ from ohmskin.errors import (
     ProtocolMismatch,
     RecordingEnded,
     RecordingError,
+    TareRefused,
 )
 from ohmskin.estimators import METHODS, Estimate, Estimator, SkinKnowledge, make_estimator
+from ohmskin.force_reader import ForceScan
 from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
 from ohmskin.ports import open
 
 __all__ = [
     "METHODS",
     "BoardStats",
+    "CalibratedDevice",
+    "Calibration",
     "CommandRefused",
+    "Contact",
     "Device",
     "DeviceLost",
     "DeviceSilent",
     "Estimate",
     "Estimator",
+    "ForceScan",
     "Hello",
     "OhmskinError",
     "PortError",
@@ -41,6 +50,8 @@ __all__ = [
     "Scan",
     "SelfTestReport",
     "SkinKnowledge",
+    "TareRefused",
+    "load_calibration",
     "make_estimator",
     "open",
 ]

@@ -12,7 +12,10 @@ rows, columns                              R, C
 nominal_top_wire_ohm                       one wire segment of each layer [ohm], null: not told
 nominal_bottom_wire_ohm
 indenter_area_m2                           what the skin was pressed with [m^2]
-rest                     R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
+rest.date                                  ISO 8601
+rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
+rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
+tare                                       the same of a later date, in force instead; null: none
 kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
@@ -27,27 +30,59 @@ import json
 import os
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.circuit import Float
-from ohmskin.estimators import METHODS
+from ohmskin.circuit import READINGS_PER_CELL, Float
+from ohmskin.estimators import SkinKnowledge
+from ohmskin.estimators.base import check_ratio
 from ohmskin.force import ForceModel
+from ohmskin.levels import LEVEL_METHODS, LevelMeter
 from ohmskin.readings import MAX_CELLS
 from ohmskin.whole_files import whole_file
 
 FORMAT: Final = "ohmskin calibration"
 SCHEMA: Final = 1
-VOLTAGE: Final = "voltage"
 MAX_FILE_BYTES: Final = 4_000_000  # 4096 cells of 12 fields take about 1 MB
 MAX_UNIT_ID: Final = 2**32 - 1
 # Far beyond the slope of any power law in siemens, and predictions do not overflow.
 MAX_NUMBER: Final = 1e60
 _NULL_FIELDS: Final = ("residual_std", "held_out_rmse")
+_RESTS: Final = ("rest", "tare")
 _WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """The untouched skin: when, its readings (R, C, 4) [1], and the levels (R, C) that they show.
+
+    Raises ValueError, naming the field, for a value that cannot be.
+    """
+
+    date: str
+    ratio: Float
+    level: Float
+
+    def __post_init__(self) -> None:
+        _check_date(self.date)
+        if self.level.ndim != 2 or 0 in self.level.shape:
+            raise ValueError(f"level at rest has shape {self.level.shape}, not (rows, columns)")
+        good = np.isfinite(self.level) & (self.level >= 0)
+        if not good.all():
+            row, column = (int(index) for index in np.argwhere(~good)[0])
+            raise ValueError(f"level at rest of cell ({row}, {column}) is not finite and >= 0")
+        rows, columns = self.level.shape
+        check_ratio(self.ratio, rows, columns, name="ratio at rest")
+
+    @classmethod
+    def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
+        """What `method` makes of the rest readings in `knowledge`."""
+        # A reading below its offset is a cell of no conductance, within the noise.
+        level = np.maximum(LevelMeter(method, knowledge).rest(), 0.0)
+        return cls(date, np.asarray(knowledge.rest_ratio), level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,31 +95,27 @@ class Calibration:
     unit_id: int
     date: str
     method: str
-    rest: Float
+    rest: Rest
     model: ForceModel
     indenter_area_m2: float
     nominal_top_wire_ohm: float | None = None
     nominal_bottom_wire_ohm: float | None = None
+    tare: Rest | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.unit_id <= MAX_UNIT_ID:
             raise ValueError(f"unit_id is {self.unit_id}, not in 0..{MAX_UNIT_ID}")
-        try:
-            datetime.fromisoformat(self.date)
-        except ValueError:
-            raise ValueError(f"date is {self.date[:40]!r}, not ISO 8601") from None
-        if self.method != VOLTAGE and self.method not in METHODS:
+        _check_date(self.date)
+        if self.method not in LEVEL_METHODS:
             raise ValueError(
-                f"method is {self.method[:40]!r}, not one of {', '.join((*METHODS, VOLTAGE))}"
+                f"method is {self.method[:40]!r}, not one of {', '.join(LEVEL_METHODS)}"
             )
-        if self.rest.shape != self.model.kind.shape:
-            raise ValueError(f"rest has shape {self.rest.shape}, the model {self.model.kind.shape}")
-        if self.rest.size > MAX_CELLS:
+        shape = self.model.kind.shape
+        for name, rest in (("rest", self.rest), ("tare", self.tare)):
+            if rest is not None and rest.level.shape != shape:
+                raise ValueError(f"{name} has shape {rest.level.shape}, the model {shape}")
+        if self.rest.level.size > MAX_CELLS:
             raise ValueError(f"{self.rows}x{self.columns} cells, more than {MAX_CELLS}")
-        good = np.isfinite(self.rest) & (self.rest >= 0)
-        if not good.all():
-            row, column = (int(index) for index in np.argwhere(~good)[0])
-            raise ValueError(f"rest of cell ({row}, {column}) is not finite and >= 0")
         if not (np.isfinite(self.indenter_area_m2) and self.indenter_area_m2 > 0):
             raise ValueError(f"indenter_area_m2 is {self.indenter_area_m2}, it must be above 0")
         for name in _WIRES:
@@ -95,12 +126,17 @@ class Calibration:
     @property
     def rows(self) -> int:
         """R."""
-        return int(self.rest.shape[0])
+        return int(self.rest.level.shape[0])
 
     @property
     def columns(self) -> int:
         """C."""
-        return int(self.rest.shape[1])
+        return int(self.rest.level.shape[1])
+
+    @property
+    def untouched(self) -> Rest:
+        """The rest in force: the tare, if there is one."""
+        return self.rest if self.tare is None else self.tare
 
     def check(self, unit_id: int, rows: int, columns: int, *, force: bool = False) -> None:
         """Raise ValueError unless this calibration is of this board's skin, or `force` is given.
@@ -121,16 +157,17 @@ class Calibration:
             )
 
     def predict(self, level: ArrayLike, level_std: ArrayLike) -> tuple[Float, Float]:
-        """Force and its standard deviation [N], (R, C): `ForceModel.predict` of level - rest.
+        """Force and its standard deviation [N], (R, C): by `model`, of level - untouched.level.
 
         level, level_std (R, C): `cell_siemens` and `cell_siemens_std` of an estimate by `method`
         [S]; for `voltage` `voltage_level` of the readings and the std of one reading [1]. The error
         of rest is in every press alike, so the curves hold it already. Raises ValueError.
         """
         levels = np.asarray(level, dtype=np.float64)
-        if levels.shape != self.rest.shape:
-            raise ValueError(f"level has shape {levels.shape}, this calibration {self.rest.shape}")
-        return self.model.predict(levels - self.rest, level_std)
+        at_rest = self.untouched.level
+        if levels.shape != at_rest.shape:
+            raise ValueError(f"level has shape {levels.shape}, this calibration {at_rest.shape}")
+        return self.model.predict(levels - at_rest, level_std)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file that is either complete or not there: a temporary file, then a rename.
@@ -140,7 +177,8 @@ class Calibration:
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
         for name in ("unit_id", "date", "method", "rows", "columns", *_WIRES, "indenter_area_m2"):
             content[name] = getattr(self, name)
-        content["rest"] = self.rest.tolist()
+        for name in _RESTS:
+            content[name] = _rest_content(getattr(self, name))
         for name in _MODEL_FIELDS:
             nested = getattr(self.model, name).tolist()
             if name in _NULL_FIELDS:
@@ -152,6 +190,19 @@ class Calibration:
         )
         with whole_file(path) as file:
             file.write(f"{{\n{text}\n}}\n".encode())
+
+
+def _check_date(date: str) -> None:
+    try:
+        datetime.fromisoformat(date)
+    except ValueError:
+        raise ValueError(f"date is {date[:40]!r}, not ISO 8601") from None
+
+
+def _rest_content(rest: Rest | None) -> dict[str, Any] | None:
+    if rest is None:
+        return None
+    return {"date": rest.date, "ratio": rest.ratio.tolist(), "level": rest.level.tolist()}
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
@@ -201,12 +252,8 @@ def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _from_content(content: dict[str, Any]) -> Calibration:
-    known = {"format", "schema", "unit_id", "date", "method", "rows", "columns", "rest"}
-    known |= {*_WIRES, "indenter_area_m2", *_MODEL_FIELDS}
-    for name in sorted(known - content.keys()):
-        raise ValueError(f"no field '{name}'")
-    for name in sorted(content.keys() - known):
-        raise ValueError(f"unknown field {name[:40]!r}")
+    known = {"format", "schema", "unit_id", "date", "method", "rows", "columns", *_RESTS}
+    _require_fields(content, known | {*_WIRES, "indenter_area_m2", *_MODEL_FIELDS})
     for name in ("unit_id", "rows", "columns"):
         if type(content[name]) is not int:
             raise ValueError(f"{name} is not an integer")
@@ -216,7 +263,7 @@ def _from_content(content: dict[str, Any]) -> Calibration:
     shape = (content["rows"], content["columns"])
     if min(shape) < 1 or max(shape) > MAX_CELLS or shape[0] * shape[1] > MAX_CELLS:
         raise ValueError(f"rows and columns: not 1 to {MAX_CELLS} cells")
-    arrays = {name: _array(name, content[name], shape) for name in ("rest", *_MODEL_FIELDS)}
+    arrays = {name: _array(name, content[name], shape) for name in _MODEL_FIELDS}
     wires = {
         name: None if content[name] is None else _number(name, content[name]) for name in _WIRES
     }
@@ -224,11 +271,39 @@ def _from_content(content: dict[str, Any]) -> Calibration:
         unit_id=content["unit_id"],
         date=content["date"],
         method=content["method"],
-        rest=arrays.pop("rest"),
+        rest=_rest("rest", content["rest"], shape),
+        tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
         model=ForceModel(**arrays),
         indenter_area_m2=_number("indenter_area_m2", content["indenter_area_m2"]),
         **wires,
     )
+
+
+def _require_fields(content: dict[str, Any], known: set[str], place: str = "") -> None:
+    for name in sorted(known - content.keys()):
+        raise ValueError(f"no field '{place}{name}'")
+    for name in sorted(content.keys() - known):
+        raise ValueError(f"unknown field '{place}{name[:40]}'")
+
+
+def _rest(name: str, content: Any, shape: tuple[int, int]) -> Rest:
+    if not isinstance(content, dict):
+        raise ValueError(f"{name} is not an object")
+    _require_fields(content, {"date", "ratio", "level"}, f"{name}.")
+    if not isinstance(content["date"], str):
+        raise ValueError(f"{name}.date is not text")
+    try:
+        ratio = np.array(content["ratio"])
+    except (ValueError, OverflowError):
+        ratio = np.array(None)
+    expected = (*shape, READINGS_PER_CELL)
+    if ratio.dtype.kind not in "fi" or ratio.shape != expected:
+        raise ValueError(f"{name}.ratio is not an array of numbers of shape {expected}")
+    level = _array(f"{name}.level", content["level"], shape)
+    try:
+        return Rest(content["date"], ratio.astype(np.float64), level)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _array(name: str, nested: Any, shape: tuple[int, int]) -> NDArray[Any]:

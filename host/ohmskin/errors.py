@@ -36,6 +36,10 @@ class CommandRefused(OhmskinError):
         self.result = result
 
 
+class TareRefused(OhmskinError):
+    """Something seems to touch the skin, or there is no tare to undo; nothing has changed."""
+
+
 class RecordingError(OhmskinError):
     """A recording that cannot be read, or can no longer be written."""
 

@@ -11,12 +11,16 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import overload
 from urllib.parse import parse_qsl
 
 from ohmskin import protocol
+from ohmskin.calibrated_device import CalibratedDevice
+from ohmskin.calibration import Calibration, load_calibration
 from ohmskin.circuit import Float
 from ohmskin.device import Device
 from ohmskin.emulator import DEFAULT_RATE_HZ, EmulatedBoard, EmulatorLink
@@ -28,13 +32,34 @@ from ohmskin.replay import ReplayLink
 from ohmskin.scenes import Scene
 from ohmskin.simavr_link import SimavrLink
 
+CalibrationLike = Calibration | str | os.PathLike[str]
+
 _SCENE_KEYS = ("scene", "seed")
 _EMULATOR_KEYS = (*_SCENE_KEYS, "readings", "rate", "noise", "unit", "foreign", *FAULTS)
 _DEFAULT_NOISE_LSB = 0.3
 
 
-def open(url: str, *, start: bool = True) -> Device:
+@overload
+def open(url: str, *, start: bool = True) -> Device: ...
+
+
+@overload
+def open(
+    url: str, *, start: bool = True, calibration: CalibrationLike, force: bool = False
+) -> CalibratedDevice: ...
+
+
+def open(
+    url: str,
+    *,
+    start: bool = True,
+    calibration: CalibrationLike | None = None,
+    force: bool = False,
+) -> Device:
     """Connect to a board, and start scanning unless told otherwise.
+
+    calibration: a `Calibration` or the path of its file; scans then carry forces. force: take it
+    even if it is of another unit.
 
     >>> with open("emulator://8x8?scene=ghost") as skin:
     ...     skin.latest().ratio.shape
@@ -44,9 +69,18 @@ def open(url: str, *, start: bool = True) -> Device:
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
     :raises RecordingError: the recording of a ``replay://`` port cannot be read.
+    :raises ValueError: the calibration cannot be read, or is of another unit or geometry.
     """
+    if calibration is None:
+        link, baud = open_link(url)
+        return Device(link, start=start, baud=baud)
+    if not isinstance(calibration, Calibration):
+        calibration = load_calibration(calibration)
     link, baud = open_link(url)
-    return Device(link, start=start, baud=baud)
+    recorded_tare = link.tare_before if isinstance(link, ReplayLink) else lambda scan: None
+    return CalibratedDevice(
+        link, calibration, start=start, baud=baud, force=force, recorded_tare=recorded_tare
+    )
 
 
 def open_link(url: str) -> tuple[Link, int | None]:

@@ -10,8 +10,8 @@ At the recording's end iterators end, and everything else raises `RecordingEnded
 than start and stop, which let the replay run and pause, raise `CommandRefused`.
 
 Not modelled: board times that had wrapped (after 71 minutes) before the first scan or during a
-pause begin anew below 2^32 us; ``host_time_s`` is the time of the replay; tares, marks and forces
-are in `ohmskin.recording.load_recording` alone.
+pause begin anew below 2^32 us; ``host_time_s`` is the time of the replay; marks and forces are in
+`ohmskin.recording.load_recording` alone. Tares are told apart from the line, by `tare_before`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ohmskin import framing, protocol
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link import READ_TIMEOUT_S
 from ohmskin.messages import Hello, Scan
-from ohmskin.recording import messages
+from ohmskin.recording import Tare, messages
 
 # Shorter than the silence after which a board counts as lost.
 LONGEST_PAUSE_S: Final = 2.0
@@ -53,6 +53,8 @@ class ReplayLink:
         self._decoder = framing.Decoder()
         self._answers = bytearray()
         self._next: tuple[Scan, bytes] | None = None
+        self._tare: Tare | None = None
+        self._tares: dict[tuple[int, int], Tare] = {}  # by the number and time of the next scan
         self._running = False
         self._paused = True
         self._closed = False
@@ -108,7 +110,11 @@ class ReplayLink:
             if isinstance(message, Hello):
                 self._hello = message
                 self._answers += self._greeting()
+            elif isinstance(message, Tare):
+                self._tare = message
             elif isinstance(message, Scan):
+                if self._tare is not None:
+                    self._tares[_identity(message)], self._tare = self._tare, None
                 self._next = (message, self._scan(message))
         return self._next
 
@@ -143,6 +149,10 @@ class ReplayLink:
                 )
                 self._answers += self._frame("ack", ack)
             self._wake.notify_all()
+
+    def tare_before(self, scan: Scan) -> Tare | None:
+        """The tare that was recorded right before this scan of the replay, if any."""
+        return self._tares.get(_identity(scan))
 
     def pause(self, paused: bool) -> None:
         """See `PausableLink.pause`."""
@@ -196,3 +206,8 @@ class ReplayLink:
         except ValueError as exc:
             text = f"{self.name}: scan {scan.number} cannot be replayed: {exc}"
             raise RecordingError(text) from exc
+
+
+def _identity(scan: Scan) -> tuple[int, int]:
+    """What a scan has of its own on the line, whatever wraps the decoder resolves."""
+    return scan.number % (1 << 32), scan.time_us % (1 << 32)

@@ -30,4 +30,11 @@ def make_estimator(method: str, knowledge: SkinKnowledge) -> Estimator:
     return METHODS[method](knowledge)
 
 
-__all__ = ["METHODS", "Estimate", "Estimator", "SkinKnowledge", "make_estimator"]
+__all__ = [
+    "METHODS",
+    "Estimate",
+    "Estimator",
+    "OhmEstimator",
+    "SkinKnowledge",
+    "make_estimator",
+]

@@ -176,6 +176,13 @@ class Estimator(ABC):
     def reset(self) -> None:  # noqa: B027
         """Forget the previous frame: the next one starts afresh. What is known of rest stays."""
 
+    def rest(self) -> Solution | None:
+        """This method's own answer to the rest readings; None where they are not known."""
+        if self._rest is None and self.knowledge.rest_ratio is not None:
+            self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
+            self.reset()
+        return self._rest
+
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
@@ -187,9 +194,7 @@ class Estimator(ABC):
         """
         known = self.knowledge
         readings = check_ratio(ratio, known.rows, known.columns)
-        if self._rest is None and known.rest_ratio is not None:
-            self._rest = self._solve(self._reader.read(known.rest_ratio))
-            self.reset()
+        self.rest()
         started = time.perf_counter()
         ports = self._reader.read(readings)
         found = self._solve(ports)

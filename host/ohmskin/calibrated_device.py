@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board whose skin is calibrated: its scans carry forces, and it can be tared."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.calibration import Calibration
+from ohmskin.circuit import Float
+from ohmskin.device import Device
+from ohmskin.errors import TareRefused
+from ohmskin.force_reader import ForceReader, ForceScan
+from ohmskin.link import Link
+from ohmskin.messages import Scan
+from ohmskin.recording import Tare
+
+TARE_S = 1.0
+_NAMED_CELLS = 4
+
+
+class CalibratedDevice(Device):
+    """A `Device` whose scans are `ForceScan`. Made by ``ohmskin.open(port, calibration=...)``.
+
+    force: take the calibration of another unit. recorded_tare: the tare that comes right before a
+    scan in a recording, if this is a replay.
+
+    :raises ValueError: the calibration is of another unit or geometry.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        calibration: Calibration,
+        *,
+        start: bool = True,
+        baud: int | None = None,
+        force: bool = False,
+        recorded_tare: Callable[[Scan], Tare | None] = lambda scan: None,
+    ) -> None:
+        super().__init__(link, start=False, baud=baud)
+        self._calibrations = [calibration]  # with each tare one more
+        self._recorded_tare = recorded_tare
+        self._newest: _Follower | None = None
+        self._newest_lock = threading.Lock()
+        try:
+            board = self.info
+            calibration.check(board.unit_id, board.rows, board.columns, force=force)
+            ForceReader(board, calibration)  # even forced, it must have the same cells
+            if start:
+                self.start()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def calibration(self) -> Calibration:
+        """What forces are read by, with the latest tare; `Calibration.save` makes it last."""
+        return self._calibrations[-1]
+
+    # ------------------------------------------------------------------------------- reading
+
+    def __iter__(self) -> Iterator[ForceScan]:
+        """Every scan from now on, as `Device` gives them, with its forces."""
+        return map(_Follower(self).read, super().__iter__())
+
+    def latest(self, timeout_s: float | None = None) -> ForceScan:
+        """The newest scan, as `Device` gives it, with its forces."""
+        scan = super().latest(timeout_s)
+        with self._newest_lock:
+            if self._newest is None:
+                self._newest = _Follower(self)
+            return self._newest.read(scan)
+
+    # ---------------------------------------------------------------------------------- tare
+
+    def tare(self, seconds: float = TARE_S, *, force: bool = False) -> Tare:
+        """Take the mean of the coming scans for the skin's rest, from the next scan read on.
+
+        seconds: of scans, at least one. force: even if cells seem touched, because rest has
+        drifted. Returns what `ohmskin.recording.Recorder.add` keeps.
+
+        :raises TareRefused: something touches the skin.
+        """
+        rest_ratio = self._mean_ratio(seconds)
+        reader = ForceReader(self.info, self.calibration)
+        if not force:
+            touched = reader.measure(rest_ratio).estimate.touched
+            if touched.any():
+                raise TareRefused(
+                    f"{_named(touched)}: take everything off the skin, or force the tare if "
+                    "nothing is on it"
+                )
+        self._calibrations.append(reader.tared(rest_ratio, now()))
+        return Tare(rest_ratio, time.monotonic())
+
+    def undo_tare(self) -> Tare:
+        """Return to the rest before the last tare. Returns that, for a `Recorder`.
+
+        :raises TareRefused: there is no tare.
+        """
+        if len(self._calibrations) > 1:
+            self._calibrations.pop()
+        elif self.calibration.tare is not None:
+            self._calibrations = [replace(self.calibration, tare=None)]
+        else:
+            raise TareRefused("there is no tare to undo: rest is that of the calibration")
+        return Tare(self.calibration.untouched.ratio, time.monotonic())
+
+    def _mean_ratio(self, seconds: float) -> Float:
+        ratios: list[Float] = []
+        first_us = 0
+        for scan in super().__iter__():
+            first_us = first_us if ratios else scan.time_us
+            ratios.append(scan.ratio)
+            if scan.time_us - first_us >= 1e6 * seconds:
+                break
+        if not ratios:
+            raise TareRefused(f"{self.name} gives no more scans")
+        return np.asarray(np.mean(ratios, axis=0))
+
+
+class _Follower:
+    """A reader for one way of reading a device, which goes on with its newest tare."""
+
+    def __init__(self, device: CalibratedDevice) -> None:
+        self._device = device
+        self._calibration = device.calibration
+        self._reader = ForceReader(device.info, self._calibration)
+
+    def read(self, scan: Scan) -> ForceScan:
+        if self._calibration is not self._device.calibration:
+            self._calibration = self._device.calibration
+            self._reader.use(self._calibration)
+        recorded = self._device._recorded_tare(scan)
+        if recorded is not None:
+            self._reader.use(self._reader.tared(recorded.rest_ratio, now()))
+        return self._reader.read(scan)
+
+
+def now() -> str:
+    """The date and time of the host, ISO 8601, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _named(touched: NDArray[np.bool_]) -> str:
+    cells = [f"({row}, {column})" for row, column in np.argwhere(touched)]
+    more = len(cells) - _NAMED_CELLS
+    text = ", ".join(cells[:_NAMED_CELLS]) + (f" and {more} more" if more > 0 else "")
+    return f"cell {text} is touched" if len(cells) == 1 else f"cells {text} are touched"
