@@ -14,7 +14,7 @@ import ohmskin
 from ohmskin.calibrated_device import CalibratedDevice
 from ohmskin.calibration import Calibration, Rest
 from ohmskin.circuit import Float
-from ohmskin.errors import TareRefused
+from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.estimators import SkinKnowledge
 from ohmskin.force import ForceRegression
 from ohmskin.force_reader import ForceScan
@@ -198,12 +198,12 @@ def test_latest_follows_the_same_tares(tmp_path: Path) -> None:
     assert contacts == 10 * [3] + 10 * [0]
 
 
-def test_a_tare_at_the_end_of_a_replay_is_refused(tmp_path: Path) -> None:
+def test_a_tare_at_the_end_of_a_replay_says_so(tmp_path: Path) -> None:
     path = tmp_path / "skin.mcap"
     with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
         for scan in islice(board, 5):
             recorder.add(scan)
     with ohmskin.open(f"replay://{path}?speed=0", calibration=of_scene("ghost")) as board:
         assert len(list(board)) == 5
-        with pytest.raises(TareRefused, match="gives no more scans"):
+        with pytest.raises(DeviceLost, match="gives no more scans"):
             board.tare()

@@ -9,16 +9,15 @@ import os
 import select
 import signal
 import subprocess
-import sys
 import time
 import tty
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import serial
+from command_line import Done, assert_one_line
 
 import ohmskin
 from ohmskin import cli, session
@@ -34,32 +33,6 @@ EMULATED = "emulator://4x6?scene=ghost&seed=2"
 Command = Callable[..., "subprocess.Popen[str]"]
 
 
-@dataclass(frozen=True)
-class Done:
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Done]:
-    """A function that runs ``ohmskin ARGUMENTS`` in this process."""
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def call(*arguments: str) -> Done:
-        monkeypatch.setattr(sys, "argv", ["ohmskin", *arguments])
-        capsys.readouterr()
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        captured = capsys.readouterr()
-        return Done(code, captured.out, captured.err)
-
-    return call
-
-
 @pytest.fixture
 def silent_port() -> Iterator[tuple[int, str]]:
     """The far end and the path of a pseudo-terminal at which nobody answers."""
@@ -73,16 +46,6 @@ def silent_port() -> Iterator[tuple[int, str]]:
 def finish(process: subprocess.Popen[str], limit_s: float = 30.0) -> Done:
     out, err = process.communicate(timeout=limit_s)
     return Done(process.returncode, out, err)
-
-
-def assert_one_line(done: Done, *words: str) -> None:
-    assert done.code == 2
-    assert done.out == ""
-    assert done.err.startswith("ohmskin: ")
-    assert done.err.count("\n") == 1
-    assert done.err.endswith("\n")
-    for word in words:
-        assert word in done.err
 
 
 # -------------------------------------------------------------------------------------- boards
@@ -478,7 +441,11 @@ OPTIONS = {
         *("--save", "PORT"),
     ],
     "flash": ["--port"],
-    "stream": ["--method", "--json", "--scans", "--seconds", "PORT", *METHODS],
+    "stream": [
+        *("--method", "--calibration", "--force", "--tare", "--json", "--scans", "--seconds"),
+        *("PORT", *METHODS),
+    ],
+    "tare": ["--seconds", "--undo", "--force", "PORT"],
     "estimate": ["--method", "--out", "--cold", *METHODS],
     "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],
     "export": ["--begin", "--end", ".npz", ".csv"],

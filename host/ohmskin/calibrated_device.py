@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.calibration import Calibration
-from ohmskin.circuit import Float
 from ohmskin.device import Device
 from ohmskin.errors import TareRefused
 from ohmskin.force_reader import ForceReader, ForceScan
@@ -87,8 +86,9 @@ class CalibratedDevice(Device):
         drifted. Returns what `ohmskin.recording.Recorder.add` keeps.
 
         :raises TareRefused: something touches the skin.
+        :raises DeviceLost: as `mean_ratio`.
         """
-        rest_ratio = self._mean_ratio(seconds)
+        rest_ratio = self.mean_ratio(seconds)
         reader = ForceReader(self.info, self.calibration)
         if not force:
             touched = reader.measure(rest_ratio).estimate.touched
@@ -112,18 +112,6 @@ class CalibratedDevice(Device):
         else:
             raise TareRefused("there is no tare to undo: rest is that of the calibration")
         return Tare(self.calibration.untouched.ratio, time.monotonic())
-
-    def _mean_ratio(self, seconds: float) -> Float:
-        ratios: list[Float] = []
-        first_us = 0
-        for scan in super().__iter__():
-            first_us = first_us if ratios else scan.time_us
-            ratios.append(scan.ratio)
-            if scan.time_us - first_us >= 1e6 * seconds:
-                break
-        if not ratios:
-            raise TareRefused(f"{self.name} gives no more scans")
-        return np.asarray(np.mean(ratios, axis=0))
 
 
 class _Follower:

@@ -9,9 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -19,23 +17,20 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console, Group
-from rich.live import Live
+from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rich.text import Text
 from threadpoolctl import threadpool_limits
 
 import ohmskin
 from ohmskin import demo as demonstration
 from ohmskin import recording_commands as recordings
 from ohmskin import show
-from ohmskin.device import Device
+from ohmskin import stream_command as streaming
 from ohmskin.errors import OhmskinError, PortError
-from ohmskin.estimators import METHODS, Estimator, SkinKnowledge, make_estimator
+from ohmskin.estimators import METHODS
 from ohmskin.faults import FAULTS
 from ohmskin.link import serial_ports
-from ohmskin.messages import Scan
 from ohmskin.ports import emulated
 from ohmskin.protocol import ENUMS
 from ohmskin.pty_server import PtyServer
@@ -43,6 +38,7 @@ from ohmskin.readings import estimate_file, load_readings, save_arrays
 from ohmskin.scenes import SCENES
 from ohmskin.simavr_link import BOARDS
 from ohmskin.studies import commands as studies
+from ohmskin.tare_command import tare
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -55,7 +51,6 @@ app = typer.Typer(
 )
 _out = Console()
 _MESSAGES = 8  # of different ones that are printed for a file
-_DISPLAY_EVERY_S = 0.1
 _WIDTH = 160
 
 Port = Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")]
@@ -215,108 +210,8 @@ def flash(
 
 # -------------------------------------------------------------------------------------- scans
 
-
-@app.command()
-def stream(
-    port: Port,
-    method: Annotated[
-        str, typer.Option(help=f"estimator: {' | '.join(METHODS)}; none: readings alone")
-    ] = "joint",
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object a scan")] = False,
-    scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
-    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
-) -> None:
-    """Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it."""
-    if method != "none" and method not in METHODS:
-        raise ValueError(f"no method '{method}': there are none, {', '.join(METHODS)}")
-    with ohmskin.open(port) as skin:
-        estimator = None if method == "none" else _estimator(skin, method)
-        with suppress(KeyboardInterrupt):
-            if as_json:
-                _print_scans(skin, estimator, scans, seconds)
-            else:
-                _show_scans(skin, estimator, scans, seconds)
-        lost = skin.stats
-    if lost.missed or lost.line.damaged or lost.restarts:
-        text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
-        text += f"{lost.line.damaged} damaged frames, {lost.restarts} restarts"
-        print(text, file=sys.stderr)  # noqa: T201
-
-
-def _estimator(skin: Device, method: str) -> Estimator:
-    board = skin.info
-    return make_estimator(
-        method,
-        SkinKnowledge(
-            board.rows,
-            board.columns,
-            ref_top_ohm=board.ref_top_ohm,
-            ref_bottom_ohm=board.ref_bottom_ohm,
-            adc_bits=board.adc_bits,
-        ),
-    )
-
-
-def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
-    end_s = time.monotonic() + seconds if seconds else float("inf")
-    for number, scan in enumerate(scans, start=1):
-        yield scan
-        if number == count or time.monotonic() >= end_s:
-            return
-
-
-def _print_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
-    for scan in _limited(iter(skin), count, seconds):
-        line: dict[str, Any] = {
-            "scan": scan.number,
-            "time_us": scan.time_us,
-            "host_time_s": round(scan.host_time_s, 6),
-            "missed": scan.missed,
-            "ratio": scan.ratio.tolist(),
-        }
-        if estimator is not None:
-            estimate = estimator.estimate(scan.ratio)
-            line["method"] = estimator.name
-            line["cell_siemens"] = estimate.cell_siemens.tolist()
-            line["cell_siemens_std"] = estimate.cell_siemens_std.tolist()
-            line["converged"] = estimate.converged
-            line["message"] = estimate.message
-        try:
-            print(json.dumps(line), flush=True)  # noqa: T201
-        except BrokenPipeError:
-            sys.stderr.close()  # the reader, such as `head`, has had enough
-            return
-
-
-def _show_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
-    rate_hz, shown_s = 0.0, 0.0
-    first: Scan | None = None
-    with Live(console=_out, auto_refresh=False) as live:
-        for scan in _limited(iter(skin), count, seconds):
-            if first is None or scan.time_us < first.time_us:
-                first = scan  # or the board has restarted
-            elif scan.time_us > first.time_us:
-                rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
-            # A terminal shows ten pictures a second; every scan is counted all the same.
-            if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
-                shown_s = scan.host_time_s
-                live.update(_picture(skin, estimator, scan, rate_hz), refresh=True)
-
-
-def _picture(skin: Device, estimator: Estimator | None, scan: Scan, rate_hz: float) -> Group:
-    stats = skin.stats
-    caption = (
-        f"scan {scan.number}  {rate_hz:.1f} Hz  missed {stats.missed}  "
-        f"damaged {stats.line.damaged}  restarts {stats.restarts}"
-    )
-    if estimator is None:
-        title = f"{skin.name}: reading B in thousandths of Vdd"
-        return Group(Text(title), show.cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
-    estimate = estimator.estimate(scan.ratio)
-    if not estimate.converged:
-        caption += f"  not converged: {estimate.message}"
-    title = f"{skin.name}: cell conductance by '{estimator.name}' [microsiemens]"
-    return Group(Text(title), show.cells_table(estimate.cell_siemens, ""), Text(caption))
+app.command()(streaming.stream)
+app.command()(tare)
 
 
 @app.command()

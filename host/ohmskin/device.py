@@ -6,7 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
+
 from ohmskin import protocol
+from ohmskin.circuit import Float
 from ohmskin.closing import Closing
 from ohmskin.errors import DeviceLost, RecordingEnded
 from ohmskin.link import Link
@@ -86,6 +89,24 @@ class Device(Closing):
             session.newest_taken = True
             assert session.newest is not None
             return session.newest
+
+    def mean_ratio(self, seconds: float) -> Float:
+        """Mean readings of the coming scans, shape (R, C, 4): of so many seconds, at least one.
+
+        :raises DeviceLost: the board went away, or there are no more scans.
+        """
+        ratios: list[Float] = []
+        first_us = 0
+        for scan in Device.__iter__(self):
+            if ratios and scan.ratio.shape != ratios[0].shape:
+                ratios.clear()  # somebody has configured the board
+            first_us = first_us if ratios else scan.time_us
+            ratios.append(scan.ratio)
+            if scan.time_us - first_us >= 1e6 * seconds:
+                break
+        if not ratios:
+            raise DeviceLost(f"{self.name} gives no more scans")
+        return np.asarray(np.mean(ratios, axis=0))
 
     def _silence_s(self) -> float:
         return SILENCE_TIMEOUT_S + 2 / self.info.rate_hz

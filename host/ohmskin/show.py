@@ -17,32 +17,43 @@ from ohmskin.circuit import Float
 from ohmskin.errors import OhmskinError
 
 FULL_SCALE_US: Final = 200.0  # microsiemens: a cell of 5 kOhm
+FULL_SCALE_N: Final = 10.0
 _STEPS: Final = 5
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 
 
 def cells_table(cell_siemens: Float, title: str) -> Table:
     """Conductances [S], shape (rows, columns), as a table in microsiemens, coloured by value."""
+    return _table(1e6 * cell_siemens, title, 1.0, FULL_SCALE_US)
+
+
+def forces_table(force_n: Float, title: str) -> Table:
+    """Forces [N], shape (rows, columns), as a table, coloured by value."""
+    return _table(force_n, title, FULL_SCALE_N / 100, FULL_SCALE_N)
+
+
+def _table(values: Float, title: str, low: float, high: float) -> Table:
+    """Colours on a logarithmic scale from `low` to `high`."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
     table.add_column("", justify="right", style="dim")
-    for column in range(cell_siemens.shape[1]):
+    for column in range(values.shape[1]):
         table.add_column(str(column), justify="right", min_width=3, header_style="dim")
-    for row, cells in enumerate(1e6 * cell_siemens):
-        table.add_row(str(row), *(Text(_short(value), style=_colour(value)) for value in cells))
+    for row, cells in enumerate(values):
+        styled = (Text(_short(value), style=_colour(value, low, high)) for value in cells)
+        table.add_row(str(row), *styled)
     return table
 
 
-def _short(microsiemens: float) -> str:
-    if not np.isfinite(microsiemens):
+def _short(value: float) -> str:
+    if not np.isfinite(value):
         return "?"
-    return f"{microsiemens:.1f}" if microsiemens < 9.95 else f"{microsiemens:.0f}"
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
 
 
-def _colour(microsiemens: float) -> str:
-    """On a logarithmic scale from 1 to `FULL_SCALE_US`."""
-    if not microsiemens > 1:
+def _colour(value: float, low: float, high: float) -> str:
+    if not value > low:
         return _COLOURS[0]
-    share = np.log(microsiemens) / np.log(FULL_SCALE_US)
+    share = np.log(value / low) / np.log(high / low)
     return _COLOURS[int(np.clip(share * _STEPS, 0, _STEPS - 1))]
 
 
