@@ -14,8 +14,6 @@ ms_*                    median wall time of a frame's estimate, one core. `press
                         start is worth little. `slowest`: the network at rest is solved anew when
                         the wires that were learned have changed by 5 %. `paper_2x2`:
                         `regularized`, both of its steps.
-ms_linearise_*          port resistances and all their derivatives, once: as `joint` computes them,
-                        and as CasADi expressions, in its machine and as C (null: no compiler).
 error_*, ghost_*        random 8x8, up to 8 touches, cold: error of a pressed cell's conductance,
                         median and 90th percentile; largest conductance reported at a cell that
                         nothing presses, above rest, 95th percentile of the frames.
@@ -44,9 +42,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import casadi_circuit  # beside this file, like bars
 import numpy as np
-from bars import at_least, at_most, report
+from bars import at_least, at_most, report  # beside this file
 from numpy.typing import NDArray
 
 from ohmskin.circuit import Float, quantise, ratio_from_codes
@@ -302,7 +299,7 @@ BARS = (
 
 
 def main() -> int:
-    figures = times() | casadi_circuit.measure(8) | casadi_circuit.measure(16) | accuracy()
+    figures = times() | accuracy()
     all_met = report(figures, BARS)
     print(json.dumps(figures))
     return 0 if all_met else 1

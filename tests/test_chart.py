@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,11 +17,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from ohmskin import cli
-from ohmskin.circuit import readings
+from ohmskin.circuit import Skin, readings
 from ohmskin.estimators import METHODS
-from ohmskin.studies import chart, chart_figure, chart_table, commands, published
+from ohmskin.network import laplacian_readings
+from ohmskin.studies import (
+    casadi_circuit,
+    chart,
+    chart_figure,
+    chart_table,
+    commands,
+    published,
+)
 from ohmskin.studies.chart import Plan, Row, Size, pareto_front
 from ohmskin.whole_files import save_whole
 
@@ -135,12 +145,72 @@ def test_sweeps_are_the_papers(name: str) -> None:
     np.testing.assert_allclose([readings(rest) for _, rest in pairs], at_rest, atol=1e-7)
 
 
+# --------------------------------------------------------------------------- NumPy against CasADi
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which(casadi_circuit.COMPILER) is None, reason="needs a C compiler"
+)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (8, 8)])
+@pytest.mark.parametrize(
+    "name", ["numpy", "casadi", pytest.param("casadi_c", marks=needs_compiler)]
+)
+def test_each_evaluation_is_that_of_the_node_laplacian(shape: tuple[int, int], name: str) -> None:
+    """Its port resistances, and their differences, at two states: the second call is new."""
+    evaluate = casadi_circuit.evaluations(*shape)[name]
+    random = np.random.default_rng(3)
+    cells = shape[0] * shape[1]
+
+    def port_ohm(log_ohm: np.ndarray) -> np.ndarray:
+        cell, top, bottom = np.exp(log_ohm).reshape(3, *shape)
+        skin = Skin(1 / cell, top, bottom)
+        current = (1 - laplacian_readings(skin)[..., 0]) / skin.ref_top_ohm
+        return (1 / current - skin.ref_top_ohm - skin.ref_bottom_ohm).ravel()
+
+    for _ in range(2):
+        log_ohm = np.log(random.uniform([[1e4], [1e2], [2e2]], [[1e5], [1e3], [2e3]], (3, cells)))
+        found, *slopes = evaluate(log_ohm.ravel())
+        np.testing.assert_allclose(found, port_ohm(log_ohm), rtol=1e-9)
+        direction = random.standard_normal((3, cells))
+        ahead, behind = (port_ohm(log_ohm + step * direction) for step in (1e-4, -1e-4))
+        np.testing.assert_allclose(
+            np.hstack(slopes) @ direction.ravel(), (ahead - behind) / 2e-4, rtol=1e-5, atol=1e-1
+        )
+
+
+@needs_compiler
+def test_evaluations_of_numpy_and_casadi_are_in_the_table(rows: list[Row]) -> None:
+    measured = of(rows, scene="linearisation")
+    assert [row.method for row in measured] == ["numpy", "casadi", "casadi_c"]
+    for row in measured:
+        assert (row.rows, row.columns, row.source, row.on_front) == (2, 2, "measured", False)
+        assert row.ms is not None
+        assert row.ms_p90 is not None
+        assert 0 < row.ms <= row.ms_p90
+
+
+def test_without_a_compiler_there_is_no_generated_c_and_that_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(casadi_circuit, "COMPILER", "no-such-compiler")
+    rows = chart._linearisation_rows(Size(2, 2, 0))
+    assert [row.method for row in rows] == ["numpy", "casadi"]
+    assert "no C compiler" in str(chart_table.summary(rows).caption)
+    axes = Figure().add_subplot()
+    chart_figure._evaluation_panel(axes, rows)
+    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert said == ["NumPy", "CasADi", "CasADi's C: no compiler"]
+
+
 # -------------------------------------------------------------------------------------- answers
 
 
 def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
     table = list(csv.DictReader(io.StringIO(chart_table.csv_text(rows))))
-    assert len(table) == len(rows) == 2 * 3 + 2 * 3 + 2 + 6
+    evaluations = len(of(rows, scene="linearisation"))
+    assert evaluations >= 2
+    assert len(table) == len(rows) == 2 * 3 + 2 * 3 + evaluations + 2 + 6
     assert list(table[0]) == [column.name for column in fields(Row)]
     assert list(table[0])[:6] == ["scene", "source", "rows", "columns", "bits", "method"]
     for line, row in zip(table, rows, strict=True):
@@ -200,7 +270,7 @@ def run(
 
 
 def test_chart_writes_picture_and_table(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path, rows: list[Row]
 ) -> None:
     code, out, err = run("--out", str(tmp_path / "new"))
     assert code == 0
@@ -211,7 +281,7 @@ def test_chart_writes_picture_and_table(
     assert sorted((tmp_path / "new").iterdir()) == sorted([picture, table])
     assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert picture.stat().st_size > 30_000
-    assert table.read_text().count("\n") == 21
+    assert table.read_text().count("\n") == 1 + len(rows)
     assert "matrix" in err
 
 

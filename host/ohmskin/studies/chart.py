@@ -3,7 +3,8 @@
 
 Simulation, all of it. Every method gets the same frames of the same random skins (`trials`), in
 order, each started from the one before; the first few of each skin are not counted. The paper's two
-sweeps are added, each frame from a cold start. With one thread, whatever the libraries would take.
+sweeps are added, each frame from a cold start, and what decided for NumPy against CasADi in
+`joint` (`casadi_circuit`). With one thread, whatever the libraries would take.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ohmskin.estimators import METHODS
 from ohmskin.estimators.information import information_limit
 from ohmskin.estimators.paper import PaperEstimator
 from ohmskin.readings import estimate_file
-from ohmskin.studies import published
+from ohmskin.studies import casadi_circuit, published
 from ohmskin.studies.trials import Trial, random_trial, trial_of
 
 # The paper's methods take 0.1 s a frame with 9 cells, up to 16 s with 16 and a minute with 64.
@@ -31,6 +32,7 @@ PAPER_CELLS: Final = 9
 TAIL: Final = 0.9  # the quantile beside each median
 RANDOM: Final = "random"
 BOARD: Final = "board"  # the paper's own skin
+LINEARISATION: Final = "linearisation"
 MEASURED: Final = "measured"
 PAPER: Final = "Su2024"
 # |z| of a normal z, in equal steps of probability.
@@ -90,7 +92,10 @@ QUICK: Final = Plan(skins=2, frames=11, repeats=2)
 class Row:
     """One method on one kind of frames; a line of the CSV. None: there is no such number.
 
-    scene: "random", the paper's "cell_sweep" or "wire_sweep", or "board", the paper's own skin.
+    scene: "random", the paper's "cell_sweep" or "wire_sweep", or "board", the paper's own skin; or
+    "linearisation", no frame, but port resistances and all their derivatives once, as `joint` needs
+    them several times a frame: method is "numpy", "casadi" (its virtual machine) or "casadi_c" (the
+    C that it generates; no row without a compiler), and all but the times is None.
     source: "measured", or "Su2024" for what the paper printed. ms: of a frame, median and 90th
     percentile. error_percent: of the conductance of pressed cells, over the true one, likewise.
     rmse_megohm: over all cells of a frame, likewise over the frames. on_front: no other method of
@@ -143,7 +148,8 @@ class Row:
 def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
     """Run every method of the plan. `progress(done, frames)` is called after each frame.
 
-    Rows are in the order of the plan's sizes, bits and methods, then the paper's sweeps.
+    Rows are in the order of the plan's sizes, bits and methods, then the paper's sweeps, then
+    linearisations by size.
     """
     count = _Count(progress, _frames(plan))
     with threadpool_limits(limits=1):
@@ -155,6 +161,8 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
         ]
         for name in published.RMSE_MEGOHM:
             rows += _sweep_rows(name, plan, count)
+        for size in plan.sizes:
+            rows += _linearisation_rows(size)
     return [*_with_front(rows), *_published_rows()]
 
 
@@ -288,6 +296,15 @@ def _sweep_rows(name: str, plan: Plan, count: _Count) -> list[Row]:
         tally.row(scene=name, rows=3, columns=3, bits=None, method=method)
         for method, tally in tallies.items()
     ]
+
+
+def _linearisation_rows(size: Size) -> list[Row]:
+    rows = []
+    for name, times_ms in casadi_circuit.times_ms(size.rows, size.columns).items():
+        ms, ms_p90 = _middle_and_tail(times_ms)
+        row = Row(LINEARISATION, MEASURED, size.rows, size.columns, None, name)
+        rows.append(replace(row, ms=ms, ms_p90=ms_p90))
+    return rows
 
 
 def _published_rows() -> list[Row]:

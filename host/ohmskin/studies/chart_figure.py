@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of `chart`: a panel for each size and resolution, and the paper's two sweeps."""
+"""The picture of `chart`: a panel for each size and resolution, and the paper's two sweeps; beside
+them a small one, NumPy against CasADi."""
 
 from __future__ import annotations
 
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ohmskin.errors import OhmskinError
 from ohmskin.estimators import METHODS
-from ohmskin.studies.chart import BOARD, MEASURED, PAPER, RANDOM, Row
+from ohmskin.studies.casadi_circuit import EVALUATIONS, GENERATED_C, MACHINE, NUMPY
+from ohmskin.studies.chart import BOARD, LINEARISATION, MEASURED, PAPER, RANDOM, Row, or_nan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DEADLINE_MS: Final = 1e3 / 90  # a scan of the board at its usual rate
 _COLOURS: Final = ("#666666", "#0072b2", "#e69f00", "#d55e00", "#009e73", "#aa3fb4", "#000000")
@@ -27,7 +30,12 @@ _SWEEPS: Final = {
     "cell_sweep": "the paper's cell sweep, 3x3",
     "wire_sweep": "the paper's wire sweep, 3x3",
 }
-_PANELS_FOR_NOTES: Final = 3
+_EVALUATIONS: Final[dict[str, dict[str, Any]]] = {
+    NUMPY: {"label": "NumPy", "color": _INK, "marker": "o"},
+    MACHINE: {"label": "CasADi", "color": _FAINT, "marker": "o", "markerfacecolor": "white"},
+    GENERATED_C: {"label": "CasADi's C", "color": _FAINT, "marker": "x", "linestyle": ":"},
+}
+_PANELS_FOR_NOTES: Final = 2
 _NOTES: Final = (
     "Upper rows: the same random skins for all methods, 1 to 100 kΩ where touched, each frame "
     "touched anew and started from the one before. A percentage under a marker: so many frames "
@@ -41,6 +49,8 @@ _NOTES: Final = (
     "resistance; of simulated 3x3 skins errors, and no time. Lines: median of its five conditions.",
     "Sweeps: exact readings, each frame cold. All methods are told the true wires and the readings "
     "at rest; 'ohm', 'matrix' and the paper's two use neither.",
+    "One evaluation: port resistances and all their derivatives, as 'joint' needs them several "
+    "times a frame, computed in NumPy as it does, or as CasADi expressions.",
 )
 
 
@@ -66,14 +76,9 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
     random = [row for row in rows if row.scene == RANDOM]
     sizes = list(dict.fromkeys((row.rows, row.columns) for row in random))
     resolutions = list(dict.fromkeys(row.bits for row in random))
-    width = max(len(sizes), len(_SWEEPS) + _PANELS_FOR_NOTES)
+    width = max(len(sizes), len(_SWEEPS) + 1 + _PANELS_FOR_NOTES)
     lines = len(resolutions) + 1
-    figure = Figure(figsize=(3.1 * width, 2.95 * lines + 0.7), layout="constrained")
-    figure.suptitle(
-        f"Time a frame against error: simulated skins, one thread on {machine}",
-        fontsize=14,
-        color=_INK,
-    )
+    figure = Figure(figsize=(3.1 * width, 2.95 * lines + 1.1), layout="constrained")
     grid = figure.add_gridspec(lines, width, hspace=0.06)
     first: Axes | None = None
     for line, bits in enumerate(resolutions):
@@ -104,7 +109,13 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
     for axes in figure.axes:
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    _explain(figure.add_subplot(grid[-1, len(_SWEEPS) :]), {row.method for row in rows})
+    _evaluation_panel(
+        figure.add_subplot(grid[-1, len(_SWEEPS)]),
+        [row for row in rows if row.scene == LINEARISATION],
+    )
+    title = f"Time a frame against error: simulated skins, one thread on {machine}"
+    _explain(figure, title, {row.method for row in rows})
+    _write_notes(figure.add_subplot(grid[-1, len(_SWEEPS) + 1 :]))
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=120)
     return png.getvalue()
@@ -151,6 +162,41 @@ def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
         if row.source == PAPER and row.rmse_megohm is not None:
             colour = method_style(row.method)["color"]
             axes.axhline(row.rmse_megohm, color=colour, linestyle=_PRINTED, linewidth=1.3, zorder=1)
+
+
+def _evaluation_panel(axes: Axes, rows: Sequence[Row]) -> None:
+    """Time by size, quietly: it is no method's result."""
+    axes.set_title("one evaluation in 'joint', by size", fontsize=10.5, color=_INK)
+    axes.set_xlabel("time [ms]", color=_INK)
+    axes.set_xscale("log")
+    axes.grid(which="major", axis="x", color="#e4e4e4", linewidth=0.7)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    sizes = list(dict.fromkeys((row.rows, row.columns) for row in rows))
+    for name in EVALUATIONS:
+        of_name = [row for row in rows if row.method == name]
+        places = [sizes.index((row.rows, row.columns)) for row in of_name]
+        style = {"linewidth": 1.0, "markersize": 5.5, **_EVALUATIONS[name]}
+        if not of_name:
+            style["label"] += ": no compiler"
+        axes.plot([or_nan(row.ms) for row in of_name], places, **style)
+    for place, size in enumerate(sizes):
+        slowest = max(or_nan(row.ms) for row in rows if (row.rows, row.columns) == size)
+        # Not at the axis, where it would push the panels apart.
+        axes.annotate(
+            f"{size[0]}x{size[1]}",
+            (slowest, place),
+            xytext=(8, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=_SMALL,
+            color=_INK,
+        )
+    axes.set_yticks([])
+    axes.set_xlim(right=5 * axes.get_xlim()[1])  # for the last of these words
+    axes.invert_yaxis()
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.legend(loc="lower left", frameon=False, fontsize=_SMALL, labelcolor=_INK, handlelength=1.5)
 
 
 def _prepare(axes: Axes) -> None:
@@ -228,12 +274,11 @@ def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
 # ---------------------------------------------------------------------------------------- notes
 
 
-def _explain(axes: Axes, methods: set[str]) -> None:
-    """Legend and notes, in a place of their own."""
+def _explain(figure: Figure, title: str, methods: set[str]) -> None:
+    """Title and legend, above all panels."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    axes.set_axis_off()
     handles: list[Any] = [
         Line2D([], [], **method_style(method), label=method)
         for method in METHODS
@@ -249,23 +294,29 @@ def _explain(axes: Axes, methods: set[str]) -> None:
         Line2D([], [], color=_INK, linestyle=_PRINTED, label="printed RMSE, no time"),
         Line2D([], [], **mark, marker="^", markersize=8.5, label="printed time, no error"),
     ]
-    legend = axes.legend(
+    legend = figure.legend(
         handles=handles,
-        loc="upper left",
-        bbox_to_anchor=(0.0, 1.06),
-        ncols=4,
+        loc="outside upper center",
+        ncols=7,
         frameon=False,
         fontsize=9,
+        title=title,
+        title_fontsize=14,
     )
+    legend.get_title().set_color(_INK)
+
+
+def _write_notes(axes: Axes) -> None:
+    """What the panels show, in a place of their own."""
+    axes.set_axis_off()
     notes = axes.text(
         0.02,
-        0.6,
-        "\n".join(textwrap.fill(note, 128) for note in _NOTES),
+        1.05,
+        "\n".join(textwrap.fill(note, 84) for note in _NOTES),
         transform=axes.transAxes,
         va="top",
-        fontsize=8.6,
+        fontsize=_SMALL,
         color=_INK,
-        linespacing=1.4,
+        linespacing=1.35,
     )
-    for artist in (legend, notes):
-        artist.set_in_layout(False)  # its length is not the panels' business
+    notes.set_in_layout(False)  # its length is not the panels' business

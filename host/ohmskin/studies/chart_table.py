@@ -11,7 +11,8 @@ from dataclasses import fields
 
 from rich.table import Table
 
-from ohmskin.studies.chart import MEASURED, RANDOM, Row, or_nan
+from ohmskin.studies.casadi_circuit import COMPILER, GENERATED_C
+from ohmskin.studies.chart import LINEARISATION, MEASURED, RANDOM, Row, or_nan
 
 
 def csv_text(rows: Iterable[Row]) -> str:
@@ -50,7 +51,12 @@ def fronts(rows: Iterable[Row]) -> dict[str, list[str]]:
 
 def summary(rows: Iterable[Row]) -> Table:
     """What was measured, for a terminal."""
-    table = Table(box=None, caption="*: no method is as fast and as accurate")
+    rows = list(rows)
+    caption = "*: no method is as fast and as accurate"
+    evaluations = {row.method for row in rows if row.scene == LINEARISATION}
+    if evaluations and GENERATED_C not in evaluations:
+        caption += f"\nno C compiler ({COMPILER}): what CasADi generates was not measured"
+    table = Table(box=None, caption=caption)
     for heading in ("skin", "method"):
         table.add_column(heading, no_wrap=True)
     for heading in ("ms", "error %", "90th", "RMSE MΩ", "conv. %"):
@@ -60,6 +66,7 @@ def summary(rows: Iterable[Row]) -> Table:
         if row.source != MEASURED:
             continue
         size = f"{row.rows}x{row.columns} {row.resolution if row.scene == RANDOM else row.scene}"
+        share = row.converged_share
         table.add_row(
             size if row.place != before else "",
             f"{row.method} *" if row.on_front else row.method,
@@ -67,7 +74,7 @@ def summary(rows: Iterable[Row]) -> Table:
                 "" if number is None else f"{number:#.3g}"
                 for number in (row.ms, row.error_percent, row.error_p90_percent, row.rmse_megohm)
             ),
-            f"{100 * or_nan(row.converged_share):.0f}",
+            "" if share is None else f"{100 * share:.0f}",
         )
         before = row.place
     return table
