@@ -445,6 +445,7 @@ OPTIONS = {
         *("--method", "--calibration", "--force", "--tare", "--json", "--scans", "--seconds"),
         *("PORT", *METHODS),
     ],
+    "calibrate": ["recording", "table"],
     "tare": ["--seconds", "--undo", "--force", "PORT"],
     "estimate": ["--method", "--out", "--cold", *METHODS],
     "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],
@@ -471,5 +472,6 @@ def test_help_names_every_command(run: Callable[..., Done]) -> None:
     for name in OPTIONS:
         assert f" {name} " in done.out
     assert sorted(OPTIONS) == sorted(
-        command.callback.__name__ for command in cli.app.registered_commands
+        [command.callback.__name__ for command in cli.app.registered_commands]
+        + [group.name for group in cli.app.registered_groups]
     )

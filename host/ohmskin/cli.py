@@ -27,6 +27,7 @@ from ohmskin import demo as demonstration
 from ohmskin import recording_commands as recordings
 from ohmskin import show
 from ohmskin import stream_command as streaming
+from ohmskin.calibrate_commands import calibrate
 from ohmskin.errors import OhmskinError, PortError
 from ohmskin.estimators import METHODS
 from ohmskin.faults import FAULTS
@@ -212,6 +213,7 @@ def flash(
 
 app.command()(streaming.stream)
 app.command()(tare)
+app.add_typer(calibrate, name="calibrate")
 
 
 @app.command()

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.circuit import Float, Skin, readings
+from ohmskin.press import LEAVE_S, PressModel, robot_presses
 
 REST_OHM: Final = 1.0e6
 TOP_WIRE_OHM: Final = 100.0
@@ -26,10 +27,15 @@ SCENES: Final = {
     "ghost": "three corners of a rectangle: without an estimator the fourth seems touched too",
     "multi": "five touches at places drawn from the seed",
     "moving": "one fingertip on a closed curve over the whole skin, once in 4 s",
+    "press": "a robot presses cell after cell, six times each with 0.4 to 8 N, 20 s a cell, once",
 }
 _MOVING_PERIOD_S: Final = 4.0
 _FINGER_CELLS: Final = 0.7  # radius of the fingertip's pressure
 _FINGER_SIEMENS: Final = 2e-4
+_UNTOUCHED_S: Final = 2.0
+_PEAKS_N: Final = (0.5, 0.9, 1.5, 2.6, 4.4, 7.3)
+_PEAK_SPREAD: Final = 0.1  # relative, to either side
+_PRESS_STEP_S: Final = 0.01
 
 
 class Scene:
@@ -70,12 +76,13 @@ class Scene:
             ref_bottom_ohm=ref_bottom_ohm,
         )
         self._touches = self._place(random)
+        self._robot = _Robot(rows, columns, seed) if name == "press" else None
         self._still_ratio = lru_cache(maxsize=1)(lambda: readings(self.skin(0.0)))
 
     @property
     def moves(self) -> bool:
         """Whether the touches change with time."""
-        return self.name == "moving"
+        return self.name in ("moving", "press")
 
     @property
     def rest_ratio(self) -> Float:
@@ -84,8 +91,22 @@ class Scene:
 
     def skin(self, time_s: float) -> Skin:
         """The truth: every resistance at a time."""
-        touch = self._finger(time_s) if self.moves else self._touches
+        if self._robot is not None:
+            touch = self._robot.touch(time_s)[0]
+        else:
+            touch = self._finger(time_s) if self.moves else self._touches
         return replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
+
+    def force_n(self, time_s: float) -> Float:
+        """The truth of the scene "press": force on every cell [N], (rows, columns).
+
+        :raises ValueError: a scene that presses with conductances: no force is known.
+        """
+        if self._robot is not None:
+            return self._robot.touch(time_s)[1]
+        if self.name == "rest":
+            return np.zeros((self.rows, self.columns))
+        raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
 
     def touched(self, time_s: float) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
         """Cells whose conductance a touch raises by 1 microsiemens or more, (rows, columns)."""
@@ -127,3 +148,33 @@ class Scene:
 def _two_of(count: int) -> tuple[int, int]:
     """Two lines well apart, a quarter in from the edges where there is room."""
     return count // 4, count - 1 - count // 4
+
+
+class _Robot:
+    """Forces and rises of the scene "press", cell by cell: one alone is pressed at any time."""
+
+    def __init__(self, rows: int, columns: int, seed: int) -> None:
+        self._shape = (rows, columns)
+        random = np.random.default_rng([seed, rows, columns])
+        starts_s = [_UNTOUCHED_S]
+        self._histories: list[tuple[Float, Float, Float]] = []
+        for _ in range(rows * columns):
+            lift = 1 + _PEAK_SPREAD * random.uniform(-1, 1, len(_PEAKS_N))
+            knots_s, knots_n = robot_presses(_PEAKS_N * lift, random, starts_s[-1])
+            starts_s.append(float(knots_s[-1]) + LEAVE_S)
+            times_s = np.arange(starts_s[-2], starts_s[-1], _PRESS_STEP_S)
+            forces_n = np.interp(times_s, knots_s, knots_n)
+            # A model of its own for each cell: one of all cells takes 64 times the memory.
+            model = PressModel(seed=int(random.integers(1 << 32)))
+            self._histories.append((times_s, forces_n, model.rise(times_s, forces_n)))
+        self._starts_s = np.array(starts_s)
+
+    def touch(self, time_s: float) -> tuple[Float, Float]:
+        """Rises [S] and forces [N] at a time, each (rows, columns)."""
+        rise, force_n = np.zeros(self._shape), np.zeros(self._shape)
+        cell = int(np.searchsorted(self._starts_s, time_s, side="right")) - 1
+        if 0 <= cell < rise.size:
+            times_s, forces_n, rises = self._histories[cell]
+            force_n.flat[cell] = np.interp(time_s, times_s, forces_n)
+            rise.flat[cell] = np.interp(time_s, times_s, rises)
+        return rise, force_n
