@@ -26,7 +26,7 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check format firmware test-firmware check-firmware sim \
-        test-host bench-firmware bench-host bench-estimators clean distclean
+        test-host bench-firmware bench-host bench-estimators bench-force clean distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -81,6 +81,9 @@ bench-host: setup-host ## measure decoding, latency and load of the host
 
 bench-estimators: setup-host ## measure the estimators: time, error, stated uncertainty
 	$(ONE_THREAD) $(BIN)/python benchmarks/bench_estimators.py
+
+bench-force: setup-host ## measure the way from scan to force: time, ten minutes live, replay
+	$(ONE_THREAD) $(BIN)/python benchmarks/bench_force.py
 
 clean: ## remove what was built
 	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

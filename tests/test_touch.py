@@ -180,9 +180,11 @@ def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
         assert np.mean(believed) == pytest.approx(np.mean(true), rel=0.3)
 
 
-def test_a_jump_of_the_wires_is_noticed_and_nothing_where_there_is_none() -> None:
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_jump_of_the_wires_is_noticed_and_nothing_where_there_is_none(method: str) -> None:
     """Eight simulated skins, 40 frames each before and after all wires double."""
     before = after = 0
+    away = []
     for seed in range(8):
         random = np.random.default_rng(100 + seed)
         rest = skin_at_rest(8, 8, random)
@@ -191,12 +193,16 @@ def test_a_jump_of_the_wires_is_noticed_and_nothing_where_there_is_none() -> Non
         )
         frames = [touch(skin, int(random.integers(1, 9)), random) for skin in [rest] * 40]
         frames += [touch(skin, int(random.integers(1, 9)), random) for skin in [longer] * 40]
-        said = estimate_file(trial_of(rest, frames).rounded(10), "joint")["message"]
-        noticed = np.array(["wires changed" in message for message in said])
+        trial = trial_of(rest, frames)
+        out = estimate_file(trial.rounded(10), method)
+        noticed = np.array(["wires changed" in message for message in out["message"]])
         before += int(noticed[:40].sum())
         after += bool(noticed[40:].any())
+        errors = np.abs(out["cell_siemens"] - trial.cell_siemens) / out["cell_siemens_std"]
+        away += errors[60:][trial.pressed[60:]].tolist()
     assert before <= 1
     assert after >= 6
+    assert np.mean(np.array(away) < 4) > 0.95
 
 
 def test_lessons_that_contradict_the_belief_set_it_free() -> None:

@@ -47,7 +47,9 @@ MAX_ROUNDS: Final = 8
 MAX_STEPS: Final = 8  # per round
 MAX_STEP: Final = 1.5  # of a log conductance
 CLOSE: Final = 0.1  # a step below this share of every standard deviation is the last
-HEAVY: Final = 0.5  # wires matter to a reading that they may move by this share of its noise
+HEAVY: Final = 0.5  # wires matter to a reading that they may move by this share of its noise,
+LIGHT: Final = 0.03  # and to the next, down to this share,
+MAX_HEAVY: Final = 24  # up to so many in all: together they tell a bend that none tells alone
 HIDING: Final = 0.1  # deviation of a path's wires, over a cell at rest, beyond which wires hide it
 REBUILD: Final = 0.05  # relative change of a path's wires for which the network is solved anew
 CONTRADICTION: Final = 3.0  # deviations of the chi-square of the readings that wires matter to
@@ -233,7 +235,9 @@ class _Fit:
             return Touched(cells, none, none, False, self._current, less, 0, nothing)
         assert self._touched is not None
         move = (self._current**2 - base.current**2) * base.path_ohm * base.wire_std
-        heavy = move > HEAVY * self._std
+        weight = move / self._std
+        least = np.partition(weight, -MAX_HEAVY)[-MAX_HEAVY] if weight.size > MAX_HEAVY else 0.0
+        heavy = weight > np.clip(least, LIGHT, HEAVY)
         heavy[cells] = True
         ports = np.flatnonzero(heavy)
         light = ~heavy

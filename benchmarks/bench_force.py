@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the way from scan to force: time, live for ten minutes, and replay bit for bit.
+
+    make bench-force
+
+Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
+missed. Takes a little longer than the live run: 10 minutes, or `--minutes N`. All skins are
+simulated, 8x8. What is measured how:
+
+force_ms_*              median wall time of one scan, from codes to forces and contacts, one core,
+                        warm. `presses`: one second of four overlapping presses, readings made with
+                        ngspice (tests/data). `finger`: a fingertip with soft edges that covers
+                        some 15 cells. By `touch` unless `joint` is said; p99: 99th percentile.
+live_*                  a process that iterates over the forces of a board, emulated by another
+                        process at a pseudo-terminal, which a finger touches: scans in all, scans
+                        missed, age of the newest scan at the end [ms], load of the reading process
+                        [% of a core]. By `touch`.
+replay_scans, _differ   scans of the first ten seconds of that, recorded and replayed, and how many
+                        of these differ in any bit of a force or its standard deviation.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bars import at_least, at_most, report  # beside this file
+
+import ohmskin
+from ohmskin.calibrate import Bench
+from ohmskin.calibration import Calibration
+from ohmskin.circuit import Float, quantise, ratio_from_codes
+from ohmskin.force_reader import ForceReader, ForceScan
+from ohmskin.messages import Hello, Scan
+from ohmskin.presses import Presses
+from ohmskin.readings import load_readings
+from ohmskin.recording import Recorder
+from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+
+PRESSES = Path(__file__).resolve().parents[1] / "tests" / "data" / "presses_8x8.npz"
+FINGER = "emulator://8x8?scene=moving&seed=1"
+SCANS = 360
+WARM_UP = 20
+RECORDED_S = 10.0
+SIEMENS_PER_NEWTON = 20e-6
+
+
+def calibration(board: Hello, rest_ratio: Float, method: str) -> Calibration:
+    """Of a skin of which every cell answers alike: what a force costs does not depend on it."""
+    bench = Bench(board, rest_ratio, method, 1e-4, "2025-01-01", TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    cells = np.repeat(np.arange(64), 6)
+    force_n = np.tile(np.arange(1.0, 7.0), 64)
+    presses = Presses(
+        cells=cells,
+        rise=SIEMENS_PER_NEWTON * force_n,
+        rise_std=np.full(cells.size, 1e-8),
+        force_n=force_n,
+        press=np.arange(cells.size),
+        shape=(8, 8),
+    )
+    return bench.calibration(presses)[0]
+
+
+def board_8x8() -> Hello:
+    with ohmskin.open("emulator://8x8", start=False) as skin:
+        return skin.info
+
+
+def times_ms(reader: ForceReader, ratios: Float) -> Float:
+    """Of every frame of readings (F, 8, 8, 4) after the first few."""
+    taken_ms = []
+    for number, codes in enumerate(quantise(ratios)):
+        scan = Scan(codes, number, 11_111 * number, number / 90, 0)
+        begin_s = time.perf_counter()
+        reader.read(scan)
+        taken_ms.append(1e3 * (time.perf_counter() - begin_s))
+    return np.array(taken_ms[WARM_UP:])
+
+
+def scan_times() -> dict[str, float]:
+    board = board_8x8()
+    pressed = load_readings(PRESSES)
+    assert pressed.rest_ratio is not None
+    pressed_rest = ratio_from_codes(quantise(pressed.rest_ratio))
+    scene = Scene("moving", 8, 8, seed=1)
+    finger = np.array([scene.ratio(number / 90) for number in range(SCANS)])
+    presses = np.tile(pressed.ratio, (-(-SCANS // len(pressed.ratio)), 1, 1, 1))
+    figures = {}
+    for name, method, rest, ratios in (
+        ("presses", "touch", pressed_rest, presses),
+        ("presses_joint", "joint", pressed_rest, presses),
+        ("finger", "touch", scene.rest_ratio, finger),
+        ("finger_joint", "joint", scene.rest_ratio, finger),
+    ):
+        taken_ms = times_ms(ForceReader(board, calibration(board, rest, method)), ratios)
+        figures[f"force_ms_{name}"] = round(float(np.median(taken_ms)), 3)
+        figures[f"force_ms_{name}_p99"] = round(float(np.percentile(taken_ms, 99)), 3)
+    return figures
+
+
+@contextmanager
+def emulated() -> Iterator[str]:
+    """The port of a board that another process emulates."""
+    command = [sys.executable, "-c", "from ohmskin.cli import main; main()", "emulate", FINGER]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+def live(minutes: float) -> dict[str, Any]:
+    rest = Scene("moving", 8, 8, seed=1).rest_ratio
+    seen: list[ForceScan] = []
+    with tempfile.TemporaryDirectory() as place, emulated() as port:
+        path = Path(place) / "live.mcap"
+        with ohmskin.open(port, start=False) as skin:
+            of_skin = calibration(skin.info, rest, "touch")
+        with ohmskin.open(port, calibration=of_skin, start=False) as skin:
+            recorder = Recorder(path, skin.info)
+            before, begin_s = os.times(), time.monotonic()
+            count = missed = 0
+            for scan in skin:
+                count += 1
+                missed += scan.missed
+                elapsed_s = time.monotonic() - begin_s
+                if elapsed_s < RECORDED_S:
+                    recorder.add(scan)
+                    seen.append(replace(scan, contacts=()))
+                else:
+                    recorder.close()
+                if elapsed_s >= 60 * minutes:
+                    break
+            recorder.close()
+            age_s = time.monotonic() - scan.host_time_s
+            after, end_s = os.times(), time.monotonic()
+        with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as skin:
+            again = list(skin)
+    used_s = (after.user - before.user) + (after.system - before.system)
+    return {
+        "live_minutes": minutes,
+        "live_scans": count,
+        "live_missed": missed,
+        "live_scans_per_s": round(count / (end_s - begin_s), 2),
+        "live_age_ms": round(1e3 * age_s, 2),
+        "live_cpu_percent": round(100 * used_s / (end_s - begin_s), 1),
+        "replay_scans": len(again),
+        "replay_differ": abs(len(again) - len(seen))
+        + sum(bits(one) != bits(other) for one, other in zip(seen, again, strict=False)),
+    }
+
+
+def bits(scan: ForceScan) -> tuple[int, bytes, bytes]:
+    return scan.number, scan.force_n.tobytes(), scan.force_n_std.tobytes()
+
+
+BARS = (
+    at_most("force_ms_presses", 1.0),
+    at_most("live_missed", 0),
+    at_least("live_scans_per_s", 89.5),
+    at_least("replay_scans", 0.95 * 90 * RECORDED_S),
+    at_most("replay_differ", 0),
+)
+
+
+def main() -> int:
+    minutes = float(sys.argv[sys.argv.index("--minutes") + 1]) if "--minutes" in sys.argv else 10.0
+    figures = {**scan_times(), **live(minutes)}
+    all_met = report(figures, BARS)
+    print(json.dumps(figures))
+    return 0 if all_met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
