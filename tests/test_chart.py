@@ -286,9 +286,9 @@ def test_chart_writes_picture_and_table(
 
 
 def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert commands._default_folder() == Path(__file__).resolve().parents[1] / "docs"
+    assert commands.default_folder() == Path(__file__).resolve().parents[1] / "docs"
     monkeypatch.setattr(commands, "__file__", "/lib/python/site-packages/ohmskin/studies/x.py")
-    assert commands._default_folder() == Path()
+    assert commands.default_folder() == Path()
 
 
 def test_without_matplotlib_nothing_is_measured(

@@ -29,7 +29,7 @@ def _machine() -> str:
     return platform.processor() or platform.machine() or "an unknown processor"
 
 
-def _default_folder() -> Path:
+def default_folder() -> Path:
     root = Path(__file__).parents[3]
     return root / "docs" if (root / "platformio.ini").is_file() else Path()
 
@@ -47,7 +47,7 @@ def chart(
     Takes a few minutes on one core. The last line printed is one JSON object.
     """
     chart_figure.require_matplotlib()
-    folder = _default_folder() if out is None else out
+    folder = default_folder() if out is None else out
     folder.mkdir(parents=True, exist_ok=True)
     started_s = time.monotonic()
     messages = Console(stderr=True)
@@ -95,7 +95,7 @@ def stability(
     one JSON object.
     """
     chart_figure.require_matplotlib()
-    folder = _default_folder() if out is None else out
+    folder = default_folder() if out is None else out
     folder.mkdir(parents=True, exist_ok=True)
     started_s = time.monotonic()
     messages = Console(stderr=True)

@@ -2,7 +2,8 @@
 """What the paper printed of its speed and accuracy, and the skins of its simulations.
 
 [Su2024]: B. Y. Su, Y. Wu, C. Wen, C. Liu, "Optimizing Multi-Touch Textile and Tactile Skin Sensing
-Through Circuit Parameter Estimation": section V.A (errors), "Scalability" in section V (times).
+Through Circuit Parameter Estimation": section V.A (errors), "Scalability" in section V (times),
+section V.B (errors of force).
 Its methods by our names: "naive" is `ohm`, "least squares" `lsq`, "regularized" `regularized`.
 
 The paper gives a time for its 2x2 skin, whose errors are in newton, and errors in megohm for
@@ -38,6 +39,26 @@ RMSE_MEGOHM: Final = {
         "regularized": (0.0829, 0.0680, 0.0519, 0.1140, 0.1998),
     },
 }
+# RMSE of force [N] on a real 2x2 skin, from the source of the figures of section V.B: "calibration"
+# is single touch, "estimation" several. In the order of FORCE_CELLS, counted from 1. "solved" is
+# the paper's method: it does not say which of its steps, nor which forces were pressed.
+FORCE_CELLS: Final = ((1, 1), (1, 2), (2, 1), (2, 2))
+FORCE_RMSE_N: Final = {
+    "flat": {
+        ("naive", "calibration"): (1.648, 1.721, 1.979, 1.204),
+        ("solved", "calibration"): (2.307, 1.845, 2.040, 1.312),
+        ("naive", "estimation"): (3.519, 2.345, 2.594, 2.175),
+        ("solved", "estimation"): (2.278, 2.191, 1.936, 1.908),
+    },
+    "curved": {
+        ("naive", "calibration"): (2.366, 2.595, 3.122, 2.118),
+        ("solved", "calibration"): (2.728, 2.475, 3.120, 2.127),
+        ("naive", "estimation"): (2.919, 2.228, 4.540, 2.662),
+        ("solved", "estimation"): (2.208, 1.686, 3.509, 2.380),
+    },
+}
+# What the text of section V.B says of these, "reduced the RMSE by" [%].
+FORCE_REDUCED_PERCENT: Final = {"flat": 27.3, "curved": 26.4}
 _PRESSED: Final = ([0, 0, 1], [0, 1, 0])  # three corners of a rectangle
 _PRESSED_OHM: Final = 1e3  # in the wire sweep, by its caption
 _WIRE_OHM: Final = 1e3  # in the cell sweep
