@@ -25,6 +25,7 @@ from ohmskin.device import Device
 from ohmskin.errors import OhmskinError, RecordingError
 from ohmskin.export import FORMATS
 from ohmskin.export import export as export_recording
+from ohmskin.messages import Scan
 from ohmskin.recording import Mark, Recorder, Tare, load_recording
 
 _out = Console(soft_wrap=True)
@@ -46,12 +47,28 @@ def record(
     with ohmskin.open(port, start=False) as skin, Recorder(file, skin.info) as recorder:
         for text in mark or ():
             recorder.add(Mark(text, time.monotonic()))
-        with _marks_typed(recorder), _stop_signals() as (may_interrupt, is_stopped):
-            _record(skin, recorder, scans, seconds, tare_s, may_interrupt, is_stopped)
+        with _marks_typed(recorder):
+            record_scans(skin, recorder, scans, seconds, tare_s)
     size = file.stat().st_size
     _out.print(
         f"{file}: {recorder.scans} scans, missed {recorder.missed}, {size} bytes", markup=False
     )
+
+
+def record_scans(
+    skin: Device,
+    recorder: Recorder,
+    count: int,
+    seconds: float,
+    tare_s: float,
+    beside: Callable[[Scan], None] = lambda scan: None,
+) -> None:
+    """Record every scan until Ctrl-C or SIGTERM, so many scans, or so many seconds (0: never).
+
+    tare_s: of so many seconds at first a tare is recorded. beside: is called after each scan.
+    """
+    with stop_signals() as (may_interrupt, is_stopped):
+        _record(skin, recorder, count, seconds, tare_s, beside, may_interrupt, is_stopped)
 
 
 def _record(
@@ -60,6 +77,7 @@ def _record(
     count: int,
     seconds: float,
     tare_s: float,
+    beside: Callable[[Scan], None],
     may_interrupt: Callable[[bool], None],
     is_stopped: Callable[[], bool],
 ) -> None:
@@ -80,6 +98,7 @@ def _record(
                 untouched.append(scan.ratio)
             elif untouched:
                 recorder.add(_tare(untouched))
+            beside(scan)
             if is_stopped() or recorder.scans == count or (seconds and elapsed_s >= seconds):
                 return
             may_interrupt(True)
@@ -99,8 +118,12 @@ def _tare(untouched: list[Float]) -> Tare:
 
 
 @contextmanager
-def _stop_signals() -> Iterator[tuple[Callable[[bool], None], Callable[[], bool]]]:
-    """Ctrl-C and SIGTERM end the recording between two scans, never amid a write."""
+def stop_signals() -> Iterator[tuple[Callable[[bool], None], Callable[[], bool]]]:
+    """Ctrl-C and SIGTERM end the ``with`` between two scans, never amid a write.
+
+    Gives two functions: one says whether they may interrupt from now on, as while a scan is waited
+    for; the other whether one has come.
+    """
     stopped = interruptible = False
 
     def handle(number: int, frame: FrameType | None) -> None:
