@@ -131,6 +131,11 @@ def finish(
     _out.print(_report(calibration, presses))
     if message:
         _out.print(message)
+    if calibration.nominal_top_wire_ohm is None or calibration.nominal_bottom_wire_ohm is None:
+        _out.print(
+            "the wires are not told (--top-wire, --bottom-wire): standard deviations of forces will "
+            "be wide"
+        )
     _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 
 

@@ -39,7 +39,7 @@ def record(
     scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
     seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
     tare_s: Annotated[
-        float, typer.Option("--tare", help="so long nothing touches the skin: its tare [s]")
+        float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its tare")
     ] = 0.0,
     mark: Annotated[list[str] | None, typer.Option(help="a mark at the beginning")] = None,
 ) -> None:
@@ -182,9 +182,9 @@ def export(
     recording: Annotated[Path, typer.Argument(help="recording (.mcap)")],
     out: Annotated[Path, typer.Argument(help=f"file to write: {' or '.join(FORMATS)}")],
     begin_s: Annotated[
-        float, typer.Option("--begin", help="from so long after the first scan [s]")
+        float, typer.Option("--begin", help="from so long after the first scan, in seconds")
     ] = 0.0,
-    end_s: Annotated[float, typer.Option("--end", help="until then [s]; 0: to the last")] = 0.0,
+    end_s: Annotated[float, typer.Option("--end", help="until then, in seconds; 0: to the last")] = 0.0,
 ) -> None:
     """Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as a table (.csv)."""
     if out.suffix not in FORMATS:

@@ -47,7 +47,7 @@ def stream(
         bool, typer.Option("--force", help="take a calibration of another unit")
     ] = False,
     tare_s: Annotated[
-        float, typer.Option("--tare", help="so long nothing touches the skin: its rest [s]")
+        float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its rest")
     ] = 0.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object a scan")] = False,
     scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,

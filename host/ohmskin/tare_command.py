@@ -18,7 +18,9 @@ _out = Console(soft_wrap=True)
 def tare(
     port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
     calibration: Annotated[Path, typer.Argument(help="calibration file (.json), to be changed")],
-    seconds: Annotated[float, typer.Option(help="so long nothing touches the skin [s]")] = TARE_S,
+    seconds: Annotated[
+        float, typer.Option(help="so long nothing touches the skin, in seconds")
+    ] = TARE_S,
     undo: Annotated[
         bool, typer.Option("--undo", help="return to the rest of the calibration")
     ] = False,

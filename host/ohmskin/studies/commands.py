@@ -30,6 +30,7 @@ def _machine() -> str:
 
 
 def default_folder() -> Path:
+    """Where pictures go: docs of a checkout, or here."""
     root = Path(__file__).parents[3]
     return root / "docs" if (root / "platformio.ini").is_file() else Path()
 
