@@ -184,7 +184,9 @@ def export(
     begin_s: Annotated[
         float, typer.Option("--begin", help="from so long after the first scan, in seconds")
     ] = 0.0,
-    end_s: Annotated[float, typer.Option("--end", help="until then, in seconds; 0: to the last")] = 0.0,
+    end_s: Annotated[
+        float, typer.Option("--end", help="until then, in seconds; 0: to the last")
+    ] = 0.0,
 ) -> None:
     """Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as a table (.csv)."""
     if out.suffix not in FORMATS:
