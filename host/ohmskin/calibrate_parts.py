@@ -133,8 +133,7 @@ def finish(
         _out.print(message)
     if calibration.nominal_top_wire_ohm is None or calibration.nominal_bottom_wire_ohm is None:
         _out.print(
-            "the wires are not told (--top-wire, --bottom-wire): standard deviations of forces will "
-            "be wide"
+            "wires are not told (--top-wire, --bottom-wire): forces' standard deviations are wide"
         )
     _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 
