@@ -25,8 +25,9 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-host demo test check format firmware test-firmware check-firmware sim \
-        test-host bench-firmware bench-host bench-estimators bench-force clean distclean
+.PHONY: help setup setup-host demo test check docs format firmware test-firmware check-firmware sim \
+        test-host bench-firmware bench-host bench-estimators bench-force bench-view bench-boards clean \
+        distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -46,12 +47,17 @@ $(HOST_STAMP): pyproject.toml tools/setup.sh
 $(STAMP): pyproject.toml tools/setup.sh
 	tools/setup.sh all
 
-check: setup ## formatting, lint, types, generated files
+check: setup ## formatting, lint, types, generated files, docs
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run -Werror $(C_FILES)
 	$(BIN)/python protocol/generate.py --check
+	$(BIN)/python docs/draw.py --check
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+docs: setup ## build the pages of docs/ into build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 format: setup ## put Python and C++ sources into the common format
 	$(BIN)/ruff check --fix
@@ -84,6 +90,12 @@ bench-estimators: setup-host ## measure the estimators: time, error, stated unce
 
 bench-force: setup-host ## measure the way from scan to force: time, ten minutes live, replay
 	$(ONE_THREAD) $(BIN)/python benchmarks/bench_force.py
+
+bench-view: setup ## measure the page: latency to the screen, frames, load
+	$(ONE_THREAD) $(BIN)/python benchmarks/bench_view.py
+
+bench-boards: setup-host ## measure one process that reads eight boards at once: five minutes
+	$(ONE_THREAD) $(BIN)/python benchmarks/bench_boards.py
 
 clean: ## remove what was built
 	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -36,10 +36,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     ):
         pytest.skip("needs 'make firmware sim'")
     if item.get_closest_marker("ngspice") and not shutil.which("ngspice"):
-        reason = "needs ngspice, which 'make setup' installs (apt package ngspice)"
-        if os.environ.get("CI") == "true":
-            pytest.fail(reason, pytrace=False)
-        pytest.skip(reason)
+        _is_missing("ngspice", "ngspice")
+    if item.get_closest_marker("browser") and not shutil.which("chromium"):
+        _is_missing("Chromium", "chromium")
+
+
+def _is_missing(program: str, package: str) -> None:
+    reason = f"needs {program}, which 'make setup' installs (apt package {package})"
+    if os.environ.get("CI") == "true":
+        pytest.fail(reason, pytrace=False)
+    pytest.skip(reason)
 
 
 @pytest.fixture

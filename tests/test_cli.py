@@ -26,6 +26,7 @@ from ohmskin.estimators import METHODS
 from ohmskin.protocol import LAYOUT_CRC
 from ohmskin.pty_server import PtyServer
 from ohmskin.scenes import Scene
+from ohmskin.skin_faults import SKIN_FAULTS
 
 DATA = Path(__file__).parent / "data"
 EMULATED = "emulator://4x6?scene=ghost&seed=2"
@@ -369,8 +370,6 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     ),
     "demo of a real port": (["demo", "--port", "/dev/ttyACM99"], ["truth", "emulator://"]),
     "emulation of a real port": (["emulate", "/dev/ttyACM99"], ["emulator://8x8"]),
-    "flash what": (["flash"], ["uno", "megaatmega2560"]),
-    "flash another board": (["flash", "due"], ["uno", "megaatmega2560"]),
     "unknown command": (["skin"], ["skin"]),
     "unknown option": (["info", EMULATED, "--fast"], ["--fast"]),
     "missing argument": (["info"], ["port"]),
@@ -445,15 +444,18 @@ OPTIONS = {
         *("--method", "--calibration", "--force", "--tare", "--json", "--scans", "--seconds"),
         *("PORT", *METHODS),
     ],
-    "calibrate": ["recording", "table"],
+    "view": ["--calibration", "--force", "--host", "--http-port", "--no-browser", "PORT"],
+    "calibrate": ["recording", "sensor", "table", "weights"],
+    "doctor": ["--calibration", "--wires", "--json", "PORT"],
     "tare": ["--seconds", "--undo", "--force", "PORT"],
     "estimate": ["--method", "--out", "--cold", *METHODS],
     "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],
     "export": ["--begin", "--end", ".npz", ".csv"],
-    "emulate": ["--link", "--seconds", "ghost", "bitflip"],
+    "emulate": ["--link", "--seconds", "ghost", "bitflip", *SKIN_FAULTS],
     "demo": ["--seconds", "--port", "--picture"],
     "chart": ["--out", "--quick"],
     "stability": ["--out", "--quick", "--jobs"],
+    "experiment": ["flat", "curved", "timeseries", "minimum"],
 }
 
 

@@ -1,20 +1,67 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The examples run, and print what they say they print."""
+"""The examples run, and do what they say they do."""
 
 from __future__ import annotations
 
+import base64
+import importlib.util
+import json
 import re
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from command_line import Done
+from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
+from mcap.reader import make_reader
+from ros_stub import Float32MultiArray, PointCloud2, PointField, Ros
+from test_calibrated_device import of_scene
+
+import ohmskin
+from ohmskin.recording import Mark, Recorder
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+GHOST = "emulator://8x8?scene=ghost&seed=1"
 
 
 def output_of(*command: str) -> str:
     return subprocess.run(
         [sys.executable, *command], capture_output=True, text=True, check=True, timeout=60
     ).stdout
+
+
+def first_lines(count: int, *command: str) -> list[str]:
+    """Of a program that goes on for ever."""
+    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        return [process.stdout.readline() for _ in range(count)]
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+def example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def skin_json(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("calibration") / "skin.json"
+    of_scene("ghost").save(path)
+    return str(path)
 
 
 def test_every_scan_prints_consecutive_scans() -> None:
@@ -34,6 +81,181 @@ def test_estimate_prints_the_moving_finger() -> None:
     assert all(float(value) > 0 for *_, value, _ in touches)
 
 
+def test_forces_prints_contacts(skin_json: str) -> None:
+    lines = first_lines(6, str(EXAMPLES / "forces.py"), GHOST, skin_json)
+    found = [re.fullmatch(r"([\d.]+) N at \((\d\.\d), (\d\.\d)\)\n", line) for line in lines]
+    assert all(found)
+    assert len({each.groups()[1:] for each in found if each}) == 3  # the ghost is none
+
+
+def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Callable[..., Done]) -> None:
+    path, table = tmp_path / "skin.json", str(EXAMPLES / "presses.csv")
+    arguments = ("emulator://8x8", table, str(path), "--indenter-mm2", "80")
+    assert run("calibrate", "table", *arguments).code == 0
+    calibration = ohmskin.load_calibration(path)
+    assert (calibration.rows, calibration.columns, calibration.unit_id) == (8, 8, 0)
+
+
+def test_two_boards_have_one_clock() -> None:
+    urls = ("emulator://8x8?unit=1", "emulator://8x8?unit=2")
+    head, *lines = first_lines(40, str(EXAMPLES / "two_boards.py"), *urls)
+    assert head == "units 1, 2\n"
+    scans = [re.match(r"([\d.]+) s: unit (\d), scan (\d+), missed 0, 0\.\d+, ", x) for x in lines]
+    times_s = [float(each[1]) for each in scans if each]
+    assert len(times_s) == 39
+    assert all(b - a > -0.002 for a, b in pairwise(times_s))
+    assert 0 < time.monotonic() - times_s[-1] < 60
+    assert {each[2] for each in scans if each} == {"1", "2"}
+
+
+# ------------------------------------------------------------------------- into other programs
+
+
+def test_the_ros_node_publishes_forces_and_taxels(
+    monkeypatch: pytest.MonkeyPatch, skin_json: str
+) -> None:
+    ros = Ros({"port": GHOST, "calibration": skin_json, "pitch_m": 0.02}, turns=20)
+    for name, module in ros.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    begin_s = time.time()
+    example("ros2_node").main()
+    assert ros.shut_down
+    arrays = [each for topic, each in ros.published if topic == "~/forces"]
+    clouds = [each for topic, each in ros.published if topic == "~/taxels"]
+    assert len(arrays) == len(clouds) == 20
+    forces, cloud = arrays[-1], clouds[-1]
+    assert isinstance(forces, Float32MultiArray)
+    assert isinstance(cloud, PointCloud2)
+
+    # multiarray(i,j,k) = data[data_offset + dim_stride[1]*i + dim_stride[2]*j + k]
+    assert [(d.label, d.size, d.stride) for d in forces.layout.dim] == [
+        ("rows", 8, 64),
+        ("columns", 8, 8),
+    ]
+    force_n = np.array(forces.data).reshape(8, 8)
+    touched = set(zip(*np.nonzero(force_n > 0.1), strict=True))
+    assert len(touched) == 3
+
+    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (8, 8, 16, 128)
+    assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
+        (name, 4 * index, PointField.FLOAT32, 1) for index, name in enumerate("xyz")
+    ] + [("force", 12, 7, 1)]
+    assert cloud.is_dense
+    points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(8, 8, 4)
+    assert points[3, 5, :3] == pytest.approx([0.10, 0.06, 0])
+    np.testing.assert_array_equal(points[:, :, 3], force_n)
+    stamps_s = [each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec for each in clouds]
+    assert cloud.header.frame_id == "skin"
+    assert np.diff(stamps_s) == pytest.approx(1 / 90, abs=3e-3)
+    assert begin_s < stamps_s[0] < stamps_s[-1] < time.time()
+
+
+LABELS = [f"row {row} column {column}" for row in range(8) for column in range(8)]
+
+
+def test_the_lsl_outlet_pushes_forces_at_their_times(
+    monkeypatch: pytest.MonkeyPatch, skin_json: str
+) -> None:
+    samples: list[tuple[list[float], float]] = []
+    infos: list[StreamInfo] = []
+    monkeypatch.setitem(sys.modules, "pylsl", pylsl_module(samples, infos))
+    example("lsl_outlet").main(GHOST, skin_json, 0.5)
+    (info,) = infos
+    assert (info.name, info.type, info.channel_count) == ("ohmskin", "Force", 64)
+    assert info.nominal_srate == pytest.approx(90, rel=1e-3)
+    assert info.source_id == "ohmskin-unit-0"
+    assert info.get_channel("label") == LABELS
+    assert info.get_channel("unit") == ["newtons"] * 64
+    assert len(samples) > 30
+    times_s = np.array([timestamp for _, timestamp in samples])
+    assert np.diff(times_s) == pytest.approx(1 / 90, abs=3e-3)
+    assert 0 < time.monotonic() + CLOCK_OFFSET_S - times_s[-1] < 1
+    assert np.count_nonzero(np.array(samples[-1][0]) > 0.1) == 3
+
+
+def test_a_real_lsl_inlet_gets_them(skin_json: str) -> None:
+    try:
+        import pylsl
+    except (ImportError, RuntimeError) as exc:  # RuntimeError: there is no liblsl
+        pytest.skip(f"needs pylsl: {exc}")
+    outlet = threading.Thread(target=example("lsl_outlet").main, args=(GHOST, skin_json, 2.5))
+    outlet.start()
+    try:
+        found = pylsl.resolve_byprop("source_id", "ohmskin-unit-0", timeout=2.0)
+        if not found:
+            pytest.skip("this machine's network has no multicast")
+        inlet = pylsl.StreamInlet(found[0])
+        info = inlet.info()
+        pulled = [inlet.pull_sample(timeout=2.0) for _ in range(30)]
+        inlet.close_stream()
+    finally:
+        outlet.join()
+    assert info.get_channel_labels() == LABELS
+    assert info.get_channel_units() == ["newtons"] * 64
+    times_s = np.array([timestamp for _, timestamp in pulled])
+    assert np.diff(times_s) == pytest.approx(1 / 90, abs=3e-3)
+    assert np.count_nonzero(np.array(pulled[-1][0]) > 0.1) == 3
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    path = tmp_path / "recording.mcap"
+    with ohmskin.open(GHOST) as skin, Recorder(path, skin.info) as recorder:
+        recorder.add(Mark("begin", time.monotonic()))
+        for _, scan in zip(range(20), skin, strict=False):
+            recorder.add(scan)
+    return path
+
+
+def messages_of(path: Path) -> list[tuple[str, str, str, dict, int, dict]]:
+    """Topic, schema's name and text, log time and content of each; encodings as Foxglove wants."""
+    found = []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert schema is not None
+            # docs.foxglove.dev, "Custom schema encodings": these, and "type": "object".
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            text = json.loads(schema.data)
+            assert text["type"] == "object"
+            content = json.loads(message.data)
+            assert set(content) >= set(text.get("required", ()))
+            found.append((channel.topic, schema.name, text, message.log_time, content))
+    return found
+
+
+def test_a_recording_is_as_foxglove_wants_it(recorded: Path) -> None:
+    found = messages_of(recorded)
+    assert {topic for topic, *_ in found} == {"/skin/hello", "/skin/mark", "/skin/scan"}
+    named = (EXAMPLES / "foxglove.md").read_text()
+    for _, _, text, _, content in found:
+        assert set(text["properties"]) == set(content)
+    for topic in ("/skin/hello", "/skin/mark", "/skin/scan.codes", "/skin/scan.missed"):
+        assert f"`{topic}" in named
+
+
+def test_foxglove_forces_writes_a_grid(recorded: Path, skin_json: str, tmp_path: Path) -> None:
+    out = tmp_path / "forces.mcap"
+    output_of(str(EXAMPLES / "foxglove_forces.py"), str(recorded), skin_json, str(out))
+    found = messages_of(out)
+    grids = [each for each in found if each[0] == "/skin/grid"]
+    cells = [each for each in found if each[0] == "/skin/cells"]
+    scans = [each for each in messages_of(recorded) if each[0] == "/skin/scan"]
+    assert len(grids) == len(cells) == len(scans) == 20
+    for (_, name, text, log_ns, grid), (*_, scan_ns, _) in zip(grids, scans, strict=True):
+        assert name == "foxglove.Grid"
+        assert text["properties"]["data"]["contentEncoding"] == "base64"
+        assert abs(log_ns - scan_ns) < 1000
+        assert grid["timestamp"] == {"sec": log_ns // 10**9, "nsec": log_ns % 10**9}
+    force_n = np.frombuffer(base64.b64decode(grid["data"]), "<f4").reshape(8, 8)
+    assert (grid["column_count"], grid["row_stride"], grid["cell_stride"]) == (8, 32, 4)
+    assert grid["fields"] == [{"name": "force", "offset": 0, "type": 7}]
+    assert np.count_nonzero(force_n > 0.1) == 3
+    assert cells[-1][-1]["force_n"] == pytest.approx(force_n.flatten(), abs=1e-4)
+
+
 def test_every_example_is_run_here() -> None:
-    tested = {"every_scan.py", "estimate.py"}
+    tested = {
+        *("every_scan.py", "estimate.py", "forces.py", "two_boards.py", "ros2_node.py"),
+        *("lsl_outlet.py", "foxglove_forces.py"),
+    }
     assert {path.name for path in EXAMPLES.glob("*.py")} == tested

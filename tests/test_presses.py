@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from ohmskin.circuit import Float
 from ohmskin.force_log import ForceLog
-from ohmskin.messages import Scan
-from ohmskin.presses import LevelHistory, find_presses, scan_times_s
+from ohmskin.presses import LevelHistory, find_presses
 
 HZ = 90.0
 OFFSET_S = 500.0
@@ -120,28 +118,3 @@ def test_scans_without_a_force_are_left_out() -> None:
 def test_what_holds_no_press_is_refused(rise: Float, offset_s: float, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         find_presses(history(rise), log_of(pressed_in_turn()[1]), offset_s)
-
-
-def scans_at(board_s: Float, host_s: Float) -> list[Scan]:
-    codes: NDArray[np.uint16] = np.zeros((1, 1, 4), dtype=np.uint16)
-    return [
-        Scan(codes, number, round(1e6 * board), host, 0)
-        for number, (board, host) in enumerate(zip(board_s, host_s, strict=True))
-    ]
-
-
-def test_scan_times_are_free_of_the_jitter_of_their_arrival() -> None:
-    random = np.random.default_rng(1)
-    board_s = np.arange(900) / HZ
-    true_s = 77.0 + 1.0002 * board_s  # a crystal that is 200 ppm off
-    late_s = random.exponential(5e-3, 900)
-    times_s = scan_times_s(scans_at(board_s, true_s + late_s))
-    off_s = times_s - true_s - late_s.mean()
-    assert np.abs(off_s).max() < 1e-3
-    assert np.abs(late_s - late_s.mean()).max() > 20e-3
-
-
-def test_scan_times_follow_a_board_that_restarts() -> None:
-    board_s = np.concatenate([np.arange(50), np.arange(50)]) / HZ
-    host_s = np.concatenate([np.arange(50), 200 + np.arange(50)]) / HZ + 9.0
-    np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=1e-6)

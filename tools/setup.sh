@@ -4,7 +4,7 @@
 # Usage: tools/setup.sh host|all        (run by `make`, from the repository's root)
 #
 # host: .venv with the ohmskin package.
-# all: also the AVR tools and ngspice from apt, and the development tools.
+# all: also the AVR tools, ngspice and Chromium (for tests) from apt, and the development tools.
 # Installs only what is missing, and says what.
 set -euo pipefail
 
@@ -80,11 +80,15 @@ pip_install() { # requirement
 case ${1:-} in
 host)
     make_venv
-    pip_install '.[plot]'
+    pip_install '.[plot,view]'
     touch .venv/.stamp-host
     ;;
 all)
-    [[ -n ${OHMSKIN_SKIP_APT:-} ]] || apt_install "${APT_PACKAGES[@]}"
+    if [[ -z ${OHMSKIN_SKIP_APT:-} ]]; then
+        apt_install "${APT_PACKAGES[@]}"
+        apt_install chromium fonts-dejavu-core ||
+            echo "setup: without Chromium (Ubuntu has a snap alone) tests of the page are skipped"
+    fi
     make_venv
     pip_install '.[dev]'
     touch .venv/.stamp-host .venv/.stamp

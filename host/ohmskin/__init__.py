@@ -8,8 +8,10 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
+from ohmskin.boards import Boards, BoardScan, open_all
 from ohmskin.calibrated_device import CalibratedDevice
 from ohmskin.calibration import Calibration, load_calibration
+from ohmskin.clock import BoardClock
 from ohmskin.contacts import Contact
 from ohmskin.device import Device
 from ohmskin.errors import (
@@ -30,7 +32,10 @@ from ohmskin.ports import open
 
 __all__ = [
     "METHODS",
+    "BoardClock",
+    "BoardScan",
     "BoardStats",
+    "Boards",
     "CalibratedDevice",
     "Calibration",
     "CommandRefused",
@@ -54,5 +59,6 @@ __all__ = [
     "load_calibration",
     "make_estimator",
     "open",
+    "open_all",
 ]
 __version__ = "0.1.0"

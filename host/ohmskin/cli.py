@@ -4,10 +4,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import signal
-import subprocess
 import sys
 from collections import Counter
 from contextlib import ExitStack, suppress
@@ -28,18 +25,22 @@ from ohmskin import recording_commands as recordings
 from ohmskin import show
 from ohmskin import stream_command as streaming
 from ohmskin.calibrate_commands import calibrate
-from ohmskin.errors import OhmskinError, PortError
+from ohmskin.doctor_command import doctor
+from ohmskin.errors import OhmskinError
 from ohmskin.estimators import METHODS
 from ohmskin.faults import FAULTS
+from ohmskin.flash_command import flash
 from ohmskin.link import serial_ports
 from ohmskin.ports import emulated
 from ohmskin.protocol import ENUMS
 from ohmskin.pty_server import PtyServer
 from ohmskin.readings import estimate_file, load_readings, save_arrays
 from ohmskin.scenes import SCENES
-from ohmskin.simavr_link import BOARDS
+from ohmskin.skin_faults import SKIN_FAULTS
 from ohmskin.studies import commands as studies
+from ohmskin.studies.force_commands import experiment
 from ohmskin.tare_command import tare
+from ohmskin.view_command import view
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -150,7 +151,7 @@ def configure(
     ] = None,
     settle_us: Annotated[
         int | None,
-        typer.Option("--settle", help="least settle time [us]; 0: as long as the rate allows"),
+        typer.Option("--settle", help="least settle time in us; 0: as long as the rate allows"),
     ] = None,
     adc_prescaler: Annotated[
         str | None, typer.Option("--adc", help=" | ".join(ENUMS["adc_prescaler"].values))
@@ -180,39 +181,14 @@ def configure(
     )
 
 
-@app.command()
-def flash(
-    board: Annotated[str, typer.Argument(help=" | ".join(BOARDS))] = "",
-    port: Annotated[str, typer.Option(help="serial port of the board")] = "",
-) -> None:
-    """Build the firmware and write it to a board (needs a checkout and PlatformIO)."""
-    known = [p for p in serial_ports() if p.board and port in ("", p.path)]
-    if not board and len(known) == 1:
-        board, port = known[0].board, known[0].path
-    if board not in BOARDS:
-        raise PortError(f"say which board to flash: ohmskin flash {' | '.join(BOARDS)}")
-    root = Path(__file__).parents[2]
-    if not (root / "platformio.ini").is_file():
-        raise OhmskinError("the firmware is not here: run this in a checkout of the repository")
-    pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
-    if pio is None:
-        raise OhmskinError("PlatformIO is not installed: pip install 'ohmskin[flash]'")
-    command = [pio, "run", "-d", str(root), "-e", board, "-t", "upload"]
-    command += ["--upload-port", port] if port else []
-    packages = root / ".pio" / "core"  # where `make setup` puts them
-    environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
-    _out.print(f"flashing {board}{f' at {port}' if port else ''}")
-    if subprocess.run(command, env=environment | os.environ).returncode:
-        raise OhmskinError(f"flashing {board} failed: its last lines above say why")
-    if port:
-        with ohmskin.open(port, start=False) as skin:
-            _out.print(f"{port}: {skin.info.board}, firmware {skin.info.version}, answers")
-
+app.command()(flash)
 
 # -------------------------------------------------------------------------------------- scans
 
 app.command()(streaming.stream)
+app.command()(view)
 app.command()(tare)
+app.command()(doctor)
 app.add_typer(calibrate, name="calibrate")
 
 
@@ -252,7 +228,8 @@ app.command()(recordings.export)
 
 @app.command(
     epilog=f"Scenes: {'; '.join(f'{k}: {v}' for k, v in SCENES.items())}. "
-    f"Faults: {'; '.join(f'{k}: {v}' for k, v in FAULTS.items())}."
+    f"Faults of the line: {'; '.join(f'{k}: {v}' for k, v in FAULTS.items())}. "
+    f"Faults of the skin: {'; '.join(f'{k}: {v}' for k, v in SKIN_FAULTS.items())}."
 )
 def emulate(
     url: Annotated[str, typer.Argument(help="emulator://8x8?scene=ghost&seed=1")] = (
@@ -301,3 +278,4 @@ def demo(
 
 app.command()(studies.chart)
 app.command()(studies.stability)
+app.add_typer(experiment, name="experiment")

@@ -6,9 +6,9 @@ bytes go in with `receive`, time with `advance`, which returns the bytes the boa
 `EmulatorLink` runs one in real time behind the interface of a serial port.
 
 Not modelled: how long a line takes (a scan's bytes come all at once at its end, and no scan is
-dropped for want of line speed), settling of the wires, EEPROM beyond the life of the object, the
-self-test's findings (the emulated board is sound). For these there is ``simavr://``, which runs the
-firmware itself.
+dropped for want of line speed), EEPROM beyond the life of the object, the self-test's findings (the
+emulated board is sound; what is wrong with the skin is told by `ohmskin.skin_faults`). For these
+there is ``simavr://``, which runs the firmware itself.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from ohmskin.faults import Faults
 from ohmskin.link import READ_TIMEOUT_S
 
 RatioAt = Callable[[float], Float]
+Sampled = Callable[[Float, float, float, float], Float]
 
 VERSION = (0, 1, 0)
 CLOCK_HZ = 16_000_000
@@ -48,6 +49,8 @@ class EmulatedBoard:
 
     rate_hz: at boot; None: 90, or as fast as the converter runs where that is slower.
     noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed: of the noise.
+    sampled: what becomes of the readings of a scan that starts at a time [s], one each slot [s],
+    each so long after the change of pins [s].
 
     :raises ValueError: a board cannot do that.
     """
@@ -65,10 +68,12 @@ class EmulatedBoard:
         ref_top_ohm: int = 30_000,
         ref_bottom_ohm: int = 30_000,
         layout_crc: int = protocol.LAYOUT_CRC,
+        sampled: Sampled | None = None,
     ) -> None:
         if not 0 <= noise_lsb < float("inf"):
             raise ValueError(f"noise must be 0 or more, not {noise_lsb}")
         self._ratio_at = ratio_at
+        self._sampled = sampled
         self._skin_shape = (rows, columns)
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
         self._random = np.random.default_rng(seed)
@@ -140,6 +145,9 @@ class EmulatedBoard:
         ratio[:] = READING_OFFSET  # no current flows
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s)[: have[0], : have[1]]
+        if self._sampled is not None:
+            slot_s, settle_s = self._plan["slot_cycles"] / CLOCK_HZ, 1e-6 * self._plan["settle_us"]
+            ratio = self._sampled(ratio, time_s, slot_s, settle_s)
         if self._noise_ratio:
             ratio += self._noise_ratio * self._random.standard_normal(ratio.shape)
         return quantise(ratio, protocol.ADC_BITS)
@@ -227,6 +235,7 @@ class EmulatedBoard:
             slot = period // slots
         return {
             "scan_cycles": period,
+            "slot_cycles": slot,
             "settle_us": (slot - select) * 1_000_000 // CLOCK_HZ,
         }
 

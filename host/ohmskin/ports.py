@@ -31,11 +31,13 @@ from ohmskin.readings import load_readings
 from ohmskin.replay import ReplayLink
 from ohmskin.scenes import Scene
 from ohmskin.simavr_link import SimavrLink
+from ohmskin.skin_faults import SKIN_FAULTS, SkinFaults
 
 CalibrationLike = Calibration | str | os.PathLike[str]
 
 _SCENE_KEYS = ("scene", "seed")
-_EMULATOR_KEYS = (*_SCENE_KEYS, "readings", "rate", "noise", "unit", "foreign", *FAULTS)
+_BOARD_KEYS = ("readings", "rate", "noise", "unit", "foreign")
+_EMULATOR_KEYS = (*_SCENE_KEYS, *_BOARD_KEYS, *SKIN_FAULTS, *FAULTS)
 _DEFAULT_NOISE_LSB = 0.3
 
 
@@ -122,7 +124,10 @@ def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
     options = _options(url, query, _EMULATOR_KEYS)
     try:
         seed = int(options.pop("seed", "0"))
-        ratio_at, rows, columns = _skin(place, options, seed)
+        skin_faults = SkinFaults.from_texts(options)
+        for name in SKIN_FAULTS:
+            options.pop(name, None)
+        ratio_at, rows, columns = _skin(place, options, seed, skin_faults)
         board = EmulatedBoard(
             ratio_at,
             rows,
@@ -132,6 +137,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
             seed=seed,
             unit_id=int(options.pop("unit", "0")),
             layout_crc=protocol.LAYOUT_CRC ^ int(options.pop("foreign", "0")),
+            sampled=skin_faults.sampled if skin_faults.of_sampling else None,
         )
         faults = Faults(seed=seed, **{name: float(value) for name, value in options.items()})
     except (ValueError, OSError) as exc:
@@ -140,21 +146,25 @@ def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
 
 
 def _skin(
-    place: str, options: dict[str, str], seed: int
+    place: str, options: dict[str, str], seed: int, faults: SkinFaults
 ) -> tuple[Callable[[float], Float], int, int]:
     path = options.pop("readings", None)
     if path is None:
-        scene = _scene(place, options, seed)
+        scene = _scene(place, options, seed, faults)
         return scene.ratio, scene.rows, scene.columns
     if "scene" in options:
         raise ValueError("say either scene or readings")
+    if faults.of_resistances:
+        raise ValueError("readings of a file have no resistances that could be at fault")
     ratio = load_readings(path).ratio
     rate_hz = float(options.setdefault("rate", str(DEFAULT_RATE_HZ)))
     # Half a scan on, because a scan begins a rounding error before its frame's time.
     return lambda time_s: ratio[int(time_s * rate_hz + 0.5) % len(ratio)], *ratio.shape[1:3]
 
 
-def _scene(place: str, options: dict[str, str], seed: int) -> Scene:
+def _scene(
+    place: str, options: dict[str, str], seed: int, faults: SkinFaults | None = None
+) -> Scene:
     size = re.fullmatch(r"(\d{1,2})x(\d{1,2})", place)
     if size is None:
         raise ValueError(f"the size '{place}' is not of the form 8x8")
@@ -162,7 +172,7 @@ def _scene(place: str, options: dict[str, str], seed: int) -> Scene:
     most = (protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
     if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
         raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not {place}")
-    return Scene(options.pop("scene", "rest"), rows, columns, seed=seed)
+    return Scene(options.pop("scene", "rest"), rows, columns, seed=seed, faults=faults)
 
 
 def _simavr(url: str, place: str, query: str) -> tuple[Link, int | None]:

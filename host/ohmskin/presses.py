@@ -19,6 +19,7 @@ from scipy.ndimage import binary_closing
 from scipy.signal import find_peaks
 
 from ohmskin.circuit import Float
+from ohmskin.clock import scan_times_s
 from ohmskin.force_log import ForceLog
 from ohmskin.messages import Scan
 
@@ -76,24 +77,6 @@ class LevelHistory:
         return cls(
             scan_times_s(scans), np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
         )
-
-
-def scan_times_s(scans: list[Scan]) -> Float:
-    """Times of scans on the host's clock [s], (n,), without the jitter of their arrival.
-
-    The line t = p + q u through arrivals t and board times u, for each run of the board's clock.
-    """
-    host_s = np.array([scan.host_time_s for scan in scans])
-    board_s = 1e-6 * np.array([scan.time_us for scan in scans])
-    times_s = np.empty_like(host_s)
-    restarts = np.flatnonzero(np.diff(board_s) <= 0) + 1
-    for part in np.split(np.arange(host_s.size), restarts):
-        u = board_s[part] - board_s[part].mean()
-        spread = float(u @ u)
-        # Of a few scans the jitter, not the clocks' rates, would be the slope.
-        slope = float(u @ host_s[part]) / spread if part.size > 90 else 1.0
-        times_s[part] = host_s[part].mean() + slope * u
-    return times_s
 
 
 def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Presses:
@@ -170,7 +153,4 @@ def _valleys(rise: Float) -> list[int]:
     height = np.log(np.maximum(rise, floor))
     peaks, _ = find_peaks(np.pad(height, 1, constant_values=np.log(floor)), prominence=VALLEY_LOG)
     peaks -= 1
-    return [
-        int(before + height[before:after].argmin())
-        for before, after in pairwise(peaks)
-    ]
+    return [int(before + height[before:after].argmin()) for before, after in pairwise(peaks)]

@@ -13,8 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from ohmskin.circuit import Float, Skin, readings
+from ohmskin.circuit import Float, Skin
 from ohmskin.press import LEAVE_S, PressModel, robot_presses
+from ohmskin.skin_faults import SkinFaults
 
 REST_OHM: Final = 1.0e6
 TOP_WIRE_OHM: Final = 100.0
@@ -41,9 +42,10 @@ _PRESS_STEP_S: Final = 0.01
 class Scene:
     """A scene by name (see `SCENES`) on a rows x columns skin.
 
-    Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns).
+    Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns). faults: what is
+    wrong with the skin; those that depend on the instant of a reading are the board's.
 
-    :raises ValueError: no such scene, or a skin too small for it.
+    :raises ValueError: no such scene, or a skin too small for it or for the faults.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class Scene:
         seed: int = 0,
         ref_top_ohm: float = 30_000.0,
         ref_bottom_ohm: float = 30_000.0,
+        faults: SkinFaults | None = None,
     ) -> None:
         if name not in SCENES:
             raise ValueError(f"no scene '{name}': there are {', '.join(SCENES)}")
@@ -63,6 +66,8 @@ class Scene:
         self.name = name
         self.rows = rows
         self.columns = columns
+        self._faults = faults or SkinFaults()
+        self._faults.check(rows, columns)
         random = np.random.default_rng(seed)
 
         def spread(middle: float) -> Float:
@@ -77,7 +82,7 @@ class Scene:
         )
         self._touches = self._place(random)
         self._robot = _Robot(rows, columns, seed) if name == "press" else None
-        self._still_ratio = lru_cache(maxsize=1)(lambda: readings(self.skin(0.0)))
+        self._still_ratio = lru_cache(maxsize=1)(lambda: self._readings(0.0))
 
     @property
     def moves(self) -> bool:
@@ -87,7 +92,7 @@ class Scene:
     @property
     def rest_ratio(self) -> Float:
         """Exact readings of the untouched skin, shape (rows, columns, 4)."""
-        return readings(self._rest)
+        return self._faults.readings(self._faults.damaged(self._rest))
 
     def skin(self, time_s: float) -> Skin:
         """The truth: every resistance at a time."""
@@ -95,7 +100,8 @@ class Scene:
             touch = self._robot.touch(time_s)[0]
         else:
             touch = self._finger(time_s) if self.moves else self._touches
-        return replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
+        touched = replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
+        return self._faults.damaged(touched)
 
     def force_n(self, time_s: float) -> Float:
         """The truth of the scene "press": force on every cell [N], (rows, columns).
@@ -110,14 +116,18 @@ class Scene:
 
     def touched(self, time_s: float) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
         """Cells whose conductance a touch raises by 1 microsiemens or more, (rows, columns)."""
+        untouched = self._faults.damaged(self._rest)
         cells: np.ndarray[tuple[int, int], np.dtype[np.bool_]] = (
-            self.skin(time_s).cell_siemens - self._rest.cell_siemens >= 1e-6
+            self.skin(time_s).cell_siemens - untouched.cell_siemens >= 1e-6
         )
         return cells
 
     def ratio(self, time_s: float) -> Float:
         """Exact readings at a time, shape (rows, columns, 4)."""
-        return readings(self.skin(time_s)) if self.moves else self._still_ratio()
+        return self._readings(time_s) if self.moves else self._still_ratio()
+
+    def _readings(self, time_s: float) -> Float:
+        return self._faults.readings(self.skin(time_s))
 
     def _place(self, random: np.random.Generator) -> Float:
         touches = np.zeros((self.rows, self.columns))

@@ -25,13 +25,12 @@ from ohmskin.circuit import (
     READINGS_PER_CELL,
     Float,
     Skin,
-    electrode_admittance,
     quantise,
     ratio_from_codes,
-    ratio_from_current,
     readings,
 )
 from ohmskin.estimators import SkinKnowledge
+from ohmskin.skin_faults import cut, joined_readings
 from ohmskin.studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest, touch
 
 Random = np.random.Generator
@@ -40,8 +39,6 @@ Shape = tuple[int, int]
 TOUCHED_SHARE: Final = 10 / 64  # of the cells, at most, where touches are not what is swept
 PRESSED_OHM: Final = 5e3  # where wires are swept
 STUCK_SHARE: Final = 10 / 256  # of the readings
-OPEN_OHM: Final = 1e12
-SHORT_SIEMENS: Final = 10.0
 _SINCE_REST: Final = " since rest"
 
 
@@ -96,23 +93,8 @@ def converted(exact: Float, random: Random | None = None, noise_lsb: float = 0.0
 
 
 def shorted_readings(skin: Skin, first: int, second: int) -> Float:
-    """`circuit.readings`, electrodes `first` and `second` (rows first) joined by 0.1 ohm.
-
-    The joint adds its conductance to Y of the skin; rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] with Z
-    the inverse of Y, any one electrode grounded. Cells must conduct (g > 0).
-    """
-    rows = skin.shape[0]
-    admittance = electrode_admittance(skin)
-    ends = np.array([first, second])
-    admittance[ends, ends] += SHORT_SIEMENS
-    admittance[ends, ends[::-1]] -= SHORT_SIEMENS
-    ground = np.argmax(np.diagonal(admittance))
-    admittance[ground, ground] *= 2
-    impedance = np.linalg.inv(admittance)
-    diagonal = np.diagonal(impedance)
-    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
-    current = 1.0 / (port_ohm + skin.ref_top_ohm + skin.ref_bottom_ohm)
-    return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)
+    """`circuit.readings`, electrodes `first` and `second` (rows first) joined by 0.1 ohm."""
+    return joined_readings(skin, [(first, second)])
 
 
 def _case(
@@ -279,17 +261,6 @@ def _stick(ratio: Float, fault: str, place: tuple[int, int], random: Random) -> 
             raise ValueError(f"no fault of readings '{fault}'")
 
 
-def _cut(skin: Skin, layer: str, line: int, place: int) -> Skin:
-    """`skin` with segment `place` of a row ("top") or column ("bottom") open."""
-    if layer == "top":
-        top = skin.top_wire_ohm.copy()
-        top[line, place] = OPEN_OHM
-        return replace(skin, top_wire_ohm=top)
-    bottom = skin.bottom_wire_ohm.copy()
-    bottom[place, line] = OPEN_OHM
-    return replace(skin, bottom_wire_ohm=bottom)
-
-
 def _lines(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     """x: which electrodes or stripes are cut or joined; which one is drawn anew for each frame,
     but for faults since rest."""
@@ -309,11 +280,11 @@ def _with_line_fault(skin: Skin, fault: str, place: tuple[int, int]) -> Float:
     row, column = place
     match fault.removesuffix(_SINCE_REST):
         case "row open":
-            return readings(_cut(skin, "top", row, 0))
+            return readings(cut(skin, "top", row))
         case "column open":
-            return readings(_cut(skin, "bottom", column, 0))
+            return readings(cut(skin, "bottom", column))
         case "row cut midway":
-            return readings(_cut(skin, "top", row, columns // 2))
+            return readings(cut(skin, "top", row, columns // 2))
         case "two rows shorted":
             first = row % (rows - 1)
             return shorted_readings(skin, first, first + 1)

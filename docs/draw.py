@@ -1,0 +1,325 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Draw the pictures of the pages about hardware, and print the numbers in them. No simulation.
+
+python docs/draw.py            write docs/*.svg
+python docs/draw.py --check    change nothing, exit 1 when one is stale
+
+A picture keeps a digest of its numbers and of this file, by which it is told to be current:
+matplotlib draws a little differently from version to version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+sys.path.insert(0, str(ROOT / "host"))
+
+from ohmskin import framing, protocol  # noqa: E402
+from ohmskin.circuit import DEFAULT_ADC_BITS, current_std, ratio_std  # noqa: E402
+
+CLOCK_HZ = 16_000_000
+CELLS_OHM = (1e3, 1e4, 1e5, 1e6)
+REFERENCES_OHM = (3e3, 1e4, 3e4, 1e5)
+SIZES = range(1, 17)
+BITS_PER_BYTE = 10  # 8N1
+
+
+def _constant(path: str, pattern: str) -> int:
+    """A number of the firmware, from its source."""
+    found = re.search(pattern, (ROOT / "firmware/src" / path).read_text())
+    if found is None:
+        raise ValueError(f"firmware/src/{path} has no '{pattern}': mend docs/draw.py")
+    return int(found[1])
+
+
+# ------------------------------------------------------------------------------------- numbers
+
+
+def relative_std(cell_ohm: np.ndarray | float, ref_ohm: np.ndarray | float) -> Any:
+    """std(g) / g = (1 + g R)^2 std(I) / g, R both references: one cell alone, without wires."""
+    siemens, loop_ohm = 1.0 / np.asarray(cell_ohm), 2.0 * np.asarray(ref_ohm)
+    std = np.vectorize(lambda ref: current_std(ratio_std(DEFAULT_ADC_BITS), ref, ref))(ref_ohm)
+    return (1.0 + siemens * loop_ohm) ** 2 * std / siemens
+
+
+def slot() -> dict[str, float]:
+    """A slot at the default setting (8x8, 90 Hz), clock cycles from the timer's zero."""
+    trigger = _constant("board_avr.cpp", r"TRIGGER_AT = (\d+);")
+    early = _constant("board_avr.cpp", r"TRIGGER_AT \+ 2u \* prescaler \+ 3 - (\d+)\)")
+    select = _constant("core/scan_plan.h", r"SELECT_CYCLES_MAX = (\d+);")
+    prescaler = 32
+    hold = trigger + 2 * prescaler + 3
+    readings, period = 256, round(CLOCK_HZ / 90)
+    # Equal slots of whole cycles, with so many idle ones that the period is kept to 200 ppm.
+    slots = next(n for n in range(readings, 300) if abs(round(period / n) * n - period) <= 35)
+    cycles = round(period / slots)
+    return {
+        "trigger": trigger,
+        "hold": hold,
+        "interrupt": hold - early,
+        "pins_set": hold + select,
+        "conversion_done": trigger + 13 * prescaler + prescaler // 2 + 3,
+        "cycles": cycles,
+        "slots": slots,
+        "rate_hz": CLOCK_HZ / (cycles * slots),
+        "settle_us": (cycles - select) * 1e6 / CLOCK_HZ,
+    }
+
+
+def scan_rates() -> dict[str, list[float]]:
+    """Fastest scans a second of n x n cells: by the converter, and by the line."""
+    scan = protocol.FRAMES["scan"]
+    cells = np.array([n * n for n in SIZES])
+    octets = np.array(
+        [
+            len(framing.encode(scan.id, 1, b"\1" * (scan.struct.size + protocol.codes_size(n, n))))
+            for n in SIZES
+        ]
+    )
+    readings = protocol.READINGS_PER_CELL * cells
+    rates = {"converter": CLOCK_HZ / (13 * 32 * readings)}
+    for name in ("baud_default", "baud_fast"):
+        rates[name] = protocol.CONSTANTS[name] / BITS_PER_BYTE / octets
+    most = protocol.CONSTANTS["rate_mhz_max"] / 1000
+    return {name: np.minimum(rate, most).tolist() for name, rate in rates.items()}
+
+
+def numbers() -> dict[str, Any]:
+    """What is drawn, by picture."""
+    precision = {
+        f"{ref:g}": [float(relative_std(c, ref)) for c in CELLS_OHM] for ref in REFERENCES_OHM
+    }
+    return {
+        "reference-resistor": precision,
+        "circuit": None,
+        "slot": slot(),
+        "scan-rate": scan_rates(),
+    }
+
+
+def report(drawn: dict[str, Any]) -> None:
+    """Print the numbers of the pages."""
+    print("standard deviation of a cell's conductance, 10 bit [%]")
+    print("references [ohm] \\ cell [ohm]  " + "".join(f"{cell:>9.0e}" for cell in CELLS_OHM))
+    for ref, shares in drawn["reference-resistor"].items():
+        print(f"{ref:>30}  " + "".join(f"{100 * share:9.2f}" for share in shares))
+    at = drawn["slot"]
+    print(
+        f"slot at 8x8, 90 Hz: {at['cycles']} cycles, {1e6 * at['cycles'] / CLOCK_HZ:.2f} us; "
+        f"{at['slots']} slots a scan, {at['rate_hz']:.2f} Hz; settle time {at['settle_us']:.1f} us"
+    )
+    rates = drawn["scan-rate"]
+    print("fastest scans a second:   converter   500 kbaud   1 Mbaud")
+    for n in (4, 8, 10, 12, 16):
+        print(f"{n:>17}x{n:<6}" + "".join(f"{rates[name][n - 1]:12.1f}" for name in rates))
+
+
+# ------------------------------------------------------------------------------------ pictures
+
+
+def _draw_precision(axes: Any) -> None:
+    ref_ohm = np.geomspace(1e3, 3e5, 200)
+    for cell_ohm, name in zip(CELLS_OHM, ("1 kΩ", "10 kΩ", "100 kΩ", "1 MΩ"), strict=True):
+        axes.loglog(1e-3 * ref_ohm, 100 * relative_std(cell_ohm, ref_ohm), label=f"cell {name}")
+    axes.axvline(30, color="black", linestyle=":", label="30 kΩ")
+    axes.set(
+        xlabel="each reference resistor [kΩ]",
+        ylabel="std of the conductance [%]",
+        title="What rounding to 10 bit costs",
+        ylim=(0.1, 30),
+    )
+    axes.set_xticks([1, 3, 10, 30, 100, 300], ["1", "3", "10", "30", "100", "300"])
+    axes.set_yticks([0.1, 0.3, 1, 3, 10, 30], ["0.1", "0.3", "1", "3", "10", "30"])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.figure.legend(loc="outside right center", frameon=False)
+
+
+def _draw_slot(axes: Any) -> None:
+    at = slot()
+    us = 1e6 / CLOCK_HZ
+    rows = {"timer 1": 3, "converter": 2, "interrupt": 1, "pins, multiplexers": 0}
+    colours = {
+        "samples": "#f2b705",
+        "converts": "#7fb3d5",
+        "sets the pins": "#c39bd3",
+        "pins may still change": "#f5b7b1",
+        "pins set: the skin settles": "#a9dfbf",
+    }
+
+    def bar(row: str, begin: float, end: float, colour: str, text: str = "") -> None:
+        fill = colours.get(colour, colour)
+        axes.barh(rows[row], us * (end - begin), left=us * begin, color=fill, height=0.55)
+        axes.text(us * (begin + end) / 2, rows[row], text, ha="center", va="center", fontsize=8)
+
+    period = at["cycles"]
+    bar("pins, multiplexers", 0, at["hold"], "pins set: the skin settles")
+    for start, name in ((0, "k"), (period, "k+1")):
+        hold, pins_set = start + at["hold"], start + at["pins_set"]
+        bar("timer 1", start, start + period, "#eeeeee" if start else "#dddddd", f"slot {name}")
+        bar("converter", start + at["trigger"], hold, "samples")
+        bar("converter", hold, start + at["conversion_done"], "converts", f"converts {name}")
+        bar("interrupt", start + at["interrupt"], pins_set, "sets the pins")
+        bar("pins, multiplexers", hold, pins_set, "pins may still change")
+        settled = min(period + hold, 2 * period)
+        text = "for k+2" if start else f"for k+1: {at['settle_us']:.1f} us"
+        bar("pins, multiplexers", pins_set, settled, "pins set: the skin settles", text)
+        axes.plot([us * hold, us * hold], [-0.4, 3.4], color="#b03a2e", linewidth=1)
+        axes.text(us * hold, 3.5, f"hold {name}", color="#b03a2e", ha="center", fontsize=8)
+    patches = [axes.barh(0, 0, color=colour, label=name) for name, colour in colours.items()]
+    axes.figure.legend(handles=patches, loc="outside lower center", ncols=3, frameon=False)
+    axes.set_yticks(list(rows.values()), list(rows))
+    axes.set(xlabel="time [us]", xlim=(0, us * 2 * period), ylim=(-0.5, 3.9))
+    axes.set_title("Two slots at 90 Hz, 8x8")
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+
+
+def _draw_rates(axes: Any) -> None:
+    rates = scan_rates()
+    names = {
+        "converter": "converter, free running",
+        "baud_default": "line, 500 kbaud",
+        "baud_fast": "line, 1 Mbaud",
+    }
+    for name, label in names.items():
+        axes.semilogy(list(SIZES), rates[name], marker="o", markersize=3, label=label)
+    axes.axhline(90, color="black", linestyle=":", label="90 Hz, the default")
+    axes.set(
+        xlabel="rows = columns", ylabel="scans a second, at most", title="What limits the rate"
+    )
+    axes.set_xticks([1, 2, 4, 6, 8, 10, 12, 14, 16])
+    axes.set_yticks([30, 100, 300, 1000, 2000], ["30", "100", "300", "1000", "2000"])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend()
+
+
+def _draw_circuit(axes: Any) -> None:
+    """A 2x2 skin, the port of cell (0, 0) selected, the other three cells pressed."""
+    black, ghost = "black", "#b03a2e"
+    top_y, column_x, apart = (2.0, 0.0), (2.0, 5.0), 0.9
+
+    def wire(*points: tuple[float, float], colour: str = black) -> None:
+        axes.plot(*zip(*points, strict=True), color=colour, linewidth=1.2, zorder=1)
+
+    def resistor(x: float, y: float, name: str, angle: float = 0.0, fill: str = "white") -> None:
+        box = {"boxstyle": "square,pad=0.25", "facecolor": fill, "edgecolor": black}
+        axes.text(x, y, name, rotation=angle, ha="center", va="center", fontsize=7, bbox=box)
+
+    for i, y in enumerate(top_y):
+        wire((-0.4, y), (column_x[1], y))
+        axes.plot(-0.4, y, "o", color=black, markersize=4)
+        for j, x in enumerate(column_x):
+            resistor(x - 1.5, y, f"Rt[{i},{j}]")
+    for j, x in enumerate(column_x):
+        wire((x + apart, 3.6), (x + apart, top_y[1] - apart))
+        axes.plot(x + apart, 3.6, "o", color=black, markersize=4)
+        for i, y in enumerate(top_y):
+            resistor(x + apart, y + 0.45, f"Rb[{i},{j}]")
+            colour = black if i == j == 0 else ghost
+            wire((x, y), (x + apart, y - apart), colour=colour)
+            resistor(
+                x + apart / 2,
+                y - apart / 2,
+                f"g[{i},{j}]",
+                -45,
+                "white" if i == j == 0 else "#f5b7b1",
+            )
+            axes.plot([x, x + apart], [y, y - apart], "o", color=black, markersize=2.5)
+    ghosts = [(column_x[1], top_y[0]), (column_x[1] + apart, top_y[0] - apart)]
+    wire((column_x[0], top_y[0]), ghosts[0], colour=ghost)
+    wire(ghosts[1], (column_x[1] + apart, top_y[1] - apart), colour=ghost)
+    wire((column_x[1], top_y[1]), (column_x[0], top_y[1]), colour=ghost)
+    wire(
+        (column_x[0] + apart, top_y[1] - apart),
+        (column_x[0] + apart, top_y[0] - apart),
+        colour=ghost,
+    )
+    wire((-0.4, 2), (-1.6, 2), (-1.6, 3.3), (-1.6, 4.6))
+    resistor(-1.6, 2.75, "row\nmultiplexer", 0, "#eeeeee")
+    resistor(-1.6, 4.1, "R_top")
+    axes.text(-1.6, 4.7, "drive top", ha="center", va="bottom", fontsize=8)
+    axes.annotate(
+        "A0: A, D",
+        (-1.6, 3.4),
+        (-3.0, 3.4),
+        va="center",
+        fontsize=8,
+        arrowprops={"arrowstyle": "-"},
+    )
+    wire((column_x[0] + apart, 3.6), (column_x[0] + apart, 4.6), (8.2, 4.6))
+    resistor(4.6, 4.6, "column multiplexer", 0, "#eeeeee")
+    resistor(7.2, 4.6, "R_bottom")
+    axes.text(8.3, 4.6, "drive bottom", ha="left", va="center", fontsize=8)
+    axes.annotate(
+        "A1: B, C", (6.2, 4.6), (6.2, 5.3), ha="center", fontsize=8, arrowprops={"arrowstyle": "-"}
+    )
+    axes.set(xlim=(-3.2, 9.9), ylim=(-1.3, 5.6), aspect="equal")
+    axes.axis("off")
+
+
+PICTURES = {
+    "reference-resistor": (_draw_precision, (7.0, 3.4)),
+    "circuit": (_draw_circuit, (8.0, 4.3)),
+    "slot": (_draw_slot, (8.0, 3.6)),
+    "scan-rate": (_draw_rates, (6.4, 3.8)),
+}
+
+
+def _digest(content: Any) -> str:
+    rounded = json.loads(json.dumps(content), parse_float=lambda text: f"{float(text):.6g}")
+    text = Path(__file__).read_text() + json.dumps(rounded)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def stale(drawn: dict[str, Any]) -> list[Path]:
+    """Pictures that are missing, or drawn of other numbers or by another docs/draw.py."""
+    paths = {name: DOCS / f"{name}.svg" for name in PICTURES}
+    return [
+        path
+        for name, path in paths.items()
+        if not path.exists() or f"digest {_digest(drawn[name])}" not in path.read_text()
+    ]
+
+
+def draw(drawn: dict[str, Any]) -> None:
+    """Write all pictures."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    from matplotlib import pyplot
+
+    pyplot.rcParams.update({"svg.hashsalt": "ohmskin", "font.size": 9})
+    for name, (artist, size) in PICTURES.items():
+        figure, axes = pyplot.subplots(figsize=size, layout="constrained")
+        artist(axes)
+        note = f"Written by docs/draw.py; do not edit. digest {_digest(drawn[name])}"
+        figure.savefig(DOCS / f"{name}.svg", metadata={"Date": None, "Description": note})
+        pyplot.close(figure)
+
+
+def main() -> int:
+    """Draw, or check."""
+    drawn = numbers()
+    if sys.argv[1:] == ["--check"]:
+        for path in stale(drawn):
+            print(f"{path.relative_to(ROOT)} is stale: run 'python docs/draw.py'", file=sys.stderr)
+        return 1 if stale(drawn) else 0
+    report(drawn)
+    draw(drawn)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The forces of a recording, for Foxglove: python foxglove_forces.py IN.mcap CALIBRATION OUT.mcap
+
+examples/foxglove.md says which panels show them. Without hardware, with made-up presses:
+
+    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json --indenter-mm2 80
+    ohmskin record "emulator://8x8?scene=moving" recording.mcap --seconds 10
+    python examples/foxglove_forces.py recording.mcap skin.json forces.mcap
+"""
+
+import base64
+import json
+import sys
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import ohmskin
+from ohmskin.recording import load_recording
+
+PITCH_M = 0.01
+# Foxglove knows this schema by its name; of its text it needs what is base64.
+GRID = {"type": "object", "properties": {"data": {"type": "string", "contentEncoding": "base64"}}}
+CELLS = {
+    "type": "object",
+    "properties": {"force_n": {"type": "array", "items": {"type": "number"}}},
+}
+ORIGIN = {
+    "position": {"x": 0.0, "y": 0.0, "z": 0.0},
+    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+}
+
+
+def grid(force_n: np.ndarray, time_ns: int) -> dict:
+    """A foxglove.Grid of forces (rows, columns) [N]: x along columns, y along rows."""
+    return {
+        "timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9},
+        "frame_id": "skin",
+        "pose": ORIGIN,
+        "column_count": force_n.shape[1],
+        "cell_size": {"x": PITCH_M, "y": PITCH_M},
+        "row_stride": 4 * force_n.shape[1],
+        "cell_stride": 4,
+        "fields": [{"name": "force", "offset": 0, "type": 7}],  # FLOAT32
+        "data": base64.b64encode(force_n.astype("<f4").tobytes()).decode(),
+    }
+
+
+def main(recording: str, calibration: str, out: str) -> None:
+    with open(recording, "rb") as file:
+        _, _, first = next(make_reader(file).iter_messages("/skin/scan"))
+    since_1970_ns = first.log_time - round(1e9 * json.loads(first.data)["host_time_s"])
+    recorded = load_recording(recording).scans
+    with (
+        ohmskin.open(f"replay://{recording}?speed=0", calibration=calibration) as skin,
+        open(out, "xb") as file,
+    ):
+        writer = Writer(file)
+        writer.start()
+        channels = [
+            writer.register_channel(
+                topic, "json", writer.register_schema(name, "jsonschema", json.dumps(text).encode())
+            )
+            for topic, name, text in (
+                ("/skin/grid", "foxglove.Grid", GRID),
+                ("/skin/cells", "ohmskin.cells", CELLS),
+            )
+        ]
+        for told, scan in zip(recorded, skin, strict=True):
+            time_ns = since_1970_ns + round(1e9 * told.host_time_s)
+            force_n = np.nan_to_num(scan.force_n)
+            messages = (grid(force_n, time_ns), {"force_n": force_n.flatten().round(4).tolist()})
+            for channel, message in zip(channels, messages, strict=True):
+                writer.add_message(channel, time_ns, json.dumps(message).encode(), time_ns)
+        writer.finish()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

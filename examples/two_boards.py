@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print the scans of several boards on one clock: python two_boards.py [PORT ...]
+
+Without ports, of all boards at this machine. Each needs a unit id of its own:
+
+    ohmskin configure /dev/ttyACM1 --unit-id 1 --save
+
+Without hardware:
+
+    python examples/two_boards.py "emulator://8x8?unit=1" "emulator://8x8?unit=2"
+"""
+
+import sys
+
+import ohmskin
+
+with ohmskin.open_all(sys.argv[1:] or None) as skins:
+    print(f"units {', '.join(map(str, skins))}", flush=True)
+    for unit_id, scan, time_s, jitter_s in skins.scans():
+        text = f"{time_s:.4f} s: unit {unit_id}, scan {scan.number}, missed {scan.missed}, "
+        print(f"{text}{scan.ratio[0, 0, 1]:.3f}, jitter {1e3 * jitter_s:.1f} ms", flush=True)

@@ -1,0 +1,215 @@
+// SPDX-License-Identifier: Apache-2.0
+// The heat map, its bar and the curve, on canvases that keep to the screen's own pixels.
+
+import { colourAt, inkAt, isUncertain, written } from "./scale.js";
+
+const EDGE = 20; // px, for the numbers of rows and columns
+const TALLEST = 480;
+const FONT = "system-ui, 'DejaVu Sans', sans-serif";
+
+// The context of a canvas of so many CSS pixels, cleared.
+export function fit(canvas, width, height) {
+  const ratio = devicePixelRatio || 1;
+  const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
+  if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+  // Drawn by the processor: so little costs more to bring to a graphics card, or to emulate one.
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return context;
+}
+
+export const styleOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
+
+export class HeatMap {
+  constructor(map) {
+    this.cells = map.querySelector(".cells");
+    this.digits = map.querySelector(".digits");
+    this.width = 0;
+    new ResizeObserver(([entry]) => {
+      this.width = Math.floor(entry.contentRect.width);
+    }).observe(map);
+  }
+
+  // Where things are, for this size of skin.
+  plan(rows, columns) {
+    if (this.rows === rows && this.columns === columns && this.planned === this.width) return;
+    [this.rows, this.columns, this.planned] = [rows, columns, this.width];
+    const width = Math.min(this.width - EDGE, TALLEST);
+    this.size = Math.max(4, Math.floor(Math.min(width / columns, TALLEST / rows)));
+    this.height = EDGE + this.size * rows;
+    for (const canvas of [this.cells, this.digits]) canvas.style.height = `${this.height}px`;
+  }
+
+  at(row, column) {
+    return [EDGE + column * this.size, EDGE + row * this.size];
+  }
+
+  cellAt(x, y) {
+    const row = Math.floor((y - EDGE) / this.size);
+    const column = Math.floor((x - EDGE) / this.size);
+    const inside = row >= 0 && row < this.rows && column >= 0 && column < this.columns;
+    return inside ? row * this.columns + column : null;
+  }
+
+  draw(scan, scale, { values, std, touched }, chosen) {
+    this.plan(scan.rows, scan.columns);
+    const context = fit(this.cells, this.width, this.height);
+    const size = this.size;
+    for (let cell = 0; cell < values.length; cell++) {
+      const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
+      const known = Number.isFinite(values[cell]);
+      const position = known ? scale.position(values[cell]) : 0;
+      context.fillStyle = known ? colourAt(position) : styleOf("--grid");
+      context.fillRect(x, y, size - 1, size - 1);
+      if (!known || (std && isUncertain(scale, values[cell], std[cell]))) {
+        this.hatch(context, x, y, inkAt(position));
+      }
+      if (touched[cell]) {
+        context.strokeStyle = inkAt(position);
+        context.lineWidth = 1.5;
+        context.strokeRect(x + 2.5, y + 2.5, size - 6, size - 6);
+      }
+    }
+    const [x, y] = this.at(Math.floor(chosen / this.columns), chosen % this.columns);
+    context.strokeStyle = styleOf("--accent");
+    context.lineWidth = 3;
+    context.strokeRect(x - 1, y - 1, size + 1, size + 1);
+  }
+
+  hatch(context, x, y, ink) {
+    const size = this.size - 1;
+    context.save();
+    context.beginPath();
+    context.rect(x, y, size, size);
+    context.clip();
+    context.strokeStyle = ink;
+    context.globalAlpha = 0.55;
+    context.lineWidth = 1;
+    context.beginPath();
+    for (let at = 6; at < 2 * size; at += 6) {
+      context.moveTo(x + at, y);
+      context.lineTo(x + at - size, y + size);
+    }
+    context.stroke();
+    context.restore();
+  }
+
+  // The numbers: less often, because nobody reads sixty a second.
+  write(scan, scale, { values, std, touched }) {
+    const context = fit(this.digits, this.width, this.height);
+    const size = this.size;
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.font = `11px ${FONT}`;
+    context.fillStyle = styleOf("--soft");
+    const every = size < 16 ? 2 : 1;
+    for (let row = 0; row < this.rows; row += every) {
+      context.fillText(row, EDGE / 2, EDGE + (row + 0.5) * size);
+    }
+    for (let column = 0; column < this.columns; column += every) {
+      context.fillText(column, EDGE + (column + 0.5) * size, EDGE / 2);
+    }
+    if (size < 28) return;
+    for (let cell = 0; cell < values.length; cell++) {
+      const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
+      const middle = x + (size - 1) / 2;
+      const withStd = std && size >= 42 &&
+        (touched[cell] || isUncertain(scale, values[cell], std[cell]));
+      context.fillStyle = inkAt(scale.position(values[cell]) || 0);
+      context.globalAlpha = touched[cell] ? 1 : 0.6;
+      context.font = `${size >= 42 ? 13 : 10}px ${FONT}`;
+      context.fillText(written(scale.show(values[cell])), middle, y + size * (withStd ? 0.4 : 0.5));
+      if (withStd) {
+        context.font = `10px ${FONT}`;
+        context.fillText(`±${written(scale.std(values[cell], std[cell]))}`, middle, y + size * 0.72);
+      }
+      context.globalAlpha = 1;
+    }
+  }
+}
+
+export function drawBar(canvas, scale) {
+  const width = canvas.clientWidth;
+  const context = fit(canvas, width, 38);
+  const [left, right] = [EDGE, width - 26];
+  const ramp = context.createLinearGradient(left, 0, right, 0);
+  for (let stop = 0; stop <= 1; stop += 1 / 64) ramp.addColorStop(stop, colourAt(stop));
+  context.fillStyle = ramp;
+  context.fillRect(left, 2, right - left, 12);
+  context.strokeStyle = styleOf("--line");
+  context.strokeRect(left - 0.5, 1.5, right - left + 1, 13);
+  context.fillStyle = styleOf("--soft");
+  context.font = `11px ${FONT}`;
+  context.textAlign = "center";
+  for (const tick of scale.ticks) {
+    const x = left + scale.position(tick) * (right - left);
+    context.fillRect(x, 15, 1, 4);
+    context.fillText(tickText(scale, tick), x, 30);
+  }
+  context.textAlign = "left";
+  context.fillText(scale.unit, right + 5, 12);
+}
+
+const tickText = (scale, tick) => String(Number(scale.show(tick).toPrecision(3)));
+
+export const CURVE_S = 10;
+const KEPT = 1500; // scans: ten seconds at the fastest rate
+
+// The last ten seconds of all cells, so that another cell's are there when it is chosen.
+export class History {
+  constructor() {
+    this.scans = [];
+  }
+
+  add(scan) {
+    const newest = this.scans.at(-1);
+    if (newest && newest.siemens.length !== scan.siemens.length) this.scans = [];
+    this.scans.push(scan);
+    const oldest = scan.host_time_s - CURVE_S;
+    while (this.scans[0].host_time_s < oldest || this.scans.length > KEPT) this.scans.shift();
+  }
+
+  draw(canvas, scale, cell) {
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const context = fit(canvas, width, height);
+    const [left, right, top, bottom] = [46, width - 12, 8, height - 32];
+    const y = (value) => bottom - Math.min(1, Math.max(0, scale.position(value))) * (bottom - top);
+    context.font = `11px ${FONT}`;
+    context.textBaseline = "middle";
+    const label = (text, x, at, align) => {
+      context.textAlign = align;
+      context.fillStyle = styleOf("--soft");
+      context.fillText(text, x, at);
+    };
+    context.fillStyle = styleOf("--grid");
+    for (const tick of scale.ticks) context.fillRect(left, Math.round(y(tick)), right - left, 1);
+    for (const tick of scale.ticks) label(tickText(scale, tick), left - 6, y(tick), "right");
+    for (let s = 0; s <= CURVE_S; s += 2) {
+      label(s ? `−${s}` : "0", right - (s / CURVE_S) * (right - left), bottom + 12, "center");
+    }
+    label(scale.unit, 2, bottom + 12, "left");
+    label("seconds", (left + right) / 2, height - 6, "center");
+    const known = this.scans.filter((scan) => scan[scale.plane]);
+    if (!known.length) return;
+    const end = this.scans.at(-1).host_time_s;
+    const x = (scan) => right - ((end - scan.host_time_s) / CURVE_S) * (right - left);
+    const std = `${scale.plane}_std`;
+    context.beginPath();
+    for (const scan of known) {
+      const [value, spread] = [scan[scale.plane][cell], scan[std][cell] || 0];
+      context.lineTo(x(scan), y(value + spread));
+    }
+    for (const scan of known.toReversed()) {
+      const [value, spread] = [scan[scale.plane][cell], scan[std][cell] || 0];
+      context.lineTo(x(scan), y(Math.max(value - spread, 1e-12)));
+    }
+    context.fillStyle = styleOf("--band");
+    context.fill();
+    context.beginPath();
+    for (const scan of known) context.lineTo(x(scan), y(scan[scale.plane][cell]));
+    context.strokeStyle = styleOf("--accent");
+    context.lineWidth = 1.5;
+    context.stroke();
+  }
+}

@@ -1,0 +1,348 @@
+// SPDX-License-Identifier: Apache-2.0
+// One board: its controls, its maps, and what is said of it.
+
+import { drawBar, HeatMap, History } from "./draw.js";
+import { scaleOf, TOPS_N, written } from "./scale.js";
+import { Connection } from "./wire.js";
+
+const DIGITS_EVERY_MS = 200;
+const TABLE_EVERY_MS = 1000;
+const QUANTITIES = { newtons: "force (N)", siemens: "conductance (µS)", ohms: "resistance (kΩ)" };
+const STATUS = {
+  opening: "connecting …", scanning: "scanning", gone: "not there, tried again every second",
+  ended: "ended",
+};
+const MOVES = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+const LATENCIES = 90;
+
+function options(select, names, chosen, text = (name) => name) {
+  const wanted = names.map((name) => [String(name), text(name)]);
+  const now = [...select.options].map((option) => [option.value, option.text]);
+  if (JSON.stringify(wanted) !== JSON.stringify(now)) {
+    select.replaceChildren(...wanted.map(([value, label]) => new Option(label, value)));
+  }
+  if (select.value !== String(chosen)) select.value = chosen;
+}
+
+function say(element, text) {
+  if (element.textContent !== text) element.textContent = text; // spoken once
+}
+
+const median = (values) => values.slice().sort((a, b) => a - b)[values.length >> 1];
+
+export class Panel {
+  constructor(number, port, onClosed) {
+    this.number = number;
+    this.element = document.getElementById("panel").content.cloneNode(true).firstElementChild;
+    this.find = (query) => this.element.querySelector(query);
+    this.raw = new HeatMap(this.find(".raw .map"));
+    this.estimate = new HeatMap(this.find(".estimate .map"));
+    this.history = new History();
+    this.chosen = null;
+    this.quantity = null; // what the user has chosen
+    this.topN = 10;
+    this.latencies = [];
+    this.drawnAt = [];
+    this.label(port, number);
+    this.controls();
+    this.enable(false);
+    this.connection = new Connection(number, {
+      state: (state) => this.take(state),
+      notice: (notice) => this.notice(notice),
+      scan: (scan) => {
+        this.history.add(scan);
+        this.scan = scan;
+        this.dirty = true;
+      },
+      link: (there) => {
+        this.element.classList.toggle("lost", !there);
+        if (there) return; // its state comes at once
+        say(this.find(".status"), "'ohmskin view' is out of reach: trying again");
+        this.enable(false);
+      },
+      closed: () => {
+        this.element.remove();
+        onClosed(this);
+      },
+    });
+  }
+
+  label(port, number) {
+    const title = this.find("h2");
+    title.textContent = port;
+    title.id = `panel-${number}`;
+    this.element.setAttribute("aria-labelledby", title.id);
+    this.find(".controls").setAttribute("aria-label", `Controls of ${port}`);
+    this.find(".close").setAttribute("aria-label", `Close ${port}`);
+    const values = this.find(".value");
+    values.id = `value-${number}`;
+    for (const [name, text] of [["raw", "raw reading"], ["estimate", "estimate"]]) {
+      const canvas = this.find(`.${name} .cells`);
+      canvas.tabIndex = 0;
+      canvas.setAttribute("role", "application");
+      canvas.setAttribute("aria-roledescription", "heat map");
+      canvas.setAttribute("aria-label", `Heat map of the ${text}: arrow keys choose a cell, ` +
+        "whose value is spoken; all values are in the table below");
+    }
+  }
+
+  // ------------------------------------------------------------------------------- controls
+
+  controls() {
+    const command = (query, message) => {
+      this.find(query).addEventListener("click", () => this.command(message()));
+    };
+    command(".tare", () => ({ do: "tare", force: false }));
+    command(".anyway", () => ({ do: "tare", force: true }));
+    command(".undo", () => ({ do: "undo" }));
+    command(".record", () => ({ do: this.state?.recording ? "stop" : "record" }));
+    this.find(".mark").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.command({ do: "mark", text: event.target.elements.text.value });
+      event.target.reset();
+    });
+    this.find(".method").addEventListener("change", (event) => {
+      this.command({ do: "method", method: event.target.value });
+    });
+    this.find(".quantity").addEventListener("change", (event) => {
+      this.quantity = event.target.value;
+      this.rescale();
+    });
+    this.find(".top-n").addEventListener("change", (event) => {
+      this.topN = Number(event.target.value);
+      this.rescale();
+    });
+    options(this.find(".top-n"), TOPS_N, this.topN, (top) => `0 to ${top} N`);
+    for (const map of [this.raw, this.estimate]) {
+      map.cells.addEventListener("pointerdown", (event) => {
+        const cell = map.cellAt(event.offsetX, event.offsetY);
+        if (cell !== null) this.choose(cell);
+      });
+      map.cells.addEventListener("keydown", (event) => this.move(event));
+    }
+  }
+
+  command(message) {
+    this.find(".anyway").hidden = true;
+    const text = { tare: "taring for a second: let nothing touch the skin" }[message.do] ?? "";
+    this.notice({ text, good: true });
+    this.connection.say(message);
+  }
+
+  move(event) {
+    const step = MOVES[event.key];
+    if (!step || !this.scan) return;
+    event.preventDefault();
+    const { rows, columns } = this.scan;
+    const row = Math.floor(this.chosen / columns) + step[0];
+    const column = (this.chosen % columns) + step[1];
+    if (row >= 0 && row < rows && column >= 0 && column < columns) this.choose(row * columns + column);
+  }
+
+  choose(cell) {
+    this.chosen = cell;
+    this.dirty = true;
+    this.writtenMs = 0;
+    if (this.scan) say(this.find(".said"), `cell ${this.place()}: ${this.value()}`);
+  }
+
+  // --------------------------------------------------------------------------------- states
+
+  take(state) {
+    this.state = state;
+    for (const name of Object.keys(STATUS)) {
+      this.element.classList.toggle(name, state.status === name);
+    }
+    const status = STATUS[state.status];
+    say(this.find(".status"), state.text ? `${status}: ${state.text}` : status);
+    const board = state.board;
+    say(this.find(".board"), board ? `${board.name}, unit ${board.unit_id}, ${board.rows} × ` +
+      `${board.columns} cells, firmware ${board.version}` : "");
+    options(this.find(".method"), state.methods, state.method,
+      (name) => (name === state.force_method ? `${name} (calibrated)` : name));
+    const recording = this.find(".record");
+    recording.textContent = state.recording ? "Stop recording" : "Record";
+    recording.setAttribute("aria-pressed", Boolean(state.recording));
+    this.enable(true);
+    this.sayFile();
+    const date = state.rest_date?.slice(0, 19).replace("T", " ");
+    say(this.find(".rest"), !date ? "not known: tare" : `${state.tared ? "tare" : "calibration"}\n${date}`);
+    if (state.note) this.notice({ text: state.note });
+    this.rescale();
+  }
+
+  enable(linked) {
+    const { status, tared, recording } = this.state ?? {};
+    const there = linked && status === "scanning";
+    for (const query of [".method", ".tare", ".anyway"]) this.find(query).disabled = !there;
+    this.find(".undo").disabled = !there || !tared;
+    this.find(".record").disabled = !there && !(linked && recording);
+    for (const control of this.find(".mark").elements) control.disabled = !linked || !recording;
+  }
+
+  sayFile() {
+    const { recording, recorded } = this.state;
+    const scans = this.scan?.recorded ?? 0;
+    say(this.find(".file"), recording ? `recording to ${recording}: ${scans} scans`
+      : recorded && `last recording: ${recorded}`);
+  }
+
+  notice({ text, good, refused }) {
+    const line = this.find(".notice p");
+    line.className = good ? "good" : "bad";
+    say(line, text);
+    this.find(".anyway").hidden = refused !== "tare";
+  }
+
+  rescale() {
+    const withForce = this.state.force_method !== null && this.state.method === this.state.force_method;
+    const there = Object.keys(QUANTITIES).filter((name) => withForce || name !== "newtons");
+    const wanted = there.includes(this.quantity) ? this.quantity : there[0];
+    options(this.find(".quantity"), there, wanted, (name) => QUANTITIES[name]);
+    this.find(".full-scale").hidden = wanted !== "newtons";
+    this.scale = scaleOf(wanted, this.topN);
+    this.rawScale = scaleOf(wanted === "newtons" ? "siemens" : wanted, this.topN);
+    say(this.find(".amount"), withForce ? "force [N]" : "rise [µS]");
+    this.barsMs = this.writtenMs = 0;
+    this.dirty = true;
+  }
+
+  // -------------------------------------------------------------------------------- drawing
+
+  place() {
+    return `(${Math.floor(this.chosen / this.scan.columns)}, ${this.chosen % this.scan.columns})`;
+  }
+
+  shownScale() {
+    return this.scan[this.scale.plane] ? this.scale : this.rawScale; // the method has just changed
+  }
+
+  value(cell = this.chosen) {
+    const scale = this.shownScale();
+    const [value, std] = [this.scan[scale.plane][cell], this.scan[`${scale.plane}_std`][cell]];
+    return `${written(scale.show(value))} ± ${written(scale.std(value, std))} ${scale.unit}`;
+  }
+
+  // Called for each frame of the screen.
+  frame(nowMs) {
+    const scan = this.scan;
+    if (!scan || !this.state || this.element.parentNode === null) return;
+    const sizes = `${this.raw.width} ${this.estimate.width} ${devicePixelRatio}`;
+    if (sizes !== this.sizes) [this.sizes, this.dirty, this.writtenMs, this.barsMs] = [sizes, true, 0, 0];
+    if (!this.dirty || !this.raw.width) return;
+    this.dirty = false;
+    const cells = scan.rows * scan.columns;
+    if (this.chosen === null || this.chosen >= cells) {
+      this.chosen = scan.siemens.indexOf(Math.max(...scan.siemens));
+    }
+    const scale = this.shownScale();
+    const raw = { values: scan.raw, std: null, touched: scan.raw_touched };
+    const estimate = {
+      values: scan[scale.plane], std: scan[`${scale.plane}_std`], touched: scan.touched,
+    };
+    this.raw.draw(scan, this.rawScale, raw, this.chosen);
+    this.estimate.draw(scan, scale, estimate, this.chosen);
+    this.history.draw(this.find(".plot"), scale, this.chosen);
+    if (!this.barsMs) {
+      this.barsMs = nowMs;
+      drawBar(this.find(".raw .bar"), this.rawScale);
+      drawBar(this.find(".estimate .bar"), scale);
+    }
+    if (nowMs - (this.writtenMs || 0) >= DIGITS_EVERY_MS || !this.writtenMs) {
+      this.writtenMs = nowMs;
+      this.raw.write(scan, this.rawScale, raw);
+      this.estimate.write(scan, scale, estimate);
+      this.write(scan);
+    }
+    if (this.find(".values").open && nowMs - (this.tableMs || 0) >= TABLE_EVERY_MS) {
+      this.tableMs = nowMs;
+      this.table(scan, scale);
+    }
+    this.measure(scan);
+  }
+
+  // When this frame is handed to the screen; scans that stay on it are not measured again.
+  measure(scan) {
+    if (scan === this.measured) return;
+    this.measured = scan;
+    const channel = new MessageChannel(); // its message comes after the frame, a timer's late
+    channel.port1.onmessage = () => {
+      const nowMs = performance.now();
+      channel.port1.close();
+      this.drawnAt.push(nowMs);
+      while (this.drawnAt[0] < nowMs - 2000) this.drawnAt.shift();
+      const latencyMs = nowMs + this.connection.clock.offsetMs - 1000 * scan.host_time_s;
+      this.latencies.push(latencyMs);
+      if (this.latencies.length > LATENCIES) this.latencies.shift();
+      this.element.dispatchEvent(new CustomEvent("drawn", {
+        detail: { scan: scan.scan, host_time_s: scan.host_time_s, nowMs, latencyMs },
+      }));
+    };
+    channel.port2.postMessage(0);
+  }
+
+  write(scan) {
+    const count = (touched) => touched.reduce((sum, each) => sum + each, 0);
+    const cells = (number, seem) => `${number} ${number === 1 ? "cell" : "cells"} ${seem}touched`;
+    say(this.find(".raw .count"), cells(count(scan.raw_touched), "seemingly "));
+    say(this.find(".estimate .count"), `by ‘${scan.method}’: ${cells(count(scan.touched), "")}`);
+    say(this.find(".chosen"), `${this.place()}, the last ten seconds`);
+    say(this.find(".value"), this.value());
+    this.find(".plot").setAttribute("aria-label", `Curve of cell ${this.place()} over ten seconds`);
+    say(this.find(".rate"), `${scan.rate_hz.toFixed(1)} Hz`);
+    say(this.find(".missed"), `${scan.missed} scans`);
+    say(this.find(".latency"), this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–");
+    say(this.find(".shown"), `${(this.drawnAt.length / 2).toFixed(0)} a second`);
+    say(this.find(".takes"), `${(1000 * scan.estimate_s).toFixed(1)} ms`);
+    say(this.find(".chi2"), scan.chi2 === null ? "–" : scan.chi2.toPrecision(2));
+    say(this.find(".message"), scan.text);
+    const force = scan.force !== undefined;
+    const rows = scan.contacts.map(([identity, row, column, amount, std]) => {
+      const [value, spread] = force ? [amount, std] : [1e6 * amount, 1e6 * std];
+      return [identity, `${row.toFixed(1)}, ${column.toFixed(1)}`,
+        `${written(value)} ± ${written(spread)}`];
+    });
+    fill(this.find(".contacts tbody"), rows.length ? rows : [["–", "no contact", ""]]);
+    this.sayFile();
+  }
+
+  table(scan, scale) {
+    const table = this.find(".values table");
+    const { rows, columns } = scan;
+    const cells = (row) => Array.from({ length: columns }, (_, column) => this.value(row * columns + column));
+    const head = ["row", ...Array.from({ length: columns }, (_, column) => `column ${column}`)];
+    if (!table.tHead || table.tHead.rows[0].cells.length !== columns + 1) {
+      table.replaceChildren(table.createCaption(), table.createTHead(), table.createTBody());
+      table.tHead.insertRow().append(...head.map((text) => {
+        const cell = document.createElement("th");
+        cell.scope = "col";
+        cell.textContent = text;
+        return cell;
+      }));
+    }
+    say(table.caption, `Estimate of each cell and its standard deviation: ${scale.name} [${scale.unit}], ` +
+      "renewed once a second");
+    fill(table.tBodies[0], Array.from({ length: rows }, (_, row) => [row, ...cells(row)]));
+  }
+
+  close() {
+    this.connection.end();
+    this.element.remove();
+  }
+}
+
+// The rows of a table body; the first cell of each is its heading.
+function fill(body, rows) {
+  rows.forEach((texts, number) => {
+    const row = body.rows[number] ?? body.insertRow();
+    texts.forEach((text, column) => {
+      let cell = row.cells[column];
+      if (!cell) {
+        cell = row.appendChild(document.createElement(column ? "td" : "th"));
+        if (!column) cell.scope = "row";
+      }
+      say(cell, String(text));
+    });
+  });
+  while (body.rows.length > rows.length) body.deleteRow(-1);
+}

@@ -1,0 +1,68 @@
+// SPDX-License-Identifier: Apache-2.0
+// Fixed scales, never a scan's own: where a value lies on them, its colour, and how it is written.
+
+// Dark to light, of even steps in lightness ("rocket" of seaborn).
+const ANCHORS = ["03051a", "221331", "451c47", "691f55", "921c5b", "b91657", "d92847", "ed503e",
+  "f47d57", "f6a47c", "f7c9aa", "faebdd"].map((hex) => [0, 2, 4].map((at) =>
+  parseInt(hex.slice(at, at + 2), 16)));
+const STEPS = 256;
+const dark = matchMedia("(prefers-color-scheme: dark)");
+
+const RAMP = Array.from({ length: STEPS }, (_, step) => {
+  const place = (step / (STEPS - 1)) * (ANCHORS.length - 1);
+  const low = Math.min(Math.floor(place), ANCHORS.length - 2);
+  return ANCHORS[low].map((from, k) =>
+    Math.round(from + (place - low) * (ANCHORS[low + 1][k] - from)));
+});
+const COLOURS = RAMP.map((rgb) => `rgb(${rgb})`);
+const IS_LIGHT = RAMP.map(([r, g, b]) => 0.299 * r + 0.587 * g + 0.114 * b > 140);
+
+function step(position) {
+  const index = Math.round((STEPS - 1) * Math.min(1, Math.max(0, position)));
+  return dark.matches ? index : STEPS - 1 - index; // nothing looks like the page
+}
+
+export const colourAt = (position) => COLOURS[step(position)];
+export const inkAt = (position) => (IS_LIGHT[step(position)] ? "#1b1014" : "#fff");
+export const onTheme = (call) => dark.addEventListener("change", call);
+
+// Three digits, without an exponent.
+export function written(value) {
+  if (!Number.isFinite(value)) return "–";
+  const size = Math.abs(value);
+  return value.toFixed(size < 9.995 ? 2 : size < 99.95 ? 1 : 0);
+}
+
+const LOW_S = 1e-6;
+const HIGH_S = 1e-3;
+const DECADES = Math.log10(HIGH_S / LOW_S);
+const logPosition = (siemens) => Math.log10(siemens / LOW_S) / DECADES;
+
+// factor: from the plane's unit to the one written. floor: a standard deviation below is certain.
+const siemens = {
+  name: "conductance", unit: "µS", plane: "siemens", floor: 0.5e-6,
+  position: logPosition,
+  show: (value) => 1e6 * value,
+  std: (value, std) => 1e6 * std,
+  ticks: [1e-6, 1e-5, 1e-4, 1e-3],
+};
+const ohms = {
+  ...siemens, name: "resistance", unit: "kΩ",
+  show: (value) => 1e-3 / value,
+  std: (value, std) => (1e-3 * std) / value ** 2,
+};
+const newtons = (top) => ({
+  name: "force", unit: "N", plane: "force", floor: 0.1,
+  position: (value) => value / top,
+  show: (value) => value,
+  std: (value, std) => std,
+  ticks: [0, 0.25, 0.5, 0.75, 1].map((share) => share * top),
+});
+
+export const TOPS_N = [2, 5, 10, 20, 50];
+
+export function scaleOf(quantity, topN) {
+  return quantity === "newtons" ? newtons(topN) : quantity === "ohms" ? ohms : siemens;
+}
+
+export const isUncertain = (scale, value, std) => !(std <= Math.max(scale.floor, value / 4));

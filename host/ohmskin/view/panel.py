@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One panel of a page: a websocket over which a board is shown and commanded.
+
+To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes, `shown`): the
+newest one, and no other before the page has acknowledged it. So nothing queues up on the way,
+however slow page or network are. From the page come texts, whose ``do`` is one of `_COMMANDS`,
+"ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the host's clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from math import isfinite
+from typing import Any, Final
+
+import anyio
+from anyio.abc import TaskGroup
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from ohmskin.errors import OhmskinError, TareRefused
+from ohmskin.view.shown import Shown
+from ohmskin.view.viewed_board import ViewedBoard
+
+_GONE: Final = 4001  # close code: the board was closed, by this page or another
+_Command = Callable[[], str]
+
+
+class Panel:
+    """Serves one connection until the page or the board goes."""
+
+    def __init__(self, board: ViewedBoard, socket: WebSocket) -> None:
+        self._board = board
+        self._socket = socket
+        self._news = asyncio.Event()
+        self._sent: Shown | None = None
+        self._awaited: int | None = None  # number of the scan that is not yet acknowledged
+        self._is_busy = False  # with a command
+
+    async def serve(self) -> None:
+        """Returns when it is over."""
+        await self._socket.accept()
+        loop = asyncio.get_running_loop()
+
+        def wake() -> None:
+            with suppress(RuntimeError):  # the loop has just ended
+                loop.call_soon_threadsafe(self._news.set)
+
+        with self._board.watched(wake):
+            try:
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(self._send)
+                    tasks.start_soon(self._receive, tasks)
+            except* WebSocketDisconnect:
+                pass
+
+    # ------------------------------------------------------------------------------ to the page
+
+    async def _send(self) -> None:
+        said = None
+        self._news.set()
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            if self._board.is_closed:
+                await self._socket.close(_GONE)
+                raise WebSocketDisconnect(_GONE)
+            state, shown = self._board.state(), self._board.shown
+            if state != said:
+                said = state
+                await self._say("state", **state)
+            if shown is not None and shown is not self._sent and self._awaited is None:
+                self._sent, self._awaited = shown, shown.scan.number
+                await self._socket.send_bytes(shown.message)
+
+    async def _say(self, kind: str, **content: Any) -> None:
+        await self._socket.send_text(json.dumps({"kind": kind, **content}))
+
+    async def _refuse(self, text: str) -> None:
+        await self._say("notice", text=text, good=False, refused="")
+
+    # ---------------------------------------------------------------------------- from the page
+
+    async def _receive(self, tasks: TaskGroup) -> None:
+        while True:
+            text = (await self._next()) or ""
+            try:
+                message = json.loads(text)
+            except (ValueError, RecursionError):
+                message = None
+            match message:
+                case {"do": "ack", "scan": int(number)}:
+                    if number == self._awaited:
+                        self._awaited = None
+                        self._news.set()
+                case {"do": "clock", "page_ms": int() | float() as page_ms} if isfinite(page_ms):
+                    await self._say("clock", page_ms=page_ms, host_s=time.monotonic())
+                case _:
+                    command = self._asked(message)
+                    if command is None:
+                        await self._refuse("the page has asked for what this program does not know")
+                    elif self._is_busy:
+                        await self._refuse("one thing at a time: the last one is not done yet")
+                    else:
+                        self._is_busy = True
+                        tasks.start_soon(self._run, *command)
+
+    async def _next(self) -> str | None:
+        message = await self._socket.receive()
+        if message["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(message.get("code", 1000))
+        text = message.get("text")
+        return text if isinstance(text, str) else None
+
+    def _asked(self, message: object) -> tuple[str, _Command] | None:
+        board = self._board
+        match message:
+            case {"do": "method", "method": str(method)}:
+                return "method", lambda: board.use(method)
+            case {"do": "tare", "force": bool(force)}:
+                return "tare", lambda: board.tare(force=force)
+            case {"do": "undo"}:
+                return "undo", board.undo_tare
+            case {"do": "record"}:
+                return "record", board.record
+            case {"do": "stop"}:
+                return "stop", board.stop_recording
+            case {"do": "mark", "text": str(text)}:
+                return "mark", lambda: board.mark(text)
+        return None
+
+    async def _run(self, name: str, command: _Command) -> None:
+        try:
+            done = await anyio.to_thread.run_sync(command)
+        except TareRefused as exc:
+            answer = {"text": str(exc), "good": False, "refused": name}
+        except (OhmskinError, ValueError, OSError) as exc:
+            answer = {"text": str(exc), "good": False, "refused": ""}
+        else:
+            answer = {"text": done, "good": True, "refused": ""}
+        self._is_busy = False
+        await self._say("notice", **answer)

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page shows of one scan, and its bytes.
+
+==============  ======================================================================
+4 bytes         length of the header, little-endian
+header          JSON, padded with spaces to a multiple of 4 bytes
+planes          those that the header names, each R x C float32, little-endian, by row
+==============  ======================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.circuit import Float
+from ohmskin.contacts import Contact
+from ohmskin.estimators import Estimate
+from ohmskin.messages import Scan
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What is counted since the board was connected, and its scan rate [Hz] of late."""
+
+    rate_hz: float
+    missed: int
+    damaged: int
+    restarts: int
+    recorded: int
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One scan. raw: method `ohm`, what the electrodes show as they are read.
+
+    force_n, force_n_std: (R, C) [N]; None where the method has no calibration. contacts: their
+    forces are in newtons, or without forces the rise of their conductance in siemens.
+    """
+
+    scan: Scan
+    raw: Estimate
+    estimate: Estimate
+    method: str
+    contacts: tuple[Contact, ...]
+    force_n: Float | None
+    force_n_std: Float | None
+    counts: Counts
+
+    @cached_property
+    def message(self) -> bytes:
+        """The bytes of it, as in the table above."""
+        planes: dict[str, Float | NDArray[np.bool_]] = {
+            "raw": self.raw.cell_siemens,
+            "raw_touched": self.raw.touched,
+            "siemens": self.estimate.cell_siemens,
+            "siemens_std": self.estimate.cell_siemens_std,
+            "touched": self.estimate.touched,
+        }
+        if self.force_n is not None and self.force_n_std is not None:
+            planes |= {"force": self.force_n, "force_std": self.force_n_std}
+        header = json.dumps(self._header(list(planes)), allow_nan=False).encode()
+        header += b" " * (-len(header) % 4)
+        values = np.stack(list(planes.values())).astype("<f4")
+        return struct.pack("<I", len(header)) + header + values.tobytes()
+
+    def _header(self, planes: list[str]) -> dict[str, Any]:
+        scan, estimate, counts = self.scan, self.estimate, self.counts
+        return {
+            "scan": scan.number,
+            "host_time_s": scan.host_time_s,
+            "rows": scan.rows,
+            "columns": scan.columns,
+            "planes": planes,
+            "method": self.method,
+            "chi2": _number(estimate.chi2),
+            "iterations": estimate.iterations,
+            "estimate_s": estimate.seconds,
+            "text": estimate.message,
+            "rate_hz": counts.rate_hz,
+            "missed": counts.missed,
+            "damaged": counts.damaged,
+            "restarts": counts.restarts,
+            "recorded": counts.recorded,
+            "contacts": [[each.identity, *map(_number, _numbers(each))] for each in self.contacts],
+        }
+
+
+def _numbers(contact: Contact) -> tuple[float, ...]:
+    return contact.row, contact.column, contact.force_n, contact.force_n_std
+
+
+def _number(value: float) -> float | None:
+    """As JSON has it, which knows no NaN."""
+    return value if math.isfinite(value) else None

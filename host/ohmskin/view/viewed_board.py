@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One board of the page: opened, read and estimated in a thread, and opened again if it goes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from ohmskin.calibrated_device import TARE_S
+from ohmskin.calibration import Calibration
+from ohmskin.circuit import Float
+from ohmskin.closing import Closing
+from ohmskin.device import Device
+from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
+from ohmskin.messages import Hello, Scan
+from ohmskin.ports import open_link
+from ohmskin.recording import Mark, Tare
+from ohmskin.replay import ReplayLink
+from ohmskin.view.board_recording import BoardRecording
+from ohmskin.view.shown import Counts, Shown
+from ohmskin.view.skin_reader import SkinReader
+
+AGAIN_S: Final = 1.0  # until a port that is not there is tried again
+_RATE_OVER_S: Final = 2.0
+_CLOSE_S: Final = 1.0
+_LONGEST_MARK: Final = 1000
+
+
+class ViewedBoard(Closing):
+    """The board at `port`, whether it is there or not. All but `shown` and `state` may wait.
+
+    calibrations: the one of its unit is taken; with `force`, that of any. folder: where recordings
+    go.
+    """
+
+    def __init__(
+        self, port: str, calibrations: Sequence[Calibration], folder: Path, *, force: bool = False
+    ) -> None:
+        self.port = port
+        self.shown: Shown | None = None
+        """What the newest scan shows; None while nobody looks."""
+        self._calibrations, self._force = calibrations, force
+        self._folder = folder
+        self._status, self._text, self._note = "opening", "", ""
+        self._skin: Device | None = None
+        self._reader: SkinReader | None = None
+        self._recording: BoardRecording | None = None
+        self._watchers: set[Callable[[], None]] = set()
+        self._commands = threading.Lock()
+        self._closing = threading.Event()
+        # A port that never answers does not hold up the end of the program.
+        self._thread = threading.Thread(target=self._work, name=f"view {port}", daemon=True)
+        self._thread.start()
+
+    # ----------------------------------------------------------------------------- for the page
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._closing.is_set()
+
+    @contextmanager
+    def watched(self, changed: Callable[[], None]) -> Iterator[None]:
+        """Meanwhile `changed` is called, from any thread, when `shown` or `state` may be new."""
+        self._watchers.add(changed)
+        try:
+            yield
+        finally:
+            self._watchers.discard(changed)
+
+    def state(self) -> dict[str, Any]:
+        """What the page says beside the scans, as JSON has it."""
+        reader, recording = self._reader, self._recording
+        board = None if reader is None else reader.board
+        rest = None if reader is None else reader.rest
+        return {
+            "port": self.port,
+            "status": self._status,
+            "text": self._text,
+            "note": self._note,
+            "board": board
+            and {
+                "name": board.board,
+                "unit_id": board.unit_id,
+                "version": board.version,
+                "rows": board.rows,
+                "columns": board.columns,
+                "rate_hz": board.rate_hz,
+            },
+            "methods": [] if reader is None else reader.methods,
+            "method": "" if reader is None else reader.method,
+            "force_method": None if reader is None else reader.force_method,
+            "rest_date": rest and rest[1],
+            "tared": reader is not None and reader.is_tared,
+            "recording": "" if recording is None or recording.text else str(recording.path),
+            "recorded": "" if recording is None else recording.text,
+        }
+
+    def _changed(self) -> None:
+        for watcher in tuple(self._watchers):
+            watcher()
+
+    # --------------------------------------------------------------------------------- commands
+
+    def use(self, method: str) -> str:
+        """Estimate by another method. Commands return what was done, and raise why it was not."""
+        self._there()[1].use(method)
+        self._changed()
+        return f"method {method}"
+
+    def tare(self, *, force: bool = False) -> str:
+        """Take the mean of the coming second for the skin's rest.
+
+        :raises TareRefused: something touches the skin.
+        """
+        with self._one_at_a_time():
+            skin, reader = self._there()
+            rest_ratio = skin.mean_ratio(TARE_S)
+            reader.tare(rest_ratio, force=force)
+            self._record_rest(rest_ratio)
+        return "tared: what the skin reads now is its rest"
+
+    def undo_tare(self) -> str:
+        """Return to the rest before the last tare."""
+        with self._one_at_a_time():
+            rest_ratio = self._there()[1].undo_tare()
+            if rest_ratio is None:
+                return "the tare is undone: rest is not known"
+            self._record_rest(rest_ratio)
+        return "the tare is undone: rest is as it was before"
+
+    def record(self) -> str:
+        """Record every scan to a new file."""
+        with self._one_at_a_time():
+            skin, reader = self._there()
+            if (running := self._running()) is not None:
+                raise OhmskinError(f"{running.path} is being recorded already")
+            tare = None
+            if reader.is_tared and reader.rest is not None:
+                tare = Tare(reader.rest[0], time.monotonic())
+            path = self._new_file(reader.board.unit_id)
+            self._recording = BoardRecording(skin, path, tare, self._changed)
+        self._changed()
+        return "recording: every scan, whatever is shown"
+
+    def stop_recording(self) -> str:
+        """End the recording; its file is whole then."""
+        recording = self._running()
+        if recording is None:
+            raise OhmskinError("nothing is being recorded")
+        recording.close()
+        return "the recording is whole"
+
+    def mark(self, text: str) -> str:
+        """Set a mark in the recording."""
+        recording, text = self._running(), text.strip()
+        if recording is None:
+            raise OhmskinError("a mark goes into a recording: start one first")
+        if not 0 < len(text) <= _LONGEST_MARK:
+            raise OhmskinError(f"a mark is a text of 1 to {_LONGEST_MARK} characters")
+        recording.add(Mark(text, time.monotonic()))
+        return f"marked: {text}"
+
+    def _there(self) -> tuple[Device, SkinReader]:
+        skin, reader = self._skin, self._reader
+        if skin is None or reader is None:
+            raise DeviceLost(f"{self.port} is not there")
+        return skin, reader
+
+    @contextmanager
+    def _one_at_a_time(self) -> Iterator[None]:
+        if not self._commands.acquire(blocking=False):
+            raise OhmskinError("one thing at a time: the last one is not done yet")
+        try:
+            yield
+        finally:
+            self._commands.release()
+            self._changed()
+
+    def _running(self) -> BoardRecording | None:
+        recording = self._recording
+        return None if recording is None or recording.text else recording
+
+    def _record_rest(self, rest_ratio: Float) -> None:
+        if (recording := self._running()) is not None:
+            recording.add(Tare(rest_ratio, time.monotonic()))
+
+    def _new_file(self, unit_id: int) -> Path:
+        stem = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
+        path, number = self._folder / f"{stem}.mcap", 1
+        while path.exists():
+            number += 1
+            path = self._folder / f"{stem}-{number}.mcap"
+        return path
+
+    # ----------------------------------------------------------------------------------- thread
+
+    def _work(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._follow()
+            except RecordingEnded as exc:
+                self._say("ended", str(exc))
+                return
+            except (OhmskinError, ValueError, OSError) as exc:
+                self._say("gone", " ".join(str(exc).split()))
+            except Exception as exc:
+                self._say("ended", f"a defect of this program: {exc!r}")
+                raise
+            self._closing.wait(AGAIN_S)
+
+    def _say(self, status: str, text: str = "") -> None:
+        self._status, self._text = status, text
+        self._changed()
+
+    def _follow(self) -> None:
+        link, baud = open_link(self.port)
+        with Device(link, baud=baud) as skin:
+            reader = self._reader_of(skin)
+            self._reader, self._skin = reader, skin
+            try:
+                rate = _Rate()
+                while not self._closing.is_set():
+                    scan = skin.latest()
+                    if isinstance(link, ReplayLink) and (tare := link.tare_before(scan)):
+                        reader.replayed(tare.rest_ratio)
+                    counts = self._counts(skin, rate.of(scan))
+                    # A method takes a good part of a core: not while nobody looks.
+                    self.shown = reader.read(scan, counts) if self._watchers else None
+                    if self._status != "scanning":
+                        self._status, self._text = "scanning", ""
+                    self._changed()
+            finally:
+                self._skin = None
+                skin.close()  # its scans end, and so does the recording
+                if (recording := self._recording) is not None:
+                    recording.close()
+
+    def _reader_of(self, skin: Device) -> SkinReader:
+        """A board that is there again is read as before, with method and tare."""
+        board, before = skin.info, self._reader
+        if before is not None and _same(before.board, board):
+            return before
+        self._note = ""
+        for calibration in self._calibrations:
+            try:
+                calibration.check(board.unit_id, board.rows, board.columns, force=self._force)
+                reader = SkinReader(board, calibration)
+            except ValueError as exc:
+                self._note = f"no forces: {exc}"
+            else:
+                self._note = ""
+                return reader
+        return SkinReader(board, None)
+
+    def _counts(self, skin: Device, rate_hz: float) -> Counts:
+        stats, recording = skin.stats, self._running()
+        return Counts(
+            rate_hz,
+            stats.missed,
+            stats.line.damaged,
+            stats.restarts,
+            0 if recording is None else recording.scans,
+        )
+
+    def close(self) -> None:
+        """End reading; a recording is whole then. May be called again."""
+        self._closing.set()
+        skin, recording = self._skin, self._recording
+        if skin is not None:
+            skin.close()
+        if recording is not None:
+            recording.close()
+        self._thread.join(_CLOSE_S)
+        self._changed()
+
+
+class _Rate:
+    """The board's scan rate over the last `_RATE_OVER_S`, those that were missed included."""
+
+    def __init__(self) -> None:
+        self._scans: deque[tuple[int, int]] = deque()
+
+    def of(self, scan: Scan) -> float:
+        scans = self._scans
+        if scans and scan.time_us <= scans[-1][1]:
+            scans.clear()  # the board has restarted
+        scans.append((scan.number, scan.time_us))
+        while scan.time_us - scans[0][1] > 1e6 * _RATE_OVER_S:
+            scans.popleft()
+        if len(scans) < 2:
+            return 0.0
+        return 1e6 * (scan.number - scans[0][0]) / (scan.time_us - scans[0][1])
+
+
+def _same(one: Hello, other: Hello) -> bool:
+    names = ("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+    return all(getattr(one, name) == getattr(other, name) for name in names)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stand-in for what examples/lsl_outlet.py uses of pylsl, where that or its library is absent."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Final
+
+CLOCK_OFFSET_S: Final = 1000.0  # a local_clock() that is not time.monotonic()
+
+
+@dataclass
+class XMLElement:
+    name: str
+    value: str = ""
+    children: list[XMLElement] = field(default_factory=list)
+
+    def append_child(self, name: str) -> XMLElement:
+        self.children.append(XMLElement(name))
+        return self.children[-1]
+
+    def append_child_value(self, name: str, value: str) -> XMLElement:
+        assert isinstance(value, str)
+        self.append_child(name).value = value
+        return self
+
+
+class StreamInfo:
+    def __init__(
+        self,
+        name: str = "untitled",
+        type: str = "",
+        channel_count: int = 1,
+        nominal_srate: float = 0.0,
+        channel_format: str = "float32",
+        source_id: str | None = None,
+    ) -> None:
+        self.name, self.type, self.channel_count = name, type, channel_count
+        self.nominal_srate, self.channel_format = nominal_srate, channel_format
+        self.source_id = source_id
+        self._desc = XMLElement("desc")
+
+    def desc(self) -> XMLElement:
+        return self._desc
+
+    def get_channel(self, name: str) -> list[str]:
+        (channels,) = self._desc.children
+        return [
+            child.value
+            for channel in channels.children
+            for child in channel.children
+            if child.name == name
+        ]
+
+
+def pylsl_module(samples: list[tuple[list[float], float]], infos: list[StreamInfo]) -> ModuleType:
+    """`pylsl` whose outlets append to `samples` (values, timestamp) and `infos`."""
+
+    class StreamOutlet:
+        def __init__(self, info: StreamInfo) -> None:
+            self.info = info
+            infos.append(info)
+
+        def push_sample(self, x: list[float], timestamp: float = 0.0) -> None:
+            assert len(x) == self.info.channel_count
+            samples.append((x, timestamp))
+
+    made = ModuleType("pylsl")
+    vars(made).update(
+        StreamInfo=StreamInfo,
+        StreamOutlet=StreamOutlet,
+        local_clock=lambda: time.monotonic() + CLOCK_OFFSET_S,
+    )
+    return made
