@@ -44,7 +44,7 @@ from ohmskin.force_reader import ForceReader, ForceScan
 from ohmskin.messages import Hello, Scan
 from ohmskin.presses import Presses
 from ohmskin.readings import load_readings
-from ohmskin.recording import Recorder
+from ohmskin.recorder import Recorder
 from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 
 PRESSES = Path(__file__).resolve().parents[1] / "tests" / "data" / "presses_8x8.npz"

@@ -48,7 +48,7 @@ from ohmskin import framing, protocol
 from ohmskin.emulator import EmulatedBoard
 from ohmskin.errors import PortError
 from ohmskin.messages import BoardDecoder, Scan
-from ohmskin.recording import Recorder
+from ohmskin.recorder import Recorder
 
 RATE_HZ = 90
 DECODED_SCANS = 3000

@@ -12,7 +12,7 @@ from ohmskin import framing, protocol
 from ohmskin.circuit import Float
 from ohmskin.emulator import EmulatedBoard
 from ohmskin.messages import BoardDecoder, Hello, Scan
-from ohmskin.recording import Recorder
+from ohmskin.recorder import Recorder
 from ohmskin.scenes import Scene
 
 HOST_BEGIN_S = 1000.0

@@ -16,7 +16,8 @@ from press_recording import HOST_BEGIN_S, SENSOR_ZERO_N, record_presses, sensor_
 import ohmskin
 from ohmskin.calibration import load_calibration
 from ohmskin.circuit import Float
-from ohmskin.recording import ForceSample, Recorder, load_recording
+from ohmskin.recorder import Recorder
+from ohmskin.recording import ForceSample, load_recording
 from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 
 SECONDS = 44.0  # two cells of six presses

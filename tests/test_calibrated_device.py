@@ -19,7 +19,8 @@ from ohmskin.estimators import SkinKnowledge
 from ohmskin.force import ForceRegression
 from ohmskin.force_reader import ForceScan
 from ohmskin.levels import LEVEL_METHODS
-from ohmskin.recording import Recorder, Tare, load_recording
+from ohmskin.recorder import Recorder
+from ohmskin.recording import Tare, load_recording
 from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 
 NEWTON_SIEMENS = 20e-6  # of every cell, in these tests

@@ -25,7 +25,8 @@ from ros_stub import Float32MultiArray, PointCloud2, PointField, Ros
 from test_calibrated_device import of_scene
 
 import ohmskin
-from ohmskin.recording import Mark, Recorder
+from ohmskin.recorder import Recorder
+from ohmskin.recording import Mark
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 GHOST = "emulator://8x8?scene=ghost&seed=1"

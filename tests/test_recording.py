@@ -35,16 +35,8 @@ from ohmskin.export import export
 from ohmskin.messages import Hello, Scan
 from ohmskin.ports import emulated
 from ohmskin.readings import estimate_file, load_readings
-from ohmskin.recording import (
-    FLUSH_EVERY_S,
-    ForceSample,
-    Mark,
-    Recorder,
-    Recording,
-    Tare,
-    load_recording,
-    messages,
-)
+from ohmskin.recorder import FLUSH_EVERY_S, Recorder
+from ohmskin.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 

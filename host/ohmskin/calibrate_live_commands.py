@@ -42,7 +42,7 @@ from ohmskin.messages import Scan
 from ohmskin.number_table import naming
 from ohmskin.press_table import PressTable, load_press_table, save_press_table
 from ohmskin.press_watch import PressWatch
-from ohmskin.recording import Recorder
+from ohmskin.recorder import Recorder
 from ohmskin.recording_commands import record_scans, stop_signals
 
 GRAVITY: Final = 9.80665  # standard [m/s^2]

@@ -83,7 +83,7 @@ class CalibratedDevice(Device):
         """Take the mean of the coming scans for the skin's rest, from the next scan read on.
 
         seconds: of scans, at least one. force: even if cells seem touched, because rest has
-        drifted. Returns what `ohmskin.recording.Recorder.add` keeps.
+        drifted. Returns what `ohmskin.recorder.Recorder.add` keeps.
 
         :raises TareRefused: something touches the skin.
         :raises DeviceLost: as `mean_ratio`.

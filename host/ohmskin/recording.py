@@ -17,9 +17,8 @@ Codes are stored as numbers, not as frames of the link: a file outlives the prot
 other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were all noise, 46 kB/s.
 ``host_time_s`` is that of `Scan`; log times are the same instants since 1970.
 
-`Recorder` writes, `messages` reads one by one, `load_recording` all at once. What is written
-reaches the file at least every `FLUSH_EVERY_S`, as whole chunks: a file that was cut off anywhere
-is read up to its last whole chunk.
+`ohmskin.recorder` writes them; `messages` reads one by one, `load_recording` all at once. A file
+that was cut off anywhere is read up to its last whole chunk.
 """
 
 from __future__ import annotations
@@ -28,13 +27,8 @@ import json
 import math
 import os
 import struct
-import threading
-import time
 from collections.abc import Generator, Iterator
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
-from io import RawIOBase
-from pathlib import Path
+from dataclasses import dataclass, field, fields
 from typing import IO, Any, Final, cast
 
 import lz4.frame
@@ -44,16 +38,13 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, Footer, McapRecord
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
 
 from ohmskin.circuit import READINGS_PER_CELL, Float
-from ohmskin.closing import Closing
 from ohmskin.errors import RecordingError
 from ohmskin.messages import Hello, Scan
 
-FLUSH_EVERY_S: Final = 0.5
 # A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
-_LARGEST_RECORD: Final = 16_000_000
+LARGEST_RECORD: Final = 16_000_000
 _LARGEST_CELLS: Final = 4096
 _LARGEST_CODE: Final = 0xFFFF
 _LARGEST_COUNTER: Final = (1 << 63) - 1
@@ -63,7 +54,7 @@ _INTEGER: Final = {"type": "integer"}
 _TEXT: Final = {"type": "string"}
 _HOST_TIME: Final = {"type": "number", "description": "host's monotonic clock [s]"}
 _SIZE: Final = {"rows": _INTEGER, "columns": _INTEGER}
-_SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     "hello": {
         "host_time_s": _HOST_TIME,
         **{
@@ -99,7 +90,7 @@ _SCHEMAS: Final[dict[str, dict[str, Any]]] = {
         "source": {"type": "string", "description": "what measured it"},
     },
 }
-_TOPIC: Final = "/skin/"
+TOPIC: Final = "/skin/"
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,190 +121,6 @@ class ForceSample:
 
 
 Recorded = Hello | Scan | Tare | Mark | ForceSample
-
-
-# ------------------------------------------------------------------------------------- writing
-
-
-class Recorder(Closing):
-    """Writes a recording, from any thread, until it is closed or the disk is full.
-
-    hello: the board's, which comes first. file: for tests, written to instead of a new file `path`.
-
-    :raises RecordingError: the file is there already, or cannot be written. From then on nothing
-        more is written, and what was written before can be read.
-    """
-
-    def __init__(
-        self, path: str | os.PathLike[str], hello: Hello, *, file: RawIOBase | None = None
-    ) -> None:
-        self.path = Path(path)
-        self.scans = self.missed = 0
-        self._failure: RecordingError | None = None
-        self._closed = threading.Event()
-        self._lock = threading.Lock()
-        try:
-            self._tail = _Tail(file or cast(RawIOBase, self.path.open("xb", buffering=0)))
-        except FileExistsError:
-            raise RecordingError(f"{path} is there already: choose another name") from None
-        except OSError as exc:
-            raise RecordingError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()
-        self._writer = Writer(
-            cast(IO[Any], self._tail),
-            chunk_size=_LARGEST_RECORD // 4,
-            compression=CompressionType.ZSTD,
-        )
-        self._writer.start(profile="", library="ohmskin")
-        self._channels = {name: self._channel(name) for name in _SCHEMAS}
-        self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
-        try:
-            self.add(hello)
-            self._flush()
-        except BaseException:
-            self._tail.close()
-            raise
-        self._flusher.start()
-
-    def _channel(self, name: str) -> int:
-        properties = _SCHEMAS[name]
-        schema = {
-            "$schema": "https://json-schema.org/draft/2020-12/schema",
-            "title": f"ohmskin.{name}",
-            "type": "object",
-            "properties": properties,
-            "required": list(properties),
-        }
-        schema_id = self._writer.register_schema(
-            f"ohmskin.{name}", "jsonschema", json.dumps(schema).encode()
-        )
-        return self._writer.register_channel(_TOPIC + name, "json", schema_id)
-
-    def add(self, message: Recorded) -> None:
-        """Keep a message.
-
-        :raises RecordingError: the file can no longer be written.
-        """
-        match message:
-            case Hello():
-                self._write("hello", {"host_time_s": time.monotonic(), **asdict(message)})
-            case Scan(codes=codes):
-                content = {
-                    "number": message.number,
-                    "time_us": message.time_us,
-                    "host_time_s": message.host_time_s,
-                    "missed": message.missed,
-                    "rows": message.rows,
-                    "columns": message.columns,
-                    "codes": codes.reshape(-1).tolist(),
-                }
-                self._write("scan", content, sequence=message.number & 0xFFFFFFFF)
-                self.scans += 1
-                self.missed += message.missed
-            case Tare(rest_ratio=rest_ratio):
-                content = {
-                    "host_time_s": message.host_time_s,
-                    "rows": rest_ratio.shape[0],
-                    "columns": rest_ratio.shape[1],
-                    "rest_ratio": rest_ratio.reshape(-1).tolist(),
-                }
-                self._write("tare", content)
-            case Mark():
-                self._write("mark", asdict(message))
-            case ForceSample():
-                self._write("force", asdict(message))
-
-    def _write(self, name: str, content: dict[str, Any], sequence: int = 0) -> None:
-        octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-        log_ns = self._epoch_ns + round(content["host_time_s"] * 1e9)
-        with self._lock:
-            if self._failure is not None:
-                raise self._failure
-            if self._closed.is_set():
-                raise RecordingError(f"{self.path}: the recording is closed")
-            self._writer.add_message(self._channels[name], log_ns, octets, log_ns, sequence)
-
-    def _flush(self) -> None:
-        with self._lock:
-            if self._failure is not None:
-                raise self._failure
-            try:
-                self._writer.flush()  # type: ignore[no-untyped-call]
-            except OSError as exc:
-                self._fail(exc)
-
-    def _fail(self, exc: OSError) -> None:
-        self._failure = RecordingError(
-            f"{self.path}: recording ended after {self.scans} scans: {exc.strerror or exc}; "
-            "what is in the file can be read"
-        )
-        raise self._failure from exc
-
-    def _flush_often(self) -> None:
-        # A thread, because a board that falls silent must not keep its last scans from the file.
-        while not self._closed.wait(FLUSH_EVERY_S):
-            try:
-                self._flush()
-            except RecordingError:
-                return  # the next `add` or `close` raises it
-
-    def close(self) -> None:
-        """Write what is left, and the file's index. May be called again.
-
-        :raises RecordingError: that could not be written.
-        """
-        if self._closed.is_set():
-            return
-        self._closed.set()
-        self._flusher.join()
-        try:
-            self._flush()
-            with self._lock:
-                try:
-                    self._writer.finish()  # type: ignore[no-untyped-call]
-                    self._tail.flush(sync=True)
-                except OSError as exc:
-                    self._fail(exc)
-        finally:
-            self._tail.close()
-
-
-class _Tail:
-    """The file as `Writer` sees it: grows by whole flushes, or by nothing at all."""
-
-    def __init__(self, file: RawIOBase) -> None:
-        self._file = file
-        self._written = 0
-        self._waiting = bytearray()
-
-    def tell(self) -> int:
-        return self._written + len(self._waiting)
-
-    def write(self, octets: bytes) -> int:
-        self._waiting += octets
-        return len(octets)
-
-    def flush(self, *, sync: bool = False) -> None:
-        view = memoryview(bytes(self._waiting))
-        try:
-            at = 0
-            while at < len(view):
-                at += self._file.write(view[at:]) or 0
-            if sync:
-                with suppress(ValueError):  # a file of the tests
-                    os.fsync(self._file.fileno())
-        except OSError:
-            with suppress(OSError):
-                self._file.truncate(self._written)
-            raise
-        self._written += len(view)
-        self._waiting.clear()
-
-    def close(self) -> None:
-        self._file.close()
-
-
-# ------------------------------------------------------------------------------------- reading
 
 
 @dataclass(eq=False)
@@ -362,9 +169,9 @@ def messages(path: str | os.PathLike[str]) -> Generator[Recorded | None, None, N
         with open(path, "rb") as file:
             for record in _records(_Bounded(file)):
                 match record:
-                    case Channel(message_encoding="json", topic=topic) if topic.startswith(_TOPIC):
-                        topics[record.id] = topic.removeprefix(_TOPIC)
-                    case McapMessage() if topics.get(record.channel_id) in _SCHEMAS:
+                    case Channel(message_encoding="json", topic=topic) if topic.startswith(TOPIC):
+                        topics[record.id] = topic.removeprefix(TOPIC)
+                    case McapMessage() if topics.get(record.channel_id) in SCHEMAS:
                         message = _message(topics[record.channel_id], record.data)
                         if not known and not isinstance(message, Hello):
                             raise ValueError("no board says hello in it before the first message")
@@ -401,9 +208,7 @@ class _Bounded:
 
 def _records(file: _Bounded) -> Iterator[McapRecord]:
     """The records of an MCAP file, up to its footer or to where it was cut off."""
-    reader = StreamReader(
-        cast(IO[bytes], file), emit_chunks=True, record_size_limit=_LARGEST_RECORD
-    )
+    reader = StreamReader(cast(IO[bytes], file), emit_chunks=True, record_size_limit=LARGEST_RECORD)
     records = reader.records
     first = True
     while True:
@@ -422,7 +227,7 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
                 return
             continue
         try:
-            if _unpacked_size(record) > _LARGEST_RECORD:
+            if _unpacked_size(record) > LARGEST_RECORD:
                 raise ValueError("damaged: a chunk larger than any recorder writes")
             inside = breakup_chunk(record, validate_crc=True)
         except (

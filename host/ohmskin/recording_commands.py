@@ -26,7 +26,8 @@ from ohmskin.errors import OhmskinError, RecordingError
 from ohmskin.export import FORMATS
 from ohmskin.export import export as export_recording
 from ohmskin.messages import Scan
-from ohmskin.recording import Mark, Recorder, Tare, load_recording
+from ohmskin.recorder import Recorder
+from ohmskin.recording import Mark, Tare, load_recording
 
 _out = Console(soft_wrap=True)
 _TYPED_EVERY_S = 0.2

@@ -11,7 +11,8 @@ from pathlib import Path
 from ohmskin.closing import Closing
 from ohmskin.device import Device
 from ohmskin.errors import OhmskinError
-from ohmskin.recording import Mark, Recorder, Tare
+from ohmskin.recorder import Recorder
+from ohmskin.recording import Mark, Tare
 
 
 class BoardRecording(Closing):
