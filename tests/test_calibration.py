@@ -132,6 +132,9 @@ def test_rest_is_what_the_method_reads() -> None:
         level = Rest.of(method, SkinKnowledge(2, 3, rest_ratio=ratio), "2025-03-01").level
         cell_siemens = 1e-6 * np.exp(0.1 * np.random.default_rng(2).standard_normal((2, 3)))
         np.testing.assert_allclose(level, cell_siemens, rtol=tolerance)
+    a, b, c, d = np.moveaxis(ratio, -1, 0)
+    level = Rest.of("voltage", SkinKnowledge(2, 3, rest_ratio=ratio), "2025-03-01").level
+    np.testing.assert_allclose(level, (1 - a + b + 1 - c + d) / 4, rtol=1e-12)
     with pytest.raises(ValueError, match="the readings of the untouched skin are not known"):
         Rest.of("ohm", SkinKnowledge(2, 3), "2025-03-01")
 
