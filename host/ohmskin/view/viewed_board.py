@@ -124,7 +124,8 @@ class ViewedBoard(Closing):
             rest_ratio = skin.mean_ratio(TARE_S)
             reader.tare(rest_ratio, force=force)
             self._record_rest(rest_ratio)
-        return "tared: what the skin reads now is its rest"
+        lasts = "" if reader.force_method is None else "; 'ohmskin tare' makes one that lasts"
+        return f"tared, until this program ends{lasts}"
 
     def undo_tare(self) -> str:
         """Return to the rest before the last tare."""

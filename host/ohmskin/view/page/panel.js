@@ -7,6 +7,7 @@ import { Connection } from "./wire.js";
 
 const DIGITS_EVERY_MS = 200;
 const TABLE_EVERY_MS = 1000;
+const MESSAGE_EVERY_MS = 2000; // it is spoken
 const QUANTITIES = { newtons: "force (N)", siemens: "conductance (µS)", ohms: "resistance (kΩ)" };
 const STATUS = {
   opening: "connecting …", scanning: "scanning", gone: "not there, tried again every second",
@@ -41,6 +42,7 @@ export class Panel {
     this.chosen = null;
     this.quantity = null; // what the user has chosen
     this.topN = 10;
+    this.message = "";
     this.latencies = [];
     this.drawnAt = [];
     this.label(port, number);
@@ -52,6 +54,8 @@ export class Panel {
       scan: (scan) => {
         this.history.add(scan);
         this.scan = scan;
+        this.element.classList.add("seen");
+        this.message = scan.text || this.message; // also of a scan that is not drawn
         this.dirty = true;
       },
       link: (there) => {
@@ -123,7 +127,9 @@ export class Panel {
   }
 
   command(message) {
-    this.find(".anyway").hidden = true;
+    const anyway = this.find(".anyway");
+    if (document.activeElement === anyway) this.find(".tare").focus(); // it goes
+    anyway.hidden = true;
     const text = { tare: "taring for a second: let nothing touch the skin" }[message.do] ?? "";
     this.notice({ text, good: true });
     this.connection.say(message);
@@ -252,7 +258,7 @@ export class Panel {
       this.writtenMs = nowMs;
       this.raw.write(scan, this.rawScale, raw);
       this.estimate.write(scan, scale, estimate);
-      this.write(scan);
+      this.write(scan, nowMs);
     }
     if (this.find(".values").open && nowMs - (this.tableMs || 0) >= TABLE_EVERY_MS) {
       this.tableMs = nowMs;
@@ -281,7 +287,7 @@ export class Panel {
     channel.port2.postMessage(0);
   }
 
-  write(scan) {
+  write(scan, nowMs) {
     const count = (touched) => touched.reduce((sum, each) => sum + each, 0);
     const cells = (number, seem) => `${number} ${number === 1 ? "cell" : "cells"} ${seem}touched`;
     say(this.find(".raw .count"), cells(count(scan.raw_touched), "seemingly "));
@@ -295,7 +301,11 @@ export class Panel {
     say(this.find(".shown"), `${(this.drawnAt.length / 2).toFixed(0)} a second`);
     say(this.find(".takes"), `${(1000 * scan.estimate_s).toFixed(1)} ms`);
     say(this.find(".chi2"), scan.chi2 === null ? "–" : scan.chi2.toPrecision(2));
-    say(this.find(".message"), scan.text);
+    if (nowMs - (this.messageMs || 0) >= MESSAGE_EVERY_MS) {
+      this.messageMs = nowMs;
+      say(this.find(".message"), this.message);
+      this.message = "";
+    }
     const force = scan.force !== undefined;
     const rows = scan.contacts.map(([identity, row, column, amount, std]) => {
       const [value, spread] = force ? [amount, std] : [1e6 * amount, 1e6 * std];
