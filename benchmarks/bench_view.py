@@ -17,6 +17,7 @@ latency_ms_p50, _p99   from when the last byte of a scan was read (`Scan.host_ti
 latency_growth_ms      median of the last tenth less that of the first tenth: what queues up, grows.
 page_says_ms           the median that the page itself shows, by the clock of its websocket.
 frames_per_s           frames that were drawn, each with another scan.
+refreshes_per_s        frames that the browser asked for: in the others there was no newer scan.
 scans_per_s            scans of the board meanwhile, by their numbers.
 longest_gap_ms         between two frames.
 server_cpu_percent     of one core: estimator ('joint'), server and reading.
@@ -47,6 +48,12 @@ SETTLE_S = 5.0
 CLOCK_TRIES = 200
 COLLECT = """() => {
     window.drawn = [];
+    window.refreshes = 0;
+    const count = () => {
+        refreshes++;
+        requestAnimationFrame(count);
+    };
+    requestAnimationFrame(count);
     document.querySelector(".panel").addEventListener("drawn", ({ detail }) => {
         drawn.push([detail.scan, detail.host_time_s, detail.nowMs]);
     });
@@ -106,7 +113,7 @@ def measure(minutes: float) -> dict[str, Any]:
         before_s, begin_s = cpu_s(server.pid), time.monotonic()
         page.wait_for_timeout(60_000 * minutes)
         seconds = time.monotonic() - begin_s
-        drawn = np.array(page.evaluate("drawn"))
+        drawn, refreshes = np.array(page.evaluate("drawn")), page.evaluate("refreshes")
         used_s = cpu_s(server.pid) - before_s
         says = page.locator(".latency").inner_text()
         missed = page.locator(".missed").inner_text()
@@ -126,6 +133,7 @@ def measure(minutes: float) -> dict[str, Any]:
         "clock_error_ms": round(error_ms, 2),
         "page_says_ms": float(says.removesuffix(" ms")),
         "frames_per_s": round(len(drawn) / seconds, 1),
+        "refreshes_per_s": round(refreshes / seconds, 1),
         "scans_per_s": round((numbers[-1] - numbers[0]) / seconds, 1),
         "longest_gap_ms": round(float(np.diff(drawn_ms).max()), 1),
         "server_cpu_percent": round(100 * used_s / seconds, 1),

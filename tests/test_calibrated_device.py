@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -180,7 +181,7 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
         assert_same_forces(live, list(board))
     # The tare was of consequence.
     with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
-        board._recorded_tare = lambda scan: None
+        board._recorded = None
         untared = list(board)
     assert live[10].force_n.tobytes() == untared[10].force_n.tobytes()
     assert live[30].force_n.tobytes() != untared[30].force_n.tobytes()
@@ -197,6 +198,22 @@ def test_latest_follows_the_same_tares(tmp_path: Path) -> None:
     with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
         contacts = [len(board.latest().contacts) for _ in range(20)]
     assert contacts == 10 * [3] + 10 * [0]
+
+
+def test_latest_does_not_miss_a_tare_whose_scan_it_skips(tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
+        for number, scan in enumerate(islice(board, 90)):
+            if number == 20:
+                recorder.add(Tare(scan.ratio, scan.host_time_s))
+            recorder.add(scan)
+    with ohmskin.open(f"replay://{path}?speed=1", calibration=of_scene("ghost")) as board:
+        first = board.latest()
+        assert len(first.contacts) == 3
+        time.sleep(0.5)
+        later = board.latest()
+        assert later.number > first.number + 25
+        assert later.contacts == ()
 
 
 def test_a_tare_at_the_end_of_a_replay_says_so(tmp_path: Path) -> None:

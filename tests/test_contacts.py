@@ -75,7 +75,20 @@ def test_a_flicker_is_the_same_touch_and_a_later_one_is_new() -> None:
     for scan in range(1, within):
         assert seen(tracker, scan, nothing) == ()
     assert seen(tracker, within, finger(3, 3))[0].identity == 1
+    for scan in range(within + 1, 2 * within + 2):
+        assert seen(tracker, scan, nothing) == ()
     assert seen(tracker, 2 * within + 2, finger(3, 3))[0].identity == 2
+
+
+def test_a_slow_board_s_touch_stays_itself() -> None:
+    """At 1 Hz a scan is all that memory has."""
+    tracker = ContactTracker()
+    nothing = np.zeros((8, 8))
+    every = 1_000_000 // SCAN_US
+    for scan in range(3):
+        assert seen(tracker, scan * every, finger(3, 3))[0].identity == 1
+    assert seen(tracker, 3 * every, nothing) == ()
+    assert seen(tracker, 4 * every, finger(3, 3))[0].identity == 2
 
 
 def test_merging_ends_the_farther_number() -> None:

@@ -89,6 +89,8 @@ def test_info(url: str) -> None:
 
 def test_every_scan_comes_in_order(url: str) -> None:
     with ohmskin.open(url) as skin:
+        # The hello of a board that boots may be cut in two by the opening of its port.
+        before = skin.stats.line.damaged
         found = take(iter(skin), 60)
         rate_hz, stats = skin.info.rate_hz, skin.stats
     numbers = [scan.number for scan in found]
@@ -102,7 +104,9 @@ def test_every_scan_comes_in_order(url: str) -> None:
     assert_reads_the_scene(found[-1].ratio)
     assert stats.scans >= 60
     assert (stats.missed, stats.dropped_by_board, stats.board_rx_errors) == (0, 0, 0)
-    assert (stats.line.damaged, stats.unknown, stats.restarts, stats.overflowed) == (0, 0, 0, 0)
+    assert before <= 1
+    assert stats.line.damaged == before
+    assert (stats.unknown, stats.restarts, stats.overflowed) == (0, 0, 0)
     assert stats.line.octets > 60 * 320
 
 

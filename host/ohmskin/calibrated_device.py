@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,20 @@ TARE_S = 1.0
 _NAMED_CELLS = 4
 
 
+class RecordedTares(Protocol):
+    """What a replay knows of the tares in its recording."""
+
+    def tare_before(self, scan: Scan) -> Tare | None:
+        """The one that comes right before this scan."""
+
+    def tare_at(self, host_time_s: float) -> Tare | None:
+        """The newest before what has been played by then."""
+
+
 class CalibratedDevice(Device):
     """A `Device` whose scans are `ForceScan`. Made by ``ohmskin.open(port, calibration=...)``.
 
-    force: take the calibration of another unit. recorded_tare: the tare that comes right before a
-    scan in a recording, if this is a replay.
+    force: take the calibration of another unit. recorded: the tares of a replay.
 
     :raises ValueError: the calibration is of another unit or geometry.
     """
@@ -41,11 +51,11 @@ class CalibratedDevice(Device):
         start: bool = True,
         baud: int | None = None,
         force: bool = False,
-        recorded_tare: Callable[[Scan], Tare | None] = lambda scan: None,
+        recorded: RecordedTares | None = None,
     ) -> None:
         super().__init__(link, start=False, baud=baud)
         self._calibrations = [calibration]  # with each tare one more
-        self._recorded_tare = recorded_tare
+        self._recorded = recorded
         self._newest: _Follower | None = None
         self._newest_lock = threading.Lock()
         try:
@@ -67,14 +77,19 @@ class CalibratedDevice(Device):
 
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, as `Device` gives them, with its forces."""
-        return map(_Follower(self).read, super().__iter__())
+        recorded = self._recorded
+        before = None if recorded is None else recorded.tare_before
+        return map(_Follower(self, before).read, super().__iter__())
 
     def latest(self, timeout_s: float | None = None) -> ForceScan:
         """The newest scan, as `Device` gives it, with its forces."""
         scan = super().latest(timeout_s)
         with self._newest_lock:
             if self._newest is None:
-                self._newest = _Follower(self)
+                recorded = self._recorded
+                # It skips scans, and with them what was recorded right before one.
+                newest = None if recorded is None else lambda at: recorded.tare_at(at.host_time_s)
+                self._newest = _Follower(self, newest)
             return self._newest.read(scan)
 
     # ---------------------------------------------------------------------------------- tare
@@ -94,7 +109,7 @@ class CalibratedDevice(Device):
             touched = reader.measure(rest_ratio).estimate.touched
             if touched.any():
                 raise TareRefused(
-                    f"{_named(touched)}: take everything off the skin, or force the tare if "
+                    f"{touched_cells(touched)}: take everything off the skin, or force the tare if "
                     "nothing is on it"
                 )
         self._calibrations.append(reader.tared(rest_ratio, now()))
@@ -115,10 +130,17 @@ class CalibratedDevice(Device):
 
 
 class _Follower:
-    """A reader for one way of reading a device, which goes on with its newest tare."""
+    """A reader for one way of reading a device, which goes on with its newest tare.
 
-    def __init__(self, device: CalibratedDevice) -> None:
+    recorded: the tare that a recording has for a scan, if it is one that is read.
+    """
+
+    def __init__(
+        self, device: CalibratedDevice, recorded: Callable[[Scan], Tare | None] | None
+    ) -> None:
         self._device = device
+        self._recorded = recorded
+        self._followed: Tare | None = None
         self._calibration = device.calibration
         self._reader = ForceReader(device.info, self._calibration)
 
@@ -126,9 +148,10 @@ class _Follower:
         if self._calibration is not self._device.calibration:
             self._calibration = self._device.calibration
             self._reader.use(self._calibration)
-        recorded = self._device._recorded_tare(scan)
-        if recorded is not None:
-            self._reader.use(self._reader.tared(recorded.rest_ratio, now()))
+        tare = None if self._recorded is None else self._recorded(scan)
+        if tare is not None and tare is not self._followed:
+            self._followed = tare
+            self._reader.use(self._reader.tared(tare.rest_ratio, now()))
         return self._reader.read(scan)
 
 
@@ -137,7 +160,8 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _named(touched: NDArray[np.bool_]) -> str:
+def touched_cells(touched: NDArray[np.bool_]) -> str:
+    """Which cells are touched, in words."""
     cells = [f"({row}, {column})" for row, column in np.argwhere(touched)]
     more = len(cells) - _NAMED_CELLS
     text = ", ".join(cells[:_NAMED_CELLS]) + (f" and {more} more" if more > 0 else "")

@@ -17,6 +17,8 @@ from ohmskin.circuit import Float
 FARTHEST_CELLS: Final = 2.0
 # A light touch flickers about its threshold; it stays the same contact.
 MEMORY_US: Final = 100_000
+# What the scan before had is remembered for longer, since boards may scan slowly.
+SLOWEST_SCAN_US: Final = 2_000_000
 _EIGHT_NEIGHBOURS: Final = np.ones((3, 3), dtype=np.int_)
 _FAR: Final = 1e6
 
@@ -50,12 +52,19 @@ class ContactTracker:
     def __init__(self) -> None:
         self._known: list[tuple[Contact, int]] = []  # with the time it was last seen [us]
         self._last = 0
+        self._before_us = 0
 
     def update(
         self, time_us: int, touched: NDArray[np.bool_], force_n: Float, force_n_std: Float
     ) -> tuple[Contact, ...]:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
-        self._known = [each for each in self._known if 0 <= time_us - each[1] <= MEMORY_US]
+        limits_us = {self._before_us: SLOWEST_SCAN_US}
+        self._known = [
+            each
+            for each in self._known
+            if 0 <= time_us - each[1] <= limits_us.get(each[1], MEMORY_US)
+        ]
+        self._before_us = time_us
         found = _blobs(touched, force_n, force_n_std)
         same = self._matches(found)
         contacts = []

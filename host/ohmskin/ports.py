@@ -79,9 +79,9 @@ def open(
     if not isinstance(calibration, Calibration):
         calibration = load_calibration(calibration)
     link, baud = open_link(url)
-    recorded_tare = link.tare_before if isinstance(link, ReplayLink) else lambda scan: None
+    recorded = link if isinstance(link, ReplayLink) else None
     return CalibratedDevice(
-        link, calibration, start=start, baud=baud, force=force, recorded_tare=recorded_tare
+        link, calibration, start=start, baud=baud, force=force, recorded=recorded
     )
 
 

@@ -55,6 +55,7 @@ class ReplayLink:
         self._next: tuple[Scan, bytes] | None = None
         self._tare: Tare | None = None
         self._tares: dict[tuple[int, int], Tare] = {}  # by the number and time of the next scan
+        self._played: list[tuple[float, Tare]] = []  # with the time when that scan was played
         self._running = False
         self._paused = True
         self._closed = False
@@ -93,6 +94,8 @@ class ReplayLink:
                     due_s = self._due_s(scan, now_s)
                     if now_s >= due_s:
                         self._next, self._last = None, (due_s, scan.host_time_s)
+                        if (tare := self.tare_before(scan)) is not None:
+                            self._played.append((now_s, tare))
                         return frame
                 if now_s >= deadline_s:
                     return b""
@@ -153,6 +156,11 @@ class ReplayLink:
     def tare_before(self, scan: Scan) -> Tare | None:
         """The tare that was recorded right before this scan of the replay, if any."""
         return self._tares.get(_identity(scan))
+
+    def tare_at(self, host_time_s: float) -> Tare | None:
+        """The newest tare that was recorded before what has been played by then, if any."""
+        played = [tare for time_s, tare in self._played if time_s <= host_time_s]
+        return played[-1] if played else None
 
     def pause(self, paused: bool) -> None:
         """See `PausableLink.pause`."""

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.calibrated_device import now
+from ohmskin.calibrated_device import now, touched_cells
 from ohmskin.calibration import Calibration
 from ohmskin.circuit import Float
 from ohmskin.contacts import MEMORY_US, Contact, ContactTracker
@@ -23,7 +23,6 @@ from ohmskin.view.shown import Counts, Shown
 # The paper's programmes take minutes for a frame of 8x8.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
 DEFAULT_METHOD: Final = "joint"
-_NAMED_CELLS: Final = 4
 
 
 class SkinReader:
@@ -82,7 +81,9 @@ class SkinReader:
         """
         touched = self._measure_once(rest_ratio)
         if touched.any() and not force:
-            raise TareRefused(f"{_named(touched)}: take everything off the skin, or tare anyway")
+            raise TareRefused(
+                f"{touched_cells(touched)}: take everything off the skin, or tare anyway"
+            )
         self._take(rest_ratio)
 
     def replayed(self, rest_ratio: Float) -> None:
@@ -171,10 +172,3 @@ class SkinReader:
                 self._forces.use(self._forces.tared(*rest))
         else:
             self._estimator = make_estimator(self.method, knowledge)
-
-
-def _named(touched: NDArray[np.bool_]) -> str:
-    cells = [f"({row}, {column})" for row, column in np.argwhere(touched)]
-    more = len(cells) - _NAMED_CELLS
-    text = ", ".join(cells[:_NAMED_CELLS]) + (f" and {more} more" if more > 0 else "")
-    return f"cell {text} is touched" if len(cells) == 1 else f"cells {text} are touched"

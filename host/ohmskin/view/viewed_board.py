@@ -226,11 +226,14 @@ class ViewedBoard(Closing):
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
             try:
-                rate = _Rate()
+                rate, followed = _Rate(), None
                 while not self._closing.is_set():
                     scan = skin.latest()
-                    if isinstance(link, ReplayLink) and (tare := link.tare_before(scan)):
-                        reader.replayed(tare.rest_ratio)
+                    if isinstance(link, ReplayLink):
+                        tare = link.tare_at(scan.host_time_s)
+                        if tare is not None and tare is not followed:
+                            followed = tare
+                            reader.replayed(tare.rest_ratio)
                     counts = self._counts(skin, rate.of(scan))
                     # A method takes a good part of a core: not while nobody looks.
                     self.shown = reader.read(scan, counts) if self._watchers else None
