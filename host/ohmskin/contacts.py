@@ -18,7 +18,7 @@ FARTHEST_CELLS: Final = 2.0
 # A light touch flickers about its threshold; it stays the same contact.
 MEMORY_US: Final = 100_000
 # What the scan before had is remembered for longer, since boards may scan slowly.
-SLOWEST_SCAN_US: Final = 2_000_000
+SLOWEST_SCAN_US: Final = 20 * MEMORY_US
 _EIGHT_NEIGHBOURS: Final = np.ones((3, 3), dtype=np.int_)
 _FAR: Final = 1e6
 
