@@ -339,6 +339,22 @@ def test_ctrl_c_is_not_lost_in_ipopt(
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.parametrize("text", ["returned a result with an exception set", "KeyboardInterrupt"])
+def test_ctrl_c_is_told_from_what_casadi_makes_of_it(
+    run: Callable[..., tuple[int, str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    text: str,
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise SystemError(text) from (KeyboardInterrupt() if "result" in text else None)
+
+    monkeypatch.setattr(chart, "measure", interrupt)
+    code, out, err = run("--out", str(tmp_path))
+    assert (code, out) == (130, "")
+    assert "Traceback" not in err
+
+
 def test_ctrl_c_while_saving_leaves_the_old_files(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -74,11 +74,22 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as exc:
+        if _is_ctrl_c(exc):
+            sys.exit(130)
         if not hasattr(exc, "format_message"):
             raise
         if text := exc.format_message():  # a wrong use of the command line
             _fail(text)
         sys.exit(2)  # no command at all: the help is the answer
+
+
+def _is_ctrl_c(exc: BaseException | None) -> bool:
+    """Whether this is what became of Ctrl-C inside CasADi, which makes other errors of it."""
+    while exc is not None:
+        if isinstance(exc, KeyboardInterrupt) or "KeyboardInterrupt" in str(exc):
+            return True
+        exc = exc.__cause__ or exc.__context__
+    return False
 
 
 def _fail(text: str) -> None:
