@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from ohmskin import framing, protocol
 from ohmskin.doctor import Examined
 from ohmskin.doctor_command import LONGEST
+from ohmskin.doctor_press import CornerScans
 from ohmskin.doctor_signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.faults import Faults
 from ohmskin.messages import BoardDecoder, Hello, Message, Scan, SelfTestReport
@@ -70,6 +71,14 @@ class Bench:
             assert now.settle_us >= other[0]
             settled = (now, self.scan(SETTLED_S))
         return Examined(board, scans, stats, settled, report)
+
+    def pressed(self) -> Examined:
+        """All that the doctor reads of a skin in the scene "corners", until they have moved."""
+        read = self.examined()
+        presses = CornerScans(read.board)
+        for scan in self.scan(9.0 - self.now_s):
+            presses.take(scan)
+        return replace(read, presses=presses)
 
 
 def examined(url: str, **changes: object) -> Examined:

@@ -3,7 +3,8 @@
 
 No port, no clock: `examine` takes what was read, and gives the findings in the order in which they
 matter. The parts: `doctor_circuit` (lines, cells, references), `doctor_signal` (hum, noise,
-settling), `doctor_wires`; here, what the link and the board tell.
+settling), `doctor_wires`, `doctor_press` (wires as well, once the skin is pressed); here, what the
+link and the board tell.
 
 A skin that is touched is not at fault: touched cells are named and left out, and what movement
 hides is not judged.
@@ -26,6 +27,7 @@ from ohmskin.doctor_circuit import (
     examine_circuit,
 )
 from ohmskin.doctor_findings import Diagnosis, Finding, in_order, named
+from ohmskin.doctor_press import CornerScans
 from ohmskin.doctor_signal import (
     SOUND_NOISE_LSB,
     RestScans,
@@ -40,6 +42,7 @@ from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
 
 LEAST_SCANS: Final = 2
 RATE_TOLERANCE: Final = 0.005  # of a resonator
+NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
 SLOW_HOST: Final = 0.1
 LEAST_SPAN_S: Final = 1.0  # by the host's clock: scans come in bursts
 BAD_RESETS: Final = {
@@ -55,8 +58,8 @@ class Examined:
 
     scans: as the board is configured; settled: those of a longer settle time, and what the board
     said of itself meanwhile. stats: of the connection. rest_ratio: readings (R, C, 4) of an earlier
-    rest. wire_ohm: nominal wires of a segment, top and bottom. latency: the USB bridge's timer [ms]
-    and where it is set.
+    rest. wire_ohm: nominal wires of a segment, top and bottom. presses: of the same skin, after all
+    else. latency: the USB bridge's timer [ms] and where it is set.
     """
 
     board: Hello
@@ -66,6 +69,7 @@ class Examined:
     report: SelfTestReport | None = None
     rest_ratio: Float | None = None
     wire_ohm: tuple[float, float] | None = None
+    presses: CornerScans | None = None
     latency: tuple[int, str] | None = None
     host_version: str = ""
 
@@ -126,13 +130,26 @@ def _of_skin(examined: Examined, usual: RestScans, measured: dict[str, Any]) -> 
     findings += _touched(circuit, signal)
     measured |= _figures(circuit, signal)
     if not (circuit.touched.any() or circuit.wrong.any() or signal.moved.any()):
-        wire_ohm = examined.wire_ohm or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
-        wires = measure_wires(
-            best.mean, signal.noise_lsb, len(best.codes), board, wire_ohm, examined.rest_ratio
-        )
-        if examined.wire_ohm is not None or examined.rest_ratio is not None:
-            findings += wire_findings(wires, wire_ohm, board.rows)
-        measured["wires"] = wires_in_words(wires, wire_ohm)
+        findings += _of_wires(examined, best, signal, measured)
+    return findings
+
+
+def _of_wires(
+    examined: Examined, rest: RestScans, signal: Signal, measured: dict[str, Any]
+) -> list[Finding]:
+    board, scans = examined.board, len(rest.codes)
+    wire_ohm = examined.wire_ohm or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    wires = measure_wires(rest.mean, signal.noise_lsb, scans, board, wire_ohm, examined.rest_ratio)
+    measured["wires"] = wires_in_words(wires, wire_ohm)
+    told = examined.wire_ohm is not None
+    findings = []
+    if told or examined.rest_ratio is not None:
+        findings = wire_findings(wires, wire_ohm, board.rows)
+    if examined.presses is not None:
+        pressed = examined.presses.measure(rest.mean, scans, signal.noise_lsb, wire_ohm)
+        measured["wires"] = NOT_PRESSED if pressed is None else pressed.in_words(wire_ohm)
+        if pressed is not None and told and pressed.differ and not findings:
+            findings = [pressed.finding(wire_ohm)]
     return findings
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +18,7 @@ from ohmskin.calibration import Calibration, load_calibration
 from ohmskin.device import Device
 from ohmskin.doctor import Examined, examine
 from ohmskin.doctor_findings import Diagnosis, Finding
+from ohmskin.doctor_press import Cell, Corners, CornerScans, moved_across, suggested_corners
 from ohmskin.doctor_signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.errors import (
     CommandRefused,
@@ -30,6 +31,8 @@ from ohmskin.errors import (
 from ohmskin.messages import Hello, Scan, SelfTestReport
 from ohmskin.usb_latency import latency_ms, latency_timer_file
 
+PRESS_S: Final = 1.0  # of scans with the same cells pressed
+WAIT_S: Final = 30.0  # for a person
 LONGEST: Final = 2.0  # times the usual, where scans are slow
 _COLOURS: Final = {"fault": "red", "warning": "yellow", "note": "cyan"}
 
@@ -46,16 +49,20 @@ def doctor(
     wires: Annotated[
         str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")
     ] = "",
+    press: Annotated[
+        bool, typer.Option(help="afterwards ask for touches, which show the wires")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what is wrong with the skin board at PORT, and what to do. Touch nothing meanwhile.
 
-    Takes under 10 s, and leaves the board as it was. Exit code 0: sound; 1: something is wrong.
+    Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
+    it says when and where to press. Exit code 0: sound; 1: something is wrong.
     """
     told = None if calibration is None else load_calibration(calibration)
     wire_ohm = _wires(wires) if wires else _wires_of(told)
     with _progress() as progress:
-        diagnosis = diagnose(port, told, wire_ohm, progress)
+        diagnosis = diagnose(port, told, wire_ohm, progress, _asking(progress) if press else None)
     if as_json:
         print(json.dumps(as_object(port, diagnosis)))  # noqa: T201
     else:
@@ -92,6 +99,22 @@ def _progress() -> Iterator[Progress]:
         yield lambda text: status.update(text)
 
 
+def _asking(progress: Progress) -> Progress:
+    """Where nobody sees a line that changes, what to press is said once."""
+    errors = Console(stderr=True)
+    if errors.is_terminal:
+        return progress
+    said: set[str] = set()
+
+    def ask(text: str) -> None:
+        request = text.partition(";")[0]
+        if request not in said:
+            said.add(request)
+            errors.print(request, markup=False, highlight=False)
+
+    return ask
+
+
 # ------------------------------------------------------------------------------- the examination
 
 
@@ -100,8 +123,11 @@ def diagnose(
     calibration: Calibration | None = None,
     wire_ohm: tuple[float, float] | None = None,
     progress: Progress = lambda text: None,
+    ask: Progress | None = None,
 ) -> Diagnosis:
     """Examine the board at `port`. What keeps it from being examined is a finding.
+
+    ask: tells a person where to press; without, nobody is asked.
 
     :raises PortError: the URL is wrong.
     :raises ValueError: the calibration is of another unit or geometry.
@@ -115,12 +141,16 @@ def diagnose(
         board = device.info
         if calibration is not None:
             calibration.check(board.unit_id, board.rows, board.columns)
+        if ask is not None:
+            suggested_corners(board.rows, board.columns)  # before the scans, if there are none
         timer_ms = None if "://" in port else latency_ms(_path(port))
         latency = (timer_ms, str(latency_timer_file(_path(port)))) if timer_ms is not None else None
         gathered = _Gathered()
         lost = None
         try:
             gathered.take(device, progress)
+            if ask is not None:
+                gathered.ask_for_presses(device, ask)
         except DeviceLost as exc:
             lost = exc
         examined = Examined(
@@ -131,6 +161,7 @@ def diagnose(
             report=gathered.report,
             rest_ratio=None if calibration is None else calibration.rest.ratio,
             wire_ohm=wire_ohm,
+            presses=gathered.presses,
             latency=latency,
             host_version=ohmskin.__version__,
         )
@@ -152,6 +183,7 @@ class _Gathered:
         self.report: SelfTestReport | None = None
         self.scans: list[Scan] = []
         self.settled: tuple[Hello, list[Scan]] | None = None
+        self.presses: CornerScans | None = None
 
     def take(self, device: Device, progress: Progress) -> None:
         progress("self-test")
@@ -177,6 +209,35 @@ class _Gathered:
         finally:
             device.stop()
             device.configure(rate_hz=board.rate_asked_mhz / 1000, settle_us=board.settle_asked_us)
+
+    def ask_for_presses(self, device: Device, ask: Progress) -> None:
+        """Until three corners were pressed, and three others, for `PRESS_S` each, or it is late."""
+        board = self.board or device.info
+        self.presses = presses = CornerScans(board)
+        wanted = suggested_corners(board.rows, board.columns)
+        held: Corners | None = None
+        begin_s = None
+        for scan in device:
+            begin_s = scan.host_time_s if begin_s is None else begin_s
+            corners = presses.take(scan)
+            if corners not in (None, held) and presses.scans(corners) >= PRESS_S * board.rate_hz:
+                if held is not None:
+                    return
+                held, wanted = corners, moved_across(corners)
+            if scan.host_time_s - begin_s >= WAIT_S:
+                return
+            ask(request(wanted, again=held is not None, pressed=presses.pressed))
+
+
+def request(wanted: Corners, *, again: bool, pressed: tuple[Cell, ...]) -> str:
+    """What a person is told."""
+    where = "now these three" if again else "press three cells firmly, at once"
+    now = _cells(pressed) if pressed else "nothing"
+    return f"{where}: {_cells(sorted(wanted))}; pressed is {now}"
+
+
+def _cells(cells: Iterable[Cell]) -> str:
+    return " ".join(f"({row}, {column})" for row, column in cells)
 
 
 def _scan(device: Device, scans: list[Scan], seconds: float) -> None:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.circuit import Float
 from ohmskin.doctor_findings import Finding, named
@@ -124,13 +124,18 @@ def examine_signal(scans: RestScans) -> Signal:
 
 
 def mean_std_lsb(noise_lsb: float, scans: int) -> float:
-    """Deviation of the mean of so many codes [LSB], each with this noise, rounding included.
+    """Deviation of the mean of so many codes [LSB], each with this noise, rounding included."""
+    return float(np.hypot(rounding_std_lsb(noise_lsb), noise_lsb / scans**0.5))
 
-    Normal noise of deviation s before rounding leaves a bias of up to exp(-2 pi^2 s^2) / pi, and
-    without noise that of rounding, 1 / sqrt(12) [Widrow, Kollar: Quantization Noise, 2008].
+
+def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
+    """What rounding leaves in the mean of many codes that scatter like this [LSB].
+
+    Normal scatter of deviation s before rounding leaves a bias of up to exp(-2 pi^2 s^2) / pi, and
+    without scatter that of rounding, 1 / sqrt(12) [Widrow, Kollar: Quantization Noise, 2008].
     """
-    before = max(noise_lsb**2 - 1 / 12, 0.0)
-    return float((np.exp(-4 * np.pi**2 * before) / 12 + noise_lsb**2 / scans) ** 0.5)
+    before = np.maximum(np.square(scatter_lsb) - 1 / 12, 0.0)
+    return np.asarray(np.exp(-2 * np.pi**2 * before) / 12**0.5)
 
 
 # ----------------------------------------------------------------------------------------- hum

@@ -18,7 +18,7 @@ The model is the nominal wires and, where there are readings of an earlier rest,
 these show; else equal cells. With z = A x + B (common + each) + noise, x is the generalised least
 squares answer under wide priors; s is chosen so that the residual has the size it should. Cells of
 1 MOhm hide wires of 100 ohm behind their own scatter: without earlier readings only gross changes
-show.
+show, and with them a factor of two does so on large skins alone. Touches show more: `doctor_press`.
 """
 
 from __future__ import annotations
@@ -48,6 +48,11 @@ LEAST_STD: Final = 0.001  # of a cell: nothing is more alike than this
 CHANGED: Final = 0.25  # share of a layer's nominal wires that matters
 LINE_CHANGED: Final = 0.75
 CLEAR_STDS: Final = 5.0
+TO_DO: Final = (
+    "is the skin stretched or bent, a stripe worn or a crimp loose? If it is to stay so, calibrate "
+    "anew"
+)
+UNKNOWN: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 KNOWN: Final = 0.15  # deviation of a share from which a layer counts as known
 
 
@@ -74,7 +79,7 @@ def measure_wires(
     refs = (board.ref_top_ohm, board.ref_bottom_ohm)
     knowledge = SkinKnowledge(rows, columns, *refs, adc_bits=board.adc_bits)
     top, bottom = (np.full((rows, columns), ohm) for ohm in wire_ohm)
-    now_ohm = _port_ohm(ratio_from_codes(mean_codes, board.adc_bits), refs)
+    now_ohm = port_ohm(ratio_from_codes(mean_codes, board.adc_bits), refs)
     estimator = make_estimator("matrix", knowledge)
     if rest_ratio is None:
         level = estimator.estimate(ratio_from_codes(mean_codes, board.adc_bits)).cell_siemens
@@ -84,7 +89,7 @@ def measure_wires(
     else:
         cell = estimator.estimate(rest_ratio).cell_siemens
         model = port_sensitivity(cell, top, bottom)
-        z = now_ohm - _port_ohm(rest_ratio, refs)
+        z = now_ohm - port_ohm(rest_ratio, refs)
     by_wire = model.by_wires().reshape(-1, 2, rows, columns)
     slopes = np.concatenate(
         [by_wire.sum(axis=(2, 3)), by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1
@@ -96,7 +101,8 @@ def measure_wires(
     return _fit(z, slopes, model.by_cell, noise_ohm, (rows, columns))
 
 
-def _port_ohm(ratio: Float, refs: tuple[float, float]) -> Float:
+def port_ohm(ratio: Float, refs: tuple[float, float]) -> Float:
+    """Port resistances (RC,) [ohm], means of all four readings (R, C, 4)."""
     current = current_from_ratio(ratio, *refs)
     return np.asarray((1 / np.maximum(current, 1e-9) - sum(refs)).ravel())
 
@@ -174,8 +180,7 @@ def _finding(where: str, share: float, std: float, nominal_ohm: float) -> Findin
         f"{share * nominal_ohm:.0f} +- {std * nominal_ohm:.0f} ohm a segment, {share:.2f} times "
         "nominal",
         f"{nominal_ohm:.0f} ohm a segment",
-        "is the skin stretched or bent, a stripe worn or a crimp loose? If it is to stay so, "
-        "calibrate anew",
+        TO_DO,
     )
 
 
@@ -188,4 +193,4 @@ def wires_in_words(wires: Wires, wire_ohm: tuple[float, float]) -> str:
         )
         if std < KNOWN
     ]
-    return "; ".join(words) or "not known: an untouched skin hides its wires behind its cells"
+    return "; ".join(words) or UNKNOWN

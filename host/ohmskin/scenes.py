@@ -27,10 +27,16 @@ SCENES: Final = {
     "single": "one touch in the middle",
     "ghost": "three corners of a rectangle: without an estimator the fourth seems touched too",
     "multi": "five touches at places drawn from the seed",
+    "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
     "moving": "one fingertip on a closed curve over the whole skin, once in 4 s",
     "press": "a robot presses cell after cell, six times each with 0.4 to 8 N, 20 s a cell, once",
 }
 _MOVING_PERIOD_S: Final = 4.0
+_CORNERS_BEGIN_S: Final = 5.5
+_CORNERS_HELD_S: Final = 1.5
+_CORNER_OHM: Final = (5e3, 8e3, 6e3)
+_TREMBLE: Final = 0.05
+_TREMBLE_HZ: Final = (3.1, 4.7, 6.1)
 _FINGER_CELLS: Final = 0.7  # radius of the fingertip's pressure
 _FINGER_SIEMENS: Final = 2e-4
 _UNTOUCHED_S: Final = 2.0
@@ -61,8 +67,8 @@ class Scene:
     ) -> None:
         if name not in SCENES:
             raise ValueError(f"no scene '{name}': there are {', '.join(SCENES)}")
-        if name == "ghost" and min(rows, columns) < 2:
-            raise ValueError("the scene 'ghost' needs a skin of at least 2x2")
+        if name in ("ghost", "corners") and min(rows, columns) < 2:
+            raise ValueError(f"the scene '{name}' needs a skin of at least 2x2")
         self.name = name
         self.rows = rows
         self.columns = columns
@@ -87,7 +93,7 @@ class Scene:
     @property
     def moves(self) -> bool:
         """Whether the touches change with time."""
-        return self.name in ("moving", "press")
+        return self.name in ("corners", "moving", "press")
 
     @property
     def rest_ratio(self) -> Float:
@@ -98,6 +104,8 @@ class Scene:
         """The truth: every resistance at a time."""
         if self._robot is not None:
             touch = self._robot.touch(time_s)[0]
+        elif self.name == "corners":
+            touch = self._corners(time_s)
         else:
             touch = self._finger(time_s) if self.moves else self._touches
         touched = replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
@@ -144,6 +152,18 @@ class Scene:
             count = min(5, touches.size)
             cells = random.choice(touches.size, count, replace=False)
             touches.flat[cells] = 1 / np.exp(random.uniform(np.log(2e3), np.log(5e4), count))
+        return touches
+
+    def _corners(self, time_s: float) -> Float:
+        touches = np.zeros((self.rows, self.columns))
+        if time_s < _CORNERS_BEGIN_S:
+            return touches
+        (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
+        across = int((time_s - _CORNERS_BEGIN_S) / _CORNERS_HELD_S) % 2
+        alone = (bottom, right) if across else (top, left)
+        cells = (alone, (top, right), (bottom, left))
+        for cell, ohm, hz in zip(cells, _CORNER_OHM, _TREMBLE_HZ, strict=True):
+            touches[cell] = (1 + _TREMBLE * np.sin(2 * np.pi * hz * time_s)) / ohm
         return touches
 
     def _finger(self, time_s: float) -> Float:
