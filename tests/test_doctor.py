@@ -454,7 +454,7 @@ def test_ports_that_do_not_answer_are_findings(
     for url, name, word in (
         ("emulator://2x2?silent=1", "nothing_answers", "nothing answers: "),
         ("emulator://2x2?foreign=1", "protocol_mismatch", "layout 0x"),
-        ("emulator://2x2?vanish=0.4", "lost", "gone"),
+        ("emulator://2x2?vanish=0.2", "lost", "gone"),
         ("/dev/ttyACM99", "port_unusable", "no port"),
     ):
         done = run("doctor", url, "--json")
