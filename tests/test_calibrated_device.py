@@ -17,8 +17,8 @@ from ohmskin.calibration import Calibration, Rest
 from ohmskin.circuit import Float
 from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.estimators import SkinKnowledge
-from ohmskin.force import ForceRegression
 from ohmskin.force_reader import ForceScan
+from ohmskin.force_regression import ForceRegression
 from ohmskin.levels import LEVEL_METHODS
 from ohmskin.recorder import Recorder
 from ohmskin.recording import Tare, load_recording

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from ohmskin.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
 from ohmskin.circuit import Skin, quantise, ratio_from_codes, readings
 from ohmskin.estimators import SkinKnowledge
-from ohmskin.force import POWER, ForceRegression
+from ohmskin.force import POWER
+from ohmskin.force_regression import ForceRegression
 
 
 def rest(seed: int, date: str) -> Rest:

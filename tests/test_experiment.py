@@ -9,11 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import curve_fit
 from typer.testing import CliRunner
 
+from ohmskin.force import MAX_EXPONENT
 from ohmskin.press import PressModel
 from ohmskin.studies import force_commands, force_experiment, force_limits, published
-from ohmskin.studies.force_experiment import CHOICE, LINE, Comparison, Row, learn, measure, rises
+from ohmskin.studies.force_experiment import (
+    CHOICE,
+    LINE,
+    REGRESSIONS,
+    SQUARES,
+    Comparison,
+    Row,
+    learn,
+    measure,
+    rises,
+)
 from ohmskin.studies.force_limits import ALONE, BESIDE, Detection, press_series, smallest_forces
 from ohmskin.studies.force_trial import ForceTrial, Plan, surface_trial
 
@@ -114,6 +126,25 @@ def test_errors_are_the_root_mean_squares(flat: ForceTrial) -> None:
     below = 100 * (1 - mean.pressed_n / voltage.pressed_n)
     assert mean.pressed_below_percent == pytest.approx(below, abs=0.1)
     assert voltage.pressed_below_percent == 0
+    best_n = min(
+        only(rows, regression=regression, method="voltage", group="mean").pressed_n
+        for regression in REGRESSIONS
+    )
+    assert mean.pressed_below_best_percent == pytest.approx(
+        100 * (1 - mean.pressed_n / best_n), abs=0.1
+    )
+
+
+def test_squares_are_curve_fits(flat: ForceTrial) -> None:
+    """The baseline's best: steeper than any law that a calibration takes."""
+    rise = rises("voltage", flat)
+    own = (flat.group < 0) & (flat.cell == 3)
+    x, force_n = rise[own, 1, 1], flat.force_n[own, 1, 1]
+    law, _ = curve_fit(lambda x, a, b: a * x**b, x, force_n, p0=[100.0, 4.0], maxfev=10_000)
+    assert law[1] > MAX_EXPONENT
+    seen = np.full((1, 2, 2), 0.4)
+    expected = law[0] * 0.4 ** law[1]
+    assert learn(flat, rise, SQUARES)(seen)[0, 1, 1] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("curved", [False, True])
@@ -125,6 +156,8 @@ def test_ours_are_well_below_the_baseline(curved: bool) -> None:
         touch = only(rows, cells=cells, regression=CHOICE, method="touch", group="mean")
         assert touch.pressed_below_percent > least
         assert touch.every_cell_below_percent > least
+        assert touch.pressed_below_best_percent > least / 2
+        assert touch.every_cell_below_best_percent > least
 
 
 def test_larger_skins_are_grouped_by_touches() -> None:

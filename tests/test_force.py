@@ -12,7 +12,8 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.stats import linregress
 
-from ohmskin.force import LINEAR, POWER, ForceModel, ForceRegression, voltage_level
+from ohmskin.force import LINEAR, POWER, ForceModel, voltage_level
+from ohmskin.force_regression import ForceRegression
 from ohmskin.readings import estimate_file
 from ohmskin.studies.trials import skin_at_rest, trial_of
 
@@ -84,6 +85,36 @@ def test_power_law_is_curve_fits(exponent: float) -> None:
         np.testing.assert_allclose(predicted[0, 0], force_here, rtol=1e-6)
         own = std[0, 0] ** 2 - found.residual_std_[0, 0] ** 2
         np.testing.assert_allclose(own, variance, rtol=1e-3)
+
+
+@pytest.mark.parametrize("exponent", [0.6, 1.0])
+def test_scatter_that_grows_with_force_is_seen_and_weighed(exponent: float) -> None:
+    """Contacts are off by a share of what they conduct. curve_fit, told so, is what to reach."""
+    random = np.random.default_rng(23)
+    cells = np.repeat(np.arange(100), 24)
+    shape = (10, 10)
+    force_n = random.uniform(0.1, 8.0, cells.size)
+    exact = 1e-4 * (force_n / 10) ** (1 / exponent)
+    rise = exact * np.exp(0.2 * random.standard_normal(cells.size))
+    found = ForceRegression().fit(cells, rise, force_n, shape=shape)
+    assert np.all(found.residual_share_ > 0)
+    expected = []
+    for cell in range(100):
+        x, force = rise[cells == cell] / 1e-4, force_n[cells == cell]
+        scatter = np.sqrt(force**2 + (0.1 * force.max()) ** 2)
+        law, _ = curve_fit(lambda x, a, b: a * x**b, x, force, p0=[10, 1], sigma=scatter)
+        expected.append(law[0] * 0.3 ** law[1])
+    power = found.kind_.ravel() == POWER
+    at, _ = found.predict(np.full(shape, 0.3e-4), np.zeros(shape))
+    np.testing.assert_allclose(at.ravel()[power], np.array(expected)[power], rtol=1e-4)
+    assert np.mean(power) > 0.95 if exponent != 1 else np.mean(power) < 0.4
+    for newton in (0.5, 2.0, 6.0):
+        rise = 1e-4 * (newton / 10) ** (1 / exponent) * np.exp(0.2 * random.standard_normal(shape))
+        predicted, std = found.predict(rise, np.zeros(shape))
+        share = np.mean(np.abs(predicted - newton) <= 2 * std)
+        print(f"{exponent}, {newton} N: {share:.0%} within 2 std of {np.median(std):.2f} N")
+        assert share > 0.88
+        assert np.median(std) < 0.35 * newton + 0.15
 
 
 @pytest.mark.parametrize(("exponent", "kind"), [(1.0, LINEAR), (0.6, POWER), (1.6, POWER)])

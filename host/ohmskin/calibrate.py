@@ -11,9 +11,9 @@ import numpy as np
 from ohmskin.alignment import Alignment, align
 from ohmskin.calibration import Calibration, Rest
 from ohmskin.circuit import Float
-from ohmskin.force import ForceRegression
 from ohmskin.force_log import ForceLog
 from ohmskin.force_reader import knowledge_of
+from ohmskin.force_regression import ForceRegression
 from ohmskin.levels import VOLTAGE, LevelMeter
 from ohmskin.messages import Hello, Scan
 from ohmskin.press_table import PressTable

@@ -34,7 +34,7 @@ from ohmskin.calibrate_parts import (
 from ohmskin.calibrated_device import TARE_S
 from ohmskin.device import Device
 from ohmskin.errors import DeviceLost, RecordingError
-from ohmskin.force import MIN_PRESSES
+from ohmskin.force_regression import MIN_PRESSES
 from ohmskin.force_sensor import DEFAULT_BAUD, ForceSensor
 from ohmskin.guide import Ask, Cells, Event, Guide, State, Steady, still_asked
 from ohmskin.levels import VOLTAGE

@@ -45,11 +45,11 @@ from ohmskin.whole_files import whole_file
 
 FORMAT: Final = "ohmskin calibration"
 SCHEMA: Final = 1
-MAX_FILE_BYTES: Final = 4_000_000  # 4096 cells of 12 fields take about 1 MB
+MAX_FILE_BYTES: Final = 4_000_000  # 4096 cells of 13 fields take about 1 MB
 MAX_UNIT_ID: Final = 2**32 - 1
 # Far beyond the slope of any power law in siemens, and predictions do not overflow.
 MAX_NUMBER: Final = 1e60
-_NULL_FIELDS: Final = ("residual_std", "held_out_rmse")
+_NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 _RESTS: Final = ("rest", "tare")
 _WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))

@@ -29,7 +29,7 @@ Out = Annotated[
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="fewer skins and frames: rough, in seconds")]
 Json = Annotated[bool, typer.Option("--json", help="no tables and no progress bar: JSON alone")]
-_TABLE_WIDTH: Final = 110  # where stderr is a file, tables are not cut to 80 columns
+_TABLE_WIDTH: Final = 128  # where stderr is a file, tables are not cut to 80 columns
 QUICK_DETECTION: Final = force_limits.Detection(seeds=1, empty_frames=100, frames=40, forces=8)
 
 

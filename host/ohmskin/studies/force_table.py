@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,11 @@ from ohmskin.studies.published import FORCE_RMSE_N
 
 
 def surface_tables(rows: Sequence[Row]) -> list[Table]:
-    """RMSE in newton by method: in the calibration, and in the test by group."""
+    """RMSE in newton by method: in the calibration, and in the test by group.
+
+    "below": less than `voltage` by the same regression; "best": than `voltage` by whichever
+    regression suits it best.
+    """
     tables = []
     for places in dict.fromkeys(
         (row.rows, row.columns, row.frames, row.regression) for row in rows
@@ -33,7 +38,7 @@ def surface_tables(rows: Sequence[Row]) -> list[Table]:
         )
         for heading in ("cells", "method"):
             table.add_column(heading, no_wrap=True)
-        for heading in ("calibr.", *groups, "below", "every cell", "below"):
+        for heading in ("calibr.", *groups, "below", "best", "every cell", "below", "best"):
             table.add_column(heading, justify="right", no_wrap=True)
         before = ""
         for cells, method in dict.fromkeys((row.cells, row.method) for row in of_table):
@@ -47,8 +52,10 @@ def surface_tables(rows: Sequence[Row]) -> list[Table]:
                 f"{mean.calibration_n:.2f}",
                 *(f"{by_group[group].pressed_n:.2f}" for group in groups),
                 f"{mean.pressed_below_percent:.0f} %",
+                f"{mean.pressed_below_best_percent:.0f} %",
                 f"{mean.every_cell_n:.2f}",
                 f"{mean.every_cell_below_percent:.0f} %",
+                f"{mean.every_cell_below_best_percent:.0f} %",
             )
             before = cells
         if places[:2] == (2, 2):
@@ -73,18 +80,16 @@ def _add_published(table: Table, surface: str) -> None:
 
 
 def best_of_ours(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """The better of `joint` and `touch` with the regression chosen, against "voltage" with it."""
+    """The better of `joint` and `touch` with the regression chosen, against "voltage"."""
     found: dict[tuple[int, int, str, int], Row] = {}
     for row in rows:
         if (row.group, row.regression) == (EVERY_GROUP, CHOICE) and row.method in OURS:
             place = (row.rows, row.columns, row.cells, row.frames)
             if place not in found or row.pressed_n < found[place].pressed_n:
                 found[place] = row
-    names = ("rows", "columns", "cells", "frames", "method", "pressed_n", "pressed_below_percent")
-    return [
-        {name: getattr(row, name) for name in (*names, "every_cell_below_percent")}
-        for row in found.values()
-    ]
+    names = ["rows", "columns", "cells", "frames", "method", "pressed_n", "every_cell_n"]
+    names += [field.name for field in fields(Row) if field.name.endswith("_percent")]
+    return [{name: getattr(row, name) for name in names} for row in found.values()]
 
 
 def talk_table(rows: Iterable[CrossTalk]) -> Table:
