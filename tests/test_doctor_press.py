@@ -17,7 +17,14 @@ from command_line import Done, assert_one_line
 from ohmskin import doctor_command
 from ohmskin.circuit import Float, quantise, readings
 from ohmskin.doctor import Examined, examine
-from ohmskin.doctor_press import CornerScans, moved_across, pressed_corners, suggested_corners
+from ohmskin.doctor_press import (
+    CornerScans,
+    all_of,
+    moved_across,
+    pressed_corners,
+    pressed_findings,
+    suggested_corners,
+)
 from ohmskin.messages import Scan
 from ohmskin.scenes import Scene
 
@@ -76,8 +83,8 @@ def test_wires_of_circuits_solved_by_ngspice(told: float) -> None:
             exact + 0.3 / 1024 * random.standard_normal((90, 3, 3, 4)) for exact in (rest, ratio)
         )
         codes = quantise(of_rest).mean(axis=0)
-        wires = taken(*of_press).measure(codes, 90, 0.42, (told * ohm, told * ohm))
-        assert wires is not None
+        [wires] = taken(*of_press).measure(codes, 90, 0.42, (told * ohm, told * ohm))
+        assert wires.where == "row 0, column 0"
         assert wires.log_share == pytest.approx(-np.log(told), abs=0.1)
         assert abs(wires.log_share + np.log(told)) < 2 * wires.log_std < 0.25
 
@@ -93,9 +100,31 @@ def test_what_a_finger_presses_beside_does_not_disturb() -> None:
             siemens[row, column] += 2e-4
         ratios.append(readings(replace(skin, cell_siemens=siemens)))
     rest = quantise(readings(skin)).astype(np.float64)
-    wires = taken(*ratios).measure(rest, 1, EXACT_LSB, NOMINAL)
-    assert wires is not None
+    wires = all_of(taken(*ratios).measure(rest, 1, EXACT_LSB, NOMINAL))
     assert abs(wires.log_share) < 3 * wires.log_std < 0.3
+
+
+@pytest.mark.parametrize(
+    ("layer", "where"), [("top", "row 4, column 4"), ("bottom", "row 7, column 7")]
+)
+def test_one_line_that_is_worn_is_named(layer: str, where: str) -> None:
+    """Row 4 shares its wire in the first corners, column 7 in those moved across."""
+    skin = Scene("rest", 8, 8, seed=2).skin(0.0)
+    top, bottom = skin.top_wire_ohm.copy(), skin.bottom_wire_ohm.copy()
+    top[4] *= 4 if layer == "top" else 1
+    bottom[:, 7] *= 4 if layer == "bottom" else 1
+    worn = replace(skin, top_wire_ohm=top, bottom_wire_ohm=bottom)
+    corners = suggested_corners(8, 8)
+    ratios = []
+    for cells in (corners, moved_across(corners)):
+        siemens = skin.cell_siemens.copy()
+        siemens[tuple(np.transpose(cells))] += 2e-4
+        ratios.append(readings(replace(worn, cell_siemens=siemens)))
+    rest = quantise(readings(worn)).astype(np.float64)
+    seen = taken(*ratios).measure(rest, 1, EXACT_LSB, NOMINAL)
+    assert [each.where for each in seen] == ["row 4, column 4", "row 7, column 7"]
+    [finding] = pressed_findings(seen, NOMINAL)
+    assert finding.where == where
 
 
 def test_presses_that_tell_nothing_are_said_to() -> None:
@@ -106,13 +135,12 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
         siemens[cell] += 2e-4
     rest = quantise(readings(skin)).astype(np.float64)
     ratio = readings(replace(skin, cell_siemens=siemens))
-    wires = taken(ratio).measure(rest, 1, EXACT_LSB, NOMINAL)
-    assert wires is not None
+    [wires] = taken(ratio).measure(rest, 1, EXACT_LSB, NOMINAL)
     assert not wires.differ
     assert wires.in_words(NOMINAL).startswith("not known: press with something smaller")
     nothing = taken(readings(skin))
     assert nothing.pressed == ()
-    assert nothing.measure(rest, 1, EXACT_LSB, NOMINAL) is None
+    assert nothing.measure(rest, 1, EXACT_LSB, NOMINAL) == []
 
 
 def test_without_nominal_wires_none_are_expected() -> None:

@@ -27,7 +27,7 @@ from ohmskin.doctor_circuit import (
     examine_circuit,
 )
 from ohmskin.doctor_findings import Diagnosis, Finding, in_order, named
-from ohmskin.doctor_press import CornerScans
+from ohmskin.doctor_press import CornerScans, all_of, pressed_findings
 from ohmskin.doctor_signal import (
     SOUND_NOISE_LSB,
     RestScans,
@@ -146,10 +146,10 @@ def _of_wires(
     if told or examined.rest_ratio is not None:
         findings = wire_findings(wires, wire_ohm, board.rows)
     if examined.presses is not None:
-        pressed = examined.presses.measure(rest.mean, scans, signal.noise_lsb, wire_ohm)
-        measured["wires"] = NOT_PRESSED if pressed is None else pressed.in_words(wire_ohm)
-        if pressed is not None and told and pressed.differ and not findings:
-            findings = [pressed.finding(wire_ohm)]
+        seen = examined.presses.measure(rest.mean, scans, signal.noise_lsb, wire_ohm)
+        measured["wires"] = all_of(seen).in_words(wire_ohm) if seen else NOT_PRESSED
+        if seen and told and not findings:
+            findings = pressed_findings(seen, wire_ohm)
     return findings
 
 

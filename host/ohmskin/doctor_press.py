@@ -40,6 +40,7 @@ neighbours, since a fingertip may press these as well. What stays unexplained wi
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -69,11 +70,14 @@ CLOSE: Final = 1e-4
 
 @dataclass(frozen=True)
 class PressedWires:
-    """Log of the wires over nominal, its deviation, and the cells that were pressed for it."""
+    """Log of the wires over nominal, and its deviation.
 
+    where: whose wires these are: of a row and a column, or of all that were seen.
+    """
+
+    where: str
     log_share: float
     log_std: float
-    arrangements: tuple[Corners, ...]
 
     @property
     def differ(self) -> bool:
@@ -94,10 +98,26 @@ class PressedWires:
     def finding(self, wire_ohm: tuple[float, float]) -> Finding:
         """That they are not nominal."""
         return Finding(
-            *("wires", "warning", "rows and columns", self.in_words(wire_ohm)),
+            *("wires", "warning", self.where, self.in_words(wire_ohm)),
             f"top {wire_ohm[0]:.0f}, bottom {wire_ohm[1]:.0f} ohm a segment",
             TO_DO,
         )
+
+
+def all_of(seen: Sequence[PressedWires]) -> PressedWires:
+    """All wires that were seen, taken for alike: the mean by precision."""
+    precisions = [each.log_std**-2 for each in seen]
+    mean = float(np.average([each.log_share for each in seen], weights=precisions))
+    return PressedWires("rows and columns", mean, sum(precisions) ** -0.5)
+
+
+def pressed_findings(seen: Sequence[PressedWires], wire_ohm: tuple[float, float]) -> list[Finding]:
+    """What is not nominal: all of it alike, or some of it, where what was seen contradicts that."""
+    together = all_of(seen)
+    alike = all(
+        abs(each.log_share - together.log_share) < CLEAR_STDS * each.log_std for each in seen
+    )
+    return [each.finding(wire_ohm) for each in ([together] if alike else seen) if each.differ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,26 +200,24 @@ class CornerScans:
 
     def measure(
         self, rest_codes: Float, rest_scans: int, noise_lsb: float, wire_ohm: tuple[float, float]
-    ) -> PressedWires | None:
-        """The wires against `wire_ohm` of a segment (top, bottom). None if no corners were pressed.
+    ) -> list[PressedWires]:
+        """The wires against `wire_ohm` of a segment (top, bottom), once for each corners pressed.
 
         rest_codes: mean codes (R, C, 4) of the untouched skin.
         """
         rest = self._look(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
         most = max(map(len, self._codes.values()), default=0)
-        held = {each: codes for each, codes in self._codes.items() if len(codes) >= most / 2}
-        if not held:
-            return None
-        log_shares, precisions = [], []
-        for corners, codes in held.items():
+        seen = []
+        for corners, codes in self._codes.items():
+            if len(codes) < most / 2:
+                continue
             # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
             scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
             pressed = self._look(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
-            log_share, std = _fit(rest, pressed, _free(rest.cell.shape, corners), wire_ohm)
-            log_shares.append(log_share)
-            precisions.append(std**-2)
-        mean = float(np.average(log_shares, weights=precisions))
-        return PressedWires(mean, float(np.sum(precisions)) ** -0.5, tuple(held))
+            log_share, log_std = _fit(rest, pressed, _free(rest.cell.shape, corners), wire_ohm)
+            row, column = corners[0]
+            seen.append(PressedWires(f"row {row}, column {column}", log_share, log_std))
+        return seen
 
     def _look(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Look:
         bits = self._board.adc_bits
