@@ -198,8 +198,8 @@ def test_wires_are_found_in_time(run: Run) -> None:
     assert done.code == 1
     assert "1. warning, wires: rows and columns" in done.out
     first, second = done.err.splitlines()
-    assert first == "press three cells firmly, at once: (4, 4) (4, 7) (7, 4)"
-    assert second.startswith("now these three")
+    assert first == "press firmly, at once: (4, 4) (4, 7) (7, 4)"
+    assert second == "now (2, 5) (5, 2) (5, 5)"
 
 
 @pytest.mark.usefixtures("hasty")
@@ -215,8 +215,14 @@ def test_a_skin_without_rectangle_is_not_asked_for_one(run: Run) -> None:
     assert_one_line(run("doctor", "emulator://1x4", "--press"), "1x4", "no rectangle")
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_terminal_shows_what_is_pressed() -> None:
-    asked = doctor_command.request(((0, 0), (0, 2), (2, 0)), again=False, pressed=((0, 2),))
-    assert asked == "press three cells firmly, at once: (0, 0) (0, 2) (2, 0); pressed is (0, 2)"
-    again = doctor_command.request(((2, 2), (0, 2), (2, 0)), again=True, pressed=())
-    assert again == "now these three: (0, 2) (2, 0) (2, 2); pressed is nothing"
+    said: list[str] = []
+    doctor_command.diagnose("emulator://4x4?scene=corners", ask=said.append)
+    first = "press firmly, at once: (1, 1) (1, 3) (3, 1)"
+    assert list(dict.fromkeys(said)) == [
+        f"{first}; pressed: nothing",
+        f"{first}; hold still",
+        "now (1, 2) (2, 1) (2, 2); pressed: (1, 1) (1, 2) (2, 1)",
+        "now (1, 2) (2, 1) (2, 2); hold still",
+    ]

@@ -226,14 +226,17 @@ class _Gathered:
                 held, wanted = corners, moved_across(corners)
             if scan.host_time_s - begin_s >= WAIT_S:
                 return
-            ask(request(wanted, again=held is not None, pressed=presses.pressed))
+            still = corners not in (None, held)
+            request = _request(wanted, again=held is not None)
+            ask(f"{request}; {'hold still' if still else _pressed(presses.pressed)}")
 
 
-def request(wanted: Corners, *, again: bool, pressed: tuple[Cell, ...]) -> str:
-    """What a person is told."""
-    where = "now these three" if again else "press three cells firmly, at once"
-    now = _cells(pressed) if pressed else "nothing"
-    return f"{where}: {_cells(sorted(wanted))}; pressed is {now}"
+def _request(wanted: Corners, *, again: bool) -> str:
+    return f"{'now' if again else 'press firmly, at once:'} {_cells(sorted(wanted))}"
+
+
+def _pressed(cells: tuple[Cell, ...]) -> str:
+    return f"pressed: {_cells(cells) if cells else 'nothing'}"
 
 
 def _cells(cells: Iterable[Cell]) -> str:
