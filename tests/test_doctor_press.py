@@ -143,6 +143,21 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
     assert nothing.measure(rest, 1, EXACT_LSB, NOMINAL) == []
 
 
+def test_what_is_pressed_in_passing_is_left_out() -> None:
+    skin = Scene("rest", 8, 8).skin(0.0)
+    corners = suggested_corners(8, 8)
+    ratios = []
+    for cells in (corners, moved_across(corners)):
+        siemens = skin.cell_siemens.copy()
+        siemens[tuple(np.transpose(cells))] += 2e-4
+        ratios.append(readings(replace(skin, cell_siemens=siemens)))
+    scans = taken(*[ratios[0]] * 5, ratios[1])
+    assert scans.scans(moved_across(corners)) == 1
+    rest = quantise(readings(skin)).astype(np.float64)
+    [wires] = scans.measure(rest, 1, EXACT_LSB, NOMINAL)
+    assert wires.where == "row 4, column 4"
+
+
 def test_without_nominal_wires_none_are_expected() -> None:
     read = replace(pressed("emulator://4x4?scene=corners&wires=2"), wire_ohm=None)
     diagnosis = examine(read)

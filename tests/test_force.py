@@ -98,6 +98,8 @@ def test_scatter_that_grows_with_force_is_seen_and_weighed(exponent: float) -> N
     rise = exact * np.exp(0.2 * random.standard_normal(cells.size))
     found = ForceRegression().fit(cells, rise, force_n, shape=shape)
     assert np.all(found.residual_share_ > 0)
+    most_n = force_n.reshape(100, 24).max(axis=1).reshape(shape)
+    np.testing.assert_allclose(found.residual_std_, 0.1 * most_n * found.residual_share_)
     expected = []
     for cell in range(100):
         x, force = rise[cells == cell] / 1e-4, force_n[cells == cell]
@@ -150,6 +152,21 @@ def test_two_standard_deviations_cover_what_they_should(exponent: float, count: 
     share = np.mean(np.abs(predicted - true_force_n) <= 2 * std)
     print(f"exponent {exponent}, {count} presses: {share:.1%} within 2 std")
     assert 0.90 <= share <= 0.99
+
+
+def test_noise_of_the_rise_is_not_counted_twice() -> None:
+    """What presses scatter by when learning is the noise that predicting adds again."""
+    random = np.random.default_rng(24)
+    cells, rise_std = np.repeat(np.arange(100), 40), 5e-6
+    true_rise, force_n = presses(cells.size, 25)
+    rise = true_rise + rise_std * random.standard_normal(cells.size)
+    found = ForceRegression().fit(
+        cells, rise, force_n, shape=(10, 10), rise_std=np.full(cells.size, rise_std)
+    )
+    _, std = found.predict(np.full((10, 10), 50e-6), np.full((10, 10), rise_std))
+    expected = np.hypot(1e5 * rise_std, NOISE_N)
+    print(f"{np.median(std):.3f} N, and {expected:.3f} N")
+    assert np.median(std) == pytest.approx(expected, rel=0.12)
 
 
 def test_cells_without_data_are_covered_too() -> None:
