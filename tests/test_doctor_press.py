@@ -69,6 +69,7 @@ def test_nominal_wires_are_no_finding(size: str) -> None:
         diagnosis = examine(pressed(f"emulator://{size}?scene=corners&seed={seed}"))
         assert diagnosis.findings == ()
         assert "times nominal" in diagnosis.measured["wires"]
+        assert diagnosis.verdict == "sound: nothing is wrong"
 
 
 @pytest.mark.parametrize("told", [0.5, 1.0, 2.0])

@@ -26,7 +26,7 @@ from ohmskin.doctor_circuit import (
     Circuit,
     examine_circuit,
 )
-from ohmskin.doctor_findings import Diagnosis, Finding, in_order, named
+from ohmskin.doctor_findings import NOT_KNOWN, Diagnosis, Finding, in_order, named
 from ohmskin.doctor_press import CornerScans, all_of, pressed_findings
 from ohmskin.doctor_signal import (
     SOUND_NOISE_LSB,
@@ -42,7 +42,7 @@ from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
 
 LEAST_SCANS: Final = 2
 RATE_TOLERANCE: Final = 0.005  # of a resonator
-NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
+NOT_PRESSED: Final = f"{NOT_KNOWN}: no three corners of a rectangle were pressed"
 SLOW_HOST: Final = 0.1
 LEAST_SPAN_S: Final = 1.0  # by the host's clock: scans come in bursts
 BAD_RESETS: Final = {

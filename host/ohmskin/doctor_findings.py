@@ -21,6 +21,7 @@ ORDER: Final = (
     *("hum", "noise", "wires"),
     *("touched", "unsettled_unknown", "version", "usb_latency", "slow_host"),
 )
+NOT_KNOWN: Final = "not known"  # how a figure begins that could not be had
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class Diagnosis:
             return text + f"first {_spoken(worse[0])}"
         if touched:
             return "no fault found, but something touches the skin: let go, and run this again"
+        if str(self.measured.get("wires", "")).startswith(NOT_KNOWN):
+            return "sound: nothing is wrong that an untouched skin shows; --press shows its wires"
         return "sound: nothing is wrong"
 
 

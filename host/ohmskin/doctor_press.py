@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.circuit import Float, current_std, port_sensitivity, ratio_from_codes
-from ohmskin.doctor_findings import Finding
+from ohmskin.doctor_findings import NOT_KNOWN, Finding
 from ohmskin.doctor_signal import rounding_std_lsb
 from ohmskin.doctor_wires import CHANGED, KNOWN, TO_DO, port_ohm
 from ohmskin.estimators import SkinKnowledge, make_estimator
@@ -87,7 +87,7 @@ class PressedWires:
     def in_words(self, wire_ohm: tuple[float, float]) -> str:
         """For the page."""
         if self.log_std > KNOWN:
-            return "not known: press with something smaller than a cell, further apart"
+            return f"{NOT_KNOWN}: press with something smaller than a cell, further apart"
         share = float(np.exp(self.log_share))
         top, bottom = (f"{share * ohm:.0f}" for ohm in wire_ohm)
         return (

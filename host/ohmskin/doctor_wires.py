@@ -35,7 +35,7 @@ from ohmskin.circuit import (
     port_sensitivity,
     ratio_from_codes,
 )
-from ohmskin.doctor_findings import Finding
+from ohmskin.doctor_findings import NOT_KNOWN, Finding
 from ohmskin.doctor_signal import mean_std_lsb
 from ohmskin.estimators import SkinKnowledge, make_estimator
 from ohmskin.messages import Hello
@@ -52,7 +52,7 @@ TO_DO: Final = (
     "is the skin stretched or bent, a stripe worn or a crimp loose? If it is to stay so, calibrate "
     "anew"
 )
-UNKNOWN: Final = "not known: an untouched skin hides its wires, --press asks for touches"
+UNKNOWN: Final = f"{NOT_KNOWN}: an untouched skin hides its wires, --press asks for touches"
 KNOWN: Final = 0.15  # deviation of a share from which a layer counts as known
 
 
