@@ -301,6 +301,11 @@ def test_wires_show_against_an_earlier_rest() -> None:
         told = {"wire_ohm": (100.0, 200.0), "rest_ratio": at_rest(3, rows, rows)}
         diagnosis = examine(examined(f"emulator://{rows}x{rows}?seed=3&wires={factor}", **told))
         assert {each.id for each in diagnosis.findings} == {"wires"}
+        lines = diagnosis.measured["wires_of_lines"]
+        assert len(lines) == 2 * rows
+        assert lines[rows].startswith("column 0: ")
+        share, std = (float(lines[-1].split()[at]) for at in (2, 4))
+        assert abs(share - factor) < 4 * std
         for finding in diagnosis.findings:
             ohm, std = (float(finding.measured.split()[at]) for at in (0, 2))
             nominal = 200.0 if "bottom" in finding.where else 100.0

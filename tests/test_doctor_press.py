@@ -15,7 +15,7 @@ from bench_board import Bench
 from command_line import Done, assert_one_line
 
 from ohmskin import doctor_command
-from ohmskin.circuit import Float, quantise, readings
+from ohmskin.circuit import Float, Skin, quantise, readings
 from ohmskin.doctor import Examined, examine
 from ohmskin.doctor_press import (
     CornerScans,
@@ -47,6 +47,17 @@ def taken(*ratios: Float) -> CornerScans:
     return scans
 
 
+def both_pressed(skin: Skin) -> list[Float]:
+    """Readings of the suggested corners, and of those moved across, pressed with 5 kOhm."""
+    corners = suggested_corners(*skin.shape)
+    ratios = []
+    for cells in (corners, moved_across(corners)):
+        siemens = skin.cell_siemens.copy()
+        siemens[tuple(np.transpose(cells))] += 2e-4
+        ratios.append(readings(replace(skin, cell_siemens=siemens)))
+    return ratios
+
+
 # ------------------------------------------------------------------------------------- wires
 
 
@@ -69,6 +80,7 @@ def test_nominal_wires_are_no_finding(size: str) -> None:
         diagnosis = examine(pressed(f"emulator://{size}?scene=corners&seed={seed}"))
         assert diagnosis.findings == ()
         assert "times nominal" in diagnosis.measured["wires"]
+        assert len(diagnosis.measured["wires_of_lines"]) == 2
         assert diagnosis.verdict == "sound: nothing is wrong"
 
 
@@ -115,14 +127,8 @@ def test_one_line_that_is_worn_is_named(layer: str, where: str) -> None:
     top[4] *= 4 if layer == "top" else 1
     bottom[:, 7] *= 4 if layer == "bottom" else 1
     worn = replace(skin, top_wire_ohm=top, bottom_wire_ohm=bottom)
-    corners = suggested_corners(8, 8)
-    ratios = []
-    for cells in (corners, moved_across(corners)):
-        siemens = skin.cell_siemens.copy()
-        siemens[tuple(np.transpose(cells))] += 2e-4
-        ratios.append(readings(replace(worn, cell_siemens=siemens)))
     rest = quantise(readings(worn)).astype(np.float64)
-    seen = taken(*ratios).measure(rest, 1, EXACT_LSB, NOMINAL)
+    seen = taken(*both_pressed(worn)).measure(rest, 1, EXACT_LSB, NOMINAL)
     assert [each.where for each in seen] == ["row 4, column 4", "row 7, column 7"]
     [finding] = pressed_findings(seen, NOMINAL)
     assert finding.where == where
@@ -146,14 +152,11 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
 
 def test_what_is_pressed_in_passing_is_left_out() -> None:
     skin = Scene("rest", 8, 8).skin(0.0)
-    corners = suggested_corners(8, 8)
-    ratios = []
-    for cells in (corners, moved_across(corners)):
-        siemens = skin.cell_siemens.copy()
-        siemens[tuple(np.transpose(cells))] += 2e-4
-        ratios.append(readings(replace(skin, cell_siemens=siemens)))
-    scans = taken(*[ratios[0]] * 5, ratios[1])
-    assert scans.scans(moved_across(corners)) == 1
+    held, passing = both_pressed(skin)
+    scans = taken(*[held] * 5, passing)
+    other = readings(Scene("rest", 4, 4).skin(0.0))  # of a board that was reset
+    assert scans.take(Scan(quantise(other), 0, 0, 0.0, 0)) is None
+    assert scans.scans(moved_across(suggested_corners(8, 8))) == 1
     rest = quantise(readings(skin)).astype(np.float64)
     [wires] = scans.measure(rest, 1, EXACT_LSB, NOMINAL)
     assert wires.where == "row 4, column 4"

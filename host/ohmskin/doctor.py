@@ -37,7 +37,7 @@ from ohmskin.doctor_signal import (
     find_hum,
     hum_finding,
 )
-from ohmskin.doctor_wires import measure_wires, wire_findings, wires_in_words
+from ohmskin.doctor_wires import lines_in_words, measure_wires, wire_findings, wires_in_words
 from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
 
 LEAST_SCANS: Final = 2
@@ -142,14 +142,18 @@ def _of_wires(
     wires = measure_wires(rest.mean, signal.noise_lsb, scans, board, wire_ohm, examined.rest_ratio)
     measured["wires"] = wires_in_words(wires, wire_ohm)
     told = examined.wire_ohm is not None
-    findings = []
+    findings, lines = [], []
     if told or examined.rest_ratio is not None:
         findings = wire_findings(wires, wire_ohm, board.rows)
+    if examined.rest_ratio is not None:
+        lines = lines_in_words(wires, board.rows)
     if examined.presses is not None:
         seen = examined.presses.measure(rest.mean, scans, signal.noise_lsb, wire_ohm)
         measured["wires"] = all_of(seen).in_words(wire_ohm) if seen else NOT_PRESSED
+        lines += [f"{each.where}: {each.share}" for each in seen]
         if seen and told and not findings:
             findings = pressed_findings(seen, wire_ohm)
+    measured["wires_of_lines"] = lines
     return findings
 
 

@@ -57,7 +57,8 @@ def doctor(
     """Say what is wrong with the skin board at PORT, and what to do. Touch nothing meanwhile.
 
     Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
-    it says when and where to press. Exit code 0: sound; 1: something is wrong.
+    it says when and where to press. Any rectangle will do: its lines are measured. Exit code 0:
+    sound; 1: something is wrong.
     """
     told = None if calibration is None else load_calibration(calibration)
     wire_ohm = _wires(wires) if wires else _wires_of(told)

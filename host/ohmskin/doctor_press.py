@@ -42,6 +42,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -82,18 +83,23 @@ class PressedWires:
     @property
     def differ(self) -> bool:
         """Whether they clearly are not nominal."""
-        return abs(self.log_share) > max(float(np.log(1 + CHANGED)), CLEAR_STDS * self.log_std)
+        least = max(float(np.log(1 + CHANGED)), CLEAR_STDS * self.log_std)
+        return self.log_std <= KNOWN and abs(self.log_share) > least
+
+    @property
+    def share(self) -> str:
+        """Over nominal, with the deviation."""
+        if self.log_std > KNOWN:
+            return f"{NOT_KNOWN}: press with something smaller than a cell, further apart"
+        share = float(np.exp(self.log_share))
+        return f"{share:.2f} +- {share * self.log_std:.2f} times nominal"
 
     def in_words(self, wire_ohm: tuple[float, float]) -> str:
         """For the page."""
         if self.log_std > KNOWN:
-            return f"{NOT_KNOWN}: press with something smaller than a cell, further apart"
-        share = float(np.exp(self.log_share))
-        top, bottom = (f"{share * ohm:.0f}" for ohm in wire_ohm)
-        return (
-            f"{share:.2f} +- {share * self.log_std:.2f} times nominal: top {top}, bottom {bottom} "
-            "ohm a segment, if both changed alike"
-        )
+            return self.share
+        top, bottom = (f"{np.exp(self.log_share) * ohm:.0f}" for ohm in wire_ohm)
+        return f"{self.share}: top {top}, bottom {bottom} ohm a segment, if both changed alike"
 
     def finding(self, wire_ohm: tuple[float, float]) -> Finding:
         """That they are not nominal."""
@@ -158,15 +164,9 @@ def pressed_corners(siemens: Float) -> Corners | None:
     if len(level) < 4 or level[2] < PRESSED_SIEMENS or level[3] > FOURTH_SHARE * level[2]:
         return None
     cells = [divmod(int(cell), siemens.shape[1]) for cell in order[:3]]
-    for corner in cells:
-        for beside in cells:
-            for below in cells:
-                if (
-                    corner not in (beside, below)
-                    and beside[0] == corner[0]
-                    and below[1] == corner[1]
-                ):
-                    return (corner, beside, below)
+    for corner, beside, below in permutations(cells):
+        if beside[0] == corner[0] and below[1] == corner[1]:
+            return corner, beside, below
     return None
 
 
@@ -183,8 +183,11 @@ class CornerScans:
 
     def take(self, scan: Scan) -> Corners | None:
         """The corners that are pressed in a scan, the one between the others first, if they are
-        three and nothing else is. `pressed` is all that is pressed.
+        three and nothing else is. `pressed` is all that is pressed. A scan of another size is left
+        out: of a board that was reset meanwhile.
         """
+        if scan.codes.shape[:2] != (self._board.rows, self._board.columns):
+            return None
         siemens = self._matrix.estimate(scan.ratio).cell_siemens
         self.pressed = tuple(
             (int(row), int(column)) for row, column in np.argwhere(siemens > PRESSED_SIEMENS)

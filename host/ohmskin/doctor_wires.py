@@ -194,3 +194,11 @@ def wires_in_words(wires: Wires, wire_ohm: tuple[float, float]) -> str:
         if std < KNOWN
     ]
     return "; ".join(words) or UNKNOWN
+
+
+def lines_in_words(wires: Wires, rows: int) -> list[str]:
+    """Each line over nominal, with its deviation."""
+    return [
+        f"{f'row {at}' if at < rows else f'column {at - rows}'}: {share:.2f} +- {std:.2f}"
+        for at, (share, std) in enumerate(zip(wires.line, wires.line_std, strict=True))
+    ]

@@ -167,14 +167,16 @@ def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], 
     x = rise.reshape(len(rise), -1)[frames, cell]
     force_n = trial.force_n.reshape(len(rise), -1)[frames, cell]
     if regression == SQUARES:
+        # In units of each cell's largest rise: a siemens to the power of 50 is no number.
+        unit = np.array([x[cell == k].max() for k in range(rows * columns)])
         curves = [
-            fit_power(x[cell == k], force_n[cell == k], Scatter(), _EXPONENTS)
+            fit_power(x[cell == k] / unit[k], force_n[cell == k], Scatter(), _EXPONENTS)
             for k in range(rows * columns)
         ]
         if None not in curves:
-            slope, exponent = np.array([(c.slope, c.exponent) for c in curves if c]).T
-            slope, exponent = slope.reshape(rows, columns), exponent.reshape(rows, columns)
-            return lambda seen: slope * np.maximum(seen, 0.0) ** exponent
+            of_cell = np.array([(c.slope, c.exponent) for c in curves if c]).T
+            slope, exponent = of_cell.reshape(2, rows, columns)
+            return lambda seen: slope * np.maximum(seen / unit.reshape(slope.shape), 0) ** exponent
         regression = LINE
     if regression == LINE:
         lines = [np.polyfit(x[cell == k], force_n[cell == k], 1) for k in range(rows * columns)]
