@@ -19,6 +19,7 @@ from ohmskin.circuit import Float, Skin, quantise, readings
 from ohmskin.doctor import Examined, examine
 from ohmskin.doctor_press import (
     CornerScans,
+    PressedWires,
     all_of,
     moved_across,
     pressed_corners,
@@ -148,6 +149,14 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
     nothing = taken(readings(skin))
     assert nothing.pressed == ()
     assert nothing.measure(rest, 1, EXACT_LSB, NOMINAL) == []
+
+
+def test_what_is_hardly_known_is_no_finding() -> None:
+    """However far it seems to be off."""
+    assert PressedWires("row 1, column 1", 0.9, 0.1).differ
+    vague = PressedWires("row 1, column 1", 0.9, 0.2)
+    assert pressed_findings([vague], NOMINAL) == []
+    assert vague.in_words(NOMINAL).startswith("not known")
 
 
 def test_what_is_pressed_in_passing_is_left_out() -> None:
