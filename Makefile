@@ -26,7 +26,7 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware test-firmware check-firmware sim \
-        test-host bench-firmware bench-host bench-estimators bench-force bench-view bench-boards clean \
+        test-host chart stability experiments bench-firmware bench-host bench-estimators bench-force bench-view bench-boards clean \
         distclean
 
 help: ## list the targets
@@ -51,6 +51,7 @@ check: setup ## formatting, lint, types, generated files, docs
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	PYTHONPATH=. $(BIN)/lint-imports
 	$(BIN)/clang-format --dry-run -Werror $(C_FILES)
 	$(BIN)/python protocol/generate.py --check
 	$(BIN)/python docs/draw.py --check
@@ -79,23 +80,34 @@ sim: setup ## build the simulator that runs the firmware on an emulated skin
 test-host: setup firmware sim ## pytest
 	$(ONE_THREAD) $(BIN)/pytest
 
+STUDY := $(ONE_THREAD) PYTHONPATH=. $(BIN)/python -m studies
+
+chart: setup ## time a frame against error, all methods, simulated: docs/speed-accuracy.png
+	$(STUDY) chart
+
+stability: setup ## where methods fail, and whether they say so, simulated: docs/stability.png
+	$(STUDY) stability
+
+experiments: setup ## the paper's experiments with force, simulated: docs/force-*.png
+	for each in flat curved timeseries minimum; do $(STUDY) experiment $$each || exit 1; done
+
 bench-firmware: setup firmware sim ## measure the firmware in the simulator
-	$(ONE_THREAD) $(BIN)/python benchmarks/bench_firmware.py
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_firmware.py
 
 bench-host: setup-host ## measure decoding, latency and load of the host
-	$(ONE_THREAD) $(BIN)/python benchmarks/bench_host.py
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_host.py
 
 bench-estimators: setup-host ## measure the estimators: time, error, stated uncertainty
-	$(ONE_THREAD) $(BIN)/python benchmarks/bench_estimators.py
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_estimators.py
 
 bench-force: setup-host ## measure the way from scan to force: time, ten minutes live, replay
-	$(ONE_THREAD) $(BIN)/python benchmarks/bench_force.py
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_force.py
 
 bench-view: setup ## measure the page: latency to the screen, frames, load
-	$(ONE_THREAD) $(BIN)/python benchmarks/bench_view.py
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_view.py
 
 bench-boards: setup-host ## measure one process that reads eight boards at once: five minutes
-	$(ONE_THREAD) $(BIN)/python benchmarks/bench_boards.py
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_boards.py
 
 clean: ## remove what was built
 	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

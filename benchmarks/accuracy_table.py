@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ohmskin.circuit import Float, quantise, ratio_from_codes
-from ohmskin.readings import Readings, estimate_file, load_readings
-from ohmskin.studies.published import CONDITIONS_MEGOHM, RMSE_MEGOHM
-from ohmskin.studies.trials import Trial, random_trial
+from ohmskin.arrays import Float
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.record.readings import Readings, estimate_file, load_readings
+from studies.published import CONDITIONS_MEGOHM, RMSE_MEGOHM
+from studies.trials import Trial, random_trial
 
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
 PAPER_NAMES = {"ohm": "naive", "lsq": "least squares", "regularized": "regularized"}

@@ -44,9 +44,9 @@ from bench_force import PRESSES, board_8x8, calibration
 from numpy.typing import NDArray
 
 import ohmskin
-from ohmskin.circuit import quantise, ratio_from_codes
-from ohmskin.emulator import EmulatedBoard
-from ohmskin.readings import load_readings
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.record.readings import load_readings
 
 BOARDS = 8
 RATE_HZ = 90

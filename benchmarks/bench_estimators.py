@@ -46,20 +46,15 @@ import numpy as np
 from bars import at_least, at_most, report  # beside this file
 from numpy.typing import NDArray
 
-from ohmskin.circuit import Float, quantise, ratio_from_codes
-from ohmskin.estimators import SkinKnowledge, make_estimator
-from ohmskin.estimators.information import information_limit
-from ohmskin.readings import Readings, estimate_file, load_readings
-from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.studies.published import RMSE_MEGOHM
-from ohmskin.studies.trials import (
-    PRESSED,
-    bent_trial,
-    random_trial,
-    skin_at_rest,
-    touch,
-    trial_of,
-)
+from ohmskin.arrays import Float
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.record.readings import Readings, estimate_file, load_readings
+from studies.information import information_limit
+from studies.published import RMSE_MEGOHM
+from studies.trials import PRESSED, bent_trial, random_trial, skin_at_rest, touch, trial_of
 
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
 SEED = 1000

@@ -41,9 +41,9 @@ from typing import Any
 
 import numpy as np
 
-from ohmskin import protocol
-from ohmskin.lockstep import BOARDS, Rig, elf_of
-from ohmskin.simavr import CPU_HZ
+from lockstep import BOARDS, Rig, elf_of
+from ohmskin.emulate.simavr import CPU_HZ
+from ohmskin.link import protocol
 
 READINGS_WANTED = 1_000_000
 

@@ -37,15 +37,16 @@ import numpy as np
 from bars import at_least, at_most, report  # beside this file
 
 import ohmskin
-from ohmskin.calibrate import Bench
-from ohmskin.calibration import Calibration
-from ohmskin.circuit import Float, quantise, ratio_from_codes
-from ohmskin.force_reader import ForceReader, ForceScan
-from ohmskin.messages import Hello, Scan
-from ohmskin.presses import Presses
-from ohmskin.readings import load_readings
-from ohmskin.recorder import Recorder
-from ohmskin.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.arrays import Float
+from ohmskin.calibrate.bench import Bench
+from ohmskin.calibrate.presses import Presses
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.force.calibration import Calibration
+from ohmskin.force.force_reader import ForceReader, ForceScan
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.readings import load_readings
+from ohmskin.record.recorder import Recorder
 
 PRESSES = Path(__file__).resolve().parents[1] / "tests" / "data" / "presses_8x8.npz"
 FINGER = "emulator://8x8?scene=moving&seed=1"
@@ -111,7 +112,7 @@ def scan_times() -> dict[str, float]:
 @contextmanager
 def emulated() -> Iterator[str]:
     """The port of a board that another process emulates."""
-    command = [sys.executable, "-c", "from ohmskin.cli import main; main()", "emulate", FINGER]
+    command = [sys.executable, "-m", "ohmskin", "emulate", FINGER]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:

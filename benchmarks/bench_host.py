@@ -45,11 +45,11 @@ import numpy as np
 from bars import at_least, at_most, report  # beside this file
 
 import ohmskin
-from ohmskin import framing, protocol
-from ohmskin.emulator import EmulatedBoard
+from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.errors import PortError
-from ohmskin.messages import BoardDecoder, Scan
-from ohmskin.recorder import Recorder
+from ohmskin.link import framing, protocol
+from ohmskin.link.messages import BoardDecoder, Scan
+from ohmskin.record.recorder import Recorder
 
 RATE_HZ = 90
 DECODED_SCANS = 3000

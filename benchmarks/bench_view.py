@@ -41,7 +41,7 @@ from typing import Any
 import numpy as np
 from bars import at_least, at_most, report  # beside this file
 
-PROGRAM = (sys.executable, "-c", "from ohmskin.cli import main; main()")
+PROGRAM = (sys.executable, "-m", "ohmskin")
 SCENE = "emulator://8x8?scene=moving"
 PAGE = Path(__file__).parents[1] / "host" / "ohmskin" / "view" / "page"
 SETTLE_S = 5.0

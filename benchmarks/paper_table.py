@@ -16,12 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ohmskin.circuit import Skin, quantise, ratio_from_codes, readings
-from ohmskin.estimators.base import Estimator, SkinKnowledge
-from ohmskin.estimators.matrix import MatrixEstimator
-from ohmskin.estimators.ohm import OhmEstimator
-from ohmskin.estimators.paper import LsqEstimator, PaperEstimator, RegularizedEstimator
-from ohmskin.studies.published import RMSE_MEGOHM
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.matrix import MatrixEstimator
+from ohmskin.estimate.ohm import OhmEstimator
+from ohmskin.estimate.paper import LsqEstimator, PaperEstimator, RegularizedEstimator
+from ohmskin.link.codes import quantise, ratio_from_codes
+from studies.published import RMSE_MEGOHM
 
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
 METHODS: tuple[type[Estimator], ...] = (

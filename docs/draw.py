@@ -24,8 +24,9 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(ROOT / "host"))
 
-from ohmskin import framing, protocol  # noqa: E402
-from ohmskin.circuit import DEFAULT_ADC_BITS, current_std, ratio_std  # noqa: E402
+from ohmskin.circuit.skin import current_std  # noqa: E402
+from ohmskin.link import framing, protocol  # noqa: E402
+from ohmskin.link.codes import DEFAULT_ADC_BITS, ratio_std  # noqa: E402
 
 CLOCK_HZ = 16_000_000
 CELLS_OHM = (1e3, 1e4, 1e5, 1e6)

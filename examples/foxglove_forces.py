@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import ohmskin
-from ohmskin.recording import load_recording
+from ohmskin.record.recording import load_recording
 
 PITCH_M = 0.01
 # Foxglove knows this schema by its name; of its text it needs what is base64.

@@ -15,15 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "host"))
 
-from ohmskin.protocol import (  # noqa: E402
-    CONSTANTS,
-    DEFINITION,
-    ENUMS,
-    FRAMES,
-    LAYOUT_CRC,
-    Field,
-    Frame,
-)
+from ohmskin.link.protocol import CONSTANTS, DEFINITION, ENUMS, FRAMES, LAYOUT_CRC, Field, Frame  # noqa: E402
 
 C_TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t"}
 

@@ -13,16 +13,16 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from command_line import Done
 from hypothesis import settings
 
 import ohmskin
-from ohmskin import cli
-from ohmskin.ports import emulated
-from ohmskin.pty_server import PtyServer
-from ohmskin.simavr import default_program
+from command_line import Done
+from ohmskin.cli import main as cli
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.simavr import default_program
+from ohmskin.opening import emulated
+from places import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 OPEN_FILES = Path("/proc/self/fd")
 
 # The same examples in every run, and no deadline: the machine may be busy.
@@ -97,14 +97,14 @@ Command = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def command() -> Iterator[Command]:
-    """A function that starts ``ohmskin ARGUMENTS`` as a process of its own."""
-    host = str(Path(ohmskin.__file__).parents[1])
-    environment = {**os.environ, "PYTHONPATH": host, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"}
+    """A function that starts ``python -m MODULE ARGUMENTS``, MODULE as a rule ohmskin."""
+    path = os.pathsep.join([str(Path(ohmskin.__file__).parents[1]), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"}
     started: list[subprocess.Popen[str]] = []
 
-    def start(*arguments: str) -> subprocess.Popen[str]:
+    def start(*arguments: str, module: str = "ohmskin") -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [sys.executable, "-c", "from ohmskin.cli import main; main()", *arguments],
+            [sys.executable, "-m", module, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -17,10 +17,10 @@ import typer.main
 from mkdocs.exceptions import PluginError
 
 import ohmskin
-from ohmskin.cli import app
-from ohmskin.lockstep import Rig
+from lockstep import Rig
+from ohmskin.cli.main import app
+from places import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("examples/*.md"))]
 NAMES = [page.name for page in PAGES]

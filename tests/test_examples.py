@@ -18,17 +18,18 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from command_line import Done
-from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
 from mcap.reader import make_reader
-from ros_stub import Float32MultiArray, PointCloud2, PointField, Ros
 from test_calibrated_device import of_scene
 
 import ohmskin
-from ohmskin.recorder import Recorder
-from ohmskin.recording import Mark
+from command_line import Done
+from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Mark
+from places import ROOT
+from ros_stub import Float32MultiArray, PointCloud2, PointField, Ros
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = ROOT / "examples"
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 
 

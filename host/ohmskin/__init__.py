@@ -9,11 +9,6 @@ with ohmskin.open("/dev/ttyACM0") as skin:
 """
 
 from ohmskin.boards import Boards, BoardScan, open_all
-from ohmskin.calibrated_device import CalibratedDevice
-from ohmskin.calibration import Calibration, load_calibration
-from ohmskin.clock import BoardClock
-from ohmskin.contacts import Contact
-from ohmskin.device import Device
 from ohmskin.errors import (
     CommandRefused,
     DeviceLost,
@@ -25,10 +20,16 @@ from ohmskin.errors import (
     RecordingError,
     TareRefused,
 )
-from ohmskin.estimators import METHODS, Estimate, Estimator, SkinKnowledge, make_estimator
-from ohmskin.force_reader import ForceScan
-from ohmskin.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.ports import open
+from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge
+from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.force.calibrated_device import CalibratedDevice
+from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.contacts import Contact
+from ohmskin.force.force_reader import ForceScan
+from ohmskin.link.clock import BoardClock
+from ohmskin.link.device import Device
+from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+from ohmskin.opening import open
 
 __all__ = [
     "METHODS",

@@ -10,18 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Generic, NamedTuple, TypeVar, cast, overload
 
-from ohmskin import ports
-from ohmskin.calibrated_device import CalibratedDevice
-from ohmskin.calibration import Calibration, load_calibration
-from ohmskin.clock import BoardClock
-from ohmskin.closing import Closing
-from ohmskin.device import Device
+from ohmskin import opening as ports
 from ohmskin.errors import DeviceSilent, PortError
-from ohmskin.force_reader import ForceScan
-from ohmskin.line_delay import line_delay_s, scan_s
-from ohmskin.link import serial_ports
-from ohmskin.messages import Scan
-from ohmskin.ports import CalibrationLike
+from ohmskin.files import Closing
+from ohmskin.force.calibrated_device import CalibratedDevice
+from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.force_reader import ForceScan
+from ohmskin.link.clock import BoardClock
+from ohmskin.link.device import Device
+from ohmskin.link.line_delay import line_delay_s, scan_s
+from ohmskin.link.messages import Scan
+from ohmskin.link.serial_port import serial_ports
+from ohmskin.opening import CalibrationLike
 
 DeviceT = TypeVar("DeviceT", bound=Device)
 ScanT = TypeVar("ScanT", bound=Scan)

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from firmware_helpers import BOOT_S
 
-from ohmskin.lockstep import BOARDS, Rig, elf_of
-from ohmskin.simavr import default_program
+from firmware_helpers import BOOT_S
+from lockstep import BOARDS, Rig, elf_of
+from ohmskin.emulate.simavr import default_program
 
 
 @pytest.fixture(params=BOARDS)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import pytest
+
 from firmware_helpers import (
     BAUD_DEFAULT,
     BAUD_FAST,
@@ -12,10 +13,9 @@ from firmware_helpers import (
     VECTORS,
     reset,
 )
-
-from ohmskin import framing, protocol
-from ohmskin.lockstep import DEFAULT_SCAN, Rig
-from ohmskin.simavr import CPU_HZ
+from lockstep import DEFAULT_SCAN, Rig
+from ohmskin.emulate.simavr import CPU_HZ
+from ohmskin.link import framing, protocol
 
 pytestmark = pytest.mark.simavr
 

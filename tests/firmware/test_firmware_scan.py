@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from firmware_helpers import (
     CYCLES_PER_US,
     assert_whole,
@@ -16,10 +17,9 @@ from firmware_helpers import (
     numbers,
     reset,
 )
-
-from ohmskin import protocol
-from ohmskin.lockstep import CODES, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of
-from ohmskin.simavr import CPU_HZ
+from lockstep import CODES, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of
+from ohmskin.emulate.simavr import CPU_HZ
+from ohmskin.link import protocol
 
 pytestmark = pytest.mark.simavr
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ohmskin.lockstep import Rig
+from lockstep import Rig
 
 pytestmark = pytest.mark.simavr
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from firmware_helpers import (
     OTHER_SCAN,
     RECORD_SIZE,
     assert_whole,
     reset,
 )
-
-from ohmskin import protocol
-from ohmskin.lockstep import DEFAULT_SCAN, Rig
+from lockstep import DEFAULT_SCAN, Rig
+from ohmskin.link import protocol
 
 pytestmark = pytest.mark.simavr
 

@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ohmskin.closing import Closing
-from ohmskin.device import Device
 from ohmskin.errors import OhmskinError
-from ohmskin.recorder import Recorder
-from ohmskin.recording import Mark, Tare
+from ohmskin.files import Closing
+from ohmskin.link.device import Device
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Mark, Tare
 
 
 class BoardRecording(Closing):

@@ -22,7 +22,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from ohmskin.errors import OhmskinError
-from ohmskin.link import serial_ports
+from ohmskin.link.serial_port import serial_ports
 from ohmskin.view.access import Guard, is_loopback
 from ohmskin.view.panel import Panel
 from ohmskin.view.viewed_boards import ViewedBoards

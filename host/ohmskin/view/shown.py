@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.circuit import Float
-from ohmskin.contacts import Contact
-from ohmskin.estimators import Estimate
-from ohmskin.messages import Scan
+from ohmskin.arrays import Float
+from ohmskin.estimate.base import Estimate
+from ohmskin.force.contacts import Contact
+from ohmskin.link.messages import Scan
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.calibrated_device import now, touched_cells
-from ohmskin.calibration import Calibration
-from ohmskin.circuit import Float
-from ohmskin.contacts import MEMORY_US, Contact, ContactTracker
+from ohmskin.arrays import Float
 from ohmskin.errors import TareRefused
-from ohmskin.estimators import METHODS, Estimate, Estimator, OhmEstimator, make_estimator
-from ohmskin.force_reader import ForceReader, knowledge_of
-from ohmskin.messages import Hello, Scan
+from ohmskin.estimate.base import Estimate, Estimator
+from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.ohm import OhmEstimator
+from ohmskin.force.calibrated_device import now, touched_cells
+from ohmskin.force.calibration import Calibration
+from ohmskin.force.contacts import MEMORY_US, Contact, ContactTracker
+from ohmskin.force.force_reader import ForceReader, knowledge_of
+from ohmskin.link.messages import Hello, Scan
 from ohmskin.view.shown import Counts, Shown
 
 # The paper's programmes take minutes for a frame of 8x8.

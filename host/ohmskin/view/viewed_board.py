@@ -12,16 +12,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from ohmskin.calibrated_device import TARE_S
-from ohmskin.calibration import Calibration
-from ohmskin.circuit import Float
-from ohmskin.closing import Closing
-from ohmskin.device import Device
+from ohmskin.arrays import Float
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
-from ohmskin.messages import Hello, Scan
-from ohmskin.ports import open_link
-from ohmskin.recording import Mark, Tare
-from ohmskin.replay import ReplayLink
+from ohmskin.files import Closing
+from ohmskin.force.calibrated_device import TARE_S
+from ohmskin.force.calibration import Calibration
+from ohmskin.link.device import Device
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.opening import open_link
+from ohmskin.record.recording import Mark, Tare
+from ohmskin.record.replay import ReplayLink
 from ohmskin.view.board_recording import BoardRecording
 from ohmskin.view.shown import Counts, Shown
 from ohmskin.view.skin_reader import SkinReader

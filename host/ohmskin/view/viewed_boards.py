@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from ohmskin.calibration import Calibration
-from ohmskin.closing import Closing
+from ohmskin.files import Closing
+from ohmskin.force.calibration import Calibration
 from ohmskin.view.viewed_board import ViewedBoard
 
 MOST_BOARDS: Final = 16

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The skin's circuit: from resistances to the four readings of every cell, and back to a current.
+
+Symbols
+
+====== ============ ==================================================================== =========
+symbol shape        meaning                                                              unit
+====== ============ ==================================================================== =========
+R, C                row stripes (top layer), column stripes (bottom layer)
+g      (R, C)       cell conductance, joins top node T[i,j] and bottom node B[i,j]       S
+Rt     (R, C)       top wire segment that ends at T[i,j], from T[i,j-1] or the electrode  ohm
+Rb     (R, C)       bottom segment that ends at B[i,j], from B[i-1,j] or the electrode    ohm
+K      (RC, RC)     voltage lost in the wires to cell e per current of cell f            ohm
+E      (R+C, RC)    incidence: +1 at a cell's row electrode, -1 at its column electrode
+Y      (R+C, R+C)   admittance of the skin seen from its electrodes                      S
+Z      (R+C, R+C)   inverse of Y, one electrode of each connected part grounded          ohm
+rho    (R, C)       port resistance between row electrode i and column electrode j       ohm
+I      (R, C)       current through a selected port, per volt of Vdd                     S
+y      (R, C, 4)    sense-node voltage / Vdd, in the order of `CONFIGURATIONS`           1
+====== ============ ==================================================================== =========
+
+Equations. With x the cell currents and V the electrode potentials,
+
+    (diag(1/g) + K) x = E^T V ,     Y = E (diag(1/g) + K)^-1 E^T ,
+    rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] ,     I = 1 / (rho + R_top + R_bottom) .
+
+This is Kirchhoff's law on the network of 2RC nodes with the wire nodes eliminated: along a chain,
+cells j and k share the wire up to the nearer of them, so K is a sum of segments. It needs half the
+unknowns of the node Laplacian, and open cells (g = 0) and wires of zero ohm need no special value.
+Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g), has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.cholesky import cholesky, solve_lower
+from ohmskin.link.protocol import ENUMS
+
+CONFIGURATIONS: Final = tuple(name.upper() for name in ENUMS["reading"].values)
+READINGS_PER_CELL: Final = len(CONFIGURATIONS)
+# Every configuration reads y = offset + sign * R * I, R the reference resistor of the sensed layer.
+READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
+READING_SIGN: Final[Float] = np.array([-1.0, 1.0, -1.0, 1.0])
+READING_SENSES_TOP: Final[NDArray[np.bool_]] = np.array([True, False, False, True])
+
+DEFAULT_REF_OHM: Final = 30_000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Every resistance of the circuit: cells (R, C) [S], wire segments (R, C) [ohm], references.
+
+    `top_wire_ohm[i, j]` ends at T[i, j], `bottom_wire_ohm[i, j]` at B[i, j]; index 0 along the
+    stripe is the segment from the electrode. Zero conductance is an open cell, zero wires are
+    allowed, both exactly. Arrays are copied and read-only.
+    Raises ValueError for other shapes, values that are negative or not finite, references not > 0.
+    """
+
+    cell_siemens: Float
+    top_wire_ohm: Float
+    bottom_wire_ohm: Float
+    ref_top_ohm: float = DEFAULT_REF_OHM
+    ref_bottom_ohm: float = DEFAULT_REF_OHM
+
+    def __post_init__(self) -> None:
+        check_references(self.ref_top_ohm, self.ref_bottom_ohm)
+        shape = np.shape(self.cell_siemens)
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(f"cell_siemens must be (rows, columns), at least 1x1, not {shape}")
+        for name in [f.name for f in fields(self)][:3]:
+            resistances = np.array(getattr(self, name), dtype=np.float64)
+            if resistances.shape != shape:
+                raise ValueError(f"{name} has shape {resistances.shape}, cell_siemens {shape}")
+            if not np.all(np.isfinite(resistances) & (resistances >= 0)):
+                raise ValueError(f"{name} must be finite and not negative")
+            resistances.setflags(write=False)
+            object.__setattr__(self, name, resistances)
+
+    @classmethod
+    def uniform(
+        cls,
+        rows: int,
+        columns: int,
+        *,
+        rest_ohm: float = 1e6,
+        top_wire_ohm: float = 100.0,
+        bottom_wire_ohm: float = 200.0,
+        ref_top_ohm: float = DEFAULT_REF_OHM,
+        ref_bottom_ohm: float = DEFAULT_REF_OHM,
+    ) -> Self:
+        """An untouched skin: all cells `rest_ohm` (inf: open), all segments of a layer alike."""
+        if rows < 1 or columns < 1:
+            raise ValueError(f"a skin has at least 1 row and 1 column, not {rows}x{columns}")
+        if not rest_ohm > 0:
+            raise ValueError(f"rest_ohm must be positive, not {rest_ohm}")
+        shape = (rows, columns)
+        return cls(
+            np.full(shape, 1.0 / rest_ohm),
+            np.full(shape, top_wire_ohm),
+            np.full(shape, bottom_wire_ohm),
+            ref_top_ohm,
+            ref_bottom_ohm,
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        rows, columns = self.cell_siemens.shape
+        return rows, columns
+
+
+def check_references(ref_top_ohm: float, ref_bottom_ohm: float) -> None:
+    """Raise ValueError unless both reference resistors are positive and finite."""
+    for name, ohm in (("ref_top_ohm", ref_top_ohm), ("ref_bottom_ohm", ref_bottom_ohm)):
+        if not (np.isfinite(ohm) and ohm > 0):
+            raise ValueError(f"{name} must be positive and finite, not {ohm}")
+
+
+def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
+    """K [ohm], shape (RC, RC): K[e, f] is the wire shared by the paths to cells e and f."""
+    rows, columns = top_wire_ohm.shape
+    i, j = np.arange(rows), np.arange(columns)
+    top_to_cell = np.cumsum(top_wire_ohm, axis=1)
+    bottom_to_cell = np.cumsum(bottom_wire_ohm, axis=0)
+    coupling = np.zeros((rows, columns, rows, columns))
+    same_row = np.einsum("ijik->ijk", coupling)
+    same_row += top_to_cell[:, np.minimum(j[:, None], j[None, :])]
+    same_column = np.einsum("ijkj->ikj", coupling)
+    same_column += bottom_to_cell[np.minimum(i[:, None], i[None, :]), :]
+    return coupling.reshape(rows * columns, rows * columns)
+
+
+def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tuple[Float, Float]:
+    """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
+
+    The second gives Y = half^T half.
+    """
+    rows, columns = root.shape
+    system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm)
+    system *= root.reshape(-1, 1)
+    system *= root.reshape(1, -1)
+    system[np.diag_indices_from(system)] += 1.0
+    factor = cholesky(system)
+    driven = np.zeros((rows, columns, rows + columns))
+    driven[np.arange(rows), :, np.arange(rows)] = root
+    driven[:, np.arange(columns), rows + np.arange(columns)] = -root
+    return factor, solve_lower(factor, driven.reshape(rows * columns, -1))
+
+
+def _admittance(half: Float) -> Float:
+    """Y = half^T half. No current leaves the skin: a diagonal made from its row keeps small
+    conductances that rounding of the large ones would drown.
+    """
+    admittance: Float = half.T @ half
+    np.fill_diagonal(admittance, 0.0)
+    np.fill_diagonal(admittance, -admittance.sum(axis=1))
+    return admittance
+
+
+def electrode_admittance(skin: Skin) -> Float:
+    """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
+    root = np.sqrt(skin.cell_siemens)
+    return _admittance(factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
+
+
+def port_resistance_ohm(skin: Skin) -> Float:
+    """rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] [ohm], shape (R, C), all other electrodes floating.
+
+    One factorisation of RC unknowns with R+C right-hand sides gives all ports. A port that no
+    chain of cells connects (all of them open) is inf.
+    """
+    rows = skin.shape[0]
+    admittance = electrode_admittance(skin)
+    part = _connected_parts(skin.cell_siemens)
+    for number in np.unique(part):
+        # Grounding any one electrode of a connected part changes no resistance within it; the
+        # best connected one costs the least precision.
+        members = np.flatnonzero(part == number)
+        ground = members[np.argmax(np.diagonal(admittance)[members])]
+        admittance[ground, ground] = 2 * admittance[ground, ground] or 1.0
+    impedance = np.linalg.inv(admittance)
+    diagonal = np.diagonal(impedance)
+    resistance = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    connected = part[:rows, None] == part[None, rows:]
+    return np.where(connected, np.maximum(resistance, 0.0), np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Port resistances and how each resistance of the skin moves them.
+
+    port_ohm: rho, shape (RC,), ports in row-major order. cell_current: shape (RC, R, C), current
+    through each cell per port current. d rho / d log r_e = r_e i_e^2 [ohm], i_e the current in e.
+    """
+
+    cell_siemens: Float
+    top_wire_ohm: Float
+    bottom_wire_ohm: Float
+    port_ohm: Float
+    cell_current: Float
+
+    @property
+    def by_cell(self) -> Float:
+        """d rho / d log r of the cells, port by cell, shape (RC, RC) [ohm]."""
+        current = self.cell_current
+        return (current * current / self.cell_siemens).reshape(len(current), -1)
+
+    def by_wires(self, ports: slice | NDArray[np.intp] = slice(None)) -> Float:
+        """d rho / d log r of the wires, top ones then bottom ones, shape (ports, 2RC) [ohm]."""
+        return by_wires(self.cell_current[ports], self.top_wire_ohm, self.bottom_wire_ohm)
+
+
+def by_wires(cell_current: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
+    """d rho / d log r of all wires [ohm], (ports, 2RC), from cell currents (ports, R, C)."""
+    ports, rows, columns = cell_current.shape
+    slopes = np.empty((ports, 2, rows, columns))
+    # A wire segment carries what the cells behind it draw: sums as products, which is faster.
+    np.matmul(cell_current, np.tri(columns), out=slopes[:, 0])
+    np.matmul(np.tri(rows).T, cell_current, out=slopes[:, 1])
+    slopes *= slopes
+    slopes *= np.stack([top_wire_ohm, bottom_wire_ohm])
+    return slopes.reshape(ports, 2 * rows * columns)
+
+
+def port_sensitivity(
+    cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float
+) -> Sensitivity:
+    """rho of every port and the cell currents that give all its derivatives.
+
+    The adjoint of a resistive network is the network itself (Tellegen): the currents that give rho
+    give its derivative as well, so one factorisation of RC unknowns and R+C right-hand sides are
+    enough for all RC x 3RC derivatives. Cells must conduct (g > 0): (R, C) [S]; wires (R, C) [ohm].
+    """
+    rows, columns = cell_siemens.shape
+    cells = rows * columns
+    root = np.sqrt(cell_siemens)
+    factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
+    impedance, port_ohm = impedance_of(half, rows)
+    per_potential = solve_lower(factor, half, transposed=True)
+    per_potential *= root.reshape(-1, 1)
+    # Electrode potentials for unit current into row i and out of column j, port by port.
+    potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(-1, cells)
+    current = (potential.T @ per_potential.T).reshape(cells, rows, columns)
+    return Sensitivity(cell_siemens, top_wire_ohm, bottom_wire_ohm, port_ohm, current)
+
+
+def impedance_of(half: Float, rows: int) -> tuple[Float, Float]:
+    """Z and rho (RC,) of Y = half^T half, if all cells conduct."""
+    admittance = _admittance(half)
+    ground = np.argmax(np.diagonal(admittance))
+    admittance[ground, ground] *= 2
+    impedance = np.linalg.inv(admittance)
+    diagonal = np.diagonal(impedance)
+    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    return np.asarray(impedance), np.asarray(port_ohm.ravel())
+
+
+def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:
+    """Number of the connected part of each electrode, shape (R+C,): rows first, then columns."""
+    rows, columns = cell_siemens.shape
+    joined = cell_siemens > 0
+    if joined.all():
+        return np.zeros(rows + columns, dtype=np.intp)
+    reach = np.eye(rows + columns, dtype=bool)
+    reach[:rows, rows:] = joined
+    reach[rows:, :rows] = joined.T
+    for _ in range(int(rows + columns).bit_length()):
+        reach = reach @ reach
+    return np.asarray(reach.argmax(axis=1), dtype=np.intp)
+
+
+def reference_ohm(ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
+    """The reference resistor that each configuration senses [ohm], shape (4,)."""
+    return np.where(READING_SENSES_TOP, ref_top_ohm, ref_bottom_ohm)
+
+
+def ratio_from_current(
+    current_siemens: ArrayLike, ref_top_ohm: float, ref_bottom_ohm: float
+) -> Float:
+    """y = offset + sign * R_ref * I, shape (..., 4), for currents per Vdd (...) [S]."""
+    current = np.asarray(current_siemens, dtype=np.float64)[..., None]
+    slope = READING_SIGN * reference_ohm(ref_top_ohm, ref_bottom_ohm)
+    return np.asarray(READING_OFFSET + slope * current, dtype=np.float64)
+
+
+def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
+    """I = sum_k R_k s_k (y_k - offset_k) / sum_k R_k^2, per Vdd [S], shape (...,) from (..., 4).
+
+    Each reading alone gives I_k = s_k (y_k - offset_k) / R_k; weights R_k^2 are the combination of
+    least variance when all readings are equally noisy.
+    """
+    reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
+    weight = READING_SIGN * reference / np.sum(reference**2)
+    return np.asarray((ratio - READING_OFFSET) @ weight, dtype=np.float64)
+
+
+def current_std(ratio_std: float, ref_top_ohm: float, ref_bottom_ohm: float) -> float:
+    """Standard deviation of `current_from_ratio` [S]: ratio_std * sum_k R_k / sum_k R_k^2.
+
+    The sum is linear, not quadratic, because rounding errors do not average out: without other
+    noise D is 1 - A, C is 1 - B, and with equal references B equals D, so all four round alike.
+    For other noise this is an upper bound (too large by 2 at most).
+    """
+    reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
+    return float(ratio_std * np.sum(reference) / np.sum(reference**2))
+
+
+def readings(skin: Skin) -> Float:
+    """Sense-node voltages / Vdd, shape (R, C, 4): y = offset + sign R_ref / (rho + Rt + Rb)."""
+    current = 1.0 / (port_resistance_ohm(skin) + skin.ref_top_ohm + skin.ref_bottom_ohm)
+    return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)

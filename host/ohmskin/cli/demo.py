@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main job on an emulated skin: scan, estimate, and compare with the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+import ohmskin
+from ohmskin.arrays import Float
+from ohmskin.cli.show import cells_table
+from ohmskin.emulate.scenes import Scene
+from ohmskin.errors import PortError
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.messages import BoardStats
+
+URL: Final = "emulator://8x8?scene=ghost&seed=1"
+_METHODS: Final = ("ohm", "joint")
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What was seen. panels: name, conductance [S] and touched cells of truth and each method."""
+
+    title: str
+    panels: list[tuple[str, Float, NDArray[np.bool_]]]
+    rate_hz: float
+    stats: BoardStats
+    estimate_ms: dict[str, float]
+
+    @property
+    def ghosts(self) -> dict[str, int]:
+        """Cells that a method takes for touched and nothing touches."""
+        truth = self.panels[0][2]
+        return {name: int((touched & ~truth).sum()) for name, _, touched in self.panels[1:]}
+
+
+def run(url: str, seconds: float) -> Demo:
+    """Scan `url`, an emulated port, for so long, with every scan through every method.
+
+    :raises PortError: the truth behind this port is not known.
+    """
+    scene = _scene_of(url)
+    with ohmskin.open(url) as skin:
+        board = skin.info
+        knowledge = SkinKnowledge(
+            board.rows,
+            board.columns,
+            ref_top_ohm=board.ref_top_ohm,
+            ref_bottom_ohm=board.ref_bottom_ohm,
+            adc_bits=board.adc_bits,
+            rest_ratio=ratio_from_codes(quantise(scene.rest_ratio)),
+        )
+        estimators = [make_estimator(method, knowledge) for method in _METHODS]
+        times: dict[str, list[float]] = {method: [] for method in _METHODS}
+        estimates = {}
+        scan = first = skin.latest()
+        end_s = time.monotonic() + seconds
+        for scan in skin:
+            for estimator in estimators:
+                estimates[estimator.name] = estimator.estimate(scan.ratio)
+                times[estimator.name].append(estimates[estimator.name].seconds)
+            if time.monotonic() >= end_s:
+                break
+        rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
+        stats = skin.stats
+    now_s = scan.time_us * 1e-6
+    panels = [("truth", scene.skin(now_s).cell_siemens, scene.touched(now_s))]
+    panels += [(name, e.cell_siemens, e.touched) for name, e in estimates.items()]
+    milliseconds = {name: 1e3 * float(np.median(taken)) for name, taken in times.items()}
+    title = f"scene '{scene.name}', simulated {board.rows}x{board.columns} skin"
+    return Demo(title, panels, rate_hz, stats, milliseconds)
+
+
+def _scene_of(url: str) -> Scene:
+    parts = urlsplit(url)
+    options = {key: values[-1] for key, values in parse_qs(parts.query).items()}
+    if parts.scheme != "emulator" or "readings" in options:
+        raise PortError(f"{url}: the demo needs the truth: use {URL}")
+    try:
+        rows, columns = map(int, parts.netloc.split("x"))
+        seed = int(options.get("seed", "0"))
+        return Scene(options.get("scene", "rest"), rows, columns, seed=seed)
+    except ValueError as exc:
+        raise PortError(f"{url}: {exc}") from exc
+
+
+def report(demo: Demo, console: Console) -> None:
+    """Print truth and estimates side by side, and what they say."""
+    console.print(f"{demo.title}: cell conductance in microsiemens")
+    tables = [cells_table(cells, name) for name, cells, _ in demo.panels]
+    widths = [console.measure(table).maximum for table in tables]
+    if sum(widths) <= console.width:
+        beside = Table.grid()
+        beside.add_row(*tables)
+        console.print(beside)
+    else:
+        console.print(*tables, sep="\n")
+    for name, ghosts in demo.ghosts.items():
+        verdict = f"{ghosts} ghosts" if ghosts != 1 else "1 ghost"
+        console.print(
+            f"{name:>8}: {verdict if ghosts else 'no ghost'}, "
+            f"{demo.estimate_ms[name]:.2f} ms a scan"
+        )
+    console.print(
+        f"{demo.stats.scans} scans at {demo.rate_hz:.2f} Hz, {demo.stats.missed} missed, "
+        f"{demo.stats.line.damaged} damaged"
+    )

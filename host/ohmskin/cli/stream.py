@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin stream``: the skin at a port, live in a terminal or as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import ArrayLike
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+import ohmskin
+from ohmskin.cli import show
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.force.calibrated_device import CalibratedDevice
+from ohmskin.force.force_reader import ForceScan, knowledge_of
+from ohmskin.link.device import Device
+from ohmskin.link.messages import Scan
+
+_out = Console()
+_DISPLAY_EVERY_S = 0.1
+_DEFAULT_METHOD = "joint"
+
+
+def stream(
+    port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
+    method: Annotated[
+        str,
+        typer.Option(
+            help=f"estimator: {' | '.join(METHODS)}; none: readings alone. Default: joint, or the "
+            "calibration's"
+        ),
+    ] = "",
+    calibration: Annotated[
+        Path | None, typer.Option(help="calibration file (.json): show forces")
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="take a calibration of another unit")
+    ] = False,
+    tare_s: Annotated[
+        float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its rest")
+    ] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object a scan")] = False,
+    scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
+    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+) -> None:
+    """Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it."""
+    if method not in ("", "none", *METHODS):
+        raise ValueError(f"no method '{method}': there are none, {', '.join(METHODS)}")
+    if method and calibration is not None:
+        raise ValueError(
+            "say either --method or --calibration: forces are by the calibration's method"
+        )
+    with _opened(port, calibration, force) as skin:
+        estimator = None
+        if isinstance(skin, CalibratedDevice):
+            if tare_s:
+                skin.tare(tare_s)
+        elif method != "none":
+            rest_ratio = skin.mean_ratio(tare_s) if tare_s else None
+            knowledge = knowledge_of(skin.info, rest_ratio)
+            estimator = make_estimator(method or _DEFAULT_METHOD, knowledge)
+        with suppress(KeyboardInterrupt):
+            if as_json:
+                _print_scans(skin, estimator, scans, seconds)
+            else:
+                _show_scans(skin, estimator, scans, seconds)
+        lost = skin.stats
+    if lost.missed or lost.line.damaged or lost.restarts:
+        text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
+        text += f"{lost.line.damaged} damaged frames, {lost.restarts} restarts"
+        print(text, file=sys.stderr)  # noqa: T201
+
+
+def _opened(port: str, calibration: Path | None, force: bool) -> Device:
+    if calibration is None:
+        return ohmskin.open(port)
+    return ohmskin.open(port, calibration=calibration, force=force)
+
+
+def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
+    end_s = time.monotonic() + seconds if seconds else float("inf")
+    for number, scan in enumerate(scans, start=1):
+        yield scan
+        if number == count or time.monotonic() >= end_s:
+            return
+
+
+def _print_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
+    for scan in _limited(iter(skin), count, seconds):
+        line: dict[str, Any] = {
+            "scan": scan.number,
+            "time_us": scan.time_us,
+            "host_time_s": round(scan.host_time_s, 6),
+            "missed": scan.missed,
+            "ratio": scan.ratio.tolist(),
+        }
+        estimate = scan.estimate if isinstance(scan, ForceScan) else None
+        if estimator is not None:
+            estimate = estimator.estimate(scan.ratio)
+        if estimate is not None:
+            line["method"] = _method(skin, estimator)
+            line["cell_siemens"] = _numbers(estimate.cell_siemens)
+            line["cell_siemens_std"] = _numbers(estimate.cell_siemens_std)
+            line["converged"] = estimate.converged
+            line["message"] = estimate.message
+        if isinstance(scan, ForceScan):
+            line |= forces_as_json(scan)
+        try:
+            print(json.dumps(line), flush=True)  # noqa: T201
+        except BrokenPipeError:
+            sys.stderr.close()  # the reader, such as `head`, has had enough
+            return
+
+
+def forces_as_json(scan: ForceScan) -> dict[str, Any]:
+    """Forces and contacts of a scan."""
+    return {
+        "force_n": _numbers(scan.force_n),
+        "force_n_std": _numbers(scan.force_n_std),
+        "contacts": [
+            {
+                name: _numbers(getattr(contact, name))
+                for name in ("identity", "row", "column", "force_n", "force_n_std")
+            }
+            for contact in scan.contacts
+        ],
+    }
+
+
+def _numbers(values: ArrayLike) -> Any:
+    """As JSON has them, which knows no NaN: null."""
+    array = np.asarray(values)
+    objects = array.astype(object)
+    objects[np.isnan(array)] = None
+    return objects.tolist()
+
+
+def _method(skin: Device, estimator: Estimator | None) -> str:
+    if estimator is not None:
+        return estimator.name
+    return skin.calibration.method if isinstance(skin, CalibratedDevice) else "none"
+
+
+def _show_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
+    rate_hz, shown_s = 0.0, 0.0
+    first: Scan | None = None
+    with Live(console=_out, auto_refresh=False) as live:
+        for scan in _limited(iter(skin), count, seconds):
+            if first is None or scan.time_us < first.time_us:
+                first = scan  # or the board has restarted
+            elif scan.time_us > first.time_us:
+                rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
+            # A terminal shows ten pictures a second; every scan is counted all the same.
+            if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
+                shown_s = scan.host_time_s
+                live.update(_picture(skin, estimator, scan, rate_hz), refresh=True)
+
+
+def _picture(skin: Device, estimator: Estimator | None, scan: Scan, rate_hz: float) -> Group:
+    stats = skin.stats
+    caption = (
+        f"scan {scan.number}  {rate_hz:.1f} Hz  missed {stats.missed}  "
+        f"damaged {stats.line.damaged}  restarts {stats.restarts}"
+    )
+    method = _method(skin, estimator)
+    if isinstance(scan, ForceScan):
+        title = f"{skin.name}: force by '{method}' [N]"
+        table, estimate = show.forces_table(scan.force_n, ""), scan.estimate
+    elif estimator is None:
+        title = f"{skin.name}: reading B in thousandths of Vdd"
+        return Group(Text(title), show.cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
+    else:
+        estimate = estimator.estimate(scan.ratio)
+        title = f"{skin.name}: cell conductance by '{method}' [microsiemens]"
+        table = show.cells_table(estimate.cell_siemens, "")
+    if not estimate.converged:
+        caption += f"  not converged: {estimate.message}"
+    if isinstance(scan, ForceScan):
+        caption = f"{_contact_line(scan)}\n{caption}"
+    return Group(Text(title), table, Text(caption))
+
+
+def _contact_line(scan: ForceScan) -> str:
+    if not scan.contacts:
+        return "no contact"
+    return "   ".join(
+        f"contact {each.identity}: {each.force_n:.2f} +- {each.force_n_std:.2f} N "
+        f"at ({each.row:.1f}, {each.column:.1f})"
+        for each in scan.contacts
+    )

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin view``: a live page of one or several boards."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ohmskin.errors import OhmskinError
+from ohmskin.force.calibration import load_calibration
+
+HTTP_PORT = 8765
+
+
+def view(
+    ports: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="PORT", help="serial ports or URLs; none: the page asks"),
+    ] = None,
+    calibration: Annotated[
+        list[Path] | None,
+        typer.Option(help="calibration file (.json): show forces; may be given for each unit"),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="take a calibration of another unit")
+    ] = False,
+    host: Annotated[
+        str, typer.Option(help="address to listen at; another than loopback asks for a token")
+    ] = "127.0.0.1",
+    http_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")
+    ] = HTTP_PORT,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="only print the page's address")
+    ] = False,
+) -> None:
+    """Show skins live on a page in the browser: heat map, contacts, tare, recording.
+
+    Only this machine reaches the page, unless --host says otherwise. Recordings go to the current
+    folder. Ctrl-C ends it; a recording is whole then.
+    """
+    try:
+        from ohmskin.view import server
+    except ImportError as exc:
+        raise OhmskinError(
+            f"the page needs more ({exc.name}): pip install 'ohmskin[view]'"
+        ) from exc
+    from ohmskin.view.viewed_boards import ViewedBoards
+
+    calibrations = [load_calibration(path) for path in calibration or ()]
+
+    def started(url: str) -> None:
+        print(url, flush=True)  # noqa: T201
+        if not no_browser and _has_display():
+            # Some browsers return only when they are closed.
+            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+
+    with suppress(KeyboardInterrupt):
+        server.serve(
+            ViewedBoards(ports or (), calibrations, Path(), force=force), host, http_port, started
+        )
+
+
+def _has_display() -> bool:
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the conductance of a pressed cell follows the force on it: a simulation of textile contact.
+
+Symbols
+
+====== ============= =========================================================== ====
+symbol shape         meaning                                                     unit
+====== ============= =========================================================== ====
+t      (n,)          `time_s`, rising                                            s
+F      (n, R, C)     `force_n`, straight between the times, constant before      N
+y      (n, R, C)     what F has crept to                                         N
+e      (n, R, C)     force that would press the layers as deep, had they crept   N
+p      (n, R, C)     e, with the memory of unloading                             N
+w      (n, R, C)     log of the contact noise                                    1
+G      (n, R, C)     rise of the cell's conductance above rest                   S
+====== ============= =========================================================== ====
+
+    creep       e = (F + a y) / (1 + a),  T dy/dt = F - y            standard linear solid [Findley]
+    hysteresis  p = max(e, min(u(e), p before)),  u(e) = e + h e / (e + h)   generalised play [BS]
+    contact     c = k p^b exp(w),  G = c / (1 + c / full)      contact grows, until all is contact
+    noise       w = n(t) + d(t), two Ornstein-Uhlenbeck processes: n fast (contacts come and go),
+                d slow (the same press does not give the same twice)
+
+u(e) is the unloading branch: h above the loading branch at large force, none at zero force. So no
+force, for good, is no rise. k and b differ from cell to cell, log-normally.
+
+The defaults are fitted to the shape of public measurements of a piezoresistive cell
+(TAMS-Group/tams_tactile_sensor_array_hardware); no data of theirs are part of this project. Three
+series of 7 to 11 presses up to 7 to 8 N, one for each cover, by a cylindrical tip; measured there:
+
+================================================= ====================== =======================
+quantity                                          the three series       here
+================================================= ====================== =======================
+conductance on loading at 1 N [uS]                16, 38, 55             k = 30e-6 S
+exponent of loading, 0.2 to 2 N                   1.6, 1.7, 1.75         b = 1.7
+full contact [mS]                                 4.1, 4.1, 4.1          full = 4e-3 S
+unloading over loading, at 0.5 N                  1.5, 1.6, 1.5          1.6, at their pace
+the same at 1 N                                   1.0, 1.4, 1.2          1.4, at their pace
+width h that fits the loop beside the creep [N]   0, 0.045, 0.068        h = 0.06 N
+force that relaxes at hold, over what stays       0.30, 0.085, 0.089     a = 0.09
+time constant of that, in samples                 10.8, 5.4, 4.3         T = (1 + a) 5.4 samples
+scatter within a press, relative, 1 standard dev. 0.28, 0.20, 0.24       0.24
+correlation of that from sample to sample         0.33, 0.48, 0.66       time constant 1.4 samples
+scatter of whole presses, relative                0.11, 0.13, 0.13       0.12
+================================================= ====================== =======================
+
+Chosen, not measured: their rate is not told, and taken as 10 samples/s; cells differ by 20 % in k
+and 3 % in b; the slow noise has a minute's time constant (in two series each press conducted less
+than the one before). Their cell falls to its short, all at once, at 3 to 4 N; a knitted cell is
+taken to have nothing to break through, so here contact only saturates. k is in the range
+of theirs and gives a knitted skin's resistances: 33 kOhm at 1 N, 0.5 MOhm at 0.2 N, 1 kOhm at 9 N.
+Not modelled: a threshold below which the layers do not touch, pressure that spreads to neighbours.
+
+[BS] Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, section 2.4.
+[Findley] Findley, Lai and Onaran, "Creep and Relaxation of Nonlinear Viscoelastic Materials", 1976.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ohmskin.arrays import Float
+
+RAMP_S: Final = 1.0
+HOLD_S: Final = 0.3
+PAUSE_S: Final = (0.3, 0.9)
+# So long after its last press a cell's creep has faded to nanosiemens.
+LEAVE_S: Final = 2.5
+
+
+@dataclass(frozen=True)
+class PressModel:
+    """The cells of one skin under force; equations and where the defaults come from: the module.
+
+    siemens_at_1n: k [S/N^b]. exponent: b. full_contact_siemens [S]. play_n: h [N]. creep: a.
+    creep_time_s: T. noise, drift: standard deviations of n and d. noise_time_s, drift_time_s: their
+    time constants. gain_spread, exponent_spread: of ln k and ln b between cells. seed: of the cells
+    and of the noise. Raises ValueError for a value that cannot be.
+    """
+
+    siemens_at_1n: float = 30e-6
+    exponent: float = 1.7
+    full_contact_siemens: float = 4e-3
+    play_n: float = 0.06
+    creep: float = 0.09
+    creep_time_s: float = 0.6
+    noise: float = 0.24
+    noise_time_s: float = 0.14
+    drift: float = 0.12
+    drift_time_s: float = 60.0
+    gain_spread: float = 0.2
+    exponent_spread: float = 0.03
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        above_zero = ("siemens_at_1n", "exponent", "full_contact_siemens")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            above = field.name in above_zero or field.name.endswith("_time_s")
+            if not (np.isfinite(value) and (value > 0 if above else value >= 0)):
+                raise ValueError(
+                    f"{field.name} is {value}, it must be {'above' if above else '>='} 0"
+                )
+
+    def without_memory(self) -> PressModel:
+        """The same cells and the same noise, no hysteresis and no creep."""
+        return replace(self, play_n=0.0, creep=0.0)
+
+    def rise(self, time_s: ArrayLike, force_n: ArrayLike) -> Float:
+        """Conductance above rest G [S] over a history of forces [N], both (n,) or (n, R, C).
+
+        time_s (n,) rising. The first force counts as having been there for ever. The same
+        arguments give the same answer. Raises ValueError, naming the row, for times that do not
+        rise and for forces below 0.
+        """
+        times, forces = _checked(time_s, force_n)
+        cells = forces.reshape(len(times), -1)
+        random = np.random.default_rng(self.seed)
+        gain = self.siemens_at_1n * np.exp(
+            self.gain_spread * random.standard_normal(cells.shape[1])
+        )
+        exponent = self.exponent * np.exp(
+            self.exponent_spread * random.standard_normal(cells.shape[1])
+        )
+        log_noise = self.noise * _wander(times, cells.shape[1], self.noise_time_s, random)
+        log_noise += self.drift * _wander(times, cells.shape[1], self.drift_time_s, random)
+        contact = gain * self._pressing(times, cells) ** exponent * np.exp(log_noise)
+        return np.asarray(contact / (1 + contact / self.full_contact_siemens)).reshape(forces.shape)
+
+    def _pressing(self, times: Float, forces: Float) -> Float:
+        """p of the module's table [N], (n, cells)."""
+        steps = np.diff(times) / self.creep_time_s
+        stays = np.exp(-steps)
+        # Exact for forces that are straight between the times.
+        of_step = 1 + np.expm1(-steps) / steps
+        pressing = np.empty_like(forces)
+        crept = before = forces[0]
+        pressing[0] = before
+        for i in range(1, len(times)):
+            step_n = forces[i] - forces[i - 1]
+            crept = (
+                stays[i - 1] * crept + (1 - stays[i - 1]) * forces[i - 1] + of_step[i - 1] * step_n
+            )
+            depth = (forces[i] + self.creep * crept) / (1 + self.creep)
+            width = depth + self.play_n
+            unloading = depth + self.play_n * depth / np.where(width > 0, width, 1.0)
+            before = np.maximum(depth, np.minimum(unloading, before))
+            pressing[i] = before
+        return pressing
+
+
+def robot_presses(
+    peaks_n: Sequence[float], random: np.random.Generator, start_s: float
+) -> tuple[Float, Float]:
+    """A robot's presses of one cell: times [s] and forces [N], straight in between, each (4 m,).
+
+    Each press rises in 1 s, holds 0.3 s and leaves in 1 s, after a pause of 0.3 to 0.9 s.
+    """
+    times_s, forces_n = [], []
+    now_s = start_s
+    for peak_n in peaks_n:
+        now_s += random.uniform(*PAUSE_S)
+        times_s += [now_s, now_s + RAMP_S, now_s + RAMP_S + HOLD_S, now_s + 2 * RAMP_S + HOLD_S]
+        forces_n += [0.0, peak_n, peak_n, 0.0]
+        now_s = times_s[-1]
+    return np.array(times_s), np.array(forces_n)
+
+
+def _wander(times: Float, cells: int, time_constant_s: float, random: np.random.Generator) -> Float:
+    """Ornstein-Uhlenbeck processes of unit variance, (n, cells), exact at any steps of time."""
+    values = random.standard_normal((len(times), cells))
+    stays = np.exp(-np.diff(times) / time_constant_s)
+    fresh = np.sqrt(1 - stays**2)
+    for i, (stay, new) in enumerate(zip(stays, fresh, strict=True), start=1):
+        values[i] = stay * values[i - 1] + new * values[i]
+    return values
+
+
+def _checked(time_s: ArrayLike, force_n: ArrayLike) -> tuple[Float, Float]:
+    times = np.asarray(time_s, dtype=np.float64)
+    forces = np.asarray(force_n, dtype=np.float64)
+    if times.ndim != 1 or not times.size:
+        raise ValueError(f"time_s has shape {times.shape}, it must be (n,) with n above 0")
+    if forces.ndim not in (1, 3) or len(forces) != len(times):
+        raise ValueError(
+            f"force_n has shape {forces.shape}, it must be ({len(times)},) or "
+            f"({len(times)}, rows, columns)"
+        )
+    # Both written so that NaN fails too.
+    rising = np.isfinite(times) & np.append(True, np.diff(times) > 0)
+    if not rising.all():
+        row = int(np.argmin(rising))
+        raise ValueError(f"row {row}: time_s is {times[row]:g}, it must rise from row to row")
+    good = (np.isfinite(forces) & (forces >= 0)).reshape(len(times), -1).all(axis=1)
+    if not good.all():
+        raise ValueError(f"row {int(np.argmin(good))}: a force is below 0 or not finite")
+    return times, forces

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Skins that do not exist, and what touches them: simulation, for demos and tests.
+
+A scene is a skin whose cells at rest and wires are drawn from a seed, and touches that are a
+function of time alone, so that a scene can be asked twice and answers the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin
+from ohmskin.emulate.press import LEAVE_S, PressModel, robot_presses
+from ohmskin.emulate.skin_faults import SkinFaults
+
+REST_OHM: Final = 1.0e6
+TOP_WIRE_OHM: Final = 100.0
+BOTTOM_WIRE_OHM: Final = 200.0
+_SPREAD: Final = 0.1  # relative, of rest resistances and wires
+
+SCENES: Final = {
+    "rest": "nothing touches the skin",
+    "single": "one touch in the middle",
+    "ghost": "three corners of a rectangle: without an estimator the fourth seems touched too",
+    "multi": "five touches at places drawn from the seed",
+    "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
+    "moving": "one fingertip on a closed curve over the whole skin, once in 4 s",
+    "press": "a robot presses cell after cell, six times each with 0.4 to 8 N, 20 s a cell, once",
+}
+_MOVING_PERIOD_S: Final = 4.0
+_CORNERS_BEGIN_S: Final = 5.5
+_CORNERS_HELD_S: Final = 1.5
+_CORNER_OHM: Final = (5e3, 8e3, 6e3)
+_TREMBLE: Final = 0.05
+_TREMBLE_HZ: Final = (3.1, 4.7, 6.1)
+_FINGER_CELLS: Final = 0.7  # radius of the fingertip's pressure
+_FINGER_SIEMENS: Final = 2e-4
+_UNTOUCHED_S: Final = 2.0
+_PEAKS_N: Final = (0.5, 0.9, 1.5, 2.6, 4.4, 7.3)
+_PEAK_SPREAD: Final = 0.1  # relative, to either side
+_PRESS_STEP_S: Final = 0.01
+
+
+class Scene:
+    """A scene by name (see `SCENES`) on a rows x columns skin.
+
+    Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns). faults: what is
+    wrong with the skin; those that depend on the instant of a reading are the board's.
+
+    :raises ValueError: no such scene, or a skin too small for it or for the faults.
+    """
+
+    def __init__(
+        self,
+        name: str = "rest",
+        rows: int = 8,
+        columns: int = 8,
+        *,
+        seed: int = 0,
+        ref_top_ohm: float = 30_000.0,
+        ref_bottom_ohm: float = 30_000.0,
+        faults: SkinFaults | None = None,
+    ) -> None:
+        if name not in SCENES:
+            raise ValueError(f"no scene '{name}': there are {', '.join(SCENES)}")
+        if name in ("ghost", "corners") and min(rows, columns) < 2:
+            raise ValueError(f"the scene '{name}' needs a skin of at least 2x2")
+        self.name = name
+        self.rows = rows
+        self.columns = columns
+        self._faults = faults or SkinFaults()
+        self._faults.check(rows, columns)
+        random = np.random.default_rng(seed)
+
+        def spread(middle: float) -> Float:
+            return middle * np.exp(_SPREAD * random.standard_normal((rows, columns)))
+
+        self._rest = Skin(
+            cell_siemens=1 / spread(REST_OHM),
+            top_wire_ohm=spread(TOP_WIRE_OHM),
+            bottom_wire_ohm=spread(BOTTOM_WIRE_OHM),
+            ref_top_ohm=ref_top_ohm,
+            ref_bottom_ohm=ref_bottom_ohm,
+        )
+        self._touches = self._place(random)
+        self._robot = _Robot(rows, columns, seed) if name == "press" else None
+        self._still_ratio = lru_cache(maxsize=1)(lambda: self._readings(0.0))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the touches change with time."""
+        return self.name in ("corners", "moving", "press")
+
+    @property
+    def rest_ratio(self) -> Float:
+        """Exact readings of the untouched skin, shape (rows, columns, 4)."""
+        return self._faults.readings(self._faults.damaged(self._rest))
+
+    def skin(self, time_s: float) -> Skin:
+        """The truth: every resistance at a time."""
+        if self._robot is not None:
+            touch = self._robot.touch(time_s)[0]
+        elif self.name == "corners":
+            touch = self._corners(time_s)
+        else:
+            touch = self._finger(time_s) if self.moves else self._touches
+        touched = replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
+        return self._faults.damaged(touched)
+
+    def force_n(self, time_s: float) -> Float:
+        """The truth of the scene "press": force on every cell [N], (rows, columns).
+
+        :raises ValueError: a scene that presses with conductances: no force is known.
+        """
+        if self._robot is not None:
+            return self._robot.touch(time_s)[1]
+        if self.name == "rest":
+            return np.zeros((self.rows, self.columns))
+        raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
+
+    def touched(self, time_s: float) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+        """Cells whose conductance a touch raises by 1 microsiemens or more, (rows, columns)."""
+        untouched = self._faults.damaged(self._rest)
+        cells: np.ndarray[tuple[int, int], np.dtype[np.bool_]] = (
+            self.skin(time_s).cell_siemens - untouched.cell_siemens >= 1e-6
+        )
+        return cells
+
+    def ratio(self, time_s: float) -> Float:
+        """Exact readings at a time, shape (rows, columns, 4)."""
+        return self._readings(time_s) if self.moves else self._still_ratio()
+
+    def _readings(self, time_s: float) -> Float:
+        return self._faults.readings(self.skin(time_s))
+
+    def _place(self, random: np.random.Generator) -> Float:
+        touches = np.zeros((self.rows, self.columns))
+        if self.name == "single":
+            touches[self.rows // 2, self.columns // 2] = 1 / 5e3
+        elif self.name == "ghost":
+            (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
+            # Light touches: heavy ones leave a trace at the fourth corner wherever a method
+            # neglects the wires.
+            touches[top, left] = 1 / 30e3
+            touches[top, right] = 1 / 40e3
+            touches[bottom, left] = 1 / 35e3
+        elif self.name == "multi":
+            count = min(5, touches.size)
+            cells = random.choice(touches.size, count, replace=False)
+            touches.flat[cells] = 1 / np.exp(random.uniform(np.log(2e3), np.log(5e4), count))
+        return touches
+
+    def _corners(self, time_s: float) -> Float:
+        touches = np.zeros((self.rows, self.columns))
+        if time_s < _CORNERS_BEGIN_S:
+            return touches
+        (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
+        across = int((time_s - _CORNERS_BEGIN_S) / _CORNERS_HELD_S) % 2
+        alone = (bottom, right) if across else (top, left)
+        cells = (alone, (top, right), (bottom, left))
+        for cell, ohm, hz in zip(cells, _CORNER_OHM, _TREMBLE_HZ, strict=True):
+            touches[cell] = (1 + _TREMBLE * np.sin(2 * np.pi * hz * time_s)) / ohm
+        return touches
+
+    def _finger(self, time_s: float) -> Float:
+        angle = 2 * np.pi * time_s / _MOVING_PERIOD_S
+        row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
+        column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
+        away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
+        touch: Float = _FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_CELLS**2))
+        return touch
+
+
+def _two_of(count: int) -> tuple[int, int]:
+    """Two lines well apart, a quarter in from the edges where there is room."""
+    return count // 4, count - 1 - count // 4
+
+
+class _Robot:
+    """Forces and rises of the scene "press", cell by cell: one alone is pressed at any time."""
+
+    def __init__(self, rows: int, columns: int, seed: int) -> None:
+        self._shape = (rows, columns)
+        random = np.random.default_rng([seed, rows, columns])
+        starts_s = [_UNTOUCHED_S]
+        self._histories: list[tuple[Float, Float, Float]] = []
+        for _ in range(rows * columns):
+            lift = 1 + _PEAK_SPREAD * random.uniform(-1, 1, len(_PEAKS_N))
+            knots_s, knots_n = robot_presses(_PEAKS_N * lift, random, starts_s[-1])
+            starts_s.append(float(knots_s[-1]) + LEAVE_S)
+            times_s = np.arange(starts_s[-2], starts_s[-1], _PRESS_STEP_S)
+            forces_n = np.interp(times_s, knots_s, knots_n)
+            # A model of its own for each cell: one of all cells takes 64 times the memory.
+            model = PressModel(seed=int(random.integers(1 << 32)))
+            self._histories.append((times_s, forces_n, model.rise(times_s, forces_n)))
+        self._starts_s = np.array(starts_s)
+
+    def touch(self, time_s: float) -> tuple[Float, Float]:
+        """Rises [S] and forces [N] at a time, each (rows, columns)."""
+        rise, force_n = np.zeros(self._shape), np.zeros(self._shape)
+        cell = int(np.searchsorted(self._starts_s, time_s, side="right")) - 1
+        if 0 <= cell < rise.size:
+            times_s, forces_n, rises = self._histories[cell]
+            force_n.flat[cell] = np.interp(time_s, times_s, forces_n)
+            rise.flat[cell] = np.interp(time_s, times_s, rises)
+        return rise, force_n

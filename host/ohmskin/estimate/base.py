@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every estimator is told, what it answers, and the steps they share.
+
+An estimator turns the readings of one frame, shape (R, C, 4), into cell conductances. A method
+derives from `Estimator` and writes `_solve`; checking the readings, timing, and deciding which
+cells are touched happen here, so that all methods do them alike.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import (
+    CONFIGURATIONS,
+    DEFAULT_REF_OHM,
+    READINGS_PER_CELL,
+    check_references,
+    current_std,
+    ratio_from_current,
+)
+from ohmskin.estimate.port_readings import PortReader, PortReadings
+from ohmskin.link.codes import check_adc_bits, ratio_std
+
+# No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
+MIN_CELL_SIEMENS: Final = 1e-9
+MAX_CELL_SIEMENS: Final = 1.0
+
+TOUCH_SIEMENS: Final = 0.5e-6
+TOUCH_STDS: Final = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class SkinKnowledge:
+    """What is known of a skin before a frame is read.
+
+    rows, columns: its size. ref_top_ohm, ref_bottom_ohm [ohm]. adc_bits: resolution of the
+    readings, None when they are exact. rest_ratio: readings (R, C, 4) of the untouched skin.
+    nominal_top_wire_ohm, nominal_bottom_wire_ohm: one wire segment of each layer [ohm].
+    Raises ValueError for a value that cannot be.
+    """
+
+    rows: int
+    columns: int
+    ref_top_ohm: float = DEFAULT_REF_OHM
+    ref_bottom_ohm: float = DEFAULT_REF_OHM
+    adc_bits: int | None = None
+    rest_ratio: Float | None = None
+    nominal_top_wire_ohm: float | None = None
+    nominal_bottom_wire_ohm: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError(f"a skin has at least 1x1 cells, not {self.rows}x{self.columns}")
+        check_references(self.ref_top_ohm, self.ref_bottom_ohm)
+        if self.adc_bits is not None:
+            check_adc_bits(self.adc_bits)
+        if self.rest_ratio is not None:
+            rest = check_ratio(self.rest_ratio, self.rows, self.columns, name="rest_ratio").copy()
+            rest.setflags(write=False)
+            object.__setattr__(self, "rest_ratio", rest)
+        for layer in ("top", "bottom"):
+            ohm = getattr(self, f"nominal_{layer}_wire_ohm")
+            if ohm is not None and not (np.isfinite(ohm) and ohm >= 0):
+                raise ValueError(f"nominal_{layer}_wire_ohm must be finite and >= 0, not {ohm}")
+
+    @property
+    def ratio_std(self) -> float:
+        """Standard deviation of one reading, as a ratio to Vdd."""
+        return ratio_std(self.adc_bits)
+
+    @property
+    def current_std(self) -> float:
+        """Standard deviation of a cell's port current per Vdd [S]."""
+        return current_std(self.ratio_std, self.ref_top_ohm, self.ref_bottom_ohm)
+
+    @property
+    def ref_ohm(self) -> float:
+        """Both reference resistors in series [ohm]: all that limits a shorted port's current."""
+        return self.ref_top_ohm + self.ref_bottom_ohm
+
+    @property
+    def wire_ohm(self) -> tuple[float, float] | None:
+        """Nominal wire segments, top and bottom [ohm]; None unless both are told."""
+        top, bottom = self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm
+        return None if top is None or bottom is None else (top, bottom)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The answer for one frame, with its evidence.
+
+    cell_siemens_std: rounding is uniform, not normal: about 58 % of cells lie within one standard
+    deviation and 98 % within two. It covers the readings' noise, not what the method neglects.
+    NaN where the method gives none.
+    cell_siemens, cell_siemens_std, touched, top_wire_ohm, bottom_wire_ohm: shape (R, C), wires NaN
+    where the method does not estimate them. chi2: sum of squared residuals of all readings over
+    the variance of one, divided by their number (about 1 or less when the model holds).
+    message: empty if converged, else why not, or what is wrong with
+    the readings (`port_readings`). seconds: wall time of this frame.
+    """
+
+    cell_siemens: Float
+    cell_siemens_std: Float
+    touched: NDArray[np.bool_]
+    top_wire_ohm: Float
+    bottom_wire_ohm: Float
+    chi2: float
+    iterations: int
+    converged: bool
+    message: str
+    seconds: float
+
+    @property
+    def cell_ohm(self) -> Float:
+        """1 / cell_siemens [ohm], shape (R, C); inf where the conductance is 0."""
+        with np.errstate(divide="ignore"):
+            return 1.0 / self.cell_siemens
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What a method finds; `Estimator.estimate` adds the rest. Wires None: not estimated.
+
+    cell_siemens_std_down: where an error downwards is not as likely as upwards.
+    """
+
+    cell_siemens: Float
+    cell_siemens_std: Float
+    chi2: float
+    iterations: int = 1
+    message: str = ""
+    top_wire_ohm: Float | None = None
+    bottom_wire_ohm: Float | None = None
+    cell_siemens_std_down: Float | None = None
+
+    @property
+    def std_down(self) -> Float:
+        """Downwards, where that differs."""
+        down = self.cell_siemens_std_down
+        return self.cell_siemens_std if down is None else down
+
+
+class Estimator(ABC):
+    """One method for one skin, fed frame after frame."""
+
+    name: ClassVar[str]
+
+    def __init__(self, knowledge: SkinKnowledge) -> None:
+        self.knowledge = knowledge
+        self._reader = PortReader(
+            (knowledge.rows, knowledge.columns),
+            (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm),
+            knowledge.adc_bits,
+            knowledge.rest_ratio,
+            knowledge.wire_ohm,
+        )
+        self._rest: Solution | None = None
+
+    @abstractmethod
+    def _solve(self, ports: PortReadings) -> Solution:
+        """Answer for one frame, started from the previous frame if there is one.
+
+        Must return finite values with an honest standard deviation (NaN: none is known), or set
+        `message`.
+        """
+
+    # Not abstract: a method that keeps nothing from frame to frame has nothing to forget.
+    def reset(self) -> None:  # noqa: B027
+        """Forget the previous frame: the next one starts afresh. What is known of rest stays."""
+
+    def rest(self) -> Solution | None:
+        """This method's own answer to the rest readings; None where they are not known."""
+        if self._rest is None and self.knowledge.rest_ratio is not None:
+            self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
+            self.reset()
+        return self._rest
+
+    def estimate(self, ratio: ArrayLike) -> Estimate:
+        """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
+
+        A cell is touched when g - g_rest > max(0.5e-6 S, 4 sqrt(std^2 + std_rest^2)), std the one
+        downwards. g_rest is this method's own answer to `rest_ratio`; without one it is the median
+        over the cells of this frame, which supposes that less than half of them are touched (one
+        cell alone then never is). A standard deviation of NaN counts as none.
+        Raises ValueError for another shape, or for a reading that is no number in 0..1.
+        """
+        known = self.knowledge
+        readings = check_ratio(ratio, known.rows, known.columns)
+        self.rest()
+        started = time.perf_counter()
+        ports = self._reader.read(readings)
+        found = self._solve(ports)
+        message = "; ".join(filter(None, (ports.fault, found.message)))
+        touched = self._touched(found)
+        unknown = np.full((known.rows, known.columns), np.nan)
+        return Estimate(
+            cell_siemens=found.cell_siemens,
+            cell_siemens_std=found.cell_siemens_std,
+            touched=touched,
+            top_wire_ohm=unknown if found.top_wire_ohm is None else found.top_wire_ohm,
+            bottom_wire_ohm=unknown if found.bottom_wire_ohm is None else found.bottom_wire_ohm,
+            chi2=found.chi2,
+            iterations=found.iterations,
+            converged=not message,
+            message=message,
+            seconds=time.perf_counter() - started,
+        )
+
+    def _touched(self, found: Solution) -> NDArray[np.bool_]:
+        if self._rest is None:
+            rise = found.cell_siemens - np.median(found.cell_siemens)
+            rise_std = found.std_down
+        else:
+            rise = found.cell_siemens - self._rest.cell_siemens
+            rise_std = np.hypot(found.std_down, self._rest.cell_siemens_std)
+        return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
+
+    def _chi2(self, ratio: Float, current_siemens: Float) -> float:
+        """chi2 per reading of a model that predicts these port currents (R, C) [S]."""
+        known = self.knowledge
+        model = ratio_from_current(current_siemens, known.ref_top_ohm, known.ref_bottom_ohm)
+        residual = (ratio - model).ravel() / known.ratio_std
+        return float(residual @ residual) / residual.size
+
+
+def check_ratio(ratio: ArrayLike, rows: int, columns: int, name: str = "ratio") -> Float:
+    """Readings as float64 (R, C, 4), or ValueError naming the first offending cell."""
+    readings = np.asarray(ratio, dtype=np.float64)
+    expected = (rows, columns, READINGS_PER_CELL)
+    if readings.shape != expected:
+        raise ValueError(f"{name} has shape {readings.shape}, this skin {expected}")
+    # Written so that NaN fails too.
+    good = (readings >= 0) & (readings <= 1)
+    if not good.all():
+        row, column, k = (int(index) for index in np.argwhere(~good)[0])
+        raise ValueError(
+            f"{name} of cell ({row}, {column}), reading {CONFIGURATIONS[k]}, is "
+            f"{readings[row, column, k]:g}, not in 0..1"
+        )
+    return readings

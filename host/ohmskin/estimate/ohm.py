@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Method `ohm`: a port's resistance is the cell's, as if there were no other path and no wire.
+
+Symbols: I (R, C) port current per Vdd [S], R = R_top + R_bottom [ohm], g (R, C) cells [S].
+
+    g = 1 / (1/I - R) = I / (1 - I R) ,    std(g) = (dg/dI) std(I) = (1 + g R)^2 std(I)
+
+This is the paper's naive estimate. It sees ghosts: three pressed corners of a rectangle make the
+fourth look pressed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, Estimator, Solution
+from ohmskin.estimate.port_readings import PortReadings
+
+# Beyond what any cell could draw by this many standard deviations, a reading is at fault.
+_FAULT_STDS = 5.0
+
+
+def conductance_from_current(current_siemens: Float, ref_ohm: float) -> Float:
+    """g = I / (1 - I R) [S], I first clipped to what cells of 1e-9 S to 1 S draw."""
+    least, most = port_current(MIN_CELL_SIEMENS, ref_ohm), port_current(MAX_CELL_SIEMENS, ref_ohm)
+    current = np.clip(current_siemens, least, most)
+    return np.clip(current / (1.0 - current * ref_ohm), MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
+
+
+def port_current(cell_siemens: float, ref_ohm: float) -> float:
+    """I = g / (1 + g R) per Vdd [S]: the current through one cell and both references."""
+    return cell_siemens / (1.0 + cell_siemens * ref_ohm)
+
+
+class OhmEstimator(Estimator):
+    """rho = Rc. A port that reads shorter than its reference resistors gets the conductance bound
+    of 1 S with the large standard deviation that belongs there; beyond 5 standard deviations past
+    the bound the frame is not converged."""
+
+    name = "ohm"
+
+    def _solve(self, ports: PortReadings) -> Solution:
+        ref_ohm = self.knowledge.ref_ohm
+        current = ports.current
+        cell = conductance_from_current(current, ref_ohm)
+        allowed = port_current(MAX_CELL_SIEMENS, ref_ohm) + _FAULT_STDS * self.knowledge.current_std
+        excess = current - allowed
+        message = ""
+        if (excess > 0).any():
+            row, column = np.unravel_index(int(np.argmax(excess)), excess.shape)
+            message = f"cell ({row}, {column}) reads a current that no resistance allows"
+        return Solution(
+            cell_siemens=cell,
+            cell_siemens_std=(1.0 + cell * ref_ohm) ** 2 * ports.current_std,
+            chi2=self._chi2(ports.ratio, cell / (1.0 + cell * ref_ohm)),
+            message=message,
+        )

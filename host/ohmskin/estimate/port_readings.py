@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a frame's readings to one current per port, and what no touches can make of a skin.
+
+Symbols: y (R, C, 4) readings, s their standard deviation; I, I_rest (R, C) port currents per Vdd,
+of this frame and of the rest readings, and s_I theirs [S].
+
+    chi2_cell = sum_k (y_k - y_k(I))^2 / s^2          three degrees of freedom: one current, four
+    s_I grows with the root of chi2_cell / 3, or of the median cell's if that is larger
+
+A frame is at fault, and its answer not to be relied on, where
+
+- the readings of most cells disagree by far more than noise, or those of one cell so that no three
+  of the four agree (one that is stuck is left out);
+- a current is below that at rest: lowering resistances lowers the resistance between any two
+  electrodes (Rayleigh's monotonicity law), so touches do not do that, but open lines do;
+- two lines that differed at rest draw the same current from every other, and all of it more than
+  at rest: shorted electrodes; or they did so at rest already, and more than the other lines;
+- a port has less resistance than it had if every cell were pressed as hard as can be, by the same
+  law: a row shorted to a column;
+- a line showed no current at rest, though others did.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import (
+    READING_OFFSET,
+    READING_SIGN,
+    READINGS_PER_CELL,
+    Skin,
+    current_from_ratio,
+    current_std,
+    port_resistance_ohm,
+    ratio_from_current,
+    reference_ohm,
+)
+from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
+from ohmskin.link.codes import ratio_std
+
+_DEGREES: Final = READINGS_PER_CELL - 1
+_MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
+# Disagreement of a cell's readings, root of its mean square, ratio to Vdd: of most cells, of one.
+DISAGREE_ALL: Final = 0.016
+DISAGREE_ONE: Final = 0.03
+DISAGREE_OVER_NOISE: Final = 6.0
+AGREE: Final = 4.0  # deviations of a reading: three that disagree by less agree
+DROP_SHARE: Final = 0.85  # of the current at rest, below which drift is no explanation
+CLEAR_STDS: Final = 5.0
+# Joined electrodes give the same code, or differ by what the readings disagree within a cell; one
+# code is 3.5 deviations of rounding.
+SAME_STDS: Final = 2.5
+# Shorted lines draw so much more than at rest, or than other lines.
+RISE_SHARE: Final = 1.15
+PAIR_SHARE: Final = 1.15
+WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of it is pressed
+
+
+@dataclass(frozen=True, eq=False)
+class PortReadings:
+    """One frame: ratio (R, C, 4); current, its standard deviation [S] (R, C); fault, or empty."""
+
+    ratio: Float
+    current: Float
+    current_std: Float
+    fault: str = ""
+
+
+class PortReader:
+    """Reads frames of a skin whose references and, perhaps, rest readings and wires are known.
+
+    wire_ohm: nominal ones of a segment, top and bottom, or None. rest_ratio: (R, C, 4) or None.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        ref_ohm: tuple[float, float],
+        adc_bits: int | None,
+        rest_ratio: Float | None,
+        wire_ohm: tuple[float, float] | None,
+    ) -> None:
+        self._ref_ohm = ref_ohm
+        self._loop_ohm = sum(ref_ohm)
+        self._slope = READING_SIGN * reference_ohm(*ref_ohm)
+        self._ratio_std = ratio_std(adc_bits)
+        self._current_std = current_std(self._ratio_std, *ref_ohm)
+        self._highest_current: Float = np.full(shape, np.inf)
+        if wire_ohm is not None:
+            top, bottom = (np.full(shape, WIRE_SHARE * ohm) for ohm in wire_ohm)
+            pressed = Skin(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
+            self._highest_current = 1.0 / (port_resistance_ohm(pressed) + self._loop_ohm)
+        self._rest: PortReadings | None = None
+        self._rest_fault = ""
+        if rest_ratio is not None:
+            self._rest = rest = self.read(rest_ratio)
+            self._rest_apart = [_apart(rest, axis) for axis in (0, 1)]
+            self._rest_fault = self._fault_at_rest(rest)
+
+    def read(self, ratio: Float) -> PortReadings:
+        """Currents of checked readings (R, C, 4), and what is wrong with them."""
+        current = current_from_ratio(ratio, *self._ref_ohm)
+        residual = ratio - ratio_from_current(current, *self._ref_ohm)
+        square = np.einsum("ijk,ijk->ij", residual, residual)
+        middle = square.size // 2
+        typical = float(np.partition(square, middle, axis=None)[middle])
+        variance = self._ratio_std**2
+        common = max(1.0, typical / (_MEDIAN_CHI2 * variance))
+        std = self._current_std * np.sqrt(np.maximum(common, square / (_DEGREES * variance)))
+        fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
+        found = PortReadings(ratio, current, std)
+        if not fault:
+            fault = self._short(found) or (self._change(found) if self._rest is not None else "")
+        return replace(found, fault=fault) if fault else found
+
+    def _disagreement(
+        self, current: Float, std: Float, ratio: Float, square: Float, typical: float
+    ) -> str:
+        """Readings that disagree; leaves out, in `current` and `std`, one that three others do not
+        agree with.
+        """
+        most = (typical / _DEGREES) ** 0.5
+        if most > DISAGREE_ALL:
+            return f"the four readings of most cells disagree, by {100 * most:.0f} % of Vdd"
+        limit = max(DISAGREE_ONE, DISAGREE_OVER_NOISE * most)
+        if square.max() <= _DEGREES * limit**2:
+            return ""
+        fault = ""
+        for index in np.flatnonzero(square > _DEGREES * limit**2):
+            row, column = divmod(int(index), square.shape[1])
+            without, off = self._without_one(ratio[row, column])
+            if off < max(AGREE * self._ratio_std, DISAGREE_OVER_NOISE * most):
+                current[row, column] = without
+                std[row, column] = 2.0 * std.min()
+            else:
+                by = 100 * float(square[row, column] / _DEGREES) ** 0.5
+                fault = f"cell ({row}, {column}): its readings disagree by {by:.0f} % of Vdd"
+        return fault
+
+    def _without_one(self, ratio: Float) -> tuple[float, float]:
+        """The current of the three of four readings that agree best, and how they disagree."""
+        found = []
+        for left_out in range(READINGS_PER_CELL):
+            kept = np.arange(READINGS_PER_CELL) != left_out
+            slope = self._slope[kept]
+            current = float(slope @ (ratio - READING_OFFSET)[kept] / (slope @ slope))
+            off = (ratio - READING_OFFSET)[kept] - slope * current
+            found.append((float(off @ off / (kept.sum() - 1)) ** 0.5, current))
+        off, current = min(found)
+        return current, off
+
+    def _short(self, found: PortReadings) -> str:
+        """A port with less resistance than a skin can have."""
+        excess = found.current - self._highest_current - CLEAR_STDS * found.current_std
+        worst = int(excess.argmax())
+        if excess.flat[worst] <= 0:
+            return ""
+        return f"{_cell(worst, excess)}: less resistance than wires have: row and column shorted?"
+
+    def _change(self, found: PortReadings) -> str:
+        """What has changed since rest, and no touch can have."""
+        rest = self._rest
+        assert rest is not None
+        std = np.hypot(found.current_std, rest.current_std)
+        drop = DROP_SHARE * rest.current - found.current - CLEAR_STDS * std
+        worst = int(drop.argmax())
+        if np.mean(drop > 0) > 0.5:
+            return "the whole skin conducts less than at rest: take the rest readings anew"
+        if drop.flat[worst] > 0:
+            return f"{_cell(worst, drop)}: conducts less than at rest, is a line open?"
+        risen = found.current > RISE_SHARE * rest.current
+        for axis, line in enumerate(("rows", "columns")):
+            if found.current.shape[1 - axis] < 3:
+                continue
+            up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
+            if np.count_nonzero(up) < 2:
+                continue
+            same = (_apart(found, axis) < SAME_STDS) & up & up[:, None]
+            same &= self._rest_apart[axis] > 2 * SAME_STDS
+            if same.any():
+                one, other = (int(index) for index in np.argwhere(same)[0])
+                return f"{line} {one} and {other} read alike as they did not at rest: shorted?"
+        return ""
+
+    def _fault_at_rest(self, rest: PortReadings) -> str:
+        clear = rest.current / rest.current_std
+        for axis, line in enumerate(("row", "column")):
+            most = clear.max(axis=1 - axis)
+            dark = (most < CLEAR_STDS) & (float(np.median(most)) > 4 * CLEAR_STDS)
+            if dark.any():
+                return f"{line} {int(dark.argmax())} conducted nothing at rest: is it open?"
+            current = rest.current if axis == 0 else rest.current.T
+            lines, ports = current.shape
+            if ports < 3 or lines < 4:
+                continue
+            up = np.all(current > PAIR_SHARE * np.median(current, axis=0), axis=1)
+            same = np.triu((self._rest_apart[axis] < SAME_STDS) & up & up[:, None], 1)
+            if same.any():
+                one, other = (int(index) for index in np.argwhere(same)[0])
+                return f"{line}s {one} and {other} conducted alike at rest, and more than others"
+        return ""
+
+
+def _apart(ports: PortReadings, axis: int) -> Float:
+    """Largest difference between the currents of two rows (axis 0) or columns, over its deviation.
+
+    Square, lines by lines.
+    """
+    current, std = ports.current, ports.current_std
+    if axis:
+        current, std = current.T, std.T
+    difference = np.abs(current[:, None, :] - current[None, :, :])
+    difference /= np.maximum(std[:, None, :], std[None, :, :])
+    return np.asarray(difference.max(axis=2))
+
+
+def _cell(index: int, of: Float) -> str:
+    row, column = np.unravel_index(index, of.shape)
+    return f"cell ({int(row)}, {int(column)})"

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration file (JSON): one skin's rest and force curves, kept from session to session.
+
+======================== ================= ======================================================
+field                    shape             meaning
+======================== ================= ======================================================
+format, schema                             "ohmskin calibration", 1
+unit_id                                    the board's, 0 to 2^32 - 1
+date                                       ISO 8601
+method                                     the estimator that told the cells, or "voltage"
+rows, columns                              R, C
+nominal_top_wire_ohm                       one wire segment of each layer [ohm], null: not told
+nominal_bottom_wire_ohm
+indenter_area_m2                           what the skin was pressed with [m^2]
+rest.date                                  ISO 8601
+rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
+rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
+tare                                       the same of a later date, in force instead; null: none
+kind                     R, C              "linear" or "power"
+slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
+======================== ================= ======================================================
+
+Numbers are written so that they are read back bit for bit. A file from elsewhere is data: its size,
+its fields, their types, shapes and ranges are checked before anything is made of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import READINGS_PER_CELL
+from ohmskin.estimate.base import SkinKnowledge, check_ratio
+from ohmskin.estimate.levels import LEVEL_METHODS, LevelMeter
+from ohmskin.files import whole_file
+from ohmskin.force.curve import ForceModel
+from ohmskin.record.readings import MAX_CELLS
+
+FORMAT: Final = "ohmskin calibration"
+SCHEMA: Final = 1
+MAX_FILE_BYTES: Final = 4_000_000  # 4096 cells of 13 fields take about 1 MB
+MAX_UNIT_ID: Final = 2**32 - 1
+# Far beyond the slope of any power law in siemens, and predictions do not overflow.
+MAX_NUMBER: Final = 1e60
+_NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
+_RESTS: Final = ("rest", "tare")
+_WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm")
+_MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """The untouched skin: when, its readings (R, C, 4) [1], and the levels (R, C) that they show.
+
+    Raises ValueError, naming the field, for a value that cannot be.
+    """
+
+    date: str
+    ratio: Float
+    level: Float
+
+    def __post_init__(self) -> None:
+        _check_date(self.date)
+        if self.level.ndim != 2 or 0 in self.level.shape:
+            raise ValueError(f"level at rest has shape {self.level.shape}, not (rows, columns)")
+        good = np.isfinite(self.level) & (self.level >= 0)
+        if not good.all():
+            row, column = (int(index) for index in np.argwhere(~good)[0])
+            raise ValueError(f"level at rest of cell ({row}, {column}) is not finite and >= 0")
+        rows, columns = self.level.shape
+        check_ratio(self.ratio, rows, columns, name="ratio at rest")
+
+    @classmethod
+    def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
+        """What `method` makes of the rest readings in `knowledge`."""
+        # A reading below its offset is a cell of no conductance, within the noise.
+        level = np.maximum(LevelMeter(method, knowledge).rest(), 0.0)
+        return cls(date, np.asarray(knowledge.rest_ratio), level)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a calibration file holds, checked; fields, shapes and units in the module's table.
+
+    Raises ValueError, naming the field, for a value that cannot be.
+    """
+
+    unit_id: int
+    date: str
+    method: str
+    rest: Rest
+    model: ForceModel
+    indenter_area_m2: float
+    nominal_top_wire_ohm: float | None = None
+    nominal_bottom_wire_ohm: float | None = None
+    tare: Rest | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.unit_id <= MAX_UNIT_ID:
+            raise ValueError(f"unit_id is {self.unit_id}, not in 0..{MAX_UNIT_ID}")
+        _check_date(self.date)
+        if self.method not in LEVEL_METHODS:
+            raise ValueError(
+                f"method is {self.method[:40]!r}, not one of {', '.join(LEVEL_METHODS)}"
+            )
+        shape = self.model.kind.shape
+        for name, rest in (("rest", self.rest), ("tare", self.tare)):
+            if rest is not None and rest.level.shape != shape:
+                raise ValueError(f"{name} has shape {rest.level.shape}, the model {shape}")
+        if self.rest.level.size > MAX_CELLS:
+            raise ValueError(f"{self.rows}x{self.columns} cells, more than {MAX_CELLS}")
+        if not (np.isfinite(self.indenter_area_m2) and self.indenter_area_m2 > 0):
+            raise ValueError(f"indenter_area_m2 is {self.indenter_area_m2}, it must be above 0")
+        for name in _WIRES:
+            ohm = getattr(self, name)
+            if ohm is not None and not (np.isfinite(ohm) and ohm >= 0):
+                raise ValueError(f"{name} is {ohm}, it must be finite and >= 0")
+
+    @property
+    def rows(self) -> int:
+        """R."""
+        return int(self.rest.level.shape[0])
+
+    @property
+    def columns(self) -> int:
+        """C."""
+        return int(self.rest.level.shape[1])
+
+    @property
+    def untouched(self) -> Rest:
+        """The rest in force: the tare, if there is one."""
+        return self.rest if self.tare is None else self.tare
+
+    def check(self, unit_id: int, rows: int, columns: int, *, force: bool = False) -> None:
+        """Raise ValueError unless this calibration is of this board's skin, or `force` is given.
+
+        Forced onto another number of cells it passes here, but `predict` refuses the arrays.
+        """
+        if force:
+            return
+        if (rows, columns) != (self.rows, self.columns):
+            raise ValueError(
+                f"this calibration is of a {self.rows}x{self.columns} skin, the board scans "
+                f"{rows}x{columns}: calibrate this skin"
+            )
+        if unit_id != self.unit_id:
+            raise ValueError(
+                f"this calibration is of unit {self.unit_id}, the board is unit {unit_id}: "
+                "calibrate this skin, or force it if the same skin has a new board"
+            )
+
+    def predict(self, level: ArrayLike, level_std: ArrayLike) -> tuple[Float, Float]:
+        """Force and its standard deviation [N], (R, C): by `model`, of level - untouched.level.
+
+        level, level_std (R, C): `cell_siemens` and `cell_siemens_std` of an estimate by `method`
+        [S]; for `voltage` `voltage_level` of the readings and the std of one reading [1]. The error
+        of rest is in every press alike, so the curves hold it already. Raises ValueError.
+        """
+        levels = np.asarray(level, dtype=np.float64)
+        at_rest = self.untouched.level
+        if levels.shape != at_rest.shape:
+            raise ValueError(f"level has shape {levels.shape}, this calibration {at_rest.shape}")
+        return self.model.predict(levels - at_rest, level_std)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file that is either complete or not there: a temporary file, then a rename.
+
+        Raises ValueError if it cannot be written.
+        """
+        content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
+        for name in ("unit_id", "date", "method", "rows", "columns", *_WIRES, "indenter_area_m2"):
+            content[name] = getattr(self, name)
+        for name in _RESTS:
+            content[name] = _rest_content(getattr(self, name))
+        for name in _MODEL_FIELDS:
+            nested = getattr(self.model, name).tolist()
+            if name in _NULL_FIELDS:
+                nested = [[None if x != x else x for x in row] for row in nested]
+            content[name] = nested
+        text = ",\n".join(
+            f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
+            for name, value in content.items()
+        )
+        with whole_file(path) as file:
+            file.write(f"{{\n{text}\n}}\n".encode())
+
+
+def _check_date(date: str) -> None:
+    try:
+        datetime.fromisoformat(date)
+    except ValueError:
+        raise ValueError(f"date is {date[:40]!r}, not ISO 8601") from None
+
+
+def _rest_content(rest: Rest | None) -> dict[str, Any] | None:
+    if rest is None:
+        return None
+    return {"date": rest.date, "ratio": rest.ratio.tolist(), "level": rest.level.tolist()}
+
+
+def load_calibration(path: str | os.PathLike[str]) -> Calibration:
+    """Read and check a calibration file.
+
+    Raises ValueError, one line that names the file and the field, for whatever is wrong with it.
+    """
+    try:
+        return _from_content(_read_json(path))
+    except ValueError as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{os.fspath(path)}: {reason}") from error
+
+
+def _read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+    try:
+        with open(path, "rb") as file:
+            encoded = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror or error}") from error
+    if len(encoded) > MAX_FILE_BYTES:
+        raise ValueError(f"more than {MAX_FILE_BYTES} bytes")
+    try:
+        content = json.loads(
+            encoded.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_repeats
+        )
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"no JSON of ours: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
+    if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
+        raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
+    return content
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number")
+
+
+def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in content:
+            raise ValueError(f"field {name[:40]!r} stands twice")
+        content[name] = value
+    return content
+
+
+def _from_content(content: dict[str, Any]) -> Calibration:
+    known = {"format", "schema", "unit_id", "date", "method", "rows", "columns", *_RESTS}
+    _require_fields(content, known | {*_WIRES, "indenter_area_m2", *_MODEL_FIELDS})
+    for name in ("unit_id", "rows", "columns"):
+        if type(content[name]) is not int:
+            raise ValueError(f"{name} is not an integer")
+    for name in ("date", "method"):
+        if not isinstance(content[name], str):
+            raise ValueError(f"{name} is not text")
+    shape = (content["rows"], content["columns"])
+    if min(shape) < 1 or max(shape) > MAX_CELLS or shape[0] * shape[1] > MAX_CELLS:
+        raise ValueError(f"rows and columns: not 1 to {MAX_CELLS} cells")
+    arrays = {name: _array(name, content[name], shape) for name in _MODEL_FIELDS}
+    wires = {
+        name: None if content[name] is None else _number(name, content[name]) for name in _WIRES
+    }
+    return Calibration(
+        unit_id=content["unit_id"],
+        date=content["date"],
+        method=content["method"],
+        rest=_rest("rest", content["rest"], shape),
+        tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
+        model=ForceModel(**arrays),
+        indenter_area_m2=_number("indenter_area_m2", content["indenter_area_m2"]),
+        **wires,
+    )
+
+
+def _require_fields(content: dict[str, Any], known: set[str], place: str = "") -> None:
+    for name in sorted(known - content.keys()):
+        raise ValueError(f"no field '{place}{name}'")
+    for name in sorted(content.keys() - known):
+        raise ValueError(f"unknown field '{place}{name[:40]}'")
+
+
+def _rest(name: str, content: Any, shape: tuple[int, int]) -> Rest:
+    if not isinstance(content, dict):
+        raise ValueError(f"{name} is not an object")
+    _require_fields(content, {"date", "ratio", "level"}, f"{name}.")
+    if not isinstance(content["date"], str):
+        raise ValueError(f"{name}.date is not text")
+    try:
+        ratio = np.array(content["ratio"])
+    except (ValueError, OverflowError):
+        ratio = np.array(None)
+    expected = (*shape, READINGS_PER_CELL)
+    if ratio.dtype.kind not in "fi" or ratio.shape != expected:
+        raise ValueError(f"{name}.ratio is not an array of numbers of shape {expected}")
+    level = _array(f"{name}.level", content["level"], shape)
+    try:
+        return Rest(content["date"], ratio.astype(np.float64), level)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _array(name: str, nested: Any, shape: tuple[int, int]) -> NDArray[Any]:
+    rows, columns = shape
+    if not (
+        isinstance(nested, list)
+        and len(nested) == rows
+        and all(isinstance(row, list) and len(row) == columns for row in nested)
+    ):
+        raise ValueError(f"{name} is not {rows} lists of {columns}")
+    flat = [cell for row in nested for cell in row]
+    if name == "kind":
+        if not all(isinstance(cell, str) and len(cell) <= 16 for cell in flat):
+            raise ValueError("kind holds something other than names of curves")
+        return np.array(flat).reshape(shape)
+    if name == "pooled":
+        if not all(isinstance(cell, bool) for cell in flat):
+            raise ValueError("pooled holds something other than true and false")
+        return np.array(flat).reshape(shape)
+    if name in _NULL_FIELDS:
+        numbers = [np.nan if cell is None else _number(name, cell) for cell in flat]
+    else:
+        numbers = [_number(name, cell) for cell in flat]
+    return np.array(numbers, dtype=np.float64).reshape(shape)
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{name} holds {type(value).__name__}, not numbers")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = np.inf
+    if not abs(number) <= MAX_NUMBER:
+        raise ValueError(f"{name} holds a number that is not finite, or beyond {MAX_NUMBER:g}")
+    return number

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what a cell shows to the force on it [N], by its curve.
+
+Symbols
+
+====== ======= ======================================================================= ==========
+symbol shape   meaning                                                                 unit
+====== ======= ======================================================================= ==========
+x      (R, C)  rise above rest: conductance g - g_rest, or the reading's (`voltage`)   S, or 1
+F      (R, C)  force normal to the skin                                                N
+a      (R, C)  `slope`                                                                 N / x^b
+b      (R, C)  `exponent`, 1 where the cell is linear                                  1
+c      (R, C)  `intercept`, 0 unless asked for                                         N
+K      (2, 2)  covariance of a cell's two free coefficients: (a, c), or (a, b)
+s0     (R, C)  `residual_std`: scatter of presses about the curve at no force          N
+s1     (R, C)  `residual_share`: how that grows with force                             1
+dx     (R, C)  standard deviation of x                                                 as x
+====== ======= ======================================================================= ==========
+
+    linear  F = a x + c   (section IV.G of the paper; c = 0 makes an untouched cell report no force)
+    power   F = a x^b     (x < 0 counts as 0)
+
+Standard deviation of a force, with J the derivatives of F by the cell's free coefficients:
+
+    F_std^2 = d^2 + s0^2 + (s1 F)^2 + J K J^T ,     d = max(F(x + dx) - F(x), F(x) - F(x - dx)) .
+
+For a line d = a dx; for x^b with b < 1 the differential is infinite at rest, the difference is not.
+`force_regression` learns the curves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ohmskin.arrays import Float
+
+LINEAR: Final = "linear"
+POWER: Final = "power"
+MIN_EXPONENT: Final = 0.2
+MAX_EXPONENT: Final = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class ForceModel:
+    """The curve of every cell, each array (R, C); symbols and units in the module's table.
+
+    kind: "linear" or "power". slope, exponent, intercept and their standard errors (0: fixed).
+    correlation: of the errors of slope and of the other free coefficient.
+    residual_std, residual_share: s0 and s1; NaN where nothing tells them. pooled: the cell has no
+    curve of its own but the skin's. held_out_rmse: error on presses not fitted [N], of pooled cells
+    on cells not fitted; NaN where nothing tells it. Raises ValueError, naming the array, for what
+    no fit gives.
+    """
+
+    kind: NDArray[np.str_]
+    slope: Float
+    slope_std: Float
+    exponent: Float
+    exponent_std: Float
+    intercept: Float
+    intercept_std: Float
+    correlation: Float
+    residual_std: Float
+    residual_share: Float
+    pooled: NDArray[np.bool_]
+    held_out_rmse: Float
+
+    def __post_init__(self) -> None:
+        shape = self.kind.shape
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(f"kind has shape {shape}, it must be (rows, columns)")
+        for field in fields(self):
+            array = getattr(self, field.name)
+            if array.shape != shape:
+                raise ValueError(f"{field.name} has shape {array.shape}, kind {shape}")
+        power = self.kind == POWER
+        _require("kind", power | (self.kind == LINEAR), f"neither {LINEAR} nor {POWER}")
+        for name in ("slope", "exponent", "intercept", "correlation"):
+            _require(name, np.isfinite(getattr(self, name)), "not finite")
+        for name in ("slope_std", "exponent_std", "intercept_std"):
+            std = getattr(self, name)
+            _require(name, np.isfinite(std) & (std >= 0), "not finite and >= 0")
+        for name in ("residual_std", "residual_share", "held_out_rmse"):
+            known = getattr(self, name)
+            _require(name, np.isnan(known) | (np.isfinite(known) & (known >= 0)), "negative or inf")
+        _require("slope", self.slope > 0, "not above 0")
+        _require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
+        inside = (self.exponent >= MIN_EXPONENT) & (self.exponent <= MAX_EXPONENT)
+        _require("exponent", inside, f"not in {MIN_EXPONENT:g}..{MAX_EXPONENT:g}")
+        _require("exponent", power | (self.exponent == 1), "not 1, as of a linear cell")
+        _require("exponent_std", power | (self.exponent_std == 0), "not 0, as of a linear cell")
+        _require("intercept", ~power | (self.intercept == 0), "not 0, as of a power law")
+        _require("intercept_std", ~power | (self.intercept_std == 0), "not 0, as of a power law")
+
+    def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
+        """Force and its standard deviation [N], each (R, C), of rises above rest (R, C).
+
+        No force is below 0; the standard deviation is that before the cut. It is NaN where
+        `rise_std` is (the method gives none), and where the scatter is unknown: in cells without
+        data when one cell alone was pressed, say. Raises ValueError, naming the cell, for a shape
+        or a value that cannot be.
+        """
+        x, dx = self._checked("rise", rise), self._checked("rise_std", rise_std)
+        _require("rise", np.isfinite(x), "not finite")
+        _require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
+        force_n = self._curve(x)
+        known_dx = np.nan_to_num(dx)
+        spread = np.maximum(
+            self._curve(x + known_dx) - force_n, force_n - self._curve(x - known_dx)
+        )
+        power = self.kind == POWER
+        above = np.maximum(x, 0.0)
+        safe = np.where(above > 0, above, 1.0)
+        powered = above**self.exponent
+        by_slope = np.where(power, powered, x) * self.slope_std
+        by_other = np.where(
+            power, self.slope * powered * np.log(safe) * self.exponent_std, self.intercept_std
+        )
+        # The two nearly cancel in a power law, whose slope is that at 1 S: far from any press.
+        of_fit = by_slope**2 + by_other**2 + 2 * self.correlation * by_slope * by_other
+        reported_n = np.maximum(force_n, 0.0)
+        scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
+        variance = spread**2 + scatter + np.maximum(of_fit, 0.0)
+        return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))
+
+    def _curve(self, x: Float) -> Float:
+        powered = self.slope * np.maximum(x, 0.0) ** self.exponent
+        return np.where(self.kind == POWER, powered, self.slope * x + self.intercept)
+
+    def _checked(self, name: str, values: ArrayLike) -> Float:
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape != self.kind.shape:
+            raise ValueError(f"{name} has shape {array.shape}, this calibration {self.kind.shape}")
+        return array
+
+
+def _require(name: str, good: NDArray[np.bool_], what: str) -> None:
+    if not good.all():
+        row, column = (int(index) for index in np.argwhere(~good)[0])
+        raise ValueError(f"{name} of cell ({row}, {column}) is {what}")

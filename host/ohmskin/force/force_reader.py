@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From scan to force: readings, levels of the cells, newtons, contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from ohmskin.arrays import Float
+from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.levels import Level, LevelMeter
+from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.contacts import Contact, ContactTracker
+from ohmskin.link.messages import Hello, Scan
+
+
+def knowledge_of(
+    board: Hello,
+    rest_ratio: Float | None = None,
+    nominal_top_wire_ohm: float | None = None,
+    nominal_bottom_wire_ohm: float | None = None,
+) -> SkinKnowledge:
+    """What an estimator is told of the skin at this board; `SkinKnowledge` says what is what."""
+    return SkinKnowledge(
+        board.rows,
+        board.columns,
+        ref_top_ohm=board.ref_top_ohm,
+        ref_bottom_ohm=board.ref_bottom_ohm,
+        adc_bits=board.adc_bits,
+        rest_ratio=rest_ratio,
+        nominal_top_wire_ohm=nominal_top_wire_ohm,
+        nominal_bottom_wire_ohm=nominal_bottom_wire_ohm,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ForceScan(Scan):
+    """A scan, and the forces that it shows.
+
+    force_n, force_n_std: normal force of each cell and its standard deviation, (R, C) [N]; NaN
+    where `ForceModel.predict` has none. contacts: touched cells that adjoin. estimate: what the
+    forces are from, with ``message`` where the readings cannot be trusted.
+    """
+
+    force_n: Float
+    force_n_std: Float
+    contacts: tuple[Contact, ...]
+    estimate: Estimate
+
+
+class ForceReader:
+    """Reads the forces of scan after scan: the same scans in the same order, the same forces.
+
+    Raises ValueError where the board scans other cells than were calibrated.
+    """
+
+    def __init__(self, board: Hello, calibration: Calibration) -> None:
+        self._board = board
+        self._tracker = ContactTracker()
+        self.use(calibration)
+
+    def use(self, calibration: Calibration) -> None:
+        """Go on with another tare. Raises ValueError as the constructor."""
+        calibration.check(calibration.unit_id, self._board.rows, self._board.columns)
+        self.calibration = calibration
+        self._meter = LevelMeter(calibration.method, self._knowledge(calibration.untouched.ratio))
+
+    def tared(self, rest_ratio: Float, date: str) -> Calibration:
+        """The calibration with these readings of the untouched skin (R, C, 4) as its tare."""
+        rest = Rest.of(self.calibration.method, self._knowledge(rest_ratio), date)
+        return replace(self.calibration, tare=rest)
+
+    def _knowledge(self, rest_ratio: Float) -> SkinKnowledge:
+        return knowledge_of(
+            self._board,
+            rest_ratio,
+            self.calibration.nominal_top_wire_ohm,
+            self.calibration.nominal_bottom_wire_ohm,
+        )
+
+    def measure(self, ratio: Float) -> Level:
+        """What readings (R, C, 4) show, without forces."""
+        return self._meter.read(ratio)
+
+    def read(self, scan: Scan) -> ForceScan:
+        """The forces of a scan. Raises ValueError if it is of other cells."""
+        found = self.measure(scan.ratio)
+        force_n, force_n_std = self.calibration.predict(found.level, found.level_std)
+        touched = found.estimate.touched
+        return ForceScan(
+            scan.codes,
+            scan.number,
+            scan.time_us,
+            scan.host_time_s,
+            scan.missed,
+            force_n=force_n,
+            force_n_std=force_n_std,
+            contacts=self._tracker.update(scan.time_us, touched, force_n, force_n_std),
+            estimate=found.estimate,
+        )

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a board says, as Python objects, decoded from bytes without port or thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.link import protocol
+from ohmskin.link.codes import ratio_from_codes
+from ohmskin.link.framing import Decoder, DecoderStats, RawFrame
+
+_COUNTER_SPAN = 1 << 32
+_DROPPED_SPAN = 1 << 16
+_LAYOUT_CRC_SIZE = 2
+
+
+@dataclass(frozen=True)
+class Hello:
+    """The fields of the frame `hello`, as ``protocol/FRAMES.md`` describes them."""
+
+    layout_crc: int
+    version_major: int
+    version_minor: int
+    version_patch: int
+    board: str
+    unit_id: int
+    rows: int
+    columns: int
+    readings_per_cell: int
+    adc_bits: int
+    ref_top_ohm: int
+    ref_bottom_ohm: int
+    rate_asked_mhz: int
+    scan_cycles: int
+    clock_hz: int
+    settle_asked_us: int
+    settle_us: int
+    adc_prescaler: str
+    baud: int
+    settings: str
+    reset_cause: tuple[str, ...]
+    scanning: int
+
+    @property
+    def version(self) -> str:
+        """Firmware version, ``"0.1.0"``."""
+        return f"{self.version_major}.{self.version_minor}.{self.version_patch}"
+
+    @property
+    def rate_hz(self) -> float:
+        """Scan rate that the board keeps [Hz]: clock_hz / scan_cycles."""
+        return self.clock_hz / self.scan_cycles
+
+
+@dataclass(frozen=True)
+class ForeignHello:
+    """A `hello` of another protocol definition: nothing in it but the CRC can be read."""
+
+    layout_crc: int
+
+
+@dataclass(frozen=True)
+class Ack:
+    """A board's answer to a command. `result`: name of a member of the enum `result`."""
+
+    command: int
+    command_sequence: int
+    result: str
+
+
+@dataclass(frozen=True)
+class SelfTestReport:
+    """What the sense nodes read over all multiplexer inputs.
+
+    `findings`: names of what no skin can cause, empty on a sound board. `code_min`, `code_max`:
+    per configuration A to D.
+    """
+
+    findings: tuple[str, ...]
+    code_min: tuple[int, ...]
+    code_max: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """All readings of a skin at one time.
+
+    codes: shape (rows, columns, 4), ADC codes of the configurations A to D. number: of the scan
+    since the board was started. time_us: board time at the scan's start [us], without wraps, from
+    the board's start. host_time_s: `time.monotonic()` when its last byte was read [s]. missed:
+    scans made since the one before this that never came, dropped there or damaged on the way.
+    """
+
+    codes: NDArray[np.uint16]
+    number: int
+    time_us: int
+    host_time_s: float
+    missed: int
+
+    @property
+    def ratio(self) -> NDArray[np.float64]:
+        """Sense-node voltages over Vdd, (code + 0.5) / 2^bits, shape (rows, columns, 4)."""
+        return ratio_from_codes(self.codes, protocol.ADC_BITS)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the skin."""
+        return int(self.codes.shape[0])
+
+    @property
+    def columns(self) -> int:
+        """Columns of the skin."""
+        return int(self.codes.shape[1])
+
+
+Message = Hello | ForeignHello | Ack | SelfTestReport | Scan
+
+
+@dataclass
+class BoardStats:
+    """Counts since the connection was made; what went missing is here, never only in a log."""
+
+    line: DecoderStats = field(default_factory=DecoderStats)
+    """Bytes, frames and damaged frames on the line."""
+    scans: int = 0
+    """Scans received whole."""
+    missed: int = 0
+    """Scans the board made that never came: `dropped_by_board`, and those damaged on the line."""
+    dropped_by_board: int = 0
+    """Of these, the scans that the board dropped whole because the line was full."""
+    board_rx_errors: int = 0
+    """Damaged commands that the board reports."""
+    unknown: int = 0
+    """Valid frames whose type or size this host does not know."""
+    restarts: int = 0
+    """Times the board has restarted by itself, or was reset."""
+    overflowed: int = 0
+    """Scans lost to iterators that were slower than the board."""
+
+
+class BoardDecoder:
+    """Messages from a board's bytes: `feed` takes any chunk, and never raises for what is in it.
+
+    The state between scans (wrapping counters, gaps in their numbers) is kept here.
+    """
+
+    def __init__(self) -> None:
+        self._frames = Decoder()
+        self.stats = BoardStats(line=self._frames.stats)
+        self._number: int | None = None  # of the last scan; None: unknown, -1: none since start
+        self._time_us = 0
+        self._host_time_s: float | None = None  # of the last scan
+        self._dropped = 0
+
+    def feed(self, chunk: bytes, host_time_s: float) -> list[Message]:
+        """The messages that `chunk`, read at `host_time_s`, completes."""
+        messages: list[Message] = []
+        for frame in self._frames.feed(chunk):
+            message = self._message(frame, host_time_s)
+            if message is None:
+                self.stats.unknown += 1
+            else:
+                messages.append(message)
+        return messages
+
+    def _message(self, raw: RawFrame, host_time_s: float) -> Message | None:
+        frame = protocol.FRAMES_BY_ID.get(raw.type)
+        if frame is None or frame.sender != "board":
+            return None
+        if frame.name == "hello":
+            return self._hello(frame, raw.payload)
+        try:
+            values = frame.unpack(raw.payload)
+            if frame.name == "scan":
+                return self._scan(values, raw.payload[frame.struct.size :], host_time_s)
+        except ValueError:
+            return None
+        return Ack(**values) if frame.name == "ack" else SelfTestReport(**values)
+
+    def _hello(self, frame: protocol.Frame, payload: bytes) -> Message | None:
+        # The first field is the same in every definition; the rest may not be.
+        if len(payload) < _LAYOUT_CRC_SIZE:
+            return None
+        layout_crc = int.from_bytes(payload[:_LAYOUT_CRC_SIZE], "little")
+        if layout_crc != protocol.LAYOUT_CRC or len(payload) != frame.struct.size:
+            return ForeignHello(layout_crc)
+        hello = Hello(**frame.unpack(payload))
+        if not hello.scanning:
+            self._number = -1
+        return hello
+
+    def _scan(self, values: dict[str, Any], packed: bytes, host_time_s: float) -> Scan:
+        codes = protocol.unpack_codes(packed, values["rows"], values["columns"])
+        number, dropped = values["scan"], values["dropped"]
+        step = 1 if self._number is None else (number - self._number) % _COUNTER_SPAN
+        if self._number is None or self._number < 0 or not 0 < step < _COUNTER_SPAN // 2:
+            # The first scan since a start; numbers that go back tell of one nobody has seen.
+            missed = 0 if self._number is None else number
+            self._dropped = dropped if self._number is None else 0
+            self._time_us = self._time_at_start(values["time_us"], host_time_s)
+        else:
+            missed = step - 1
+            self._time_us += (values["time_us"] - self._time_us) % _COUNTER_SPAN
+        stats = self.stats
+        stats.scans += 1
+        stats.missed += missed
+        stats.dropped_by_board += (dropped - self._dropped) % _DROPPED_SPAN
+        stats.board_rx_errors = values["rx_errors"]
+        self._number, self._dropped = number, dropped
+        self._host_time_s = host_time_s
+        return Scan(codes, number, self._time_us, host_time_s, missed)
+
+    def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
+        """Goes on, with its wraps, for a board that was only stopped; small after a reset."""
+        if self._host_time_s is None:
+            return counter_us
+        elapsed_us = (host_time_s - self._host_time_s) * 1e6
+        expected_us = self._time_us + elapsed_us
+        time_us = counter_us + _COUNTER_SPAN * round((expected_us - counter_us) / _COUNTER_SPAN)
+        # A resonator may be 0.5 % off.
+        near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + 0.005 * elapsed_us
+        return time_us if near else counter_us
+
+    def snapshot(self) -> BoardStats:
+        """The counts now, as a copy."""
+        return replace(self.stats, line=replace(self.stats.line))
+
+
+def _check_definition() -> None:
+    for cls, name in ((Hello, "hello"), (Ack, "ack"), (SelfTestReport, "self_test_report")):
+        declared = [f.name for f in fields(cls)]
+        if declared != [f.name for f in protocol.FRAMES[name].fields]:
+            raise AssertionError(f"{cls.__name__} does not match frames.toml")
+
+
+_check_definition()

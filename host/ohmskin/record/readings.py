@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The readings file (.npz): frames of readings in, one estimate per frame out.
+
+In (F frames of R x C cells, 4 readings a cell; other arrays are ignored):
+
+======================= ============================ =========================================
+array                   shape                        meaning
+======================= ============================ =========================================
+ratio                   F, R, C, 4                   sense voltage / Vdd, order A, B, C, D
+rest_ratio              R, C, 4 or F, R, C, 4        the same untouched (optional)
+ref_top_ohm             scalar                       reference resistors, 30 kOhm if absent
+ref_bottom_ohm          scalar
+nominal_top_wire_ohm    scalar or F                  one wire segment, per layer (optional)
+nominal_bottom_wire_ohm scalar or F
+adc_bits                scalar                       absent: the readings are exact
+======================= ============================ =========================================
+
+Out: cell_ohm, cell_siemens, cell_siemens_std, top_wire_ohm, bottom_wire_ohm (F, R, C; NaN where the
+method does not estimate them), touched (F, R, C, bool), converged (F, bool), message (F, text: why
+a frame is not converged, or what is wrong with its readings), chi2 (F, per reading),
+iterations (F), seconds (F).
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import DEFAULT_REF_OHM, READINGS_PER_CELL
+from ohmskin.estimate.base import Estimate, SkinKnowledge, check_ratio
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.files import whole_file
+
+MAX_ARRAY_BYTES: Final = 200_000_000
+# The estimators' matrices grow with the square: 4096 cells make 134 MB.
+MAX_CELLS: Final = 4096
+
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,  # an encrypted member; its subclass NotImplementedError: an odd compression
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """The contents of a readings file, checked. Shapes and units as in the module's table."""
+
+    ratio: Float
+    rest_ratio: Float | None = None
+    ref_top_ohm: float = DEFAULT_REF_OHM
+    ref_bottom_ohm: float = DEFAULT_REF_OHM
+    nominal_top_wire_ohm: Float | None = None
+    nominal_bottom_wire_ohm: Float | None = None
+    adc_bits: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.ratio.ndim != 4 or self.ratio.shape[-1] != READINGS_PER_CELL:
+            raise ValueError(f"ratio has shape {self.ratio.shape}, not (frames, rows, columns, 4)")
+        frames, rows, columns, _ = self.ratio.shape
+        if frames < 1 or not 1 <= rows * columns <= MAX_CELLS:
+            raise ValueError(
+                f"ratio has {frames} frames of {rows}x{columns} cells: at least 1 frame and "
+                f"1 to {MAX_CELLS} cells"
+            )
+        for frame, ratio in enumerate(self.ratio):
+            check_ratio(ratio, rows, columns, name=f"ratio, frame {frame},")
+        rest = self.rest_ratio
+        if rest is not None and rest.ndim == 4 and len(rest) != frames:
+            raise ValueError(f"rest_ratio has {len(rest)} frames, ratio {frames}")
+        for name in ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm"):
+            wire_ohm = getattr(self, name)
+            if wire_ohm is not None and wire_ohm.shape not in ((), (frames,)):
+                raise ValueError(f"{name} has shape {wire_ohm.shape}, not () or ({frames},)")
+        for frame in range(frames if self.one_skin_per_frame else 1):
+            self.knowledge(frame)
+
+    @property
+    def one_skin_per_frame(self) -> bool:
+        """Whether rest or wires are given per frame: then frames are not one skin in time."""
+        wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
+        per_frame_rest = self.rest_ratio is not None and self.rest_ratio.ndim == 4
+        return per_frame_rest or any(wire is not None and wire.ndim == 1 for wire in wires)
+
+    def knowledge(self, frame: int) -> SkinKnowledge:
+        """What an estimator is told before it reads `frame`."""
+        rest = self.rest_ratio
+        return SkinKnowledge(
+            rows=self.ratio.shape[1],
+            columns=self.ratio.shape[2],
+            ref_top_ohm=self.ref_top_ohm,
+            ref_bottom_ohm=self.ref_bottom_ohm,
+            adc_bits=self.adc_bits,
+            rest_ratio=rest[frame] if rest is not None and rest.ndim == 4 else rest,
+            nominal_top_wire_ohm=_of_frame(self.nominal_top_wire_ohm, frame),
+            nominal_bottom_wire_ohm=_of_frame(self.nominal_bottom_wire_ohm, frame),
+        )
+
+
+def _of_frame(per_frame: Float | None, frame: int) -> float | None:
+    if per_frame is None:
+        return None
+    return float(per_frame[frame] if per_frame.ndim else per_frame)
+
+
+def load_readings(path: str | os.PathLike[str]) -> Readings:
+    """Read a readings file. Nothing in it is executed; no array may exceed 2e8 bytes.
+
+    Raises ValueError, one line that names the file and the array, for whatever is wrong with it.
+    """
+    arrays: dict[str, Any] = {}
+    name = "the archive"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            present = {info.filename: info for info in archive.infolist()}
+            for name in Readings.__dataclass_fields__:
+                info = present.get(f"{name}.npy")
+                if info is not None:
+                    arrays[name] = _read_array(archive, info)
+    except _UNREADABLE as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, OSError) and error.strerror:
+            reason = error.strerror
+        raise ValueError(f"{os.fspath(path)}: {name} cannot be read: {reason}") from error
+    if "ratio" not in arrays:
+        raise ValueError(f"{os.fspath(path)}: no array 'ratio'")
+    try:
+        for name in ("ref_top_ohm", "ref_bottom_ohm", "adc_bits"):
+            if name in arrays:
+                arrays[name] = _scalar(name, arrays[name])
+        return Readings(**arrays)
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from error
+
+
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Float:
+    # zipfile never yields more than the size it declares, so this bounds what is unpacked.
+    if info.file_size > MAX_ARRAY_BYTES:
+        raise ValueError(f"{info.file_size} bytes, more than {MAX_ARRAY_BYTES}")
+    with archive.open(info) as member:
+        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"it holds {array.dtype}, not real numbers")
+    return array.astype(np.float64)
+
+
+def _scalar(name: str, array: Float) -> float | int:
+    if array.size != 1:
+        raise ValueError(f"{name} has shape {array.shape}, it must be one number")
+    number = float(array.item())
+    return int(number) if number.is_integer() and name == "adc_bits" else number
+
+
+def estimate_file(
+    readings: Readings,
+    method: str,
+    *,
+    cold: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Estimate all frames in order; the Out arrays of the module's table, by name.
+
+    Each frame starts from the one before, unless `cold`, or unless rest or wires are given per
+    frame: then each frame is a skin of its own. `progress(done, frames)` is called after each.
+    Raises ValueError for an unknown method.
+    """
+    frames = len(readings.ratio)
+    estimator = make_estimator(method, readings.knowledge(0))
+    estimates: list[Estimate] = []
+    for frame, ratio in enumerate(readings.ratio):
+        if frame and readings.one_skin_per_frame:
+            estimator = make_estimator(method, readings.knowledge(frame))
+        elif cold:
+            estimator.reset()
+        estimates.append(estimator.estimate(ratio))
+        if progress is not None:
+            progress(frame + 1, frames)
+    names = (
+        *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched"),
+        *("top_wire_ohm", "bottom_wire_ohm", "converged", "message", "chi2", "iterations"),
+        "seconds",
+    )
+    return {name: np.array([getattr(each, name) for each in estimates]) for name in names}
+
+
+def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write an .npz that is either complete or not there: a temporary file, then a rename.
+
+    Raises ValueError if it cannot be written, or for an array of Python objects.
+    """
+    for name, array in arrays.items():
+        if array.dtype.hasobject:
+            raise ValueError(f"{name} holds Python objects, which no .npz of ours may")
+    with whole_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)

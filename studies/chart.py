@@ -1,0 +1,355 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Speed against accuracy of all methods, beside what one frame can tell and what the paper printed.
+
+Simulation, all of it. Every method gets the same frames of the same random skins (`trials`), in
+order, each started from the one before; the first few of each skin are not counted. The paper's two
+sweeps are added, each frame from a cold start, and what decided for NumPy against CasADi in
+`joint` (`casadi_circuit`). With one thread, whatever the libraries would take.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import NormalDist
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from ohmskin.arrays import Float
+from ohmskin.estimate.methods import METHODS
+from ohmskin.estimate.paper import PaperEstimator
+from ohmskin.record.readings import estimate_file
+from studies import casadi_circuit, published
+from studies.information import information_limit
+from studies.trials import Trial, random_trial, trial_of
+
+# The paper's methods take 0.1 s a frame with 9 cells, up to 16 s with 16 and a minute with 64.
+PAPER_CELLS: Final = 9
+TAIL: Final = 0.9  # the quantile beside each median
+RANDOM: Final = "random"
+BOARD: Final = "board"  # the paper's own skin
+LINEARISATION: Final = "linearisation"
+MEASURED: Final = "measured"
+PAPER: Final = "Su2024"
+# |z| of a normal z, in equal steps of probability.
+_NORMAL: Final[Float] = np.abs([NormalDist().inv_cdf((k + 0.5) / 400) for k in range(400)])
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Size:
+    """A skin, and the most touches in a frame of it."""
+
+    rows: int
+    columns: int
+    touches: int
+
+    @property
+    def cells(self) -> int:
+        """How many it has."""
+        return self.rows * self.columns
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is measured.
+
+    bits: of the readings, None: exact. skins: of each size; frames: of each skin, of which the
+    first `warm_up` are not counted. repeats: of each frame of the paper's sweeps, one more is not
+    counted.
+    """
+
+    skins: int
+    frames: int
+    warm_up: int = 3
+    repeats: int = 5
+    sizes: tuple[Size, ...] = (
+        *(Size(2, 2, 2), Size(3, 3, 4), Size(4, 4, 5)),
+        *(Size(8, 8, 8), Size(16, 16, 8)),
+    )
+    bits: tuple[int | None, ...] = (None, 10)
+    methods: tuple[str, ...] = field(default_factory=lambda: tuple(METHODS))
+
+    def methods_for(self, size: Size) -> list[str]:
+        """Those that answer in reasonable time."""
+        return [
+            method
+            for method in self.methods
+            if size.cells <= PAPER_CELLS or not issubclass(METHODS[method], PaperEstimator)
+        ]
+
+
+FULL: Final = Plan(skins=8, frames=33)
+QUICK: Final = Plan(skins=2, frames=11, repeats=2)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one kind of frames; a line of the CSV. None: there is no such number.
+
+    scene: "random", the paper's "cell_sweep" or "wire_sweep", or "board", the paper's own skin; or
+    "linearisation", no frame, but port resistances and all their derivatives once, as `joint` needs
+    them several times a frame: method is "numpy", "casadi" (its virtual machine) or "casadi_c" (the
+    C that it generates; no row without a compiler), and all but the times is None.
+    source: "measured", or "Su2024" for what the paper printed. ms: of a frame, median and 90th
+    percentile. error_percent: of the conductance of pressed cells, over the true one, likewise.
+    rmse_megohm: over all cells of a frame, likewise over the frames. on_front: no other method of
+    this scene, size and resolution is as fast and as accurate (error_percent; in the sweeps
+    rmse_megohm). limit_std_percent: median over the pressed cells of the posterior's relative
+    deviation at the truth (`information`); limit_percent: the median error that goes with these
+    deviations, were it normal (about 0.67 of it); limit_told_percent: the same where the mean
+    wire of each layer and the cells at rest are known exactly.
+    """
+
+    scene: str
+    source: str
+    rows: int
+    columns: int
+    bits: int | None
+    method: str
+    frames: int | None = None
+    pressed_cells: int | None = None
+    ms: float | None = None
+    ms_p90: float | None = None
+    error_percent: float | None = None
+    error_p90_percent: float | None = None
+    rmse_megohm: float | None = None
+    rmse_p90_megohm: float | None = None
+    converged_share: float | None = None
+    on_front: bool = False
+    limit_std_percent: float | None = None
+    limit_percent: float | None = None
+    limit_told_percent: float | None = None
+
+    @property
+    def resolution(self) -> str:
+        """Of the readings, in words."""
+        return "exact" if self.bits is None else f"{self.bits} bit"
+
+    @property
+    def place(self) -> tuple[str, int, int, int | None]:
+        """What rows must share to be compared."""
+        return self.scene, self.rows, self.columns, self.bits
+
+    @property
+    def judged_by(self) -> float | None:
+        """The error by which the front is found."""
+        return self.error_percent if self.scene == RANDOM else self.rmse_megohm
+
+
+# ------------------------------------------------------------------------------------ measuring
+
+
+def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
+    """Run every method of the plan. `progress(done, frames)` is called after each frame.
+
+    Rows are in the order of the plan's sizes, bits and methods, then the paper's sweeps, then
+    linearisations by size.
+    """
+    count = _Count(progress, _frames(plan))
+    with threadpool_limits(limits=1):
+        rows = [
+            row
+            for size in plan.sizes
+            for bits, trials in _of_each_resolution(size, plan)
+            for row in _random_rows(size, bits, trials, plan, count)
+        ]
+        for name in published.RMSE_MEGOHM:
+            rows += _sweep_rows(name, plan, count)
+        for size in plan.sizes:
+            rows += _linearisation_rows(size)
+    return [*_with_front(rows), *_published_rows()]
+
+
+def _frames(plan: Plan) -> int:
+    random = sum(len(plan.methods_for(size)) for size in plan.sizes)
+    conditions = sum(map(len, published.CONDITIONS_MEGOHM.values()))
+    return random * len(plan.bits) * plan.skins * plan.frames + len(plan.methods) * conditions * (
+        plan.repeats + 1
+    )
+
+
+class _Count:
+    """Frames done, over all that are to do."""
+
+    def __init__(self, progress: Progress | None, frames: int) -> None:
+        self._progress, self._frames, self._done = progress, frames, 0
+
+    def frame(self, *_: int) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._frames)
+
+
+@dataclass
+class _Tally:
+    """What one method did, frame by frame; errors cell by cell."""
+
+    seconds: list[float] = field(default_factory=list)
+    error: list[float] = field(default_factory=list)
+    rmse_megohm: list[float] = field(default_factory=list)
+    converged: list[bool] = field(default_factory=list)
+
+    def add(self, answers: dict[str, NDArray[Any]], trial: Trial, skip: int) -> None:
+        truth, pressed = trial.cell_siemens[skip:], trial.pressed[skip:]
+        error = np.abs(answers["cell_siemens"][skip:] / truth - 1)
+        away_ohm = answers["cell_ohm"][skip:] - 1 / truth
+        self.seconds += answers["seconds"][skip:].tolist()
+        self.error += error[pressed].tolist()
+        self.rmse_megohm += (1e-6 * np.sqrt(np.mean(away_ohm**2, axis=(1, 2)))).tolist()
+        self.converged += answers["converged"][skip:].tolist()
+
+    def row(self, **what: Any) -> Row:
+        ms, ms_p90 = _middle_and_tail(1e3 * np.array(self.seconds))
+        error, error_p90 = _middle_and_tail(1e2 * np.array(self.error))
+        rmse, rmse_p90 = _middle_and_tail(np.array(self.rmse_megohm))
+        return Row(
+            source=MEASURED,
+            frames=len(self.seconds),
+            pressed_cells=len(self.error),
+            ms=ms,
+            ms_p90=ms_p90,
+            error_percent=error,
+            error_p90_percent=error_p90,
+            rmse_megohm=rmse,
+            rmse_p90_megohm=rmse_p90,
+            converged_share=float(np.mean(self.converged)),
+            **what,
+        )
+
+
+def _middle_and_tail(values: Float) -> tuple[float, float] | tuple[None, None]:
+    if not values.size:
+        return None, None
+    return float(np.median(values)), float(np.quantile(values, TAIL))
+
+
+def _of_each_resolution(size: Size, plan: Plan) -> Iterator[tuple[int | None, list[Trial]]]:
+    trials = [
+        random_trial(size.rows, size.columns, size.touches, plan.frames, seed)
+        for seed in range(plan.skins)
+    ]
+    for bits in plan.bits:
+        yield bits, trials
+
+
+def _random_rows(
+    size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, count: _Count
+) -> list[Row]:
+    tallies: dict[str, _Tally] = defaultdict(_Tally)
+    # Method by method within a skin, so that a slow minute of the machine hits all alike.
+    for trial in trials:
+        readings = trial.rounded(bits)
+        for method in plan.methods_for(size):
+            answers = estimate_file(readings, method, progress=count.frame)
+            tallies[method].add(answers, trial, plan.warm_up)
+    limits = _limits(trials, bits, plan.warm_up)
+    return [
+        tally.row(
+            scene=RANDOM, rows=size.rows, columns=size.columns, bits=bits, method=method, **limits
+        )
+        for method, tally in tallies.items()
+    ]
+
+
+def _limits(trials: Sequence[Trial], bits: int | None, skip: int) -> dict[str, float]:
+    """The columns `limit_...` of a row: what a perfect estimator of one frame could do."""
+    percent: dict[bool, list[float]] = {False: [], True: []}
+    for trial in trials:
+        knowledge = trial.rounded(bits).knowledge(0)
+        for skin, pressed in zip(trial.frames[skip:], trial.pressed[skip:], strict=True):
+            for told, found in percent.items():
+                known_std = 0.0 if told else None
+                std = information_limit(
+                    skin, knowledge, pressed, rest_std=known_std, layer_std=known_std
+                )
+                found += (1e2 * std[pressed]).tolist()
+    if not percent[False]:
+        return {}
+    return {
+        "limit_std_percent": float(np.median(percent[False])),
+        "limit_percent": _median_error(percent[False]),
+        "limit_told_percent": _median_error(percent[True]),
+    }
+
+
+def _median_error(stds: Iterable[float]) -> float:
+    """Median of |e|, with e from normal distributions of these deviations in equal parts."""
+    return float(np.median(np.outer(list(stds), _NORMAL)))
+
+
+def _sweep_rows(name: str, plan: Plan, count: _Count) -> list[Row]:
+    """The paper's simulation with exact readings; rest readings and true wires are told."""
+    tallies: dict[str, _Tally] = defaultdict(_Tally)
+    for pressed, rest in published.sweep(name):
+        wire_ohm = (float(rest.top_wire_ohm[0, 0]), float(rest.bottom_wire_ohm[0, 0]))
+        trial = trial_of(rest, [pressed] * (plan.repeats + 1), wire_ohm)
+        for method in plan.methods:
+            answers = estimate_file(trial.readings, method, cold=True, progress=count.frame)
+            tallies[method].add(answers, trial, 1)
+    return [
+        tally.row(scene=name, rows=3, columns=3, bits=None, method=method)
+        for method, tally in tallies.items()
+    ]
+
+
+def _linearisation_rows(size: Size) -> list[Row]:
+    rows = []
+    for name, times_ms in casadi_circuit.times_ms(size.rows, size.columns).items():
+        ms, ms_p90 = _middle_and_tail(times_ms)
+        row = Row(LINEARISATION, MEASURED, size.rows, size.columns, None, name)
+        rows.append(replace(row, ms=ms, ms_p90=ms_p90))
+    return rows
+
+
+def _published_rows() -> list[Row]:
+    rows = [
+        Row(BOARD, PAPER, 2, 2, 10, method, ms=milliseconds)
+        for method, milliseconds in published.TIME_2X2_MS.items()
+    ]
+    for name, by_method in published.RMSE_MEGOHM.items():
+        for method, rmse_megohm in by_method.items():
+            middle, tail = _middle_and_tail(np.array(rmse_megohm))
+            row = Row(name, PAPER, 3, 3, None, method, frames=len(rmse_megohm))
+            rows.append(replace(row, rmse_megohm=middle, rmse_p90_megohm=tail))
+    return rows
+
+
+# ------------------------------------------------------------------------------------ the front
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Whether each point is on the front: no other is as small in both numbers, smaller in one.
+
+    Equal points are on it together. A point with a NaN is not on it, and keeps none off.
+    """
+    return [
+        not np.isnan([x, y]).any()
+        and not any(u <= x and v <= y and (u < x or v < y) for u, v in points)
+        for x, y in points
+    ]
+
+
+def _with_front(rows: Sequence[Row]) -> list[Row]:
+    by_place: dict[object, list[Row]] = defaultdict(list)
+    for row in rows:
+        by_place[row.place].append(row)
+    return [
+        replace(row, on_front=on_front)
+        for rivals in by_place.values()
+        for row, on_front in zip(
+            rivals,
+            pareto_front([(or_nan(rival.ms), or_nan(rival.judged_by)) for rival in rivals]),
+            strict=True,
+        )
+    ]
+
+
+def or_nan(value: float | None) -> float:
+    """The number, or NaN where there is none."""
+    return np.nan if value is None else value

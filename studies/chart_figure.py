@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture of `chart`: a panel for each size and resolution, and the paper's two sweeps; beside
+them a small one, NumPy against CasADi."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from ohmskin.errors import OhmskinError
+from ohmskin.estimate.methods import METHODS
+from studies.casadi_circuit import EVALUATIONS, GENERATED_C, MACHINE, NUMPY
+from studies.chart import BOARD, LINEARISATION, MEASURED, PAPER, RANDOM, Row, or_nan
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DEADLINE_MS: Final = 1e3 / 90  # a scan of the board at its usual rate
+_COLOURS: Final = ("#666666", "#0072b2", "#e69f00", "#d55e00", "#009e73", "#aa3fb4", "#000000")
+_MARKERS: Final = ("s", "D", "^", "v", "o", "P", "X")
+_INK: Final = "#333333"
+_FAINT: Final = "#777777"
+_BAND: Final = "#f5e3ad"
+_SMALL: Final = 8.0  # points
+_PRINTED: Final = (0, (5, 2))  # dashes: what the paper printed
+_SWEEPS: Final = {
+    "cell_sweep": "the paper's cell sweep, 3x3",
+    "wire_sweep": "the paper's wire sweep, 3x3",
+}
+_EVALUATIONS: Final[dict[str, dict[str, Any]]] = {
+    NUMPY: {"label": "NumPy", "color": _INK, "marker": "o"},
+    MACHINE: {"label": "CasADi", "color": _FAINT, "marker": "o", "markerfacecolor": "white"},
+    GENERATED_C: {"label": "CasADi's C", "color": _FAINT, "marker": "x", "linestyle": ":"},
+}
+_PANELS_FOR_NOTES: Final = 2
+_NOTES: Final = (
+    "Upper rows: the same random skins for all methods, 1 to 100 kΩ where touched, each frame "
+    "touched anew and started from the one before. A percentage under a marker: so many frames "
+    "converged; the others count as well. Without it: all did.",
+    "Limit: the median error of the best possible estimator of one frame alone, from the posterior "
+    "at the truth (0.67 of its standard deviation, if all cells had the same). Upper edge: "
+    "told which cells are pressed, else with the priors of 'joint'; lower edge: told the cells at "
+    "rest and each layer's mean wire as well. What learns the wires from earlier frames can fall "
+    "below.",
+    "Paper (Su et al. 2024): of its 2x2 skin it prints the time (AMD 7940HS), and no error of "
+    "resistance; of simulated 3x3 skins errors, and no time. Lines: median of its five conditions.",
+    "Sweeps: exact readings, each frame cold. All methods are told the true wires and the readings "
+    "at rest; 'ohm', 'matrix' and the paper's two use neither.",
+    "One evaluation: port resistances and all their derivatives, as 'joint' needs them several "
+    "times a frame, computed in NumPy as it does, or as CasADi expressions.",
+)
+
+
+def require_matplotlib() -> None:
+    """Nobody should wait for a picture that cannot be drawn.
+
+    :raises OhmskinError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError as exc:
+        raise OhmskinError("pictures need matplotlib: pip install 'ohmskin[plot]'") from exc
+
+
+def picture(rows: Sequence[Row], machine: str) -> bytes:
+    """The rows of `chart.measure`, taken on this machine, as a PNG.
+
+    :raises OhmskinError: matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    random = [row for row in rows if row.scene == RANDOM]
+    sizes = list(dict.fromkeys((row.rows, row.columns) for row in random))
+    resolutions = list(dict.fromkeys(row.bits for row in random))
+    width = max(len(sizes), len(_SWEEPS) + 1 + _PANELS_FOR_NOTES)
+    lines = len(resolutions) + 1
+    figure = Figure(figsize=(3.1 * width, 2.95 * lines + 1.1), layout="constrained")
+    grid = figure.add_gridspec(lines, width, hspace=0.06)
+    first: Axes | None = None
+    for line, bits in enumerate(resolutions):
+        for column, size in enumerate(sizes):
+            axes = figure.add_subplot(grid[line, column], sharex=first, sharey=first)
+            first = first or axes
+            of_panel = [row for row in random if (row.rows, row.columns, row.bits) == (*size, bits)]
+            _random_panel(axes, of_panel)
+            _mark_times(axes, [row for row in rows if row.place == (BOARD, *size, bits)])
+            axes.tick_params(labelleft=column == 0)
+            if line == 0:
+                axes.set_title(f"{size[0]}x{size[1]}", fontsize=13, fontweight="bold", color=_INK)
+            if line == len(resolutions) - 1:
+                axes.set_xlabel("time a frame [ms]", color=_INK)
+            if column == 0:
+                readings = "exact readings" if bits is None else f"{bits}-bit readings"
+                axes.set_ylabel(f"{readings}\nerror of pressed cells [%]", color=_INK)
+    below: Axes | None = None
+    for column, (scene, title) in enumerate(_SWEEPS.items()):
+        axes = figure.add_subplot(grid[-1, column], sharex=first, sharey=below)
+        below = below or axes
+        _sweep_panel(axes, [row for row in rows if row.scene == scene])
+        axes.set_title(title, fontsize=10.5, color=_INK)
+        axes.set_xlabel("time a frame [ms]", color=_INK)
+        axes.tick_params(labelleft=column == 0)
+        if column == 0:
+            axes.set_ylabel("exact readings\nRMSE of all cells [MΩ]", color=_INK)
+    for axes in figure.axes:
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    _evaluation_panel(
+        figure.add_subplot(grid[-1, len(_SWEEPS)]),
+        [row for row in rows if row.scene == LINEARISATION],
+    )
+    title = f"Time a frame against error: simulated skins, one thread on {machine}"
+    _explain(figure, title, {row.method for row in rows})
+    _write_notes(figure.add_subplot(grid[-1, len(_SWEEPS) + 1 :]))
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=120)
+    return png.getvalue()
+
+
+def method_style(method: str) -> dict[str, Any]:
+    """Colour and marker, the same in all panels: by the method's place in `METHODS`."""
+    number = list(METHODS).index(method)
+    return {
+        "color": _COLOURS[number % len(_COLOURS)],
+        "marker": _MARKERS[number % len(_MARKERS)],
+        "markersize": 8.5,
+        "markeredgewidth": 1.5,
+        "linestyle": "",
+    }
+
+
+# --------------------------------------------------------------------------------------- panels
+
+
+def _random_panel(axes: Axes, rows: Sequence[Row]) -> None:
+    _prepare(axes)
+    limits = (rows[0].limit_told_percent, rows[0].limit_percent)
+    if limits[0] is not None and limits[1] is not None:
+        axes.axhspan(limits[0], limits[1], color=_BAND, zorder=0.5, linewidth=0)
+    _points(axes, [(row, row.error_percent, row.error_p90_percent) for row in rows])
+    absent = [method for method in METHODS if method not in {row.method for row in rows}]
+    if absent:
+        axes.text(
+            0.02,
+            0.02,
+            f"not run: {', '.join(absent)}",
+            transform=axes.transAxes,
+            fontsize=_SMALL,
+            color=_FAINT,
+        )
+
+
+def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
+    _prepare(axes)
+    measured = [row for row in rows if row.source == MEASURED]
+    _points(axes, [(row, row.rmse_megohm, row.rmse_p90_megohm) for row in measured])
+    for row in rows:
+        if row.source == PAPER and row.rmse_megohm is not None:
+            colour = method_style(row.method)["color"]
+            axes.axhline(row.rmse_megohm, color=colour, linestyle=_PRINTED, linewidth=1.3, zorder=1)
+
+
+def _evaluation_panel(axes: Axes, rows: Sequence[Row]) -> None:
+    """Time by size, quietly: it is no method's result."""
+    axes.set_title("one evaluation in 'joint', by size", fontsize=10.5, color=_INK)
+    axes.set_xlabel("time [ms]", color=_INK)
+    axes.set_xscale("log")
+    axes.grid(which="major", axis="x", color="#e4e4e4", linewidth=0.7)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    sizes = list(dict.fromkeys((row.rows, row.columns) for row in rows))
+    for name in EVALUATIONS:
+        of_name = [row for row in rows if row.method == name]
+        places = [sizes.index((row.rows, row.columns)) for row in of_name]
+        style = {"linewidth": 1.0, "markersize": 5.5, **_EVALUATIONS[name]}
+        if not of_name:
+            style["label"] += ": no compiler"
+        axes.plot([or_nan(row.ms) for row in of_name], places, **style)
+    for place, size in enumerate(sizes):
+        slowest = max(or_nan(row.ms) for row in rows if (row.rows, row.columns) == size)
+        # Not at the axis, where it would push the panels apart.
+        axes.annotate(
+            f"{size[0]}x{size[1]}",
+            (slowest, place),
+            xytext=(8, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=_SMALL,
+            color=_INK,
+        )
+    axes.set_yticks([])
+    axes.set_xlim(right=5 * axes.get_xlim()[1])  # for the last of these words
+    axes.invert_yaxis()
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.legend(loc="lower left", frameon=False, fontsize=_SMALL, labelcolor=_INK, handlelength=1.5)
+
+
+def _prepare(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.grid(which="major", color="#e4e4e4", linewidth=0.7)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.axvline(DEADLINE_MS, color=_FAINT, linestyle=":", linewidth=1.3, zorder=1)
+
+
+def _points(axes: Axes, points: Sequence[tuple[Row, float | None, float | None]]) -> None:
+    """Markers at (row, median, 90th percentile), and a line through those on the front."""
+    front: list[tuple[float, float]] = []
+    said: list[float] = []  # times of the markers with a percentage under them
+    for row, middle, tail in points:
+        if row.ms is None or middle is None or tail is None:
+            continue
+        style = method_style(row.method)
+        # Broad and pale, for the line of the front often runs along it.
+        axes.plot(
+            [row.ms, row.ms],
+            [middle, tail],
+            color=style["color"],
+            alpha=0.3,
+            linewidth=4,
+            solid_capstyle="butt",
+            zorder=1.5,
+        )
+        face = style["color"] if row.on_front else "white"
+        axes.plot([row.ms], [middle], **style, markerfacecolor=face, zorder=4)
+        if row.on_front:
+            front.append((row.ms, middle))
+        if row.converged_share is not None and row.converged_share < 0.995:
+            near = [other for other in said if max(row.ms / other, other / row.ms) < 2]
+            axes.annotate(
+                f"{100 * row.converged_share:.0f} %",
+                (row.ms, middle),
+                xytext=(0, -8 - 10 * len(near)),
+                textcoords="offset points",
+                ha="center",
+                va="top",
+                fontsize=_SMALL,
+                color=style["color"],
+                zorder=5,
+            )
+            said.append(row.ms)
+    if front:
+        times, errors = zip(*sorted(front), strict=True)
+        axes.plot(times, errors, drawstyle="steps-post", color=_INK, linewidth=1.1, zorder=2)
+
+
+def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
+    """The paper's times, without an error: at the axis."""
+    times = {row.method: row.ms for row in rows if row.ms is not None}
+    if not times:
+        return
+    at_axis = axes.get_xaxis_transform()
+    for method, time_ms in times.items():
+        style = {**method_style(method), "marker": "^", "zorder": 5}
+        axes.plot([time_ms], [0.025], transform=at_axis, clip_on=False, **style)
+    axes.text(
+        max(times.values()),
+        0.09,
+        f"paper: {' and '.join(f'{time_ms:g}' for time_ms in times.values())} ms",
+        transform=at_axis,
+        ha="right",
+        fontsize=_SMALL,
+        color=_INK,
+        backgroundcolor="white",
+    )
+
+
+# ---------------------------------------------------------------------------------------- notes
+
+
+def _explain(figure: Figure, title: str, methods: set[str]) -> None:
+    """Title and legend, above all panels."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [
+        Line2D([], [], **method_style(method), label=method)
+        for method in METHODS
+        if method in methods
+    ]
+    mark: dict[str, Any] = {"color": _INK, "linestyle": ""}
+    handles += [
+        Line2D([], [], color=_INK, linewidth=1.1, label="Pareto front (filled markers)"),
+        Line2D([], [], **mark, marker="o", markerfacecolor="white", label="median"),
+        Line2D([], [], color=_FAINT, alpha=0.5, linewidth=4, label="up to the 90th percentile"),
+        Line2D([], [], color=_FAINT, linestyle=":", label="90 Hz: 11.1 ms"),
+        Patch(color=_BAND, label="limit of one frame"),
+        Line2D([], [], color=_INK, linestyle=_PRINTED, label="printed RMSE, no time"),
+        Line2D([], [], **mark, marker="^", markersize=8.5, label="printed time, no error"),
+    ]
+    legend = figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=7,
+        frameon=False,
+        fontsize=9,
+        title=title,
+        title_fontsize=14,
+    )
+    legend.get_title().set_color(_INK)
+
+
+def _write_notes(axes: Axes) -> None:
+    """What the panels show, in a place of their own."""
+    axes.set_axis_off()
+    notes = axes.text(
+        0.02,
+        1.05,
+        "\n".join(textwrap.fill(note, 84) for note in _NOTES),
+        transform=axes.transAxes,
+        va="top",
+        fontsize=_SMALL,
+        color=_INK,
+        linespacing=1.35,
+    )
+    notes.set_in_layout(False)  # its length is not the panels' business

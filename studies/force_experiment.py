@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Force from voltages against force from estimated conductances: flat and curved skins, simulated.
+
+Section V.B of [Su2024] (see `published`), with our methods beside theirs. Each cell's regression is
+learned from single touches and used on several touches at once. Three kinds of regression, the same
+for voltage and for every method:
+
+    "line"     F = a x + c by ordinary least squares, nothing else: the paper's
+    "squares"  F = a x^b by ordinary least squares, b up to 50, nothing else
+    "choice"   `ForceRegression`: a line or a power law, scatter that may grow; never below 0
+
+A voltage saturates, so "squares" follows its heavy presses by exponents of 4 to 11, which none of
+the laws of "choice" has: it is there so that the baseline is compared at its best, too.
+
+Errors are root mean squares in newton over frames, then the mean over skins. Besides the methods
+there are "voltage", the paper's baseline, and "truth", the true conductances: what the regression,
+the cells' memory and their noise leave to the best readout there can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ohmskin.arrays import Float
+from ohmskin.emulate.press import PressModel
+from ohmskin.estimate.levels import VOLTAGE, voltage_level
+from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.force.curve_fit import Scatter, fit_power
+from ohmskin.force.regression import ForceRegression
+from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
+
+Progress = Callable[[int, int], None]
+
+TRUTH: Final = "truth"
+LINE: Final = "line"
+SQUARES: Final = "squares"
+CHOICE: Final = "choice"
+REGRESSIONS: Final = (LINE, SQUARES, CHOICE)
+_EXPONENTS: Final = np.geomspace(0.1, 50, 81)
+EVERY_GROUP: Final = "mean"
+# Ipopt gives up on most frames of one touch, after 0.2 and 0.3 s.
+SLOW: Final = ("lsq", "regularized")
+FAST: Final = (VOLTAGE, *(name for name in METHODS if name not in SLOW), TRUTH)
+ALL: Final = (VOLTAGE, *METHODS, TRUTH)
+OURS: Final = ("joint", "touch")
+CELLS: Final = {
+    "whole": PressModel(),
+    "no memory": PressModel().without_memory(),
+    "ideal": replace(PressModel().without_memory(), noise=0.0, drift=0.0),
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Methods on the same frames: the skin, how much is pressed and read, and cells of `CELLS`."""
+
+    rows: int
+    columns: int
+    plan: Plan
+    methods: tuple[str, ...]
+    cells: tuple[str, ...]
+
+
+# The second: so few frames that the paper's methods can be run on them as well.
+FULL: Final = (
+    Comparison(2, 2, Plan(), FAST, tuple(CELLS)),
+    Comparison(2, 2, Plan(4, 5, 4, 1), ALL, ("whole",)),
+    Comparison(8, 8, Plan(4, 6, 3, 3), FAST, tuple(CELLS)),
+)
+QUICK: Final = (
+    Comparison(2, 2, Plan(1, 6, 2, 2), FAST, tuple(CELLS)),
+    Comparison(2, 2, Plan(1, 2, 1, 1), ALL, ("whole",)),
+    Comparison(4, 4, Plan(1, 6, 2, 1), FAST, ("whole",)),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method's errors [N], mean over skins.
+
+    cells: "whole", "no memory" (no hysteresis, no creep), "ideal" (no noise either). frames: read
+    of each skin. group: see `surface_trial`; "mean": the mean over groups. calibration_n: of the
+    pressed cell, over the calibration's own frames (2x2: of the group's cell). pressed_n: of the
+    robot's cell in the test. every_cell_n: of all cells in the test, be they pressed, under a
+    weight or free. pressed_below_percent, every_cell_below_percent: how much less than "voltage"
+    by the same regression; ..._below_best_percent: by the regression with which it errs least.
+    """
+
+    surface: str
+    rows: int
+    columns: int
+    cells: str
+    skins: int
+    frames: int
+    regression: str
+    method: str
+    group: str
+    calibration_n: float
+    pressed_n: float
+    every_cell_n: float
+    pressed_below_percent: float
+    every_cell_below_percent: float
+    pressed_below_best_percent: float
+    every_cell_below_best_percent: float
+
+
+def measure(
+    comparisons: Sequence[Comparison], *, curved: bool, progress: Progress | None = None
+) -> list[Row]:
+    """All comparisons on a flat skin, or on one bent after its calibration.
+
+    `progress(done, steps)` is called after each method on each skin.
+    """
+    total = sum(len(c.cells) * c.plan.seeds * len(c.methods) for c in comparisons)
+    done = 0
+    rows: list[Row] = []
+    with threadpool_limits(limits=1):
+        for comparison in comparisons:
+            for cells in comparison.cells:
+                errors: dict[tuple[str, str], list[Float]] = {}
+                frames = 0
+                for seed in range(comparison.plan.seeds):
+                    trial = surface_trial(
+                        comparison.rows,
+                        comparison.columns,
+                        seed,
+                        comparison.plan,
+                        CELLS[cells],
+                        curved=curved,
+                    )
+                    frames = len(trial.time_s)
+                    for method in comparison.methods:
+                        rise = rises(method, trial)
+                        for regression in REGRESSIONS:
+                            of_method = errors.setdefault((regression, method), [])
+                            of_method.append(_errors(trial, rise, regression))
+                        done += 1
+                        if progress is not None:
+                            progress(done, total)
+                means = {key: np.mean(skins, axis=0) for key, skins in errors.items()}
+                rows += _rows("curved" if curved else "flat", comparison, cells, frames, means)
+    return rows
+
+
+def rises(method: str, trial: ForceTrial) -> Float:
+    """What a method shows above rest in every frame, (F, R, C) [S]; [1] for "voltage"."""
+    if method == TRUTH:
+        return trial.rise_siemens
+    if method == VOLTAGE:
+        return voltage_level(trial.ratio) - voltage_level(trial.rest_ratio)
+    estimator = make_estimator(method, trial.knowledge)
+    rest = estimator.estimate(trial.rest_ratio).cell_siemens
+    return np.array([estimator.estimate(frame).cell_siemens - rest for frame in trial.ratio])
+
+
+def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], Float]:
+    """The curves of all cells from the calibration's frames: from rises (F, R, C) to forces [N]."""
+    frames = np.flatnonzero(trial.group < 0)
+    rows, columns = rise.shape[1:]
+    cell = trial.cell[frames]
+    x = rise.reshape(len(rise), -1)[frames, cell]
+    force_n = trial.force_n.reshape(len(rise), -1)[frames, cell]
+    if regression == SQUARES:
+        # In units of each cell's largest rise: a siemens to the power of 50 is no number.
+        unit = np.array([x[cell == k].max() for k in range(rows * columns)])
+        curves = [
+            fit_power(x[cell == k] / unit[k], force_n[cell == k], Scatter(), _EXPONENTS)
+            for k in range(rows * columns)
+        ]
+        if None not in curves:
+            of_cell = np.array([(c.slope, c.exponent) for c in curves if c]).T
+            slope, exponent = of_cell.reshape(2, rows, columns)
+            return lambda seen: slope * np.maximum(seen / unit.reshape(slope.shape), 0) ** exponent
+        regression = LINE
+    if regression == LINE:
+        lines = [np.polyfit(x[cell == k], force_n[cell == k], 1) for k in range(rows * columns)]
+        slope, intercept = np.array(lines).T.reshape(2, rows, columns)
+        return lambda seen: slope * seen + intercept
+    model = ForceRegression().fit(
+        cell, x, force_n, shape=(rows, columns), press=trial.press[frames]
+    )
+    nothing = np.zeros((rows, columns))
+    return lambda seen: np.array([model.predict(frame, nothing)[0] for frame in seen])
+
+
+def _errors(trial: ForceTrial, rise: Float, regression: str) -> Float:
+    """Errors (groups, 3) [N]: `Row`'s calibration_n, pressed_n, every_cell_n."""
+    shape = rise.shape[1:]
+    off_n = (learn(trial, rise, regression)(rise) - trial.force_n).reshape(len(rise), -1)
+    of_robot_n = off_n[np.arange(len(rise)), trial.cell]
+    single = trial.group < 0
+    names = groups_of(*shape)
+    own = len(names) == len(off_n.T)
+    return np.array(
+        [
+            [
+                _rms(of_robot_n[single & (trial.cell == group) if own else single]),
+                _rms(of_robot_n[trial.group == group]),
+                _rms(off_n[trial.group == group]),
+            ]
+            for group in range(len(names))
+        ]
+    )
+
+
+def _rms(off_n: Float) -> float:
+    return float(np.sqrt(np.mean(off_n**2)))
+
+
+def _rows(
+    surface: str,
+    comparison: Comparison,
+    cells: str,
+    frames: int,
+    means: dict[tuple[str, str], Float],
+) -> list[Row]:
+    rows = []
+    shape = (comparison.rows, comparison.columns)
+    with_mean = {
+        key: np.vstack([by_group, by_group.mean(axis=0)]) for key, by_group in means.items()
+    }
+    best = np.min([with_mean[regression, VOLTAGE] for regression in REGRESSIONS], axis=0)
+    for (regression, method), values in with_mean.items():
+        below = 100 * (1 - values / with_mean[regression, VOLTAGE])
+        below_best = 100 * (1 - values / best)
+        for place, group in enumerate([*groups_of(*shape), EVERY_GROUP]):
+            rows.append(
+                Row(
+                    surface,
+                    *shape,
+                    cells,
+                    comparison.plan.seeds,
+                    frames,
+                    regression,
+                    method,
+                    group,
+                    *(round(float(value), 4) for value in values[place]),
+                    *(round(float(value), 1) for value in below[place, 1:]),
+                    *(round(float(value), 1) for value in below_best[place, 1:]),
+                )
+            )
+    return rows

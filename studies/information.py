@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the readings of one frame can tell at all: the posterior's standard deviation at the truth.
+
+Symbols, at the true resistances
+
+====== ============ ================================================================ ==========
+symbol shape        meaning                                                          unit
+====== ============ ================================================================ ==========
+J_p    (RC, k)      d current / d log r of the k pressed cells, over the noise       1
+B      (RC, n)      the same of everything else, times the root of its prior         1
+S      (RC, RC)     B B^T + 1: the readings' covariance if the pressed cells stood   1
+====== ============ ================================================================ ==========
+
+With W the inverse variance of the port currents and P the covariance of the prior, the posterior
+covariance of the log resistances is (J^T W J + P^-1)^-1: the Cramer-Rao bound with a prior (Van
+Trees 1968, section 2.4). A pressed cell's prior is so wide that P - P J^T (J P J^T + 1)^-1 J P
+would cancel to nothing, so the pressed cells come last:
+
+    covariance of the pressed cells   V = (J_p^T S^-1 J_p + 1/PRESSED_STD^2)^-1
+    variance of a cell at rest        s^2 (1 - b^T S^-1 b + b^T S^-1 J_p V J_p^T S^-1 b)
+
+with s its prior's deviation and b its column of B. The priors are those of `joint`, but for the
+cells: it is known which are pressed. No estimator of one frame does better on average, as far as
+the circuit is linear within these deviations; one that remembers earlier frames may, for it can
+know the wires better than the prior does.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, port_sensitivity
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.prior import (
+    LAYER_STD,
+    REST_STD,
+    SEGMENT_STD,
+    UNKNOWN_LAYER_STD,
+    UNKNOWN_REST_STD,
+    UNTOUCHED_OHM,
+)
+
+# Of a pressed cell's log conductance: nine decades within one deviation either way is no knowledge.
+PRESSED_STD: Final = 10.0
+# Where nobody says which cells are pressed: those that conduct so much more than a usual rest.
+PRESSED_SIEMENS: Final = 1.5 / UNTOUCHED_OHM
+
+
+def information_limit(
+    skin: Skin,
+    knowledge: SkinKnowledge,
+    pressed: NDArray[np.bool_] | None = None,
+    *,
+    rest_std: float | None = None,
+    layer_std: float | None = None,
+) -> Float:
+    """Standard deviation of each cell's conductance over its true value, shape (R, C).
+
+    skin: the truth. knowledge: what an estimator is told; without rest readings or nominal wires
+    the priors are wider, as in `joint`. pressed: (R, C); if absent, what conducts 1.5 microsiemens.
+    rest_std, layer_std: how well cells at rest and the mean of each layer's wires are known, of the
+    log, instead of the priors of `joint`; 0: exactly.
+    Raises ValueError for an open cell, and for shapes that differ.
+    """
+    if skin.shape != (knowledge.rows, knowledge.columns):
+        raise ValueError(f"the skin is {skin.shape}, the knowledge of another size")
+    if not np.all(skin.cell_siemens > 0):
+        raise ValueError("cells must conduct: an open one has no relative deviation")
+    if pressed is None:
+        pressed = skin.cell_siemens > PRESSED_SIEMENS
+    if pressed.shape != skin.shape:
+        raise ValueError(f"pressed has shape {pressed.shape}, the skin {skin.shape}")
+    free = pressed.ravel()
+    if rest_std is None:
+        rest_std = UNKNOWN_REST_STD if knowledge.rest_ratio is None else REST_STD
+    nominal = (knowledge.nominal_top_wire_ohm, knowledge.nominal_bottom_wire_ohm)
+    if layer_std is None:
+        layer_std = UNKNOWN_LAYER_STD if None in nominal else LAYER_STD
+
+    circuit = port_sensitivity(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm)
+    current = 1.0 / (circuit.port_ohm + knowledge.ref_ohm)
+    slope = (current**2 / knowledge.current_std)[:, None]
+    by_cell, by_wire = slope * circuit.by_cell, slope * circuit.by_wires()
+    at_rest = rest_std * by_cell[:, ~free]
+    layers = layer_std * by_wire.reshape(free.size, 2, free.size).sum(axis=2)
+    others = np.hstack([at_rest, SEGMENT_STD * by_wire, layers])
+    factor = scipy.linalg.cholesky(others @ others.T + np.eye(free.size), lower=True)
+
+    told = scipy.linalg.solve_triangular(factor, by_cell[:, free], lower=True)
+    precision = told.T @ told
+    precision[np.diag_indices_from(precision)] += PRESSED_STD**-2
+    root = np.linalg.inv(np.linalg.cholesky(precision))  # V = root^T root
+    learned = scipy.linalg.solve_triangular(factor, at_rest, lower=True)
+    shared = root @ (told.T @ learned)
+
+    std = np.empty(free.size)
+    std[free] = np.sqrt(np.sum(root**2, axis=0))
+    share = 1.0 - np.sum(learned**2, axis=0) + np.sum(shared**2, axis=0)
+    std[~free] = rest_std * np.sqrt(np.maximum(share, 1e-12))  # as far as rounding lets it be known
+    return std.reshape(skin.shape)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated skins whose truth is known: what methods are measured on. Simulation, all of it.
+
+A trial is one skin and frames of touches, drawn from a seed: cells of about 1 MOhm at rest, touches
+of 1 to 100 kOhm (log-uniform) at random places, wires that vary by 10 % around 100 and 200 Ohm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.record.readings import Readings
+
+REST_OHM: Final = 1e6
+TOP_WIRE_OHM: Final = 100.0
+BOTTOM_WIRE_OHM: Final = 200.0
+SPREAD: Final = 0.1  # of the log of rest resistances and wires
+TOUCH_OHM: Final = (1e3, 1e5)
+# A cell counts as pressed from here on, as a multiple of its conductance at rest.
+PRESSED: Final = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Readings, what is told with them, and the truth behind them.
+
+    readings: exact, of F frames. frames: the skin in each of them. rest: the untouched skin.
+    """
+
+    readings: Readings
+    frames: tuple[Skin, ...]
+    rest: Skin
+
+    @property
+    def cell_siemens(self) -> Float:
+        """The truth, (F, R, C) [S]."""
+        return np.array([skin.cell_siemens for skin in self.frames])
+
+    @property
+    def pressed(self) -> NDArray[np.bool_]:
+        """Cells that conduct half as much again as at rest, or more, (F, R, C)."""
+        return np.asarray(self.cell_siemens > PRESSED * self.rest.cell_siemens)
+
+    def rounded(self, bits: int | None) -> Readings:
+        """The readings as a converter of so many bits gives them; None: exact."""
+        exact = self.readings
+        if bits is None:
+            return exact
+        rest = exact.rest_ratio
+        return replace(
+            exact,
+            ratio=ratio_from_codes(quantise(exact.ratio, bits), bits),
+            rest_ratio=None if rest is None else ratio_from_codes(quantise(rest, bits), bits),
+            adc_bits=bits,
+        )
+
+
+def skin_at_rest(
+    rows: int,
+    columns: int,
+    random: np.random.Generator,
+    *,
+    wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    spread: float = SPREAD,
+) -> Skin:
+    """An untouched skin; every resistance is log-normal with this spread."""
+    middles = (1 / REST_OHM, *wire_ohm)
+    cell, top, bottom = (
+        middle * np.exp(spread * random.standard_normal((rows, columns))) for middle in middles
+    )
+    return Skin(cell, top, bottom)
+
+
+def touch(skin: Skin, touches: int, random: np.random.Generator) -> Skin:
+    """`skin` with so many cells, at random places, pressed to 1 to 100 kOhm."""
+    cell = skin.cell_siemens.copy()
+    low, high = np.log(TOUCH_OHM)
+    places = random.choice(cell.size, min(touches, cell.size), replace=False)
+    cell.flat[places] = 1 / np.exp(random.uniform(low, high, places.size))
+    return replace(skin, cell_siemens=cell)
+
+
+def trial_of(
+    rest: Skin,
+    frames: list[Skin],
+    nominal_wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+) -> Trial:
+    """A trial whose estimators are told the rest readings and the nominal wires."""
+    told = Readings(
+        ratio=np.array([readings(skin) for skin in frames]),
+        rest_ratio=readings(rest),
+        ref_top_ohm=rest.ref_top_ohm,
+        ref_bottom_ohm=rest.ref_bottom_ohm,
+        nominal_top_wire_ohm=np.array(nominal_wire_ohm[0]),
+        nominal_bottom_wire_ohm=np.array(nominal_wire_ohm[1]),
+    )
+    return Trial(told, tuple(frames), rest)
+
+
+def random_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
+    """Frames of 0 to `touches` touches, each frame touched anew: the hardest for a warm start."""
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(rows, columns, random)
+    counts = random.integers(0, touches + 1, frames)
+    return trial_of(rest, [touch(rest, int(count), random) for count in counts])
+
+
+def bent_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
+    """As `random_trial`, on a skin bent since its rest readings: wires 35 % above nominal."""
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(rows, columns, random)
+    bent = replace(
+        rest,
+        top_wire_ohm=1.35 * rest.top_wire_ohm,
+        bottom_wire_ohm=1.35 * rest.bottom_wire_ohm,
+    )
+    counts = random.integers(0, touches + 1, frames)
+    return trial_of(rest, [touch(bent, int(count), random) for count in counts])

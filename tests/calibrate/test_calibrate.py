@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin calibrate`` from recordings and tables: what is found, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ohmskin
+from command_line import Done, assert_one_line
+from ohmskin.arrays import Float
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.force.calibration import load_calibration
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import ForceSample, load_recording
+from press_recording import HOST_BEGIN_S, SENSOR_ZERO_N, record_presses, sensor_log, write_log
+
+SECONDS = 44.0  # two cells of six presses
+SHAPE = (1, 2)
+SENSOR_BEGIN_S = 70_000.0
+TOLD = (
+    *("--indenter-mm2", "80"),
+    *("--top-wire", str(TOP_WIRE_OHM), "--bottom-wire", str(BOTTOM_WIRE_OHM)),
+)
+Run = Callable[..., Done]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene("press", *SHAPE, seed=1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
+    """A folder with presses.mcap and forces.csv."""
+    folder = tmp_path_factory.mktemp("presses")
+    record_presses(folder / "presses.mcap", scene, SECONDS)
+    times_s, force_n = sensor_log(scene, SECONDS)
+    write_log(folder / "forces.csv", times_s + SENSOR_BEGIN_S, force_n)
+    return folder
+
+
+@pytest.fixture
+def presses(made: Path, tmp_path: Path) -> tuple[Path, Path, Path]:
+    """Paths of a recording, of a force log, and of the calibration to be written."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "presses.mcap", tmp_path / "forces.csv", tmp_path / "skin.json"
+
+
+def calibrate(run: Run, presses: tuple[Path, Path, Path], *more: str) -> Done:
+    recording, forces, out = presses
+    return run(
+        *("calibrate", "recording", str(recording), str(out), "--forces", str(forces)),
+        *TOLD,
+        *(more or ("--rest", "1.5")),
+    )
+
+
+def test_a_recording_and_a_force_log_make_a_calibration(
+    run: Run, presses: tuple[Path, Path, Path], scene: Scene
+) -> None:
+    recording, _, out = presses
+    done = calibrate(run, presses)
+    assert (done.code, done.err) == (0, "")
+    offset_s = float(done.out.partition("offset of the clocks ")[2].partition(" s")[0])
+    # Creep and the sensor's rate leave some hundredths.
+    assert offset_s == pytest.approx(HOST_BEGIN_S - SENSOR_BEGIN_S, abs=0.05)
+    zero_n = float(done.out.partition("zero of the force sensor ")[2].partition(" N")[0])
+    assert zero_n == pytest.approx(SENSOR_ZERO_N, abs=0.02)
+    found = load_calibration(out)
+    assert (found.unit_id, found.method) == (3, "joint")
+    assert found.indenter_area_m2 == pytest.approx(80e-6)
+    assert (found.nominal_top_wire_ohm, found.nominal_bottom_wire_ohm) == (100.0, 200.0)
+    assert not found.model.pooled.any()
+    rest_siemens = scene.skin(0.0).cell_siemens
+    np.testing.assert_allclose(found.rest.level, rest_siemens, rtol=0.1)
+    np.testing.assert_allclose(found.rest.ratio, scene.rest_ratio, atol=1e-3)
+
+    # What the calibration makes of the same skin, against what pressed it.
+    with ohmskin.open(f"replay://{recording}?speed=0", calibration=out) as skin:
+        scans = list(islice(skin, 0, None, 9))
+    true_n = np.array([scene.force_n(1e-6 * scan.time_us) for scan in scans])
+    force_n = np.array([scan.force_n for scan in scans])
+    pressed = true_n > 0.3
+    assert np.sqrt(np.mean((force_n - true_n)[pressed] ** 2)) < 0.15 * true_n.max()
+    assert np.abs(force_n[~pressed & (true_n == 0)]).max() < 0.3
+    held_out_n = np.sqrt(np.mean(found.model.held_out_rmse**2))
+    assert 0.05 < held_out_n < 1.0
+    assert f"({len(np.unique(true_n[:, 0, 0] > 0.3)) * 3})" in done.out  # six presses
+
+
+def test_the_recording_can_hold_the_forces(
+    run: Run, presses: tuple[Path, Path, Path], scene: Scene, tmp_path: Path
+) -> None:
+    recording, _, out = presses
+    given = load_recording(recording)
+    both = tmp_path / "both.mcap"
+    times_s, force_n = sensor_log(scene, SECONDS)
+    with Recorder(both, given.hellos[0]) as recorder:
+        for scan in given.scans:
+            recorder.add(scan)
+        for time_s, force in zip(times_s, force_n, strict=True):
+            recorder.add(ForceSample(float(force), HOST_BEGIN_S + float(time_s), source="cell"))
+    done = run("calibrate", "recording", str(both), str(out), "--rest", "1.5", *TOLD)
+    assert (done.code, done.err) == (0, "")
+    own = load_calibration(out).model.slope
+    assert calibrate(run, presses).code == 0
+    np.testing.assert_allclose(own, load_calibration(out).model.slope, rtol=0.02)
+
+
+@pytest.mark.parametrize("method", ["voltage", "touch"])
+def test_other_methods(run: Run, presses: tuple[Path, Path, Path], method: str) -> None:
+    done = calibrate(run, presses, "--rest", "1.5", "--method", method)
+    assert (done.code, done.err) == (0, "")
+    assert load_calibration(presses[2]).method == method
+
+
+def edited(path: Path, edit: Callable[[Float, Float], tuple[Float, Float]]) -> None:
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    write_log(path, *edit(table[:, 0], table[:, 1]))
+
+
+def test_bad_force_logs(run: Run, presses: tuple[Path, Path, Path]) -> None:
+    _, forces, out = presses
+    good = forces.read_text()
+    random = np.random.default_rng(1)
+    for edit, words in (
+        (lambda t, f: (t, -f), ["forces.csv", "turn the sign"]),
+        (lambda t, f: (t, np.full(f.size, 2.0)), ["forces.csv", "force_n is 2 throughout"]),
+        (lambda t, f: (t[:5], f[:5]), ["forces.csv", "5 samples are too few"]),
+        (lambda t, f: (t, random.permutation(f)), ["presses.mcap", "fit at no offset"]),
+        (lambda t, f: (1e3 * t, f), ["presses.mcap"]),
+    ):
+        forces.write_text(good)
+        edited(forces, edit)
+        assert_one_line(calibrate(run, presses), *words)
+        assert not out.exists()
+    for header, words in (
+        ("time_ms,force_n", ["time_s", "time_ms"]),
+        ("time_s,force_g", ["force_n", "force_g"]),
+    ):
+        forces.write_text(good.replace("time_s,force_n", header))
+        assert_one_line(calibrate(run, presses), "forces.csv", *words)
+    lines = good.splitlines()
+    forces.write_text("\n".join([*lines[:40], "70000.5,", *lines[41:]]))
+    assert_one_line(calibrate(run, presses), "forces.csv", "row 41")
+    assert not out.exists()
+
+
+def test_a_gap_in_the_log_costs_its_presses_alone(
+    run: Run, presses: tuple[Path, Path, Path]
+) -> None:
+    def with_gap(t: Float, f: Float) -> tuple[Float, Float]:
+        kept = (t < SENSOR_BEGIN_S + 8) | (t > SENSOR_BEGIN_S + 12)
+        return t[kept], f[kept]
+
+    edited(presses[1], with_gap)
+    done = calibrate(run, presses)
+    assert (done.code, done.err) == (0, "")
+    assert load_calibration(presses[2]).model.pooled.sum() <= 1
+
+
+def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    recording, forces, out = presses
+    assert_one_line(
+        run("calibrate", "recording", str(recording), str(out), "--rest", "1", *TOLD),
+        "presses.mcap: no force in it: say --forces LOG.csv",
+    )
+    assert_one_line(
+        calibrate(run, presses, "--method", "joint"),
+        "presses.mcap: no tare in it: say --rest 2",
+    )
+    given = load_recording(recording)
+    edited(forces, lambda t, f: (t[t < SENSOR_BEGIN_S + 21], f[t < SENSOR_BEGIN_S + 21]))
+    for name, scans, words in (
+        ("none", [], ["none.mcap: no scan in it"]),
+        ("one", [scan for scan in given.scans if scan.time_us < 5e6], ["one.mcap"]),
+    ):
+        path = tmp_path / f"{name}.mcap"
+        with Recorder(path, given.hellos[0]) as recorder:
+            for scan in scans:
+                recorder.add(scan)
+        assert_one_line(calibrate(run, (path, forces, out)), *words)
+    foreign = tmp_path / "foreign.mcap"
+    foreign.write_bytes(b"no recording at all")
+    assert_one_line(calibrate(run, (foreign, forces, out)), "foreign.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(recording.read_bytes()[:200])
+    assert_one_line(calibrate(run, (cut, forces, out)), "cut.mcap")
+    assert not out.exists()
+
+
+# --------------------------------------------------------------------------------------- table
+
+REST = "emulator://2x3?seed=1&unit=5"
+
+
+def press_table(path: Path, seed: int = 1) -> Float:
+    """Presses of all cells of `REST` at 10 microsiemens a newton; their rests (2, 3)."""
+    rest = Scene("rest", 2, 3, seed=1).skin(0.0).cell_siemens
+    lines = ["row,column,force_n,conductance"]
+    for row, column in np.ndindex(2, 3):
+        for force_n in (0.5, 1, 2, 3, 5, 8):
+            lines.append(f"{row},{column},{force_n},{rest[row, column] + 10e-6 * force_n}")
+    path.write_text("\n".join(lines) + "\n")
+    return rest
+
+
+def test_a_table_makes_a_calibration(run: Run, tmp_path: Path) -> None:
+    table, out = tmp_path / "presses.csv", tmp_path / "skin.json"
+    rest = press_table(table)
+    done = run("calibrate", "table", REST, str(table), str(out), "--rest", "0.3", *TOLD)
+    assert (done.code, done.err) == (0, "")
+    found = load_calibration(out)
+    assert (found.unit_id, found.rows, found.columns) == (5, 2, 3)
+    np.testing.assert_allclose(found.model.slope, 1e5, rtol=0.02)
+    np.testing.assert_allclose(found.rest.level, rest, rtol=0.1)
+    with ohmskin.open(REST, calibration=out) as skin:
+        assert np.abs(skin.latest().force_n).max() < 0.02
+
+
+def test_bad_tables(run: Run, tmp_path: Path) -> None:
+    table, out = tmp_path / "presses.csv", tmp_path / "skin.json"
+    press_table(table)
+    good = table.read_text()
+    header, *rows = good.splitlines()
+    for text, words in (
+        (header, ["no press"]),
+        (f"{header}\n{rows[0]}", ["1 press is too few"]),
+        ("\n".join([header, *rows[:6]]), ["all presses are on cell (0, 0)"]),
+        (good.replace("0,0,1,", "2,0,1,"), ["row 3: cell (2, 0) is not on this 2x3 skin"]),
+        (good.replace("0,0,1,", "0,0,-1,"), ["row 3", "force_n is -1"]),
+        (good.replace("conductance", "conductance_us"), ["conductance_us"]),
+        (good.replace("force_n", "force_g"), ["force_g"]),
+        ("\n".join([header, *(f"{row[:4]}2,{row[-9:]}" for row in rows)]), ["presses.csv"]),
+    ):
+        table.write_text(text)
+        done = run("calibrate", "table", REST, str(table), str(out), "--rest", "0.05", *TOLD)
+        assert_one_line(done, *words)
+        assert not out.exists()
+    table.write_text(good)
+    assert_one_line(
+        run("calibrate", "table", REST, str(table), str(out), *TOLD, "--method", "voltage"),
+        "a table has conductances",
+    )
+
+
+def test_a_missing_indenter_is_asked_for(run: Run, tmp_path: Path) -> None:
+    done = run("calibrate", "table", REST, "t.csv", str(tmp_path / "skin.json"))
+    assert done.code == 2
+    assert "--indenter-mm2" in done.err

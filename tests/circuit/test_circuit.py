@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The forward model against ngspice, a plain node Laplacian, and hand arithmetic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ohmskin.circuit.skin import (
+    Skin,
+    current_from_ratio,
+    current_std,
+    port_resistance_ohm,
+    readings,
+)
+from ohmskin.link.codes import quantise, ratio_from_codes, ratio_std
+from places import DATA
+
+REFERENCE_FILES = sorted(DATA.glob("*_[0-9]x[0-9].npz"))
+
+
+def random_skin(rows: int, columns: int, seed: int) -> Skin:
+    random = np.random.default_rng(seed)
+    shape = (rows, columns)
+    return Skin(
+        1 / np.exp(random.uniform(np.log(1e3), np.log(2e6), shape)),
+        random.uniform(1, 1000, shape),
+        random.uniform(1, 1000, shape),
+        ref_top_ohm=27e3,
+        ref_bottom_ohm=33e3,
+    )
+
+
+def node_laplacian_port_ohm(skin: Skin) -> np.ndarray:
+    """Kirchhoff's law on every node, electrodes included, one dense solve per port."""
+    rows, columns = skin.shape
+    cells = rows * columns
+    nodes = 2 * cells + rows + columns
+    laplacian = np.zeros((nodes, nodes))
+
+    def join(first: int, second: int, siemens: float) -> None:
+        laplacian[[first, second], [first, second]] += siemens
+        laplacian[[first, second], [second, first]] -= siemens
+
+    for i in range(rows):
+        for j in range(columns):
+            top, bottom = i * columns + j, cells + i * columns + j
+            before_top = top - 1 if j else 2 * cells + i
+            before_bottom = bottom - columns if i else 2 * cells + rows + j
+            join(top, bottom, skin.cell_siemens[i, j])
+            join(top, before_top, 1 / skin.top_wire_ohm[i, j])
+            join(bottom, before_bottom, 1 / skin.bottom_wire_ohm[i, j])
+    resistance = np.empty((rows, columns))
+    for i in range(rows):
+        for j in range(columns):
+            inject = np.zeros(nodes)
+            source, sink = 2 * cells + i, 2 * cells + rows + j
+            inject[source] = 1
+            keep = np.arange(nodes) != sink
+            resistance[i, j] = np.linalg.solve(laplacian[np.ix_(keep, keep)], inject[keep])[
+                source - (source > sink)
+            ]
+    return resistance
+
+
+def test_all_reference_files_are_there() -> None:
+    assert len(REFERENCE_FILES) == 7
+
+
+@pytest.mark.parametrize("path", REFERENCE_FILES, ids=lambda path: path.stem)
+def test_readings_agree_with_ngspice(path: Path) -> None:
+    with np.load(path) as reference:
+        for frame, expected in enumerate(reference["ratio"]):
+            skin = Skin(
+                1 / reference["cell_ohm"][frame],
+                reference["top_wire_ohm"][frame],
+                reference["bottom_wire_ohm"][frame],
+                float(reference["ref_top_ohm"]),
+                float(reference["ref_bottom_ohm"]),
+            )
+            # Measured: 6e-13, the last digit ngspice printed.
+            np.testing.assert_allclose(readings(skin), expected, rtol=0, atol=2e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(rows=st.integers(1, 5), columns=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_port_resistance_agrees_with_the_node_laplacian(rows: int, columns: int, seed: int) -> None:
+    skin = random_skin(rows, columns, seed)
+    np.testing.assert_allclose(port_resistance_ohm(skin), node_laplacian_port_ohm(skin), rtol=1e-8)
+
+
+def test_one_cell_is_a_series_circuit() -> None:
+    skin = Skin.uniform(
+        1, 1, rest_ohm=39_700, top_wire_ohm=100, bottom_wire_ohm=200, ref_bottom_ohm=20_000
+    )
+    assert port_resistance_ohm(skin) == pytest.approx(40_000)
+    # 1 V over 30 + 40 + 20 kOhm.
+    np.testing.assert_allclose(readings(skin)[0, 0], [6 / 9, 2 / 9, 7 / 9, 3 / 9], rtol=1e-12)
+
+
+def test_two_by_two_without_wires_is_a_cell_beside_three_in_series() -> None:
+    ohm = np.array([[1e3, 2e3], [3e3, 4e3]])
+    skin = Skin(1 / ohm, np.zeros((2, 2)), np.zeros((2, 2)))
+    others = ohm.sum() - ohm
+    np.testing.assert_allclose(port_resistance_ohm(skin), ohm * others / ohm.sum(), rtol=1e-12)
+
+
+def test_one_column_without_wires_has_no_other_path() -> None:
+    ohm = np.array([[1e3], [2e6], [5e4]])
+    skin = Skin(1 / ohm, np.zeros((3, 1)), np.zeros((3, 1)))
+    np.testing.assert_allclose(port_resistance_ohm(skin), ohm, rtol=1e-12)
+
+
+def test_one_row_adds_the_segments_up_to_the_cell() -> None:
+    skin = Skin(np.array([[1e-3, 1e-3, 1e-3]]), np.array([[10.0, 20, 30]]), np.full((1, 3), 5.0))
+    np.testing.assert_allclose(port_resistance_ohm(skin), [[1015, 1035, 1065]], rtol=1e-12)
+
+
+def test_open_cells_give_inf_ports_and_readings_at_the_rails() -> None:
+    skin = Skin.uniform(3, 2, rest_ohm=np.inf)
+    assert np.all(np.isinf(port_resistance_ohm(skin)))
+    np.testing.assert_array_equal(readings(skin), np.broadcast_to([1, 0, 1, 0], (3, 2, 4)))
+
+
+def test_parts_of_a_skin_that_no_cell_connects_are_solved_apart() -> None:
+    cell = np.zeros((3, 3))
+    cell[0, 0], cell[1, 1] = 1e-3, 1e-6
+    skin = Skin(cell, np.full((3, 3), 10.0), np.full((3, 3), 10.0))
+    expected = np.full((3, 3), np.inf)
+    expected[0, 0], expected[1, 1] = 1020, 1_000_040
+    np.testing.assert_allclose(port_resistance_ohm(skin), expected, rtol=1e-12)
+
+
+def test_an_open_cell_is_the_limit_of_a_very_high_resistance() -> None:
+    cell = np.full((3, 4), 1e-5)
+    cell[1, 2] = 0
+    nearly = cell.copy()
+    nearly[1, 2] = 1e-15
+    wires = np.full((3, 4), 100.0)
+    np.testing.assert_allclose(
+        port_resistance_ohm(Skin(cell, wires, wires)),
+        port_resistance_ohm(Skin(nearly, wires, wires)),
+        rtol=1e-8,
+    )
+
+
+def test_reciprocity_both_directions_see_the_same_current() -> None:
+    skin = random_skin(4, 3, seed=7)
+    a, b, c, d = np.moveaxis(readings(skin), -1, 0)
+    np.testing.assert_allclose((1 - a) / skin.ref_top_ohm, d / skin.ref_top_ohm, rtol=1e-12)
+    np.testing.assert_allclose((1 - c) / skin.ref_bottom_ohm, b / skin.ref_bottom_ohm, rtol=1e-12)
+    np.testing.assert_allclose(d / skin.ref_top_ohm, b / skin.ref_bottom_ohm, rtol=1e-12)
+
+
+def test_swapping_the_layers_transposes_the_ports() -> None:
+    skin = random_skin(3, 5, seed=11)
+    swapped = Skin(skin.cell_siemens.T, skin.bottom_wire_ohm.T, skin.top_wire_ohm.T)
+    np.testing.assert_allclose(
+        port_resistance_ohm(swapped), port_resistance_ohm(skin).T, rtol=1e-10
+    )
+
+
+def test_current_is_the_combination_of_least_variance() -> None:
+    skin = random_skin(2, 3, seed=3)
+    exact = readings(skin)
+    refs = (skin.ref_top_ohm, skin.ref_bottom_ohm)
+    truth = 1 / (port_resistance_ohm(skin) + sum(refs))
+    np.testing.assert_allclose(current_from_ratio(exact, *refs), truth, rtol=1e-12)
+
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((4000, *exact.shape))
+    spread = current_from_ratio(exact + noise, *refs).std()
+    least = 1e-3 / np.sqrt(2 * refs[0] ** 2 + 2 * refs[1] ** 2)
+    error = (current_from_ratio(exact + noise, *refs) - truth).std()
+    assert error == pytest.approx(least, rel=0.02)
+    assert spread > error
+    # The stated one also holds for noise that all four readings share, twice as much at most.
+    assert least < current_std(1e-3, *refs) <= 2 * least
+
+
+def test_codes() -> None:
+    ratio = [-0.1, 0.0, 1 / 1024 - 1e-12, 1 / 1024, 0.5, 1023 / 1024, 1.0, 1.5]
+    assert quantise(ratio).tolist() == [0, 0, 0, 1, 512, 1023, 1023, 1023]
+    assert ratio_from_codes([0, 512, 1023]).tolist() == [0.5 / 1024, 512.5 / 1024, 1023.5 / 1024]
+    assert quantise([0.5, 1.0], bits=12).tolist() == [2048, 4095]
+    assert ratio_std(10) == pytest.approx(1 / 1024 / np.sqrt(12))
+
+
+@given(st.integers(1, 16), st.floats(0, 1))
+def test_a_code_is_within_half_a_step_of_its_ratio(bits: int, ratio: float) -> None:
+    assert abs(ratio_from_codes(quantise(ratio, bits), bits) - ratio) <= 0.5 / 2**bits
+    codes = np.arange(2**bits)
+    np.testing.assert_array_equal(quantise(ratio_from_codes(codes, bits), bits), codes)
+
+
+@pytest.mark.parametrize("bits", [0, 17, 10.5, True, float("nan"), float("inf")])
+def test_impossible_adc_bits_are_refused(bits: int) -> None:
+    with pytest.raises(ValueError, match="adc bits"):
+        quantise(0.5, bits)
+
+
+def test_a_ratio_that_is_no_number_has_no_code() -> None:
+    with pytest.raises(ValueError, match="not a number"):
+        quantise([0.5, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cell_siemens": np.ones(4)}, "cell_siemens must be"),
+        ({"cell_siemens": np.ones((0, 2))}, "cell_siemens must be"),
+        ({"top_wire_ohm": np.ones((2, 3))}, "top_wire_ohm has shape"),
+        ({"bottom_wire_ohm": np.full((2, 2), -1.0)}, "bottom_wire_ohm must be finite"),
+        ({"cell_siemens": np.full((2, 2), np.nan)}, "cell_siemens must be finite"),
+        ({"ref_top_ohm": 0.0}, "ref_top_ohm must be positive"),
+        ({"ref_bottom_ohm": np.inf}, "ref_bottom_ohm must be positive"),
+    ],
+)
+def test_impossible_skins_are_refused(change: dict[str, object], message: str) -> None:
+    skin = {name: np.ones((2, 2)) for name in ("cell_siemens", "top_wire_ohm", "bottom_wire_ohm")}
+    with pytest.raises(ValueError, match=message):
+        Skin(**(skin | change))  # type: ignore[arg-type]
+
+
+def test_a_skin_keeps_its_own_copy() -> None:
+    cell = np.ones((2, 2))
+    skin = Skin(cell, np.ones((2, 2)), np.ones((2, 2)))
+    cell[0, 0] = 7
+    assert skin.cell_siemens[0, 0] == 1
+    with pytest.raises(ValueError, match="read-only"):
+        skin.cell_siemens[0, 0] = 2

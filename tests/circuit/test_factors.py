@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Factors against numpy, and matrices that rounding has made indefinite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_factors_solve_what_numpy_solves(order: str) -> None:
+    random = np.random.default_rng(1)
+    rows = random.normal(size=(5, 9))
+    right = random.normal(size=(5, 3))
+    system = np.array(rows @ rows.T, order=order)
+    kept = system.copy()
+    factor = cholesky(system)
+    np.testing.assert_array_equal(system, kept)
+    np.testing.assert_allclose(solve(factor, right), np.linalg.solve(kept, right))
+    lower = np.linalg.cholesky(kept)
+    np.testing.assert_allclose(solve_lower(factor, right), np.linalg.solve(lower, right))
+    transposed = solve_lower(factor, right, transposed=True)
+    np.testing.assert_allclose(transposed, np.linalg.solve(lower.T, right))
+
+
+def test_gram_adds_lower_triangles() -> None:
+    random = np.random.default_rng(2)
+    one, two = random.normal(size=(4, 6)), random.normal(size=(4, 3))
+    both = gram(two, -0.5, gram(one))
+    np.testing.assert_allclose(np.tril(both), np.tril(one @ one.T - 0.5 * two @ two.T))
+
+
+def test_a_matrix_that_rounding_made_indefinite_is_mended() -> None:
+    row = np.array([[1e10, 2e10, 3e10]])
+    system = row.T @ row + np.eye(3)
+    system[1, 1] -= 1e5
+    factor = np.tril(cholesky(system))
+    np.testing.assert_allclose(factor @ factor.T, system, rtol=1e-6)
+
+
+def test_an_indefinite_matrix_is_refused() -> None:
+    with pytest.raises(np.linalg.LinAlgError):
+        cholesky(-np.eye(2))

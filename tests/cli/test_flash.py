@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ohmskin flash`: which board and port it means, what it runs, and how it knows that it worked.
+
+PlatformIO is a script that writes down its arguments; the board is emulated at a pseudo-terminal.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from command_line import Done, assert_one_line
+from ohmskin.cli import flash as flash_command
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.link import session
+from ohmskin.link.serial_port import SerialPort
+from ohmskin.opening import emulated
+from places import ROOT
+
+Run = Callable[..., Done]
+
+
+class FlashedBoard(EmulatedBoard):
+    """One that says which real board it is."""
+
+    says = "uno"
+
+    def _send(self, name: str, tail: bytes = b"", **values: Any) -> None:
+        if name == "hello":
+            values["board"] = self.says
+        super()._send(name, tail, **values)
+
+
+class Pio:
+    """A ``pio`` that notes its arguments, then does what `upload` says, and ends with `code`."""
+
+    def __init__(self, place: Path) -> None:
+        self._noted = place / "noted"
+        self._script = place / "pio"
+        self.end_with(0)
+
+    def end_with(self, code: int, then: str = "") -> None:
+        self._script.write_text(
+            f"#!/bin/sh\nprintf '%s\\n' \"$@\" > {self._noted}\n"
+            f"echo core=$PLATFORMIO_CORE_DIR\n{then}\nexit {code}\n"
+        )
+        self._script.chmod(0o755)
+
+    @property
+    def arguments(self) -> list[str]:
+        return self._noted.read_text().splitlines() if self._noted.exists() else []
+
+
+@pytest.fixture(autouse=True)
+def pio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pio:
+    place = tmp_path / "bin"
+    place.mkdir()
+    monkeypatch.setattr(sys, "executable", str(place / "python"))
+    monkeypatch.setenv("PATH", f"{place}:/usr/bin:/bin")
+    return Pio(place)
+
+
+@pytest.fixture
+def attach(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """A function that says which ports this machine has: path and board of each."""
+
+    def say(*ports: tuple[str, str]) -> None:
+        found = [SerialPort(path, "", board) for path, board in ports]
+        monkeypatch.setattr(flash_command, "serial_ports", lambda: found)
+
+    say()
+    return say
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., str]]:
+    """A function that serves a board at a pseudo-terminal, and gives its port."""
+    with ExitStack() as stack:
+
+        def begin(board: EmulatedBoard, silent_s: float = 0.0) -> str:
+            server = stack.enter_context(PtyServer(board))
+            done = threading.Event()
+
+            def work() -> None:
+                done.wait(silent_s)
+                while not done.is_set():
+                    server.serve(0.05)
+
+            thread = threading.Thread(target=work)
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(done.set)
+            return server.path
+
+        yield begin
+
+
+def board(says: str = "uno") -> FlashedBoard:
+    made = FlashedBoard(emulated("emulator://8x8")[0]._ratio_at, 8, 8)
+    made.says = says
+    made.reset()  # its first hello was of a class that did not know yet
+    return made
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind"),
+    [
+        ([], "uno"),
+        (["uno"], "uno"),
+        (["uno", "--port", "{}"], "uno"),
+        (["--port", "{}"], "uno"),
+        ([], "megaatmega2560"),
+    ],
+)
+def test_it_flashes_and_hears_from_the_board(
+    run: Run,
+    pio: Pio,
+    attach: Callable[..., None],
+    serve: Callable[..., str],
+    arguments: list[str],
+    kind: str,
+) -> None:
+    port = serve(board(kind))
+    attach(("/dev/ttyS0", ""), (port, kind))
+    done = run("flash", *(each.format(port) for each in arguments))
+    assert (done.code, done.err) == (0, "")
+    assert f"flashing {kind} at {port}" in done.out
+    assert f"{port}: {kind}, firmware 0.1.0, answers" in done.out
+    expected = ["run", "-d", str(ROOT), "-e", kind, "-t", "upload", "--upload-port", port]
+    assert pio.arguments == expected
+
+
+def test_a_board_with_another_usb_bridge_is_named(
+    run: Run, pio: Pio, attach: Callable[..., None], serve: Callable[..., str]
+) -> None:
+    port = serve(board())
+    attach((port, ""))
+    assert run("flash", "uno", "--port", port).code == 0
+    assert pio.arguments[-1] == port
+
+
+def test_the_board_may_take_its_time_to_boot(
+    run: Run, attach: Callable[..., None], serve: Callable[..., str]
+) -> None:
+    port = serve(board(), silent_s=1.0)
+    attach((port, "uno"))
+    assert run("flash").code == 0
+
+
+def test_the_port_may_be_gone_for_a_while(
+    run: Run, pio: Pio, attach: Callable[..., None], serve: Callable[..., str], tmp_path: Path
+) -> None:
+    port, link = serve(board()), tmp_path / "ttyACM0"
+    attach((str(link), "uno"))
+    back = threading.Timer(0.7, link.symlink_to, [port])
+    back.start()
+    assert run("flash").code == 0
+    back.join()
+
+
+def test_the_port_may_come_back_by_another_name(
+    run: Run,
+    attach: Callable[..., None],
+    serve: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    port = serve(board())
+    begin_s = time.monotonic()
+
+    def ports() -> list[SerialPort]:
+        renamed = time.monotonic() - begin_s > 0.5
+        return [SerialPort(port if renamed else "/dev/ttyACM77", "", "uno")]
+
+    monkeypatch.setattr(flash_command, "serial_ports", ports)
+    done = run("flash")
+    assert done.code == 0
+    assert f"{port}: uno" in done.out
+
+
+UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {
+    "nothing attached": ([], [], ["uno", "megaatmega2560", "--port"]),
+    "no such board": (["due"], [], ["no board 'due'", "uno, megaatmega2560"]),
+    "two boards": (
+        [],
+        [("/dev/ttyACM0", "uno"), ("/dev/ttyACM1", "megaatmega2560")],
+        ["2 boards", "--port", "/dev/ttyACM0 (uno)", "/dev/ttyACM1 (megaatmega2560)"],
+    ),
+    "two of the board": (
+        ["uno"],
+        [("/dev/ttyACM0", "uno"), ("/dev/ttyACM1", "uno")],
+        ["2 boards", "--port", "/dev/ttyACM0", "/dev/ttyACM1"],
+    ),
+    "the other board": (
+        ["uno", "--port", "/dev/ttyACM1"],
+        [("/dev/ttyACM1", "megaatmega2560")],
+        ["/dev/ttyACM1 is a megaatmega2560, not a uno"],
+    ),
+    "only an unknown bridge": (
+        ["uno"],
+        [("/dev/ttyUSB0", ""), ("/dev/ttyUSB1", "")],
+        ["no uno is found", "--port", "/dev/ttyUSB0, /dev/ttyUSB1"],
+    ),
+    "an unknown bridge, no board": (
+        ["--port", "/dev/ttyUSB0"],
+        [("/dev/ttyUSB0", "")],
+        ["/dev/ttyUSB0", "say which board", "uno | megaatmega2560"],
+    ),
+}
+
+
+@pytest.mark.parametrize("what", UNCLEAR)
+def test_what_is_not_clear_is_asked_and_nothing_is_written(
+    what: str, run: Run, pio: Pio, attach: Callable[..., None]
+) -> None:
+    arguments, ports, words = UNCLEAR[what]
+    attach(*ports)
+    assert_one_line(run("flash", *arguments), *words)
+    assert pio.arguments == []
+
+
+def test_the_one_of_that_kind_is_taken(
+    run: Run, pio: Pio, attach: Callable[..., None], serve: Callable[..., str]
+) -> None:
+    port = serve(board("megaatmega2560"))
+    attach(("/dev/ttyACM0", "uno"), (port, "megaatmega2560"))
+    assert run("flash", "megaatmega2560").code == 0
+    assert pio.arguments[-1] == port
+
+
+def failed(run: Run) -> str:
+    done = run("flash")
+    assert done.code == 2
+    assert done.err.count("\n") == 1
+    assert "answers" not in done.out
+    return done.err
+
+
+def test_a_failed_upload_is_said(run: Run, pio: Pio, attach: Callable[..., None]) -> None:
+    attach(("/dev/ttyACM0", "uno"))
+    pio.end_with(1)
+    assert "flashing uno at /dev/ttyACM0 failed" in failed(run)
+
+
+def test_a_board_that_stays_silent_is_said(
+    run: Run,
+    attach: Callable[..., None],
+    serve: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
+    attach((serve(board(), silent_s=30.0), "uno"))
+    assert "is silent" in failed(run)
+
+
+def test_a_port_that_does_not_come_back_is_said(
+    run: Run, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flash_command, "REBOOT_S", 0.3)
+    attach(("/dev/ttyACM77", "uno"))
+    assert "no port /dev/ttyACM77" in failed(run)
+
+
+def test_another_board_at_the_port_is_said(
+    run: Run, attach: Callable[..., None], serve: Callable[..., str]
+) -> None:
+    attach((serve(board("megaatmega2560")), "uno"))
+    assert "answers as 'megaatmega2560', not as uno" in failed(run)
+
+
+def test_without_platformio_it_says_how_to_get_it(
+    run: Run, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attach(("/dev/ttyACM0", "uno"))
+    monkeypatch.setenv("PATH", os.devnull)
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    assert_one_line(run("flash"), "pip install 'ohmskin[flash]'")
+
+
+def test_without_a_checkout_it_says_so(
+    run: Run, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    attach(("/dev/ttyACM0", "uno"))
+    monkeypatch.setattr(flash_command, "_ROOT", tmp_path)
+    assert_one_line(run("flash"), "run this in a checkout")

@@ -1,0 +1,473 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The emulated board, sans-IO, and that it and the firmware answer alike."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.simavr import SkinSim
+from ohmskin.errors import PortError
+from ohmskin.link import framing, protocol
+from ohmskin.link.codes import quantise
+from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
+from ohmskin.opening import emulated
+from places import ROOT
+
+DEFAULT = {
+    "rows": 8,
+    "columns": 8,
+    "rate_mhz": 90_000,
+    "settle_us": 0,
+    "adc_prescaler": 32,
+}
+
+
+class Board(Protocol):
+    def exchange(self, octets: bytes, seconds: float) -> bytes:
+        """Send to the board, let time pass, and return what it has sent."""
+
+
+class Emulated:
+    def __init__(self, **options: Any) -> None:
+        self.board = EmulatedBoard(Scene().ratio, 8, 8, **options)
+        self._now_s = 0.0
+
+    def exchange(self, octets: bytes, seconds: float) -> bytes:
+        self.board.receive(octets)
+        self._now_s += seconds
+        return self.board.advance(self._now_s)
+
+
+class Firmware:
+    """The built firmware in lock-step: simulated time passes only in `exchange`."""
+
+    def __init__(self, board: str) -> None:
+        self.sim = SkinSim(board, ROOT / ".pio" / "build" / board / "firmware.elf")
+        self.sim.set_table(Scene().ratio(0.0))
+
+    def exchange(self, octets: bytes, seconds: float) -> bytes:
+        self.sim.write(octets)
+        return self.sim.run(seconds)
+
+
+class Host:
+    """Asks a board, and waits in the board's own time."""
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self._decoder = BoardDecoder()
+        self._sequence = 0
+        self.messages: list[Message] = []
+        self.run(0.02)
+
+    def run(self, seconds: float, octets: bytes = b"") -> list[Message]:
+        new = self._decoder.feed(self._board.exchange(octets, seconds), 0.0)
+        self.messages += new
+        return new
+
+    def send(self, frame_type: int, payload: bytes) -> str:
+        """The result in the ack of a frame, which may be none of the protocol's."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        octets = framing.encode(frame_type, self._sequence, payload)
+        for _ in range(2000):
+            for message in self.run(0.002, octets):
+                if isinstance(message, Ack) and message.command_sequence == self._sequence:
+                    assert message.command == frame_type
+                    return message.result
+            octets = b""
+        raise TimeoutError("no ack within 4 s")
+
+    def ask(self, name: str, **values: protocol.Value) -> str:
+        frame = protocol.FRAMES[name]
+        return self.send(frame.id, frame.pack(**values))
+
+    def hello(self) -> Hello:
+        assert self.ask("get_hello") == "ok"
+        return [m for m in self.messages if isinstance(m, Hello)][-1]
+
+    def scans(self) -> list[Scan]:
+        return [m for m in self.messages if isinstance(m, Scan)]
+
+
+def asked_for(hello: Hello) -> dict[str, int]:
+    return {
+        "rows": hello.rows,
+        "columns": hello.columns,
+        "rate_mhz": hello.rate_asked_mhz,
+        "settle_us": hello.settle_asked_us,
+        "adc_prescaler": protocol.ENUMS["adc_prescaler"].values[hello.adc_prescaler],
+    }
+
+
+# ------------------------------------------------------------------------------ sans-IO board
+
+
+def test_scans_come_at_their_time_and_read_the_skin() -> None:
+    scene = Scene("moving", 5, 3, seed=4)
+    board = EmulatedBoard(scene.ratio, 5, 3, rate_hz=100)
+    host = BoardDecoder()
+    host.feed(board.advance(0.0), 0.0)
+    start = protocol.FRAMES["start"]
+    board.receive(framing.encode(start.id, 1, b""))
+    host.feed(board.advance(0.0), 0.0)
+    assert board.next_scan_s == pytest.approx(0.01)
+    assert host.feed(board.advance(0.0099), 0.0) == []
+    found = [m for m in host.feed(board.advance(0.2001), 0.0) if isinstance(m, Scan)]
+    assert [s.number for s in found] == list(range(20))
+    assert [s.time_us for s in found] == [10_000 * n for n in range(20)]
+    for scan in found:
+        np.testing.assert_array_equal(scan.codes, quantise(scene.ratio(scan.time_us * 1e-6)))
+
+
+def test_noise_is_that_of_the_seed_and_of_its_size() -> None:
+    ratio = np.full((8, 8, 4), 0.5)
+
+    def codes(seed: int, noise_lsb: float) -> np.ndarray:
+        board = EmulatedBoard(lambda _: ratio, 8, 8, noise_lsb=noise_lsb, seed=seed)
+        return np.stack([board.codes_at(0.0) for _ in range(40)]).astype(float)
+
+    np.testing.assert_array_equal(codes(1, 3.0), codes(1, 3.0))
+    assert (codes(1, 3.0) != codes(2, 3.0)).any()
+    assert codes(1, 0.0).std() == 0
+    assert codes(1, 3.0).std() == pytest.approx(3.0, rel=0.05)
+    assert codes(1, 3.0).mean() == pytest.approx(511.5, abs=0.2)
+
+
+def test_lines_beyond_the_skin_are_open() -> None:
+    host = Host(Emulated())
+    assert host.ask("configure", **(DEFAULT | {"rows": 9, "columns": 10, "rate_mhz": 0})) == "ok"
+    assert host.ask("start") == "ok"
+    host.run(0.1)
+    codes = host.scans()[-1].codes
+    assert codes.shape == (9, 10, 4)
+    np.testing.assert_array_equal(codes[8], np.tile([1023, 0, 1023, 0], (10, 1)))
+    np.testing.assert_array_equal(codes[:, 8:], np.tile([1023, 0, 1023, 0], (9, 2, 1)))
+    np.testing.assert_array_equal(codes[:8, :8], quantise(Scene().ratio(0.0)))
+
+
+def test_saved_settings_outlive_a_reset_and_others_do_not() -> None:
+    board = Emulated()
+    host = Host(board)
+    assert host.ask("configure", **(DEFAULT | {"rows": 3})) == "ok"
+    assert host.ask("set_unit_id", unit_id=77) == "ok"
+    assert host.ask("save") == "ok"
+    assert host.ask("configure", **(DEFAULT | {"rows": 2})) == "ok"
+    assert host.ask("start") == "ok"
+    board.board.reset()
+    hello = host.hello()
+    assert (hello.rows, hello.unit_id, hello.settings) == (3, 77, "stored")
+    assert (hello.scanning, hello.reset_cause) == (0, ("external",))
+    assert host.ask("load_defaults") == "ok"
+    assert (host.hello().rows, host.hello().unit_id) == (8, 0)
+    board.board.reset()
+    assert host.hello().rows == 3
+
+
+def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
+    hello = Host(Emulated()).hello()
+    assert hello.rate_hz == pytest.approx(90, rel=1e-4)
+    board, _, _ = emulated("emulator://16x16")
+    message = BoardDecoder().feed(board.advance(0.0), 0.0)[0]
+    assert isinstance(message, Hello)
+    assert (message.rows, message.columns) == (16, 16)
+    assert message.rate_hz == pytest.approx(16e6 / (13 * 32 * 1024))
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("emulator://8x8?rate=1000", "too_fast"),
+        ("emulator://16x16?rate=90", "too_fast"),
+        ("emulator://8x8?rate=0.5", "bad_rate"),
+        ("emulator://8x8?rate=-1", "bad_rate"),
+        ("emulator://8x8?rate=inf", "rate|times a second"),
+        ("emulator://8x8?rate=nan", "rate|times a second"),
+        ("emulator://8x8?rate=0.0001", "times a second"),
+        ("emulator://8x8?rate=", "float"),
+        ("emulator://8x8?noise=nan", "noise"),
+        ("emulator://8x8?noise=-1", "noise"),
+        ("emulator://8x8?drop=1.5", "drop"),
+        ("emulator://8x8?drop=nan", "drop"),
+        ("emulator://8x8?stall=-1", "stall"),
+        ("emulator://8x8?unit=-1", "unit_id is -1"),
+        ("emulator://8x8?foreign=70000", "layout_crc"),
+        ("emulator://8x8?seed=-4", "negative"),
+        ("emulator://8x8?rows=4", "no option 'rows'"),
+        ("emulator://8x8?scene=nothing", "no scene"),
+        ("emulator://1x1?scene=ghost", "2x2"),
+        ("emulator://0x4", "1x1 to 16x16"),
+        ("emulator://17x4", "1x1 to 16x16"),
+        ("emulator://", "of the form"),
+        ("emulator://8x8?readings=/no/such.npz", "such.npz"),
+        ("emulator://4x6?readings=tests/data/random_4x6.npz&scene=rest", "either"),
+    ],
+)
+def test_wrong_urls(url: str, reason: str) -> None:
+    with pytest.raises(PortError, match=reason):
+        emulated(url)
+
+
+def test_readings_of_a_file_come_in_order_one_a_scan() -> None:
+    path = ROOT / "tests" / "data" / "random_4x6.npz"
+    board, _, _ = emulated(f"emulator://4x6?readings={path}&noise=0&rate=90")
+    with np.load(path) as archive:
+        expected = quantise(archive["ratio"])
+    decoder = BoardDecoder()
+    board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
+    messages = decoder.feed(board.advance((len(expected) + 3.5) / 90), 0.0)
+    codes = [m.codes for m in messages if isinstance(m, Scan)]
+    assert len(codes) >= len(expected) + 3
+    for n, found in enumerate(codes):
+        np.testing.assert_array_equal(found, expected[n % len(expected)])
+
+
+# ---------------------------------------------------------------------- emulator and firmware
+
+ODD_FRAMES: list[tuple[int, bytes]] = [
+    (0x00, b""),
+    (0x01, b""),
+    (0x02, bytes(9)),
+    (0x7F, b"abc"),
+    (0x8A, b""),
+    (0xFF, bytes(9)),
+    (0x81, b"\0"),
+    (0x82, b""),
+    (0x82, bytes(8)),
+    (0x82, bytes(10)),
+    (0x83, b"\1"),
+    (0x84, b"\0\0"),
+    (0x85, bytes(3)),
+    (0x85, bytes(5)),
+    (0x86, b"\0"),
+    (0x87, b"\0"),
+    (0x88, b"\0"),
+    (0x89, b""),
+    (0x89, bytes(4)),
+    (0x89, (9600).to_bytes(4, "little")),
+]
+
+# Every one with 8x8, 90 Hz, no settle time and the default prescaler unless it says otherwise.
+# Fast scans that a line of 500 kbaud cannot carry are not among them: the emulator has no line.
+CONFIGURATIONS: list[dict[str, int]] = [
+    {},
+    {"rows": 0},
+    {"rows": 17},
+    {"rows": 255},
+    {"columns": 0},
+    {"columns": 17},
+    {"rows": 0, "columns": 0},
+    {"rows": 1, "columns": 1},
+    {"rows": 1, "columns": 16},
+    {"rows": 16, "columns": 1},
+    {"rows": 3, "columns": 5},
+    {"rate_mhz": 0},
+    {"rate_mhz": 1},
+    {"rate_mhz": 999},
+    {"rate_mhz": 1000},
+    {"rate_mhz": 1001},
+    {"rate_mhz": 12_345},
+    {"rate_mhz": 140_000},
+    {"rate_mhz": 143_000},
+    {"rate_mhz": 144_000},
+    {"rate_mhz": 150_000},
+    {"rate_mhz": 2_000_000},
+    {"rate_mhz": 2_000_001},
+    {"rate_mhz": 0xFFFFFFFF},
+    {"rows": 1, "columns": 1, "rate_mhz": 1000},
+    {"rows": 1, "columns": 1, "rate_mhz": 2_000_000},
+    {"rows": 2, "columns": 2, "rate_mhz": 500_000},
+    {"rows": 2, "columns": 2, "rate_mhz": 2_000_000},
+    {"rows": 4, "columns": 4, "rate_mhz": 300_000},
+    {"rows": 16, "columns": 16},
+    {"rows": 16, "columns": 16, "rate_mhz": 20_000},
+    {"rows": 16, "columns": 16, "rate_mhz": 30_000},
+    {"rows": 16, "columns": 16, "rate_mhz": 0},
+    {"settle_us": 1},
+    {"settle_us": 20},
+    {"settle_us": 36},
+    {"settle_us": 40},
+    {"settle_us": 100},
+    {"settle_us": 3000},
+    {"settle_us": 3001},
+    {"settle_us": 0xFFFF},
+    {"settle_us": 3000, "rate_mhz": 1000},
+    {"settle_us": 3000, "rate_mhz": 1500},
+    {"settle_us": 100, "rate_mhz": 0},
+    {"settle_us": 10, "rate_mhz": 0},
+    {"settle_us": 50, "rows": 16, "columns": 16, "rate_mhz": 10_000},
+    {"settle_us": 500, "rows": 1, "columns": 2, "rate_mhz": 100_000},
+    {"settle_us": 500, "rows": 1, "columns": 2, "rate_mhz": 240_000},
+    {"settle_us": 500, "rows": 1, "columns": 2, "rate_mhz": 250_000},
+    {"adc_prescaler": 0},
+    {"adc_prescaler": 16},
+    {"adc_prescaler": 33},
+    {"adc_prescaler": 255},
+    {"adc_prescaler": 64},
+    {"adc_prescaler": 128},
+    {"adc_prescaler": 64, "rate_mhz": 70_000},
+    {"adc_prescaler": 128, "rate_mhz": 30_000},
+    {"adc_prescaler": 64, "rate_mhz": 0},
+    {"adc_prescaler": 128, "rate_mhz": 0, "settle_us": 200},
+    # With several faults, the first of the checks decides.
+    {"rows": 0, "rate_mhz": 1},
+    {"columns": 99, "settle_us": 9999},
+    {"rate_mhz": 1, "settle_us": 9999},
+    {"settle_us": 9999, "adc_prescaler": 1},
+    {"adc_prescaler": 1, "rate_mhz": 2_000_000},
+]
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize("board", ["uno", "megaatmega2560"])
+def test_emulator_and_firmware_answer_alike(board: str) -> None:
+    firmware = Firmware(board)
+    try:
+        real, model = Host(firmware), Host(Emulated())
+        results: dict[str, int] = {}
+        for change in CONFIGURATIONS:
+            wanted = DEFAULT | change
+            result = real.ask("configure", **wanted)
+            assert model.ask("configure", **wanted) == result, change
+            results[result] = results.get(result, 0) + 1
+            kept, modelled = real.hello(), model.hello()
+            assert asked_for(kept) == asked_for(modelled)
+            assert (asked_for(kept) == wanted) >= (result == "ok"), change
+            assert modelled.rate_hz == pytest.approx(kept.rate_hz, rel=0.002), change
+            assert modelled.settle_us == pytest.approx(kept.settle_us, rel=0.05, abs=1), change
+        print(f"{board}: {len(CONFIGURATIONS)} configurations: {results}")
+        assert len(CONFIGURATIONS) >= 60
+        assert {"ok", "bad_rows", "bad_columns", "bad_rate"} < set(results)
+        assert {"bad_settle", "bad_prescaler", "too_fast"} < set(results)
+        for frame_type, payload in ODD_FRAMES:
+            answers = [host.send(frame_type, payload) for host in (real, model)]
+            assert answers[0] == answers[1] != "ok", (frame_type, payload)
+        both_in_every_state(real, model)
+    finally:
+        firmware.sim.close()
+
+
+def both_in_every_state(real: Host, model: Host) -> None:
+    """Commands while scanning and after, whose answers and consequences must be the same."""
+    for host in (real, model):
+        assert host.ask("configure", **(DEFAULT | {"rows": 4, "columns": 3})) == "ok"
+    commands: list[tuple[str, dict[str, protocol.Value]]] = [
+        ("stop", {}),
+        ("start", {}),
+        ("start", {}),
+        ("configure", DEFAULT | {"rows": 1}),
+        ("configure", DEFAULT | {"rows": 0}),
+        ("load_defaults", {}),
+        ("self_test", {}),
+        ("set_baud", {"baud": 1_000_000}),
+        ("set_unit_id", {"unit_id": 0xFFFFFFFF}),
+        ("save", {}),
+        ("get_hello", {}),
+        ("stop", {}),
+        ("stop", {}),
+        ("self_test", {}),
+        ("load_defaults", {}),
+        ("get_hello", {}),
+    ]
+    for name, values in commands:
+        answers = [host.ask(name, **values) for host in (real, model)]
+        assert answers[0] == answers[1], (name, answers)
+        if name == "save":
+            real.run(0.3)
+            model.run(0.3)
+        told = [host.hello() for host in (real, model)]
+        for what in ("unit_id", "rows", "columns", "scanning", "baud", "ref_top_ohm"):
+            assert getattr(told[0], what) == getattr(told[1], what), (name, what)
+    for host in (real, model):
+        found = host.scans()
+        assert len(found) > 20
+        assert [scan.missed for scan in found] == [0] * len(found)
+        assert found[0].number == 0
+        report = [m for m in host.messages if isinstance(m, SelfTestReport)][-1]
+        assert report.findings == ()
+        assert len(report.code_min) == len(report.code_max) == 4
+    # The same skin reads the same, but for the instant of the hold: this one does not move.
+    np.testing.assert_array_equal(real.scans()[-1].codes, model.scans()[-1].codes)
+
+
+# ------------------------------------------------------------- any request, and what it changes
+
+u8, u16, u32 = st.integers(0, 255), st.integers(0, 0xFFFF), st.integers(0, 0xFFFFFFFF)
+requests = st.fixed_dictionaries(
+    {
+        "rows": st.one_of(st.integers(0, 18), u8),
+        "columns": st.one_of(st.integers(0, 18), u8),
+        "rate_mhz": st.one_of(st.integers(0, 2_100_000), st.integers(0, 150_000), u32),
+        "settle_us": st.one_of(st.integers(0, 3100), st.integers(0, 100), u16),
+        "adc_prescaler": st.one_of(st.sampled_from([32, 64, 128]), u8),
+    }
+)
+LIMITS = {
+    "bad_rows": lambda asked: not 1 <= asked["rows"] <= 16,
+    "bad_columns": lambda asked: not 1 <= asked["columns"] <= 16,
+    "bad_rate": lambda asked: asked["rate_mhz"] and not 1000 <= asked["rate_mhz"] <= 2_000_000,
+    "bad_settle": lambda asked: asked["settle_us"] > 3000,
+    "bad_prescaler": lambda asked: asked["adc_prescaler"] not in (32, 64, 128),
+}
+
+
+def check_configure(host: Host, asked: dict[str, int]) -> None:
+    """Refused for its first fault and without a consequence, or kept as asked for."""
+    before = host.hello()
+    result = host.ask("configure", **asked)
+    after = host.hello()
+    fault = next((name for name, broken in LIMITS.items() if broken(asked)), None)
+    if fault is not None:
+        assert result == fault
+    if result != "ok":
+        assert after == before
+        assert result in (fault, "too_fast", "line_too_slow")
+        return
+    assert asked_for(after) == asked
+    if asked["rate_mhz"]:
+        assert after.rate_hz == pytest.approx(asked["rate_mhz"] / 1000, rel=0.002)
+    assert after.settle_us >= asked["settle_us"]
+    conversion_s = 13 * asked["adc_prescaler"] / 16e6
+    assert after.scan_cycles / 16e6 >= 4 * asked["rows"] * asked["columns"] * conversion_s
+
+
+@settings(max_examples=500)
+@given(requests)
+@example(DEFAULT | {"rate_mhz": 0})
+@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
+def test_the_emulator_takes_or_refuses_any_configuration(asked: dict[str, int]) -> None:
+    check_configure(Host(Emulated()), asked)
+
+
+@pytest.fixture(scope="module")
+def firmware_host() -> Any:
+    firmware = Firmware("uno")
+    yield Host(firmware)
+    firmware.sim.close()
+
+
+@pytest.mark.simavr
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(requests)
+@example(DEFAULT | {"rate_mhz": 0})
+@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
+def test_the_firmware_takes_or_refuses_any_configuration(
+    firmware_host: Host, asked: dict[str, int]
+) -> None:
+    check_configure(firmware_host, asked)
+
+
+@settings(max_examples=200)
+@given(st.lists(st.tuples(u8, st.binary(max_size=24)), max_size=10))
+def test_no_frame_upsets_the_emulator(sent: list[tuple[int, bytes]]) -> None:
+    host = Host(Emulated())
+    results = {member for member in protocol.ENUMS["result"].values if member != "busy"}
+    for frame_type, payload in sent:
+        assert host.send(frame_type, payload) in results
+    assert host.hello().layout_crc == protocol.LAYOUT_CRC

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bad lines and boards: the host gets over it, or says so in one of the documented errors."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+import time
+import tty
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ohmskin
+from ohmskin.emulate.board import EmulatorLink
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.simavr_link import SimavrLink
+from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
+from ohmskin.link import device, framing, protocol, session
+from ohmskin.link.codes import quantise
+from ohmskin.link.device import Device
+from ohmskin.link.messages import Scan
+from ohmskin.link.serial_port import SerialLink
+from ohmskin.opening import emulated, open_link
+
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+ADC = "clock_250khz"
+BAD_LINES = ["drop=0.1", "bitflip=1e-4", "garbage=0.3", "drop=0.02&bitflip=5e-5&garbage=0.1"]
+
+
+def made_since(found: list[Scan]) -> int:
+    return found[-1].number - found[0].number + 1
+
+
+def read_bad_line(url: str) -> None:
+    """Read 100 scans, count all that was made, and compare every one with the truth."""
+    expected = quantise(Scene("multi", 8, 8, seed=5).ratio(0.0))
+    with ohmskin.open(url) as skin:
+        found: list[Scan] = []
+        for scan in skin:
+            found.append(scan)
+            if len(found) == 100:
+                break
+        skin.stop()
+        stats = skin.stats
+    for scan in found:
+        np.testing.assert_array_equal(scan.codes, expected)
+    for before, after in itertools.pairwise(found):
+        assert after.missed == after.number - before.number - 1
+    print(f"{url}: {stats}")
+    assert stats.scans >= 100
+    assert stats.restarts == 0
+    # What the iterator has seen, and what had come or gone before it began.
+    assert sum(scan.missed for scan in found[1:]) + len(found) == made_since(found)
+    assert found[0].missed <= found[0].number
+    assert stats.missed >= sum(scan.missed for scan in found)
+    if "bitflip" in url:
+        assert stats.line.damaged > 0
+    if "drop" in url:
+        assert stats.missed > 0
+    if "garbage" in url:
+        assert stats.line.damaged > 10
+
+
+@pytest.mark.parametrize("fault", BAD_LINES)
+def test_bad_line(fault: str) -> None:
+    read_bad_line(f"emulator://8x8?scene=multi&seed=5&noise=0&rate=140&{fault}")
+
+
+def test_bad_line_of_a_serial_port(pty_board: Callable[[str], PtyServer]) -> None:
+    url = "emulator://8x8?scene=multi&seed=5&noise=0&rate=140&bitflip=1e-4&drop=0.03"
+    with ohmskin.open(pty_board(url).path) as skin:
+        found = list(itertools.islice(skin, 100))
+    assert sum(scan.missed for scan in found) > 0
+    for before, after in itertools.pairwise(found):
+        assert after.missed == after.number - before.number - 1
+
+
+def test_every_scan_that_was_made_is_received_or_missed() -> None:
+    """In the board's own time: 20,000 scans over a line that loses, adds and flips."""
+    board, _, faults = emulated("emulator://2x2?rate=100&seed=2&drop=0.05&bitflip=3e-4&garbage=0.1")
+    decoder = ohmskin.link.messages.BoardDecoder()
+    host = np.random.default_rng(7)
+    decoder.feed(board.advance(0.0), 0.0)
+    board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
+    decoder.feed(board.advance(0.0), 0.0)
+    last = -1
+    for step in range(1, 20_001):
+        octets = faults.apply(board.advance(step / 100 + 1e-6), 0.0)
+        cut = int(host.integers(0, len(octets) + 1))
+        for part in (octets[:cut], octets[cut:]):
+            for message in decoder.feed(part, 0.0):
+                if isinstance(message, Scan):
+                    assert message.number > last
+                    last = message.number
+    stats = decoder.stats
+    print(f"20000 scans made: {stats}")
+    assert stats.scans + stats.missed == last + 1
+    assert last > 19_990
+    assert stats.missed > 1500
+
+
+def test_a_reset_board_goes_on_as_it_was_configured() -> None:
+    with ohmskin.open("emulator://8x8?rate=90&reset=0.7") as skin:
+        skin.set_unit_id(7)
+        skin.configure(rows=5, columns=4, rate_hz=130, settle_us=30, adc_prescaler=ADC)
+        shapes = set()
+        for scan in skin:
+            shapes.add(scan.codes.shape)
+            if skin.stats.restarts >= 3 and scan.number > 5:
+                break
+        skin.set_unit_id(8)  # asks the board what it keeps
+        info, stats = skin.info, skin.stats
+    print(f"resets every 0.7 s: {stats}")
+    assert shapes == {(5, 4, 4)}
+    assert (info.rows, info.columns, info.rate_asked_mhz) == (5, 4, 130_000)
+    assert (info.settle_asked_us, info.adc_prescaler) == (30, ADC)
+    assert info.reset_cause == ("external",)
+    assert stats.line.damaged == 0
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize("baud", [500_000, 1_000_000])
+def test_a_reset_of_the_firmware(baud: int) -> None:
+    """Its line speed is that of the start again, too; the simulated line follows the board's."""
+    link, _ = open_link("simavr://uno")
+    assert isinstance(link, SimavrLink)
+    with ohmskin.Device(link, baud=baud) as skin:
+        kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
+        scans = iter(skin)
+        for _ in range(20):
+            assert next(scans).codes.shape == (3, 7, 4)
+        link._sim.reset()
+        until = next(scan for scan in scans if skin.stats.restarts)
+        for scan in itertools.islice(scans, 20):
+            assert scan.codes.shape == (3, 7, 4)
+            assert scan.missed == 0
+        assert until.codes.shape == (3, 7, 4)
+        print(f"reset at {baud} baud: {skin.stats}")
+        assert skin.stats.restarts == 1
+        assert skin.info.reset_cause == ("external",)
+        assert skin.info.baud == 500_000
+        skin.set_unit_id(5)  # asks the board what it keeps
+        assert skin.info == replace(
+            kept, unit_id=5, baud=500_000, reset_cause=("external",), scanning=1
+        )
+
+
+def test_a_reset_board_says_its_name_anew() -> None:
+    """A name that was not saved is gone after a reset, and `info` must not pretend otherwise."""
+    with ohmskin.open("emulator://2x2?reset=0.5&unit=3") as skin:
+        skin.set_unit_id(7)
+        for _ in skin:
+            if skin.stats.restarts:
+                break
+        assert skin.info.unit_id == 3
+
+
+class ResetAfterConfigure(EmulatorLink):
+    """Resets the board right after its first answer to `configure`."""
+
+    resets_due = 1
+
+    def write(self, octets: bytes) -> None:
+        super().write(octets)
+        (frame,) = framing.Decoder().feed(octets)
+        if frame.type == protocol.FRAMES["configure"].id and self.resets_due:
+            self.resets_due -= 1
+            with self._wake:
+                self._waiting += self._board.advance(self._now_s())
+                self._board.reset()
+
+
+def test_a_reset_right_after_configure_does_not_undo_it() -> None:
+    link = ResetAfterConfigure(*emulated("emulator://4x4"))
+    with ohmskin.Device(link) as skin:
+        assert skin.configure(rows=2, rate_hz=77).rows == 2
+        assert link.resets_due == 0
+        assert skin.info.rate_asked_mhz == 77_000
+        assert skin.latest().codes.shape == (2, 4, 4)
+
+
+def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
+    board, name, _ = emulated("emulator://4x4")
+    with Device(EmulatorLink(board, name), start=False) as skin:
+        skin.configure(rows=2, columns=3, rate_hz=77)
+        board.reset()
+        skin.start()
+        assert skin.latest().codes.shape == (2, 3, 4)
+        assert skin.info.rate_asked_mhz == 77_000
+
+
+def test_a_stall_of_two_seconds() -> None:
+    with ohmskin.open("emulator://2x2?rate=500&stall=2") as skin:
+        gap_s, gap, before = 0.0, 0, skin.latest()
+        for scan in skin:
+            if scan.host_time_s - before.host_time_s > gap_s:
+                gap_s, gap = scan.host_time_s - before.host_time_s, scan.missed
+            assert scan.missed == scan.number - before.number - 1 or before.number < 5
+            before = scan
+            if gap_s > 1:
+                break
+        print(f"stall of 2 s: gap of {gap_s:.2f} s, {skin.stats}")
+        assert gap == pytest.approx(1000, abs=30)
+        assert skin.stats.missed == gap
+        assert skin.latest().number >= scan.number
+
+
+READS: dict[str, Callable[[ohmskin.Device], object]] = {
+    "iterator": lambda skin: list(skin),
+    "latest": lambda skin: [skin.latest() for _ in range(100_000)],
+    "command": lambda skin: [skin.set_unit_id(1) for _ in range(1_000_000)],
+    "configure": lambda skin: [skin.configure(rows=2) for _ in range(1_000_000)],
+}
+
+
+@pytest.mark.parametrize("use", READS)
+def test_a_board_that_is_unplugged(use: str) -> None:
+    with (
+        ohmskin.open("emulator://2x2?vanish=0.6") as skin,
+        pytest.raises(DeviceLost, match="gone"),
+    ):
+        READS[use](skin)
+
+
+@pytest.mark.parametrize("use", READS)
+def test_a_serial_port_that_goes_away(use: str, pty_board: Callable[[str], PtyServer]) -> None:
+    server = pty_board("emulator://2x2?rate=300")
+    timer = threading.Timer(0.4, server.close)
+    with ohmskin.open(server.path) as skin:
+        timer.start()
+        with pytest.raises(DeviceLost, match="still plugged in"):
+            READS[use](skin)
+        with pytest.raises(DeviceLost):
+            READS["latest"](skin)
+    timer.join()
+
+
+def test_a_board_that_stops_talking(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.1)
+    with ohmskin.open("emulator://2x2?stall=600") as skin:
+        with pytest.raises(DeviceLost, match=r"said nothing for 0\.3 s"):
+            list(skin)
+        with pytest.raises(DeviceLost, match="said nothing"):
+            READS["latest"](skin)
+        with pytest.raises(DeviceLost, match="does not answer 'set_unit_id'"):
+            skin.set_unit_id(1)
+
+
+def test_a_silent_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.5)
+    with pytest.raises(DeviceSilent, match=r"is silent: .*ohmskin flash"):
+        ohmskin.open("emulator://2x2?silent=1")
+
+
+def test_a_port_with_other_things_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a board with another sketch, which prints lines for ever."""
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.7)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    done = threading.Event()
+
+    def chatter() -> None:
+        while not done.wait(0.01):
+            os.write(master, b"A0=512 A1=13\r\n")
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    try:
+        with pytest.raises(DeviceSilent, match="no frames"):
+            ohmskin.open(os.ttyname(slave))
+    finally:
+        done.set()
+        thread.join()
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_board_of_another_definition() -> None:
+    with pytest.raises(ProtocolMismatch) as error:
+        ohmskin.open("emulator://2x2?foreign=257")
+    assert f"0x{protocol.LAYOUT_CRC ^ 257:04X}" in str(error.value)
+    assert f"0x{protocol.LAYOUT_CRC:04X}" in str(error.value)
+    assert "ohmskin flash" in str(error.value)
+
+
+def test_a_board_that_is_reset_by_the_opening_of_its_port() -> None:
+    """An Uno says nothing for up to 3 s after its port is opened; then it boots."""
+    board, _, _ = emulated("emulator://3x3")
+
+    class Bootloader:
+        name = "an Uno"
+
+        def __init__(self) -> None:
+            self._begin_s = time.monotonic()
+            self._booted_s: float | None = None
+
+        def read(self) -> bytes:
+            time.sleep(0.01)
+            now = time.monotonic()
+            if now - self._begin_s < 1.2:
+                return b""
+            if self._booted_s is None:
+                self._booted_s = now
+            return board.advance(now - self._booted_s)
+
+        def write(self, octets: bytes) -> None:
+            if self._booted_s is not None:  # the bootloader takes what comes before
+                board.receive(octets)
+
+        def set_baud(self, baud: int) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    with ohmskin.Device(Bootloader()) as skin:
+        assert skin.latest().codes.shape == (3, 3, 4)
+        assert skin.stats.restarts == 0
+
+
+def test_a_lost_answer_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(session, "_HELLO_EVERY_S", 0.05)
+    for seed in range(5):
+        with ohmskin.open(f"emulator://2x2?rate=200&drop=0.15&seed={seed}", start=False) as skin:
+            for unit_id in range(10):
+                try:
+                    skin.set_unit_id(unit_id)
+                except DeviceLost:
+                    continue  # three answers lost in a row: rare, and said
+                assert skin.info.unit_id == unit_id
+
+
+def test_refusals_on_a_bad_line_stay_refusals() -> None:
+    with ohmskin.open("emulator://4x4?drop=0.1&bitflip=1e-4&seed=3") as skin:
+        before = skin.info
+        for _ in range(5):
+            with pytest.raises(CommandRefused, match="bad_rows"):
+                skin.configure(rows=0)
+        assert skin.info == before
+        assert skin.latest().codes.shape == (4, 4, 4)
+
+
+def test_no_thread_or_file_is_left_when_opening_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
+    master, slave = os.openpty()  # nobody answers there
+    try:
+        urls = [
+            "emulator://2x2?silent=1",
+            "emulator://2x2?foreign=1",
+            "emulator://2x2?vanish=1e-6",
+        ]
+        for url in [*urls, os.ttyname(slave)]:
+            threads, files = threading.active_count(), len(os.listdir("/proc/self/fd"))
+            with pytest.raises(OhmskinError):
+                ohmskin.open(url)
+            assert threading.active_count() == threads
+            assert len(os.listdir("/proc/self/fd")) == files
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_wrong_option_leaves_no_port_open(pty_board: Callable[[str], PtyServer]) -> None:
+    path = pty_board("emulator://2x2").path
+    with pytest.raises(OhmskinError, match="baud=7"):
+        ohmskin.open(f"{path}?baud=7")
+    SerialLink(path).close()  # it was locked if it were still open

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of simulated skins: what their readings become, node by node and reading by reading."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from network import Network, skin_network
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, ratio_from_current
+from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
+from ohmskin.errors import PortError
+from ohmskin.opening import emulated
+
+R, C = 4, 5
+
+
+def network_readings(skin: Skin, joints: list[tuple[int, int]]) -> Float:
+    """Readings from the currents of a network, node by node, with 0.1 ohm between electrodes."""
+    alone = skin_network(skin)
+    tail, head = zip(*joints, strict=True) if joints else ((), ())
+    network = Network(
+        alone.nodes,
+        np.append(alone.tail, tail).astype(np.intp),
+        np.append(alone.head, head).astype(np.intp),
+        np.append(alone.branch_ohm, [0.1] * len(joints)),
+    )
+    rows, columns = skin.shape
+    current = np.empty(skin.shape)
+    for i in range(rows):
+        for j in range(columns):
+            branch_a = network.solve({i: 1.0, rows + j: 0.0}).branch_a
+            port_a = branch_a[network.tail == i].sum() - branch_a[network.head == i].sum()
+            loop_ohm = 1 / max(port_a, 1e-15) + skin.ref_top_ohm + skin.ref_bottom_ohm
+            current[i, j] = 1 / loop_ohm
+    return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)
+
+
+FAULTS = {
+    "none": (SkinFaults(), {}, []),
+    "open row": (SkinFaults(open_row=2), {"top": np.s_[2, 0]}, []),
+    "open column": (SkinFaults(open_column=4), {"bottom": np.s_[0, 4]}, []),
+    "dead": (SkinFaults(dead=(1, 2)), {"dead": (1, 2)}, []),
+    "saturated": (SkinFaults(saturated=(3, 0)), {"saturated": (3, 0)}, []),
+    "rows": (SkinFaults(short_rows=(0, 3)), {}, [(0, 3)]),
+    "columns": (SkinFaults(short_columns=(2, 1)), {}, [(R + 2, R + 1)]),
+    "many": (
+        SkinFaults(short_rows=(0, 1), short_columns=(2, 3), dead=(3, 0), open_column=4),
+        {"dead": (3, 0), "bottom": np.s_[0, 4]},
+        [(0, 1), (R + 2, R + 3)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_readings_are_those_of_the_network(name: str) -> None:
+    faults, changes, joints = FAULTS[name]
+    sound = Scene("rest", R, C, seed=4).skin(0.0)
+    cell, top, bottom = (
+        each.copy() for each in (sound.cell_siemens, sound.top_wire_ohm, sound.bottom_wire_ohm)
+    )
+    for what, place in changes.items():
+        match what:
+            case "top":
+                top[place] = np.inf
+            case "bottom":
+                bottom[place] = np.inf
+            case "dead":
+                cell[place] = 0.0
+            case "saturated":
+                cell[place] = 10.0
+    finite = [np.where(np.isinf(ohm), 1e15, ohm) for ohm in (top, bottom)]
+    expected = network_readings(Skin(cell, *finite), joints)
+    found = Scene("rest", R, C, seed=4, faults=faults).ratio(0.0)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    changed = np.abs(found - Scene("rest", R, C, seed=4).ratio(0.0)).max()
+    assert changed > 1e-2 or name == "none"
+
+
+def test_a_dead_cell_never_conducts_and_is_not_called_touched() -> None:
+    scene = Scene("single", R, C, faults=SkinFaults(dead=(R // 2, C // 2), saturated=(0, 0)))
+    assert scene.skin(0.0).cell_siemens[R // 2, C // 2] == 0
+    assert not scene.touched(0.0).any()
+
+
+def test_true_references_and_wires() -> None:
+    skin = Scene("rest", R, C, faults=SkinFaults(ref_top=33e3, ref_bottom=29e3, wires=2.5)).skin(0)
+    sound = Scene("rest", R, C).skin(0.0)
+    assert (skin.ref_top_ohm, skin.ref_bottom_ohm) == (33e3, 29e3)
+    np.testing.assert_allclose(skin.top_wire_ohm, 2.5 * sound.top_wire_ohm)
+    np.testing.assert_allclose(skin.bottom_wire_ohm, 2.5 * sound.bottom_wire_ohm)
+    ratio = Scene("rest", R, C, faults=SkinFaults(ref_top=33e3)).ratio(0.0)
+    np.testing.assert_allclose((1 - ratio[..., 0]) / ratio[..., 1], 1.1)
+    np.testing.assert_allclose(ratio[..., 3] / (1 - ratio[..., 2]), 1.1)
+
+
+def test_hum_is_met_by_every_reading_at_its_own_time() -> None:
+    flat = np.full((3, 2, 4), 0.5)
+    slot_s, start_s = 1e-3, 7.1234
+    found = SkinFaults(hum=50, hum_lsb=4).sampled(flat, start_s, slot_s, 1e-4)
+    at = 0
+    for column in range(2):
+        for row in range(3):
+            for reading in range(4):
+                hum = 4 / 1024 * np.sin(2 * np.pi * 50 * (start_s + at * slot_s))
+                assert found[row, column, reading] == pytest.approx(0.5 + hum, abs=1e-12)
+                at += 1
+    assert np.array_equal(flat, np.full((3, 2, 4), 0.5))
+
+
+def test_nodes_settle_slot_by_slot() -> None:
+    """Both nodes, stepped one slot at a time, through scan after scan."""
+    ratio = Scene("single", 3, 2).ratio(0.0)
+    settle_s, tau_us = 30e-6, 20.0
+    kept = np.exp(-settle_s / (1e-6 * tau_us))
+    top = bottom = 0.0
+    for _ in range(5):
+        expected = np.empty_like(ratio)
+        for column in range(2):
+            for row in range(3):
+                a, b, c, d = ratio[row, column]
+                slots = [(a, b), (a, b), (d, c), (d, c)]
+                for reading, (top_goal, bottom_goal) in enumerate(slots):
+                    top = top_goal + (top - top_goal) * kept
+                    bottom = bottom_goal + (bottom - bottom_goal) * kept
+                    expected[row, column, reading] = (top, bottom, bottom, top)[reading]
+    found = SkinFaults(tau_us=tau_us).sampled(ratio, 0.0, 40e-6, settle_s)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert np.abs(found - ratio).max() > 0.05
+    quick = SkinFaults(tau_us=0.5).sampled(ratio, 0.0, 40e-6, settle_s)
+    np.testing.assert_allclose(quick, ratio, rtol=0, atol=1e-9)
+
+
+def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
+    assert list(SKIN_FAULTS) == list(SkinFaults.__dataclass_fields__)
+    values = {"short_rows": "0,2", "short_columns": "1,2", "dead": "1,2", "saturated": "0,0"}
+    for name in SKIN_FAULTS:
+        board, _, _ = emulated(f"emulator://{R}x{C}?{name}={values.get(name, '2')}&noise=0")
+        assert board.codes_at(0.0).shape == (R, C, 4)
+    assert SkinFaults.from_texts({"short_rows": "0,2", "noise": "3"}) == SkinFaults(
+        short_rows=(0, 2)
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "reason"),
+    [
+        ("open_row=4", "no row 4: the skin has rows 0 to 3"),
+        ("open_column=-1", "no column -1"),
+        ("short_rows=1,4", "no row 4"),
+        ("short_rows=1,1", "two different"),
+        ("short_columns=3", "two numbers, as 1,2"),
+        ("dead=0,5", "no column 5"),
+        ("dead=a,b", "two numbers"),
+        ("open_row=x", "a number, not 'x'"),
+        ("ref_top=0", "above 0"),
+        ("wires=nan", "above 0"),
+        ("hum=-50", "0 or more"),
+        ("tau_us=inf", "0 or more"),
+    ],
+)
+def test_wrong_faults_are_refused(option: str, reason: str) -> None:
+    with pytest.raises(PortError, match=reason):
+        emulated(f"emulator://{R}x{C}?{option}")
+
+
+def test_readings_of_a_file_have_no_resistances() -> None:
+    with pytest.raises(PortError, match="no resistances"):
+        emulated("emulator://4x6?readings=tests/data/random_4x6.npz&dead=1,2")

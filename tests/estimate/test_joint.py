@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`joint` on readings from ngspice, its derivatives by finite differences, and bad readings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import (
+    Skin,
+    current_from_ratio,
+    port_resistance_ohm,
+    port_sensitivity,
+    readings,
+)
+from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.joint import JointEstimator
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.prior import LAYER_STD, SEGMENT_STD
+from ohmskin.link.codes import quantise as codes_of
+from ohmskin.link.codes import ratio_from_codes
+from places import DATA
+from studies.trials import skin_at_rest, touch
+
+
+def rounded(ratio: Float, bits: int | None) -> Float:
+    return ratio if bits is None else ratio_from_codes(codes_of(ratio, bits), bits)
+
+
+def of_frame(value: Float, frame: int) -> float:
+    return float(np.ravel(value)[frame if np.ndim(value) else 0])
+
+
+def estimates(name: str, bits: int | None) -> list[tuple[Estimate, dict[str, Float]]]:
+    """Every frame of a reference file, cold, with its truth."""
+    with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
+        data = dict(file)
+    frames, rows, columns, _ = data["ratio"].shape
+    found = []
+    for frame in range(frames):
+        rest = data["rest_ratio"]
+        knowledge = SkinKnowledge(
+            rows,
+            columns,
+            adc_bits=bits,
+            rest_ratio=rounded(rest if rest.ndim == 3 else rest[frame], bits),
+            nominal_top_wire_ohm=of_frame(data["nominal_top_wire_ohm"], frame),
+            nominal_bottom_wire_ohm=of_frame(data["nominal_bottom_wire_ohm"], frame),
+        )
+        estimate = make_estimator("joint", knowledge).estimate(rounded(data["ratio"][frame], bits))
+        truth = {"siemens": 1 / data["cell_ohm"][frame], "rest": 1 / data["rest_ohm"]}
+        found.append((estimate, truth))
+    return found
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (4, 4), (1, 5)])
+def test_sensitivity_agrees_with_finite_differences(size: tuple[int, int]) -> None:
+    random = np.random.default_rng(5)
+    logs = [
+        random.uniform(np.log(low), np.log(high), size)
+        for low, high in ((1e3, 1e6), (10, 1e3), (10, 1e3))
+    ]
+
+    def port_ohm(cell: Float, top: Float, bottom: Float) -> Float:
+        return port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom))).ravel()
+
+    circuit = port_sensitivity(np.exp(-logs[0]), np.exp(logs[1]), np.exp(logs[2]))
+    np.testing.assert_allclose(circuit.port_ohm, port_ohm(*logs), rtol=1e-9)
+    step = 1e-5
+    by_top, by_bottom = np.split(circuit.by_wires(), 2, axis=1)
+    for kind, derivative in enumerate((circuit.by_cell, by_top, by_bottom)):
+        for resistor in range(logs[0].size):
+            ends = []
+            for sign in (-1, 1):
+                moved = [log.copy() for log in logs]
+                moved[kind].flat[resistor] += sign * step
+                ends.append(port_ohm(*moved))
+            difference = (ends[1] - ends[0]) / (2 * step)
+            np.testing.assert_allclose(
+                derivative[:, resistor], difference, atol=1e-7 * circuit.port_ohm.max()
+            )
+
+
+def test_derivatives_sum_to_the_resistance() -> None:
+    """Euler: all resistances scaled alike scale every port resistance."""
+    random = np.random.default_rng(6)
+    cell, top, bottom = (np.exp(random.normal(size=(5, 4))) for _ in range(3))
+    circuit = port_sensitivity(cell, top, bottom)
+    total = circuit.by_cell.sum(1) + circuit.by_wires().sum(1)
+    np.testing.assert_allclose(total, circuit.port_ohm, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("name", "bits", "median", "tenth_worst"),
+    [
+        ("random_2x2", 10, 0.010, 0.05),
+        ("random_4x6", 10, 0.010, 0.05),
+        ("random_8x8", 10, 0.012, 0.08),
+        ("presses_8x8", 10, 0.006, 0.02),
+        ("random_8x8", None, 0.004, 0.03),
+    ],
+)
+def test_pressed_cells_are_found(
+    name: str, bits: int | None, median: float, tenth_worst: float
+) -> None:
+    errors, ghosts = [], []
+    for estimate, truth in estimates(name, bits):
+        assert estimate.converged, estimate.message
+        pressed = truth["siemens"] > 1.5 * truth["rest"]
+        errors.append(np.abs(estimate.cell_siemens / truth["siemens"] - 1)[pressed])
+        if np.count_nonzero(pressed) <= 12:
+            ghosts.append((estimate.cell_siemens - truth["rest"])[~pressed].max(initial=0.0))
+        assert not (estimate.touched & ~pressed).any()
+    relative = np.concatenate(errors)
+    assert np.median(relative) < median
+    assert np.quantile(relative, 0.9) < tenth_worst
+    assert np.quantile(ghosts, 0.95) < 0.5e-6
+
+
+@pytest.mark.parametrize("name", ["random_4x6", "random_8x8", "bent_8x8"])
+def test_errors_are_of_the_size_that_is_stated(name: str) -> None:
+    away = np.concatenate(
+        [
+            ((e.cell_siemens - truth["siemens"]) / e.cell_siemens_std).ravel()
+            for e, truth in estimates(name, 10)
+        ]
+    )
+    share = [np.mean(np.abs(away) < limit) for limit in (1, 2, 4)]
+    assert share[0] >= 0.6
+    assert share[1] >= 0.9
+    assert share[2] >= 0.99
+
+
+# The paper's best root mean square errors [MOhm], of its two simulations.
+PAPER = {
+    "wire_sweep_3x3": (0.0829, 0.0680, 0.0519, 0.0980, 0.1894),
+    "cell_sweep_3x3": (0.7235, 0.1489, 0.0696, 0.0138, 0.0145),
+}
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_the_papers_sweeps_are_below_a_quarter_of_its_best_error(name: str) -> None:
+    for (estimate, truth), best in zip(estimates(name, None), PAPER[name], strict=True):
+        error = 1 / estimate.cell_siemens - 1 / truth["siemens"]
+        assert np.sqrt(np.mean(error**2)) / 1e6 < best / 4
+
+
+def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
+    """A light touch behind wires that a hard one loads: little of it is in the readings."""
+    estimate, truth = estimates("wire_sweep_3x3", 10)[4]
+    error = np.abs(estimate.cell_siemens - truth["siemens"])
+    assert (error / truth["siemens"]).max() > 0.3
+    assert np.all(error < 4 * estimate.cell_siemens_std)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 4), (3, 1), (2, 2), (4, 4)])
+def test_nonsense_gives_finite_numbers(size: tuple[int, int]) -> None:
+    random = np.random.default_rng(7)
+    frames = [np.zeros((*size, 4)), np.ones((*size, 4)), np.full((*size, 4), 0.5)]
+    frames += list(random.random((60, *size, 4)))
+    estimator = make_estimator("joint", SkinKnowledge(*size, adc_bits=10))
+    for frame in frames:
+        estimate = estimator.estimate(frame)
+        assert np.isfinite(estimate.cell_siemens).all()
+        assert np.isfinite(estimate.cell_siemens_std).all()
+        assert (estimate.cell_siemens_std > 0).all()
+        assert np.isfinite(estimate.top_wire_ohm).all()
+        assert np.isfinite(estimate.chi2)
+
+
+def test_a_frame_seen_before_takes_one_iteration() -> None:
+    with np.load(DATA / "presses_8x8.npz", allow_pickle=False) as data:
+        ratio, rest = rounded(data["ratio"][30], 10), rounded(data["rest_ratio"], 10)
+    estimator = make_estimator("joint", SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest))
+    first, again = estimator.estimate(ratio), estimator.estimate(ratio)
+    assert again.iterations == 1
+    # Close to each other in units of what is uncertain anyway.
+    away = np.abs(again.cell_siemens - first.cell_siemens) / first.cell_siemens_std
+    assert away.max() < 0.2
+    estimator.reset()
+    assert estimator.estimate(ratio).iterations == first.iterations
+
+
+def test_the_answer_is_where_the_posterior_is_highest() -> None:
+    """Against the posterior written out with dense matrices, along each of all 3RC resistances."""
+    random = np.random.default_rng(8)
+    rest = skin_at_rest(3, 4, random)
+    touched = touch(rest, 3, random)
+    knowledge = SkinKnowledge(
+        3,
+        4,
+        adc_bits=10,
+        rest_ratio=rounded(readings(rest), 10),
+        nominal_top_wire_ohm=100.0,
+        nominal_bottom_wire_ohm=200.0,
+    )
+    estimator = JointEstimator(knowledge)
+    measured = rounded(readings(touched), 10)
+    found = estimator.estimate(measured)
+    prior = estimator._prior
+    assert prior is not None
+    layer = np.kron(np.eye(2), np.ones((12, 12)))
+    inverse = np.linalg.inv(LAYER_STD**2 * layer + SEGMENT_STD**2 * np.eye(24))
+    nominal = np.log(np.repeat([100.0, 200.0], 12))
+    current = current_from_ratio(measured, 3e4, 3e4)
+
+    def cost(log_ohm: Float) -> float:
+        cell, top, bottom = log_ohm.reshape(3, 3, 4)
+        rho = port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom)))
+        residual = (current - 1 / (rho + 6e4)) / knowledge.current_std
+        off = log_ohm[12:] - nominal
+        return float(np.sum(residual**2) + prior.cost(log_ohm[:12]) + off @ inverse @ off)
+
+    wires = np.log([found.top_wire_ohm.ravel(), found.bottom_wire_ohm.ravel()]).ravel()
+    best = np.concatenate([-np.log(found.cell_siemens.ravel()), wires])
+    lowest = cost(best)
+    for resistor in range(36):
+        for step in (-0.03, -0.003, 0.003, 0.03):
+            moved = best.copy()
+            moved[resistor] += step
+            assert cost(moved) > lowest - 0.05

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What no touches can make of a skin is said, and nothing of the kind where touches are all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
+from ohmskin.estimate.port_readings import PortReader
+from ohmskin.link.codes import quantise, ratio_from_codes
+from studies.conditions import shorted_readings
+from studies.trials import random_trial, skin_at_rest, touch
+
+REF_OHM = (30_000.0, 30_000.0)
+
+
+def ten_bits(ratio: Float) -> Float:
+    return ratio_from_codes(quantise(ratio))
+
+
+def reader_of(rest_ratio: Float | None, wires: bool = True) -> PortReader:
+    shape = (8, 8) if rest_ratio is None else rest_ratio.shape[:2]
+    return PortReader(shape, REF_OHM, 10, rest_ratio, (100.0, 200.0) if wires else None)
+
+
+@pytest.fixture
+def rest() -> Skin:
+    return skin_at_rest(8, 8, np.random.default_rng(1))
+
+
+@pytest.fixture
+def touched(rest: Skin) -> Skin:
+    return touch(rest, 5, np.random.default_rng(2))
+
+
+def test_touches_are_no_fault() -> None:
+    faults = []
+    for seed in range(20):
+        trial = random_trial(8, 8, 10, 10, seed)
+        told = trial.rounded(10)
+        reader = reader_of(told.rest_ratio)
+        faults += [reader.read(ratio).fault for ratio in told.ratio]
+    # Two lines may draw the same currents by chance.
+    assert sum(map(bool, faults)) <= 0.02 * len(faults)
+    assert all("alike" in fault for fault in faults if fault)
+
+
+def test_no_touch_lowers_a_current(rest: Skin) -> None:
+    """Rayleigh's monotonicity law, on which a fault is founded, on random skins."""
+    random = np.random.default_rng(3)
+    for _ in range(30):
+        more = rest.cell_siemens * np.exp(np.abs(random.normal(0, 3, rest.shape)))
+        below = port_resistance_ohm(rest) - port_resistance_ohm(replace(rest, cell_siemens=more))
+        assert below.min() > -1e-9 * port_resistance_ohm(rest).max()
+
+
+@pytest.mark.parametrize(("layer", "line"), [("top", "(3, "), ("bottom", ", 3)")])
+def test_an_open_line_is_named(rest: Skin, touched: Skin, layer: str, line: str) -> None:
+    wires = getattr(touched, f"{layer}_wire_ohm").copy()
+    wires[(3, 0) if layer == "top" else (0, 3)] = 1e12
+    cut = replace(touched, **{f"{layer}_wire_ohm": wires})
+    fault = reader_of(ten_bits(readings(rest))).read(ten_bits(readings(cut))).fault
+    assert "conducts less than at rest" in fault
+    assert line in fault
+
+
+def test_a_skin_that_drifted_asks_for_new_rest_readings(rest: Skin) -> None:
+    drifted = replace(rest, cell_siemens=0.7 * rest.cell_siemens)
+    fault = reader_of(ten_bits(readings(rest))).read(ten_bits(readings(drifted))).fault
+    assert fault == "the whole skin conducts less than at rest: take the rest readings anew"
+
+
+def test_a_line_open_since_rest_is_named(rest: Skin) -> None:
+    wires = rest.top_wire_ohm.copy()
+    wires[2, 0] = 1e12
+    ratio = ten_bits(readings(replace(rest, top_wire_ohm=wires)))
+    assert "row 2 conducted nothing at rest" in reader_of(ratio).read(ratio).fault
+
+
+@pytest.mark.parametrize(("first", "said"), [(4, "rows 4 and 5"), (8 + 1, "columns 1 and 2")])
+def test_shorted_lines_are_named(rest: Skin, touched: Skin, first: int, said: str) -> None:
+    shorted = ten_bits(shorted_readings(touched, first, first + 1))
+    assert said in reader_of(ten_bits(readings(rest))).read(shorted).fault
+    at_rest = ten_bits(shorted_readings(rest, first, first + 1))
+    assert said in reader_of(at_rest).read(at_rest).fault
+
+
+def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:
+    shorted = ten_bits(shorted_readings(touched, 5, 8 + 6))
+    fault = reader_of(ten_bits(readings(rest))).read(shorted).fault
+    assert fault == "cell (5, 6): less resistance than wires have: row and column shorted?"
+    assert not reader_of(None, wires=False).read(shorted).fault
+
+
+@pytest.mark.parametrize("stuck", range(4))
+@pytest.mark.parametrize("at", [0.0, 1.0])
+def test_one_stuck_reading_of_a_cell_is_left_out(
+    rest: Skin, touched: Skin, stuck: int, at: float
+) -> None:
+    reader = reader_of(ten_bits(readings(rest)))
+    ratio = ten_bits(readings(touched))
+    good = reader.read(ratio)
+    place = tuple(np.argwhere(touched.cell_siemens > rest.cell_siemens)[0])
+    ratio[(*place, stuck)] = at
+    found = reader.read(ratio)
+    assert not found.fault
+    np.testing.assert_allclose(found.current, good.current, atol=2 * good.current_std.max())
+    assert found.current_std[place] > good.current_std[place]
+
+
+def test_readings_that_disagree_are_named(rest: Skin, touched: Skin) -> None:
+    ratio = ten_bits(readings(touched))
+    reader = reader_of(ten_bits(readings(rest)))
+    ratio[2, 7, 1:3] = 0.9, 0.4
+    assert "cell (2, 7): its readings disagree by" in reader.read(ratio).fault
+    ratio[..., 0] = 0.0
+    assert "readings of most cells disagree" in reader.read(ratio).fault
+
+
+def test_noise_in_all_readings_widens_all_currents(rest: Skin) -> None:
+    """Normal noise of 4 codes: the errors of the currents are as large as stated, or smaller."""
+    random = np.random.default_rng(4)
+    reader = reader_of(None)
+    exact = reader.read(readings(rest)).current
+    away = []
+    for _ in range(20):
+        noisy = readings(rest) + 4 / 1024 * random.standard_normal((8, 8, 4))
+        found = reader.read(ten_bits(noisy))
+        assert not found.fault
+        away.append((found.current - exact) / found.current_std)
+    assert 0.25 < np.std(away) < 1.0
+
+
+def test_without_rest_readings_nothing_is_said_of_a_change(rest: Skin) -> None:
+    dark = replace(rest, cell_siemens=np.full((8, 8), 1e-9))
+    assert not reader_of(None).read(ten_bits(readings(dark))).fault

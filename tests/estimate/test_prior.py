@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is expected of cells, and how a deviation of a log becomes one of a conductance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS, TAIL, CellPrior, rest_level, siemens_std
+
+REST = np.log([1e6])
+
+
+@pytest.mark.parametrize("tail", [TAIL, 3.0, np.inf])
+def test_the_stand_in_normal_has_the_slope_of_the_prior(tail: float) -> None:
+    prior = CellPrior(REST, np.full(1, 0.05), tail)
+    # The last three are harder than the hardest touch of 300 ohm.
+    for away in (-4.0, -0.3, -0.051, -0.02, 0.0, 0.03, 0.2, -8.2, -8.5, -9.5):
+        at = REST + away
+        slope = (prior.cost(at + 1e-6) - prior.cost(at - 1e-6)) / 2e-6
+        mean, variance = prior.normal(at)
+        assert slope == pytest.approx(float(2 * (at - mean)[0] / variance[0]), rel=1e-3, abs=1e-3)
+
+
+def test_the_further_from_rest_the_less_a_step_costs_up_to_the_hardest_touch() -> None:
+    prior = CellPrior(REST, np.full(1, 0.05), TAIL)
+    steps = np.diff([prior.cost(REST - away) for away in (0.0, 2.0, 4.0, 6.0, 8.0)])
+    assert np.all(steps > 0)
+    assert np.all(np.diff(steps) < 0)
+    assert prior.cost(REST - 10.0) - prior.cost(REST - 8.0) > 10
+
+
+def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:
+    log_siemens, log_std = np.log([1e-6, 1e-5, 1e-4]), np.full(3, 0.001)
+    up, down = siemens_std(log_siemens, log_std, np.full(3, 1.0), np.full(3, 0.1), 6e4)
+    np.testing.assert_allclose(up, 0.001 * np.exp(log_siemens), rtol=0.03)
+    np.testing.assert_allclose(down, 0.001 * np.exp(log_siemens), rtol=0.03)
+
+
+def test_a_cell_behind_unknown_wires_may_be_a_short() -> None:
+    """1 kOhm +- 50 % behind 10 kOhm of wire: four deviations down are below nothing."""
+    up, down = siemens_std(np.log([1e-3]), np.array([0.5]), np.array([1e4]), np.array([0.05]), 6e4)
+    assert 1e-3 + 4 * up[0] == pytest.approx(HIGHEST_TOUCH_SIEMENS)
+    assert 0 < down[0] < 0.25e-3
+
+
+def test_the_level_of_an_untouched_skin_is_found_and_touches_raise_it_little() -> None:
+    skin = Skin.uniform(8, 8, rest_ohm=8e5, top_wire_ohm=0.0, bottom_wire_ohm=0.0)
+    current = readings(skin)[:, :, 1] / skin.ref_bottom_ohm
+    assert rest_level(current, 6e4) == pytest.approx(1 / 8e5, rel=1e-6)
+    cells = skin.cell_siemens.copy()
+    cells[[1, 4, 6], [2, 2, 5]] = 1e-4
+    touched = Skin(cells, skin.top_wire_ohm, skin.bottom_wire_ohm)
+    current = readings(touched)[:, :, 1] / skin.ref_bottom_ohm
+    assert 1.0 < rest_level(current, 6e4) * 8e5 < 1.5

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forces from a board: what open promises with a calibration, tare, and replay bit for bit."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ohmskin
+from ohmskin.arrays import Float
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.errors import DeviceLost, TareRefused
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.levels import LEVEL_METHODS
+from ohmskin.force.calibrated_device import CalibratedDevice
+from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.force_reader import ForceScan
+from ohmskin.force.regression import ForceRegression
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Tare, load_recording
+
+NEWTON_SIEMENS = 20e-6  # of every cell, in these tests
+GHOST = "emulator://8x8?scene=ghost&seed=1"
+
+
+def calibration(
+    rest_ratio: Float, method: str = "touch", unit_id: int = 0, siemens: float = NEWTON_SIEMENS
+) -> Calibration:
+    """One of cells of which each is linear: `siemens` (for "voltage" 1) a newton."""
+    rows, columns = rest_ratio.shape[:2]
+    knowledge = SkinKnowledge(
+        rows,
+        columns,
+        adc_bits=10,
+        rest_ratio=rest_ratio,
+        nominal_top_wire_ohm=TOP_WIRE_OHM,
+        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+    )
+    force_n = np.arange(1.0, 11.0)
+    cells = np.arange(force_n.size) % (rows * columns)
+    found = ForceRegression().fit(cells, siemens * force_n, force_n, shape=(rows, columns))
+    return Calibration(
+        unit_id=unit_id,
+        date="2025-03-01",
+        method=method,
+        rest=Rest.of(method, knowledge, "2025-03-01"),
+        model=found.model_,
+        indenter_area_m2=1e-4,
+        nominal_top_wire_ohm=TOP_WIRE_OHM,
+        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+    )
+
+
+def of_scene(name: str, **options: object) -> Calibration:
+    scene = Scene(name, 8, 8, seed=1)
+    return calibration(scene.rest_ratio, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
+def test_scans_carry_forces_and_contacts(method: str) -> None:
+    scene = Scene("ghost", 8, 8, seed=1)
+    skin = scene.skin(0.0)
+    at_rest = Scene("rest", 8, 8, seed=1).skin(0.0)
+    true_n = (skin.cell_siemens - at_rest.cell_siemens) / NEWTON_SIEMENS
+    with ohmskin.open(GHOST, calibration=of_scene("ghost", method=method)) as board:
+        scan = board.latest()
+        (first,) = islice(board, 1)
+    for each in (scan, first):
+        assert isinstance(each, ForceScan)
+        assert each.force_n.shape == each.force_n_std.shape == (8, 8)
+        assert each.ratio.shape == (8, 8, 4)
+    assert scan.estimate.touched[5, 5] == (method == "ohm")  # the ghost
+    assert (len(scan.contacts) == 3) == (method != "ohm")
+    if method in ("joint", "touch"):
+        assert np.abs(scan.force_n - true_n).max() < 0.05
+        assert np.all(np.abs(scan.force_n - true_n) < 4 * scan.force_n_std + 1e-3)
+        expected = sorted(true_n[true_n > 0])
+        found = sorted(contact.force_n for contact in scan.contacts)
+        assert found == pytest.approx(expected, rel=0.03)
+        centres = {(contact.row, contact.column) for contact in scan.contacts}
+        assert centres == set(map(tuple, np.argwhere(true_n > 0).astype(float).tolist()))
+
+
+def test_voltage_is_a_method() -> None:
+    assert "voltage" in LEVEL_METHODS
+    of_skin = of_scene("ghost", method="voltage", siemens=0.1)
+    with ohmskin.open(GHOST, calibration=of_skin) as board:
+        scan = board.latest()
+    level = (scan.ratio[..., 1] + scan.ratio[..., 3] - scan.ratio[..., 0] - scan.ratio[..., 2]) / 4
+    np.testing.assert_allclose(
+        scan.force_n, np.maximum((level + 0.5 - of_skin.rest.level) / 0.1, 0), atol=1e-9
+    )
+
+
+def test_the_file_is_enough(tmp_path: Path) -> None:
+    path = tmp_path / "skin.json"
+    of_scene("ghost").save(path)
+    with ohmskin.open(GHOST, calibration=path) as board:
+        assert len(board.latest().contacts) == 3
+
+
+def test_another_unit_is_refused_unless_forced() -> None:
+    other = of_scene("ghost", unit_id=7)
+    with pytest.raises(ValueError, match="of unit 7, the board is unit 0"):
+        ohmskin.open(GHOST, calibration=other)
+    with ohmskin.open(GHOST, calibration=other, force=True) as board:
+        assert len(board.latest().contacts) == 3
+    for force in (False, True):
+        with pytest.raises(ValueError, match="of a 8x8 skin, the board scans 4x8"):
+            ohmskin.open("emulator://4x8", calibration=of_scene("rest"), force=force)
+
+
+def test_tare_is_refused_while_something_touches_the_skin() -> None:
+    before = of_scene("ghost")
+    with ohmskin.open(GHOST, calibration=before) as board:
+        with pytest.raises(TareRefused, match=r"cells \(2, 2\), \(2, 5\), \(5, 2\) are touched"):
+            board.tare(0.1)
+        assert board.calibration is before
+        assert len(board.latest().contacts) == 3
+        board.tare(0.1, force=True)
+        assert board.latest().contacts == ()
+        board.undo_tare()
+        assert len(board.latest().contacts) == 3
+        with pytest.raises(TareRefused, match="no tare to undo"):
+            board.undo_tare()
+
+
+def test_tare_follows_a_drift(tmp_path: Path) -> None:
+    scene = Scene("rest", 8, 8, seed=1)
+    drifted = replace(of_scene("rest"), rest=calibration(scene.rest_ratio).rest)
+    level = drifted.rest.level * 0.9
+    drifted = replace(drifted, rest=replace(drifted.rest, level=level))
+    with ohmskin.open("emulator://8x8?seed=1", calibration=drifted) as board:
+        before_n = board.latest().force_n
+        tare = board.tare(0.2)
+        after_n = board.latest().force_n
+        board.calibration.save(tmp_path / "skin.json")
+    np.testing.assert_allclose(tare.rest_ratio, scene.rest_ratio, atol=1 / 1024)
+    assert np.median(before_n) > 0.003 > 10 * np.median(after_n)
+    with ohmskin.open("emulator://8x8?seed=1", calibration=tmp_path / "skin.json") as board:
+        assert np.median(board.latest().force_n) < 0.0003
+        board.undo_tare()
+        assert np.median(board.latest().force_n) > 0.003
+        assert board.calibration.tare is None
+
+
+def assert_same_forces(first: list[ForceScan], second: list[ForceScan]) -> None:
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        assert one.number == other.number
+        assert one.force_n.tobytes() == other.force_n.tobytes()
+        assert one.force_n_std.tobytes() == other.force_n_std.tobytes()
+        assert [c.identity for c in one.contacts] == [c.identity for c in other.contacts]
+        assert [c.force_n for c in one.contacts] == [c.force_n for c in other.contacts]
+
+
+@pytest.mark.parametrize("method", ["touch", "joint"])
+def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -> None:
+    port, path = "emulator://8x8?scene=moving&seed=1", tmp_path / "skin.mcap"
+    of_skin = of_scene("moving", method=method)
+    live: list[ForceScan] = []
+    with (
+        ohmskin.open(port, calibration=of_skin, start=False) as board,
+        Recorder(path, board.info) as recorder,
+    ):
+        for scan in islice(board, 60):
+            live.append(scan)
+            recorder.add(scan)
+            if len(live) == 20:
+                recorder.add(board.tare(0.1, force=True))
+            if len(live) == 40:
+                recorder.add(board.undo_tare())
+    assert len(load_recording(path).tares) == 2
+    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
+        assert isinstance(board, CalibratedDevice)
+        assert_same_forces(live, list(board))
+    # The tare was of consequence.
+    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
+        board._recorded = None
+        untared = list(board)
+    assert live[10].force_n.tobytes() == untared[10].force_n.tobytes()
+    assert live[30].force_n.tobytes() != untared[30].force_n.tobytes()
+
+
+def test_latest_follows_the_same_tares(tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    of_skin = of_scene("ghost")
+    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
+        for number, scan in enumerate(islice(board, 20)):
+            if number == 10:
+                recorder.add(Tare(scan.ratio, scan.host_time_s))
+            recorder.add(scan)
+    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
+        contacts = [len(board.latest().contacts) for _ in range(20)]
+    assert contacts == 10 * [3] + 10 * [0]
+
+
+def test_latest_does_not_miss_a_tare_whose_scan_it_skips(tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
+        for number, scan in enumerate(islice(board, 90)):
+            if number == 20:
+                recorder.add(Tare(scan.ratio, scan.host_time_s))
+            recorder.add(scan)
+    with ohmskin.open(f"replay://{path}?speed=1", calibration=of_scene("ghost")) as board:
+        first = board.latest()
+        assert len(first.contacts) == 3
+        time.sleep(0.5)
+        later = board.latest()
+        assert later.number > first.number + 25
+        assert later.contacts == ()
+
+
+def test_a_tare_at_the_end_of_a_replay_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
+        for scan in islice(board, 5):
+            recorder.add(scan)
+    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_scene("ghost")) as board:
+        assert len(list(board)) == 5
+        with pytest.raises(DeviceLost, match="gives no more scans"):
+            board.tare()

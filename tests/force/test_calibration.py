@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration file: the same bits after a round trip, and whatever else it may hold refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.force.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
+from ohmskin.force.curve import POWER
+from ohmskin.force.regression import ForceRegression
+from ohmskin.link.codes import quantise, ratio_from_codes
+
+
+def rest(seed: int, date: str) -> Rest:
+    """As `touch` reads a skin of that seed."""
+    cell_siemens = 1e-6 * np.exp(0.1 * np.random.default_rng(seed).standard_normal((2, 3)))
+    skin = Skin(cell_siemens, np.full((2, 3), 100.0), np.full((2, 3), 200.0))
+    ratio = ratio_from_codes(quantise(readings(skin)))
+    return Rest.of("touch", SkinKnowledge(2, 3, adc_bits=10, rest_ratio=ratio), date)
+
+
+def calibration(pressed: int = 5) -> Calibration:
+    """A 2x3 skin of which so many cells were pressed, the first by a power law."""
+    random = np.random.default_rng(1)
+    cells = np.repeat(np.arange(pressed), 20)
+    rise = random.uniform(2e-6, 100e-6, cells.size)
+    force_n = 10 * (rise / 1e-4) ** np.where(cells == 0, 0.5, 1.0)
+    force_n = np.abs(force_n + 0.1 * random.standard_normal(cells.size))
+    found = ForceRegression().fit(cells, rise, force_n, shape=(2, 3))
+    assert found.kind_[0, 0] == POWER
+    assert found.pooled_.any()
+    return Calibration(
+        unit_id=7,
+        date="2025-03-01T12:00:00+00:00",
+        method="touch",
+        rest=rest(2, "2025-03-01T11:50:00+00:00"),
+        model=found.model_,
+        indenter_area_m2=1e-4,
+        nominal_top_wire_ohm=100.0,
+    )
+
+
+def assert_same_rest(first: Rest | None, second: Rest | None) -> None:
+    assert (first is None) == (second is None)
+    if first is not None and second is not None:
+        assert first.date == second.date
+        assert first.ratio.tobytes() == second.ratio.tobytes()
+        assert first.level.tobytes() == second.level.tobytes()
+
+
+def assert_same_bits(first: Calibration, second: Calibration) -> None:
+    for field in fields(Calibration):
+        one, other = getattr(first, field.name), getattr(second, field.name)
+        if field.name in ("rest", "tare"):
+            assert_same_rest(one, other)
+        elif field.name != "model":
+            assert (type(one), one) == (type(other), other), field.name
+    pairs = [
+        (getattr(first.model, field.name), getattr(second.model, field.name))
+        for field in fields(first.model)
+    ]
+    for one, other in pairs:
+        assert one.dtype.kind == other.dtype.kind
+        if one.dtype.kind == "f":
+            # A NaN has many bit patterns; here it means "unknown", whichever it is.
+            one, other = (np.where(np.isnan(each), 0.0, each) for each in (one, other))
+            assert one.tobytes() == other.tobytes()
+        else:
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("pressed", [1, 5])
+def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
+    saved = calibration(pressed)
+    if pressed == 1:
+        assert np.isnan(saved.model.residual_std).any()
+    path = tmp_path / "skin.json"
+    saved.save(path)
+    loaded = load_calibration(path)
+    assert_same_bits(saved, loaded)
+    again = tmp_path / "again.json"
+    loaded.save(again)
+    assert again.read_bytes() == path.read_bytes()
+    level = saved.rest.level + 30e-6
+    for one, other in zip(
+        saved.predict(level, np.full((2, 3), 1e-7)),
+        loaded.predict(level, np.full((2, 3), 1e-7)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_prediction_starts_at_rest() -> None:
+    of_skin = calibration()
+    level_std = np.full((2, 3), 1e-7)
+    force, std = of_skin.predict(of_skin.rest.level, level_std)
+    assert not force.any()
+    np.testing.assert_array_equal(std, of_skin.model.predict(np.zeros((2, 3)), level_std)[1])
+    with pytest.raises(ValueError, match=r"^level has shape \(3, 2\), this calibration \(2, 3\)$"):
+        of_skin.predict(np.zeros((3, 2)), level_std)
+
+
+def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
+    before = calibration()
+    tared = replace(before, tare=rest(3, "2025-03-02T08:00:00+00:00"))
+    path = tmp_path / "skin.json"
+    tared.save(path)
+    loaded = load_calibration(path)
+    assert_same_bits(tared, loaded)
+    assert loaded.tare is not None
+    level_std = np.full((2, 3), 1e-7)
+    assert not loaded.predict(loaded.tare.level, level_std)[0].any()
+    assert loaded.predict(loaded.rest.level, level_std)[0].any()
+    undone = replace(loaded, tare=None)
+    assert not undone.predict(before.rest.level, level_std)[0].any()
+
+
+def test_rest_is_what_the_method_reads() -> None:
+    ratio = rest(2, "2025-03-01").ratio
+    for method, tolerance in (("joint", 0.05), ("ohm", 0.7)):
+        level = Rest.of(method, SkinKnowledge(2, 3, rest_ratio=ratio), "2025-03-01").level
+        cell_siemens = 1e-6 * np.exp(0.1 * np.random.default_rng(2).standard_normal((2, 3)))
+        np.testing.assert_allclose(level, cell_siemens, rtol=tolerance)
+    a, b, c, d = np.moveaxis(ratio, -1, 0)
+    level = Rest.of("voltage", SkinKnowledge(2, 3, rest_ratio=ratio), "2025-03-01").level
+    np.testing.assert_allclose(level, (1 - a + b + 1 - c + d) / 4, rtol=1e-12)
+    with pytest.raises(ValueError, match="the readings of the untouched skin are not known"):
+        Rest.of("ohm", SkinKnowledge(2, 3), "2025-03-01")
+
+
+def test_the_file_is_complete_or_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "skin.json"
+    calibration().save(path)
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ValueError, match=r"skin\.json: cannot be written: No space left on device"):
+        replace(calibration(), unit_id=8).save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["skin.json"]
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=r"x\.json: cannot be written: No such file or directory"):
+        calibration().save(tmp_path / "none" / "x.json")
+
+
+def test_other_units_and_geometries_are_refused_unless_forced() -> None:
+    of_skin = calibration()
+    of_skin.check(7, 2, 3)
+    with pytest.raises(ValueError, match=r"of unit 7, the board is unit 8: calibrate this skin"):
+        of_skin.check(8, 2, 3)
+    with pytest.raises(ValueError, match=r"of a 2x3 skin, the board scans 3x2: calibrate this"):
+        of_skin.check(7, 3, 2)
+    of_skin.check(8, 2, 3, force=True)
+    of_skin.check(7, 3, 2, force=True)
+
+
+def put(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(content: dict[str, Any]) -> None:
+        content[name] = value
+
+    return edit
+
+
+def put_rest(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(content: dict[str, Any]) -> None:
+        content["rest"][name] = value
+
+    return edit
+
+
+def put_cell(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(content: dict[str, Any]) -> None:
+        content[name][1][2] = value
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (lambda content: content.pop("slope"), "no field 'slope'"),
+        (put("colour", "red"), "unknown field 'colour'"),
+        (put("format", "other"), "no calibration: field 'format' is not 'ohmskin calibration'"),
+        (put("schema", 2), "field 'schema' is not 1: written by another version of ohmskin"),
+        (put("schema", True), "field 'schema' is not 1: written by another version of ohmskin"),
+        (put("unit_id", "7"), "unit_id is not an integer"),
+        (put("unit_id", 2**32), "unit_id is 4294967296, not in 0..4294967295"),
+        (put("date", "yesterday"), "date is 'yesterday', not ISO 8601"),
+        (put("date", 20250301), "date is not text"),
+        (put("method", "magic"), "method is 'magic', not one of ohm, matrix, "),
+        (put("rows", 2.0), "rows is not an integer"),
+        (put("rows", 0), "rows and columns: not 1 to 4096 cells"),
+        (put("columns", 10**18), "rows and columns: not 1 to 4096 cells"),
+        (put("columns", 4), "kind is not 2 lists of 4"),
+        (put("rest", None), "rest is not an object"),
+        (put("tare", [1]), "tare is not an object"),
+        (put("tare", {"date": "2025-03-02"}), "no field 'tare.level'"),
+        (put_rest("colour", 1), "unknown field 'rest.colour'"),
+        (put_rest("date", "today"), "rest: date is 'today', not ISO 8601"),
+        (put_rest("ratio", [0.5]), "rest.ratio is not an array of numbers of shape (2, 3, 4)"),
+        (put_rest("ratio", [[[2.0] * 4] * 3] * 2), "rest: ratio at rest of cell (0, 0), reading A"),
+        (put_rest("level", None), "rest.level is not 2 lists of 3"),
+        (put_rest("level", [[-1e-6] * 3] * 2), "rest: level at rest of cell (0, 0) is not finite"),
+        (put_rest("level", [[None] * 3] * 2), "rest.level holds NoneType, not numbers"),
+        (put_cell("slope", "1"), "slope holds str, not numbers"),
+        (put_cell("slope", True), "slope holds bool, not numbers"),
+        (put_cell("slope", 10**400), "slope holds a number that is not finite"),
+        (put_cell("slope", 1e61), "slope holds a number that is not finite, or beyond 1e+60"),
+        (put_cell("slope", -1.0), "slope of cell (1, 2) is not above 0"),
+        (put_cell("slope_std", -1.0), "slope_std of cell (1, 2) is not finite and >= 0"),
+        (put_cell("exponent", 99), "exponent of cell (1, 2) is not in 0.2..5"),
+        (put_cell("correlation", 2), "correlation of cell (1, 2) is not in -1..1"),
+        (put_cell("held_out_rmse", -1), "held_out_rmse of cell (1, 2) is negative or inf"),
+        (put_cell("kind", "cubic"), "kind of cell (1, 2) is neither linear nor power"),
+        (put_cell("kind", 1), "kind holds something other than names of curves"),
+        (put_cell("pooled", 1), "pooled holds something other than true and false"),
+        (put("indenter_area_m2", 0), "indenter_area_m2 is 0.0, it must be above 0"),
+        (put("nominal_top_wire_ohm", -1), "nominal_top_wire_ohm is -1.0, it must be finite"),
+        (put("nominal_bottom_wire_ohm", []), "nominal_bottom_wire_ohm holds list, not numbers"),
+    ],
+)
+def test_edited_files_are_refused_by_field(
+    tmp_path: Path, edit: Callable[[dict[str, Any]], Any], reason: str
+) -> None:
+    path = tmp_path / "skin.json"
+    calibration().save(path)
+    content = json.loads(path.read_text())
+    edit(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="^" + re.escape(f"{path}: {reason}")) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("raw", "reason"),
+    [
+        (b"", "no JSON of ours: "),
+        (b"\x89PNG\r\n\x1a\n", "no JSON of ours: "),
+        (b"[" * 100_000, "no JSON of ours: "),
+        (b'{"a": NaN}', "no JSON of ours: NaN is no number"),
+        (b'{"a": -Infinity}', "no JSON of ours: -Infinity is no number"),
+        (b'{"a": 1, "a": 2}', "no JSON of ours: field 'a' stands twice"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "no JSON of ours: "),
+        (b"[]", "no calibration: field 'format' is not 'ohmskin calibration'"),
+        (b"{}", "no calibration: field 'format' is not 'ohmskin calibration'"),
+        (b" " * (MAX_FILE_BYTES + 1), f"more than {MAX_FILE_BYTES} bytes"),
+    ],
+    ids=lambda each: None if isinstance(each, bytes) else each[:24],
+)
+def test_foreign_files_are_refused(tmp_path: Path, raw: bytes, reason: str) -> None:
+    path = tmp_path / "foreign.json"
+    path.write_bytes(raw)
+    with pytest.raises(ValueError, match="^" + re.escape(f"{path}: {reason}")) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    for path, reason in (
+        (tmp_path / "none.json", "No such file or directory"),
+        (tmp_path, "Is a directory"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(f"{path}: cannot be read: {reason}")):
+            load_calibration(path)
+
+
+def test_truncated_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "skin.json"
+    calibration().save(path)
+    whole = path.read_bytes().rstrip()
+    for length in range(0, len(whole), 97):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"skin\.json: no JSON of ours"):
+            load_calibration(path)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("calibration") / "skin.json"
+    calibration().save(path)
+    return path
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=5,
+)
+
+
+@given(draw=st.data())
+def test_whatever_a_field_holds_it_is_taken_or_refused_in_one_line(
+    saved: Path, draw: st.DataObject
+) -> None:
+    content = json.loads(saved.read_text())
+    name = draw.draw(st.sampled_from(sorted(content)))
+    value = draw.draw(JSON)
+    if isinstance(content[name], list) and draw.draw(st.booleans()):
+        content[name][0][0] = value
+    else:
+        content[name] = value
+    edited = saved.with_name("edited.json")
+    edited.write_text(json.dumps(content))
+    refusal = ""
+    try:
+        load_calibration(edited).predict(np.full((2, 3), 1e-5), np.full((2, 3), 1e-7))
+    except ValueError as error:
+        refusal = str(error)
+    assert not refusal or refusal.startswith(f"{edited}: ")
+    assert "\n" not in refusal

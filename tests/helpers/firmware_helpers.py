@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tests of the built firmware share besides fixtures."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from lockstep import Rig
+from ohmskin.emulate.simavr import CPU_HZ
+from ohmskin.link import protocol
+from places import ROOT
+
+BOOT_S = 0.01
+CYCLES_PER_US = CPU_HZ // 1_000_000
+BAUD_DEFAULT = protocol.CONSTANTS["baud_default"]
+BAUD_FAST = protocol.CONSTANTS["baud_fast"]
+VECTORS = json.loads((ROOT / "protocol" / "vectors.json").read_text(encoding="utf-8"))
+COMMANDS = [f.name for f in protocol.FRAMES.values() if f.sender == "host"]
+RECORD_SIZE = 2 + 4 + protocol.FRAMES["configure"].struct.size + 2  # layout, unit id, scan, CRC
+OTHER_SCAN = {
+    "rows": 5,
+    "columns": 3,
+    "rate_mhz": 123_456,
+    "settle_us": 60,
+    "adc_prescaler": "clock_250khz",
+}
+
+
+def reset(rig: Rig) -> dict[str, Any]:
+    """Pull the reset pin; what the board then says by itself."""
+    before = len(rig.frames("hello"))
+    rig.sim.reset()
+    rig.run(BOOT_S)
+    (hello,) = rig.frames("hello")[before:]
+    return hello
+
+
+def go_fast(rig: Rig) -> None:
+    rig.must("set_baud", baud=BAUD_FAST)
+    rig.run(0.002)
+    rig.must("get_hello")
+
+
+def numbers(rig: Rig) -> list[int]:
+    return [scan.header["scan"] for scan in rig.scans]
+
+
+def assert_whole(rig: Rig) -> None:
+    """No scan since start_scan is missing, damaged or wrong."""
+    assert rig.damaged == 0
+    assert rig.scans
+    assert numbers(rig) == list(range(len(rig.scans)))
+    assert {scan.header["dropped"] for scan in rig.scans} == {0}
+    assert rig.check().wrong == 0

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The built firmware in lock-step with a host that knows what every reading must be.
+
+For tests and benchmarks of the firmware: simulated time passes only in `Rig.run`, so that every
+figure is exact and repeatable. In real time there is ``simavr://`` (`ohmskin.emulate.simavr_link`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.emulate.simavr import CPU_HZ, HOLD_DTYPE, SkinSim
+from ohmskin.link import framing, protocol
+from places import ROOT
+
+BOARDS = ("uno", "megaatmega2560")
+CODES = 1 << protocol.ADC_BITS
+TABLE_SHAPE = (16, 16, protocol.READINGS_PER_CELL)
+DEFAULT_SCAN: dict[str, Any] = {
+    "rows": 8,
+    "columns": 8,
+    "rate_mhz": 90_000,
+    "settle_us": 0,
+    "adc_prescaler": "clock_500khz",
+}
+
+
+def elf_of(board: str) -> Path:
+    """Where PlatformIO leaves the firmware; it need not exist."""
+    return ROOT / ".pio" / "build" / board / "firmware.elf"
+
+
+@dataclass(frozen=True)
+class ReceivedScan:
+    """A `scan` frame: its header's fields, and its codes, shape (rows, columns, readings)."""
+
+    header: dict[str, Any]
+    codes: NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Check:
+    """Received scans against the skin's table at the instants of their holds.
+
+    start_cycles: of the first hold of every scan since `start_scan`, received or not.
+    """
+
+    readings: int
+    wrong: int
+    start_cycles: NDArray[np.int64]
+
+
+class Rig:
+    """A board in lock-step with a host that knows what every reading must be."""
+
+    def __init__(self, board: str) -> None:
+        self.board = board
+        self.sim = SkinSim(board, elf_of(board))
+        self.decoder = framing.Decoder()
+        self.scans: list[ReceivedScan] = []
+        self.log: list[tuple[str, dict[str, Any]]] = []
+        """Every frame in order: name and fields."""
+        self.malformed = 0
+        self._results: dict[int, str] = {}
+        self._sequence = 0
+        self._table_cycles: list[int] = []
+        self._tables: list[NDArray[np.uint16]] = []
+        self._holds: list[NDArray[np.void]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.sim.close()
+
+    def run_cycles(self, cycles: int) -> None:
+        """Let simulated time pass, and take what the board sends."""
+        for frame in self.decoder.feed(self.sim.run_cycles(cycles)):
+            kind = protocol.FRAMES_BY_ID[frame.type]
+            try:
+                fields = kind.unpack(frame.payload)
+                if kind.name == "scan":
+                    tail = frame.payload[kind.struct.size :]
+                    codes = protocol.unpack_codes(tail, fields["rows"], fields["columns"])
+                    self.scans.append(ReceivedScan(fields, codes))
+            except ValueError:  # a CRC that is right by chance
+                self.malformed += 1
+                continue
+            self.log.append((kind.name, fields))
+            if kind.name == "ack":
+                self._results[fields["command_sequence"]] = fields["result"]
+
+    @property
+    def damaged(self) -> int:
+        """Frames that came and were none."""
+        return self.decoder.stats.damaged + self.malformed
+
+    def run(self, seconds: float) -> None:
+        """Let simulated time pass [s]."""
+        self.run_cycles(round(seconds * CPU_HZ))
+
+    def frames(self, name: str) -> list[dict[str, Any]]:
+        """The fields of all frames of one kind received so far."""
+        return [fields for kind, fields in self.log if kind == name]
+
+    # ---- commands
+    def encode(self, name: str, **fields: Any) -> bytes:
+        """The bytes of a command with the next sequence number, for `sim.write`."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._results.pop(self._sequence, None)
+        frame = protocol.FRAMES[name]
+        return framing.encode(frame.id, self._sequence, frame.pack(**fields))
+
+    def send(self, name: str, **fields: Any) -> int:
+        """Queue a command on the line; its sequence number."""
+        self.sim.write(self.encode(name, **fields))
+        return self._sequence
+
+    def result_of(self, sequence: int, limit_s: float = 0.5) -> str:
+        """Run until the ack of the command with this number has come; its result.
+
+        :raises TimeoutError: none came within `limit_s` of simulated time.
+        """
+        step_s = 0.0005
+        for _ in range(round(limit_s / step_s)):
+            if sequence in self._results:
+                return self._results.pop(sequence)
+            self.run(step_s)
+        raise TimeoutError(f"no ack of command {sequence} within {limit_s} s")
+
+    def command(self, name: str, limit_s: float = 0.5, **fields: Any) -> str:
+        """Send a command and run until it is answered; its result."""
+        return self.result_of(self.send(name, **fields), limit_s)
+
+    def hello(self) -> dict[str, Any]:
+        """Ask who the board is.
+
+        :raises RuntimeError: it refuses to say.
+        """
+        result = self.command("get_hello")
+        if result != "ok":
+            raise RuntimeError(f"get_hello: {result}")
+        return self.frames("hello")[-1]
+
+    def must(self, name: str, **fields: Any) -> None:
+        """A command that has to succeed.
+
+        :raises RuntimeError: it does not.
+        """
+        result = self.command(name, **fields)
+        if result != "ok":
+            raise RuntimeError(f"{name}: {result}")
+
+    def start_scan(self, **scan: Any) -> None:
+        """Configure (the default, but for what is given), forget all scans and start."""
+        self.must("configure", **(DEFAULT_SCAN | scan))
+        self.forget()
+        self.sim.hold_log(True)
+        self.must("start")
+
+    def forget(self) -> None:
+        """Drop the scans and holds of the run before; the tables stay."""
+        self.scans.clear()
+        self.sim.hold_log(False)
+        self.sim.drain_hold_log()
+        self._holds.clear()
+
+    # ---- the skin
+    def set_codes(self, codes: NDArray[np.uint16], rng: np.random.Generator) -> None:
+        """Make the skin read `codes` (16, 16, 4): a third each at the step's edges and inside."""
+        inside = rng.random(codes.shape)
+        upper_edge = np.nextafter((codes + 1.0) / CODES, 0)
+        where = rng.integers(3, size=codes.shape)
+        ratio = np.choose(where, [codes / CODES, upper_edge, (codes + inside) / CODES])
+        self.sim.set_table(ratio)
+        self._table_cycles.append(int(self.sim.stats()["cycles"]))
+        self._tables.append(codes)
+
+    def randomize(self, rng: np.random.Generator) -> None:
+        """A new random skin, from this cycle on."""
+        self.set_codes(rng.integers(CODES, size=TABLE_SHAPE, dtype=np.uint16), rng)
+
+    def holds(self) -> NDArray[np.void]:
+        """Every hold since `start_scan`."""
+        self._holds.append(self.sim.drain_hold_log())
+        joined = np.concatenate(self._holds) if self._holds else np.empty(0, HOLD_DTYPE)
+        self._holds = [joined]
+        return joined
+
+    def take_holds(self) -> None:
+        """Fetch logged holds, of which the simulator keeps no more than about a million."""
+        self._holds.append(self.sim.drain_hold_log())
+
+    def check(self) -> Check:
+        """Compare every received scan since `start_scan`; the scan's size must not have changed.
+
+        Which hold belongs to which reading follows from the order of a scan: reading b of the first
+        cell comes once a scan, right after the scan's first hold; idle slots lie before that.
+        """
+        holds = self.holds()
+        second = (holds["row"] == 0) & (holds["column"] == 0) & (holds["configuration"] == 1)
+        first = np.flatnonzero(second) - 1
+        starts = holds["cycle"][first].astype(np.int64)
+        if not self.scans:
+            return Check(0, 0, starts)
+        size = self.scans[0].codes.size
+        rows, columns, _ = self.scans[0].codes.shape
+        numbers = np.array([scan.header["scan"] for scan in self.scans])
+        cycles = holds["cycle"][first[numbers][:, None] + np.arange(size)].astype(np.int64)
+        # The simulator holds first where a hold and a new table fall on the same cycle.
+        table = np.searchsorted(np.array(self._table_cycles), cycles, side="left") - 1
+        in_order = np.stack(self._tables)[:, :rows, :columns].transpose(0, 2, 1, 3)
+        expected = in_order.reshape(-1, size)[table, np.arange(size)]
+        received = np.stack([s.codes.transpose(1, 0, 2).reshape(-1) for s in self.scans])
+        return Check(received.size, int((received != expected).sum()), starts)

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board's clock on the host's: against known clocks, and that of the simulated firmware."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lockstep import Rig
+from ohmskin.arrays import Float
+from ohmskin.emulate.simavr import CPU_HZ
+from ohmskin.emulate.simavr_link import SimavrLink
+from ohmskin.link.clock import BoardClock, scan_times_s
+from ohmskin.link.device import Device
+from ohmskin.link.line_delay import line_delay_s, scan_s
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.opening import open_link
+
+HZ = 90.0
+START_S = 5000.0  # of the board's clock, on the host's
+
+
+def mapped(board_s: Float, arrival_s: Float) -> tuple[Float, BoardClock]:
+    """What a clock says of each time when it has just been added."""
+    clock = BoardClock()
+    found_s = []
+    for at_s, known_s in zip(board_s, arrival_s, strict=True):
+        clock.add(1e6 * at_s, known_s)
+        found_s.append(clock.host_s(1e6 * at_s))
+    return np.array(found_s), clock
+
+
+def usb_latency_timer(random: np.random.Generator, true_s: Float) -> Float:
+    """A bridge hands over what it has every 16 ms; the host is a little late at times."""
+    return np.ceil(true_s / 16e-3) * 16e-3 + random.exponential(0.5e-3, true_s.size)
+
+
+def jitter(random: np.random.Generator, true_s: Float) -> Float:
+    return true_s + random.exponential(5e-3, true_s.size)
+
+
+def bursts(random: np.random.Generator, true_s: Float) -> Float:
+    """Every second the host is busy for up to 300 ms, then takes all that has waited."""
+    busy_s = 0.3 * random.random(int(true_s[-1]) + 2)
+    until_s = np.floor(true_s) + busy_s[true_s.astype(int) - int(true_s[0])]
+    return np.maximum(true_s, until_s) + random.exponential(0.3e-3, true_s.size)
+
+
+def in_order(arrival_s: Float) -> Float:
+    return np.maximum.accumulate(arrival_s)
+
+
+@pytest.mark.parametrize("rate_error", [0.0, 100e-6, -100e-6, 5e-3, -5e-3])
+@pytest.mark.parametrize("delays", [usb_latency_timer, jitter, bursts])
+def test_delays_and_drift_leave_less_than_a_millisecond(delays, rate_error) -> None:  # type: ignore[no-untyped-def]
+    random = np.random.default_rng(3)
+    board_s = np.arange(60 * HZ) / HZ
+    true_s = START_S + (1 + rate_error) * board_s
+    arrival_s = in_order(delays(random, true_s))
+    found_s, clock = mapped(board_s, arrival_s)
+    settled = board_s > 5
+    error_s = (found_s - true_s)[settled]
+    late_s = (arrival_s - true_s)[settled]
+    print(
+        f"{delays.__name__}, {1e6 * rate_error:+.0f} ppm: "
+        f"median {1e3 * np.median(error_s):.3f} ms, largest {1e3 * np.abs(error_s).max():.2f} ms, "
+        f"of arrivals {1e3 * np.median(late_s):.1f} ms"
+    )
+    assert abs(np.median(error_s)) < 0.5e-3
+    assert np.abs(error_s).max() < 2e-3
+    assert np.diff(found_s).min() > 0
+    assert np.abs(np.diff(found_s) - 1 / HZ).max() < 1e-3
+    expected_s = np.percentile(late_s[-2048:], 95)
+    assert clock.jitter_s == pytest.approx(expected_s, rel=0.1, abs=1e-3)
+
+
+def test_a_resonator_that_warms_is_followed() -> None:
+    random = np.random.default_rng(4)
+    board_s = np.arange(120 * HZ) / HZ
+    true_s = START_S + board_s + 0.5 * 5e-6 * board_s**2  # 5 ppm a second
+    found_s, _ = mapped(board_s, in_order(jitter(random, true_s)))
+    error_s = (found_s - true_s)[board_s > 5]
+    assert abs(np.median(error_s)) < 1e-3
+    assert np.abs(error_s).max() < 3e-3
+
+
+def test_the_first_scan_has_a_time_and_no_later_one_goes_back() -> None:
+    clock = BoardClock()
+    with pytest.raises(ValueError, match="no scan has been added"):
+        clock.host_s(0)
+    board_s = np.arange(3 * HZ) / HZ
+    true_s = START_S + board_s
+    arrival_s = true_s.copy()
+    arrival_s[:60] = np.maximum(true_s[:60], true_s[59])  # the first 0.7 s came at once
+    found_s, clock = mapped(board_s, arrival_s)
+    assert found_s[0] == arrival_s[0]
+    assert np.diff(found_s).min() >= 0
+    assert np.abs(found_s - true_s)[-1] < 5e-3
+
+
+@pytest.mark.parametrize("pause_s", [0.5, 100.0])
+def test_a_board_that_restarts_begins_anew(pause_s: float) -> None:
+    random = np.random.default_rng(5)
+    run_s = np.arange(20 * HZ) / HZ
+    board_s = np.concatenate([run_s + 50, run_s])
+    true_s = START_S + 1.001 * np.concatenate([run_s, run_s + run_s[-1] + pause_s])
+    found_s, _ = mapped(board_s, in_order(jitter(random, true_s)))
+    error_s = found_s - true_s
+    assert np.abs(error_s[run_s.size :]).max() < 20e-3
+    assert np.abs(error_s[run_s.size + 180 :]).max() < 2e-3
+    assert np.diff(found_s).min() > 0
+
+
+@pytest.mark.parametrize("step_s", [0.3, -0.3])
+def test_a_clock_that_steps_is_followed(step_s: float) -> None:
+    """Late: the simulator has dropped time. Early: the host was asleep, its clock stood still."""
+    random = np.random.default_rng(6)
+    board_s = np.arange(40 * HZ) / HZ
+    true_s = START_S + board_s + np.where(board_s > 20, step_s, 0.0)
+    found_s, _ = mapped(board_s, true_s + random.exponential(1e-3, board_s.size))
+    assert np.abs(found_s - true_s)[board_s > 25].max() < 2e-3
+
+
+def test_a_pause_of_the_scans_does_not_confuse() -> None:
+    random = np.random.default_rng(7)
+    board_s = np.concatenate([np.arange(0, 20, 1 / HZ), np.arange(600, 620, 1 / HZ)])
+    true_s = START_S + 1.0001 * board_s
+    found_s, _ = mapped(board_s, in_order(jitter(random, true_s)))
+    assert np.abs(found_s - true_s)[board_s > 601].max() < 2e-3
+
+
+# --------------------------------------------------------------------------------- recordings
+
+
+def scans_at(board_s: Float, host_s: Float) -> list[Scan]:
+    codes: NDArray[np.uint16] = np.zeros((1, 1, 4), dtype=np.uint16)
+    return [
+        Scan(codes, number, round(1e6 * board), host, 0)
+        for number, (board, host) in enumerate(zip(board_s, host_s, strict=True))
+    ]
+
+
+@pytest.mark.parametrize("seconds", [10, 100])
+def test_scan_times_are_free_of_the_jitter_of_their_arrival(seconds: int) -> None:
+    random = np.random.default_rng(1)
+    board_s = np.arange(seconds * HZ) / HZ
+    true_s = 77.0 + 1.0002 * board_s  # a crystal that is 200 ppm off
+    late_s = random.exponential(5e-3, board_s.size)
+    off_s = scan_times_s(scans_at(board_s, true_s + late_s)) - true_s
+    assert np.abs(off_s).max() < 0.5e-3
+    assert late_s.max() > 20e-3
+
+
+def test_scan_times_follow_a_board_that_restarts() -> None:
+    board_s = np.concatenate([np.arange(50), np.arange(50)]) / HZ
+    host_s = np.concatenate([np.arange(50), 200 + np.arange(50)]) / HZ + 9.0
+    np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_scans_have_the_times_of_their_arrival(count: int) -> None:
+    board_s = np.arange(count) / HZ
+    np.testing.assert_allclose(scan_times_s(scans_at(board_s, board_s + 9)), board_s + 9)
+
+
+def test_scan_times_bridge_a_pause() -> None:
+    board_s = np.concatenate([np.arange(0, 20, 1 / HZ), np.arange(600, 620, 1 / HZ)])
+    host_s = 9.0 + 1.0001 * board_s
+    np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=2e-6)
+
+
+# ------------------------------------------------------------------------ the firmware's clock
+
+
+def starts_s(rig_holds: NDArray[np.void]) -> Float:
+    """When each scan's first reading was held, on the simulator's clock [s]."""
+    second = (rig_holds["row"] == 0) & (rig_holds["column"] == 0)
+    second &= rig_holds["configuration"] == 1
+    return rig_holds["cycle"][np.flatnonzero(second) - 1] / CPU_HZ
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize(
+    "scan",
+    [
+        {},
+        {"rows": 4, "columns": 4},
+        {"rows": 16, "columns": 16, "rate_mhz": 20_000},
+        {"rate_mhz": 30_000, "settle_us": 40},
+    ],
+)
+def test_the_line_delay_is_that_of_the_firmware(scan: dict[str, int]) -> None:
+    random = np.random.default_rng(1)
+    step_s = 25e-6
+    with Rig("uno") as rig:
+        rig.run(0.3)
+        rig.hello()
+        rig.start_scan(**scan)
+        board = Hello(**rig.hello())
+        numbers, left_s, modelled_s = [], [], []
+        while len(left_s) < 20:
+            before = len(rig.scans)
+            rig.run(step_s)
+            if len(rig.scans) > before:
+                now_s = rig.sim.stats()["cycles"] / CPU_HZ
+                received = rig.scans[-1]
+                header = received.header
+                numbers.append(header["scan"])
+                left_s.append(now_s - step_s / 2)
+                found = Scan(received.codes, header["scan"], header["time_us"], 0.0, 0)
+                modelled_s.append(scan_s(board) + line_delay_s(found, board))
+                # Codes with few zeros, and with many.
+                rig.sim.set_table(random.random((16, 16, 4)) ** random.integers(1, 9))
+        took_s = np.array(left_s) - starts_s(rig.holds())[numbers]
+    error_s = (took_s - modelled_s)[2:]  # at first, acks go before scans
+    spread_s = np.ptp(took_s[2:])
+    print(f"{scan}: error {1e6 * np.abs(error_s).max():.0f} us of {1e6 * spread_s:.0f} us")
+    assert np.abs(error_s).max() < 0.4e-3
+    assert spread_s > 1e-3
+
+
+def timed(device: Device, clock: BoardClock) -> Iterator[tuple[Scan, float]]:
+    board = device.info
+    took_us = 1e6 * scan_s(board)
+    for scan in device:
+        clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
+        yield scan, clock.host_s(scan.time_us)
+
+
+@pytest.mark.simavr
+def test_times_are_those_of_the_simulator() -> None:
+    """Its clock and the host's are compared by asking it for its cycles, over a pipe.
+
+    It runs a millisecond at a time, so its bytes come up to one early. Where the machine was so
+    busy that it dropped time, it is asked again.
+    """
+    for _ in range(4):
+        error_s, dropped = errors_against_simulator()
+        if not dropped:
+            break
+    else:
+        pytest.skip("the machine is too busy to simulate in real time")
+    after_s = error_s[90:]
+    print(f"error {1e3 * np.median(after_s):.2f} ms, largest {1e3 * np.abs(after_s).max():.2f} ms")
+    assert abs(np.median(after_s)) < 1e-3
+
+
+def errors_against_simulator() -> tuple[Float, int]:
+    """Of 200 scans' times [s]; and the milliseconds that the simulator dropped."""
+    link, _ = open_link("simavr://uno?scene=ghost")
+    assert isinstance(link, SimavrLink)
+    with Device(link) as device:
+        sim = link._sim
+        sim.hold_log(True)
+        found, offsets_s = [], []
+        for count, (scan, at_s) in enumerate(itertools.islice(timed(device, BoardClock()), 200)):
+            found.append((1e-6 * scan.time_us, at_s))
+            if count % 3 == 0:
+                cycles = sim.stats()["cycles"]
+                offsets_s.append(time.monotonic() - cycles / CPU_HZ)
+        begun_s = starts_s(sim.drain_hold_log())
+        dropped = sim.stats()["late_slices"]
+    board_s, at_s = np.array(found).T
+    # The board's clock begins at boot, the simulator's at power-on.
+    booted_s = np.median([begun_s[np.abs(begun_s - at).argmin()] - at for at in board_s])
+    return at_s - (board_s + booted_s + np.median(offsets_s)), dropped

@@ -1,0 +1,441 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ohmskin.open` and `Device`: the same tests over an emulated board in this process, one behind a
+pseudo-terminal that is opened like a serial port, and the firmware in the AVR simulator.
+"""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ohmskin
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.scenes import Scene
+from ohmskin.errors import CommandRefused, DeviceLost, PortError
+from ohmskin.link import device, framing, protocol, session
+from ohmskin.link.messages import Scan
+
+SCENE = "scene=multi&seed=3"
+EXPECTED = Scene("multi", 8, 8, seed=3).ratio(0.0)
+NOISE_LSB = 0.3  # of the emulator, by default; the simulator has none
+QUANTISATION = 0.5 / 1024
+
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+BACKENDS = [
+    "emulator",
+    "pty",
+    pytest.param("uno", marks=pytest.mark.simavr),
+    pytest.param("megaatmega2560", marks=pytest.mark.simavr),
+]
+
+
+@pytest.fixture(params=BACKENDS)
+def url(request: pytest.FixtureRequest, pty_board: Callable[[str], PtyServer]) -> str:
+    emulator = f"emulator://8x8?{SCENE}"
+    if request.param == "emulator":
+        return emulator
+    if request.param == "pty":
+        return pty_board(emulator).path
+    return f"simavr://{request.param}?{SCENE}"
+
+
+@pytest.fixture
+def fast() -> Iterator[ohmskin.Device]:
+    """A board of one cell that scans a thousand times a second."""
+    with ohmskin.open("emulator://1x1?rate=1000") as skin:
+        yield skin
+
+
+def take(scans: Iterator[Scan], count: int) -> list[Scan]:
+    return list(itertools.islice(scans, count))
+
+
+def until(ready: Callable[[], object], limit_s: float = 20.0) -> None:
+    end_s = time.monotonic() + limit_s
+    while not ready():
+        assert time.monotonic() < end_s, "it never came"
+        time.sleep(0.005)
+
+
+def assert_reads_the_scene(ratio: np.ndarray) -> None:
+    assert ratio.shape == (8, 8, 4)
+    assert np.abs(ratio - EXPECTED).max() <= QUANTISATION + 6 * NOISE_LSB / 1024
+    assert np.abs((ratio - EXPECTED).mean()) < 0.1 * QUANTISATION
+
+
+# ----------------------------------------------------------------------------- every backend
+
+
+def test_info(url: str) -> None:
+    with ohmskin.open(url, start=False) as skin:
+        info = skin.info
+        assert skin.name == url
+    assert info.layout_crc == protocol.LAYOUT_CRC
+    assert info.board in ("emulated", "uno", "megaatmega2560")
+    assert (info.rows, info.columns, info.readings_per_cell, info.adc_bits) == (8, 8, 4, 10)
+    assert (info.ref_top_ohm, info.ref_bottom_ohm) == (30_000, 30_000)
+    assert info.rate_hz == pytest.approx(90, rel=0.0005)
+    assert (info.scanning, info.unit_id, info.settings) == (0, 0, "defaults_blank")
+
+
+def test_every_scan_comes_in_order(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        # The hello of a board that boots may be cut in two by the opening of its port.
+        before = skin.stats.line.damaged
+        found = take(iter(skin), 60)
+        rate_hz, stats = skin.info.rate_hz, skin.stats
+    numbers = [scan.number for scan in found]
+    assert numbers == list(range(numbers[0], numbers[0] + 60))
+    assert [scan.missed for scan in found] == [0] * 60
+    assert [scan.codes.shape for scan in found] == [(8, 8, 4)] * 60
+    steps_us = np.diff([scan.time_us for scan in found])
+    assert np.abs(steps_us - 1e6 / rate_hz).max() <= 2
+    assert all(a.host_time_s <= b.host_time_s for a, b in itertools.pairwise(found))
+    assert_reads_the_scene(np.mean([scan.ratio for scan in found], axis=0))
+    assert_reads_the_scene(found[-1].ratio)
+    assert stats.scans >= 60
+    assert (stats.missed, stats.dropped_by_board, stats.board_rx_errors) == (0, 0, 0)
+    assert before <= 1
+    assert stats.line.damaged == before
+    assert (stats.unknown, stats.restarts, stats.overflowed) == (0, 0, 0)
+    assert stats.line.octets > 60 * 320
+
+
+def test_latest_is_the_newest_and_each_comes_once(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        numbers = [skin.latest().number for _ in range(10)]
+        assert all(a < b for a, b in itertools.pairwise(numbers))
+        first = skin.latest()
+        until(lambda: skin.stats.scans >= first.number + 30)
+        received = skin.stats.scans
+        newest = skin.latest()
+        assert newest.number >= received - 1  # numbers count from 0
+        assert_reads_the_scene(newest.ratio)
+        assert skin.stats.overflowed == 0
+
+
+def test_an_iterator_and_latest_in_two_threads(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        every: list[Scan] = []
+        thread = threading.Thread(target=lambda: every.extend(take(iter(skin), 50)))
+        thread.start()
+        some = [skin.latest() for _ in range(30)]
+        thread.join()
+    numbers = [scan.number for scan in every]
+    assert numbers == list(range(numbers[0], numbers[0] + 50))
+    assert [scan.missed for scan in every] == [0] * 50
+    assert all(a.number < b.number for a, b in itertools.pairwise(some))
+    by_number = {scan.number: scan for scan in every}
+    shared = [(by_number[s.number], s) for s in some if s.number in by_number]
+    assert shared
+    for one, other in shared:
+        np.testing.assert_array_equal(one.codes, other.codes)
+
+
+def test_configure_while_scanning(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        assert skin.latest().codes.shape == (8, 8, 4)
+        kept = skin.configure(rows=3, columns=5, rate_hz=120.0, settle_us=40)
+        assert (kept.rows, kept.columns, kept.settle_asked_us) == (3, 5, 40)
+        assert kept.rate_hz == pytest.approx(120, rel=0.002)
+        assert kept == skin.info
+        found = take(iter(skin), 30)
+        assert [scan.codes.shape for scan in found] == [(3, 5, 4)] * 30
+        assert [scan.missed for scan in found] == [0] * 30
+        assert np.abs(found[-1].ratio - EXPECTED[:3, :5]).max() < QUANTISATION + 6 / 1024
+        elapsed_us = found[-1].time_us - found[0].time_us
+        assert 29e6 / elapsed_us == pytest.approx(120, rel=0.002)
+        kept = skin.configure(adc_prescaler="clock_250khz")
+        assert (kept.rows, kept.adc_prescaler, kept.settle_asked_us) == (3, "clock_250khz", 40)
+        assert skin.latest().codes.shape == (3, 5, 4)
+        assert skin.stats.missed == 0
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"rows": 0}, "bad_rows"),
+    ({"rows": 17}, "bad_rows"),
+    ({"columns": 0}, "bad_columns"),
+    ({"columns": 255}, "bad_columns"),
+    ({"rate_hz": 0.9}, "bad_rate"),
+    ({"rate_hz": 2000.1}, "bad_rate"),
+    ({"settle_us": 3001}, "bad_settle"),
+    ({"adc_prescaler": 16}, "bad_prescaler"),
+    ({"rate_hz": 200}, "too_fast"),
+    ({"rows": 16, "columns": 16}, "too_fast"),
+    ({"settle_us": 3000}, "too_fast"),
+    ({"adc_prescaler": "clock_125khz"}, "too_fast"),
+]
+IMPOSSIBLE: list[dict[str, Any]] = [
+    {"rows": -1},
+    {"rows": 256},
+    {"columns": 1000},
+    {"settle_us": -1},
+    {"settle_us": 65536},
+    {"rate_hz": -1.0},
+    {"rate_hz": 1e7},
+    {"rate_hz": 0.0001},
+    {"rate_hz": float("inf")},
+    {"rate_hz": float("nan")},
+    {"adc_prescaler": "fast"},
+]
+
+
+def test_refused_values_change_nothing(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        skin.configure(rows=7, columns=8, rate_hz=95)
+        before = asdict(skin.info)
+        for values, result in REFUSED:
+            with pytest.raises(CommandRefused) as refusal:
+                skin.configure(**values)
+            assert (refusal.value.command, refusal.value.result) == ("configure", result), values
+            assert protocol.ENUMS["result"].docs[result] in str(refusal.value)
+        for values in IMPOSSIBLE:
+            with pytest.raises(ValueError, match=r"."):
+                skin.configure(**values)
+        found = take(iter(skin), 5)
+        assert [scan.codes.shape for scan in found] == [(7, 8, 4)] * 5
+        assert [scan.missed for scan in found] == [0] * 5
+        skin.stop()
+        skin.set_unit_id(0)  # asks who the board is
+        assert asdict(skin.info) == before
+
+
+def test_stop_and_start(url: str) -> None:
+    with ohmskin.open(url, start=False) as skin:
+        time.sleep(0.1)
+        assert skin.stats.scans == 0
+        skin.start()
+        skin.start()
+        skin.latest()
+        skin.stop()
+        stopped = skin.stats.scans
+        time.sleep(0.1)
+        assert skin.stats.scans == stopped
+        skin.stop()
+        skin.start()
+        first = take(iter(skin), 3)
+        assert first[0].number <= 3  # again from 0; what came before the iterator is not its own
+        assert skin.stats.missed == 0
+
+
+def test_name_and_settings_of_a_board(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        skin.set_unit_id(0xC0FFEE)
+        assert skin.info.unit_id == 0xC0FFEE
+        assert skin.info.scanning == 1
+        skin.save()
+        for wrong in (-1, 1 << 32):
+            with pytest.raises(ValueError, match=f"unit_id is {wrong}"):
+                skin.set_unit_id(wrong)
+        skin.configure(rows=2)
+        defaults = skin.load_defaults()
+        assert (defaults.rows, defaults.unit_id) == (8, 0)
+        assert skin.latest().rows == 8
+
+
+def test_self_test_of_a_sound_board(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        report = skin.self_test()
+        assert report.findings == ()
+        assert len(report.code_min) == len(report.code_max) == 4
+        for low, high in zip(report.code_min, report.code_max, strict=True):
+            assert 0 <= low <= high <= 1023
+        # Where little current flows, A and C read near Vdd, B and D near ground.
+        assert min(report.code_max[0], report.code_max[2]) > 700
+        assert max(report.code_min[1], report.code_min[3]) < 300
+        assert skin.latest().codes.shape == (8, 8, 4)
+
+
+def test_after_close_everything_says_lost(url: str) -> None:
+    skin = ohmskin.open(url)
+    scans = iter(skin)
+    next(scans)
+    skin.close()
+    skin.close()
+    with pytest.raises(DeviceLost, match="closed"):
+        list(scans)  # those that had come before, and no more
+    with pytest.raises(DeviceLost):
+        skin.latest()
+    with pytest.raises(DeviceLost):
+        next(iter(skin))
+    uses: list[Callable[[], object]] = [
+        skin.stop,
+        skin.start,
+        skin.save,
+        skin.self_test,
+        skin.load_defaults,
+        lambda: skin.set_unit_id(1),
+        lambda: skin.configure(rows=2),
+    ]
+    for use in uses:
+        with pytest.raises(DeviceLost):
+            use()
+    assert skin.stats.scans >= 1
+    assert skin.info.rows == 8
+
+
+def test_the_context_closes_on_an_exception(url: str) -> None:
+    def use(skin: ohmskin.Device) -> None:
+        with skin:
+            skin.latest()
+            raise KeyError("mine")
+
+    skin = ohmskin.open(url)
+    with pytest.raises(KeyError, match="mine"):
+        use(skin)
+    with pytest.raises(DeviceLost):
+        skin.stop()
+
+
+def test_a_port_can_be_opened_again(pty_board: Callable[[str], PtyServer]) -> None:
+    path = pty_board("emulator://4x4").path
+    for round_number in range(3):
+        with ohmskin.open(path) as skin:
+            assert skin.info.unit_id == round_number
+            assert skin.latest().codes.shape == (4, 4, 4)
+            skin.set_unit_id(round_number + 1)
+
+
+def test_close_stops_the_board(pty_board: Callable[[str], PtyServer]) -> None:
+    server = pty_board("emulator://4x4")
+    with ohmskin.open(server.path) as skin:
+        skin.latest()
+        assert server._board.next_scan_s is not None
+    until(lambda: server._board.next_scan_s is None)
+
+
+def test_a_board_left_scanning_is_taken_over(pty_board: Callable[[str], PtyServer]) -> None:
+    from ohmskin.link.serial_port import SerialLink
+
+    path = pty_board("emulator://4x4").path
+    left = SerialLink(path)
+    start = protocol.FRAMES["start"]
+    left.write(framing.encode(start.id, 0, b""))
+    time.sleep(0.2)
+    left.close()
+    with ohmskin.open(path) as skin:
+        found = take(iter(skin), 5)
+        assert [scan.missed for scan in found] == [0] * 5
+        assert found[0].number < 5
+
+
+@pytest.mark.parametrize("board", ["pty", pytest.param("uno", marks=pytest.mark.simavr)])
+def test_the_faster_line(board: str, pty_board: Callable[[str], PtyServer]) -> None:
+    url = pty_board("emulator://8x8").path if board == "pty" else f"simavr://{board}"
+    with ohmskin.open(f"{url}?baud=1000000") as skin:
+        assert skin.info.baud == 1_000_000
+        assert [scan.missed for scan in take(iter(skin), 20)] == [0] * 20
+    with pytest.raises(PortError, match="9600"):
+        ohmskin.open(f"{url}?baud=9600")
+
+
+@pytest.mark.simavr
+def test_a_moving_scene_moves_in_the_simulator_too() -> None:
+    with ohmskin.open("simavr://uno?scene=moving") as skin:
+        codes = [scan.codes for scan in take(iter(skin), 60)]
+    assert (codes[0] != codes[-1]).any()
+
+
+# --------------------------------------------------------------------------------- one backend
+
+
+@pytest.mark.parametrize("fault", ["", "&drop=0.2"])
+def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "QUEUE_SCANS", 16)
+    with ohmskin.open(f"emulator://1x1?rate=1000{fault}") as skin:
+        slow, quick = iter(skin), iter(skin)
+        before = next(slow)
+        taken = 0
+        while skin.stats.overflowed < 50:
+            taken += len(take(quick, 1))
+        later = take(slow, 40)
+        lost_on_the_line = skin.stats.missed
+    for scan in later:
+        assert scan.missed == scan.number - before.number - 1
+        before = scan
+    assert later[0].missed >= 50
+    assert taken > 50
+    assert (lost_on_the_line > 0) == bool(fault)
+
+
+def test_an_iterator_never_used_costs_nothing(
+    fast: ohmskin.Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "QUEUE_SCANS", 16)
+    unused = iter(fast)
+    until(lambda: fast.stats.overflowed > 0)  # while somebody may still use it
+    del unused
+    gc.collect()
+    before = fast.stats
+    until(lambda: fast.stats.scans > before.scans + 100)
+    assert fast.stats.overflowed <= before.overflowed + 1
+
+
+def test_latest_after_close_is_no_old_scan(fast: ohmskin.Device) -> None:
+    until(lambda: fast.stats.scans > 5)
+    fast.close()
+    with pytest.raises(DeviceLost):
+        fast.latest()
+
+
+def test_latest_waits_no_longer_than_told() -> None:
+    with ohmskin.open("emulator://1x1?rate=1") as skin:
+        begin_s = time.monotonic()
+        with pytest.raises(DeviceLost, match=r"0\.1 s"):
+            skin.latest(timeout_s=0.1)
+        assert time.monotonic() - begin_s < 0.9
+        assert skin.latest(timeout_s=10).number == 0
+
+
+def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.1)
+    with ohmskin.open("emulator://1x1?rate=2") as skin:
+        assert [scan.number for scan in take(iter(skin), 2)] == [0, 1]
+
+
+def test_close_while_another_thread_waits() -> None:
+    skin = ohmskin.open("emulator://1x1?rate=1")
+    failures: list[BaseException] = []
+
+    def wait(use: Callable[[], object]) -> None:
+        try:
+            use()
+        except DeviceLost as exc:
+            failures.append(exc)
+
+    uses = [skin.latest, lambda: take(iter(skin), 5)]
+    threads = [threading.Thread(target=wait, args=(use,)) for use in uses]
+    for thread in threads:
+        thread.start()
+    time.sleep(0.1)
+    skin.close()
+    for thread in threads:
+        thread.join(5)
+    assert [str(failure) for failure in failures] == ["emulator://1x1?rate=1 was closed"] * 2
+
+
+def test_nothing_listens_on_the_network(pty_board: Callable[[str], PtyServer]) -> None:
+    from pathlib import Path
+
+    def sockets() -> set[str]:
+        return {
+            str(file.readlink())
+            for file in Path("/proc/self/fd").iterdir()
+            if file.is_symlink() and str(file.readlink()).startswith("socket:")
+        }
+
+    if not Path("/proc/self/fd").exists():
+        pytest.skip("needs /proc")
+    before = sockets()
+    with ohmskin.open(pty_board("emulator://4x4").path) as skin:
+        skin.latest()
+        assert sockets() == before

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Board messages from bytes, and what is counted between them: gaps, wraps, restarts, strangers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ohmskin.link import framing, protocol
+from ohmskin.link.messages import Ack, BoardDecoder, ForeignHello, Hello, Scan
+
+SCAN = protocol.FRAMES["scan"]
+MINUTE_US = 60_000_000
+
+
+def scan_payload(number: int, time_us: int = 0, dropped: int = 0, rx_errors: int = 0) -> bytes:
+    header = SCAN.pack(
+        scan=number, time_us=time_us, dropped=dropped, rx_errors=rx_errors, rows=1, columns=2
+    )
+    return header + protocol.pack_codes(np.arange(8, dtype=np.uint16).reshape(1, 2, 4))
+
+
+def scan_wire(number: int, **header: int) -> bytes:
+    return framing.encode(SCAN.id, 0, scan_payload(number, **header))
+
+
+def hello_payload(**changed: Any) -> bytes:
+    values: dict[str, Any] = {f.name: 1 for f in protocol.FRAMES["hello"].fields}
+    values |= {"layout_crc": protocol.LAYOUT_CRC, "board": "uno", "reset_cause": ("external",)}
+    values |= {"adc_prescaler": "clock_500khz", "settings": "stored", "scanning": 0}
+    return protocol.FRAMES["hello"].pack(**(values | changed))
+
+
+def hello_wire(**changed: Any) -> bytes:
+    return framing.encode(protocol.FRAMES["hello"].id, 0, hello_payload(**changed))
+
+
+def scans(decoder: BoardDecoder, octets: bytes, host_time_s: float = 0.0) -> list[Scan]:
+    return [m for m in decoder.feed(octets, host_time_s) if isinstance(m, Scan)]
+
+
+def test_gaps_are_missed_scans() -> None:
+    decoder = BoardDecoder()
+    found = scans(decoder, hello_wire() + b"".join(map(scan_wire, [0, 1, 5, 6, 9])))
+    assert [s.number for s in found] == [0, 1, 5, 6, 9]
+    assert [s.missed for s in found] == [0, 0, 3, 0, 2]
+    assert decoder.stats.scans == 5
+    assert decoder.stats.missed == 5
+
+
+def test_scans_lost_right_after_the_start_are_missed() -> None:
+    decoder = BoardDecoder()
+    assert [s.missed for s in scans(decoder, hello_wire() + scan_wire(4))] == [4]
+    assert decoder.stats.missed == 4
+
+
+def test_nothing_is_missed_before_the_first_scan_of_a_running_board() -> None:
+    decoder = BoardDecoder()
+    found = scans(decoder, hello_wire(scanning=1) + scan_wire(700, dropped=9) + scan_wire(702))
+    assert [s.missed for s in found] == [0, 1]
+    assert decoder.stats.missed == 1
+
+
+def test_a_damaged_scan_is_missed_by_the_next() -> None:
+    decoder = BoardDecoder()
+    damaged = bytearray(scan_wire(1))
+    damaged[8] ^= 0x40
+    found = scans(decoder, hello_wire() + scan_wire(0) + bytes(damaged) + scan_wire(2))
+    assert [(s.number, s.missed) for s in found] == [(0, 0), (2, 1)]
+    assert decoder.stats.line.damaged == 1
+
+
+def test_the_scan_number_wraps() -> None:
+    decoder = BoardDecoder()
+    top = (1 << 32) - 1
+    found = scans(decoder, b"".join(map(scan_wire, [top - 1, top, 0, 3])))
+    assert [s.missed for s in found] == [0, 0, 0, 2]
+    assert decoder.stats.missed == 2
+
+
+def test_the_board_time_does_not_wrap() -> None:
+    decoder = BoardDecoder()
+    stream = b"".join(
+        scan_wire(number, time_us=number * 20 * MINUTE_US % (1 << 32)) for number in range(12)
+    )
+    assert [s.time_us for s in scans(decoder, stream)] == [n * 20 * MINUTE_US for n in range(12)]
+
+
+def test_the_counter_of_dropped_scans_wraps() -> None:
+    decoder = BoardDecoder()
+    counts = [65530, 65535, 2, 2]
+    scans(decoder, b"".join(scan_wire(n, dropped=d) for n, d in enumerate(counts)))
+    assert decoder.stats.dropped_by_board == 8
+
+
+def test_the_counter_of_dropped_scans_starts_again_with_the_board() -> None:
+    decoder = BoardDecoder()
+    scans(decoder, hello_wire() + scan_wire(2, dropped=2) + scan_wire(4, dropped=3))
+    assert (decoder.stats.dropped_by_board, decoder.stats.missed) == (3, 3)
+    scans(decoder, hello_wire() + scan_wire(1, dropped=1) + scan_wire(2, dropped=1))
+    assert (decoder.stats.dropped_by_board, decoder.stats.missed) == (4, 4)
+
+
+def test_rx_errors_of_the_board_are_passed_on() -> None:
+    decoder = BoardDecoder()
+    scans(decoder, scan_wire(0, rx_errors=3) + scan_wire(1, rx_errors=5))
+    assert decoder.stats.board_rx_errors == 5
+
+
+def test_a_restart_in_between_starts_the_numbers_again() -> None:
+    decoder = BoardDecoder()
+    stream = hello_wire() + scan_wire(0, time_us=9000) + scan_wire(1, time_us=20_000)
+    stream += hello_wire() + scan_wire(2, time_us=400) + scan_wire(3, time_us=11_500)
+    found = scans(decoder, stream)
+    assert [s.missed for s in found] == [0, 0, 2, 0]
+    assert [s.time_us for s in found] == [9000, 20_000, 400, 11_500]
+    assert decoder.stats.missed == 2
+
+
+def test_numbers_that_go_back_tell_of_a_restart_nobody_has_seen() -> None:
+    decoder = BoardDecoder()
+    found = scans(decoder, b"".join(map(scan_wire, [1000, 1001, 1, 2])))
+    assert [s.missed for s in found] == [0, 0, 1, 0]
+
+
+def test_board_time_goes_on_after_a_stop_later_than_its_first_wrap() -> None:
+    decoder = BoardDecoder()
+    found = []
+    for number in range(5):  # 80 minutes; the counter wraps after 71.6
+        time_us = number * 20 * MINUTE_US
+        found += scans(decoder, scan_wire(number, time_us=time_us % (1 << 32)), time_us * 1e-6)
+    assert found[-1].time_us == 80 * MINUTE_US
+    # Configured anew, and started two minutes later.
+    stopped = hello_wire() + scan_wire(0, time_us=82 * MINUTE_US % (1 << 32))
+    assert scans(decoder, stopped, 82 * 60.0)[0].time_us == 82 * MINUTE_US
+    # A reset, however, starts the time again.
+    restarted = hello_wire() + scan_wire(0, time_us=1_200_000)
+    assert scans(decoder, restarted, 83 * 60.0)[0].time_us == 1_200_000
+
+
+def test_board_time_starts_small_whatever_the_host_has_been_doing() -> None:
+    decoder = BoardDecoder()
+    (first,) = scans(decoder, hello_wire() + scan_wire(0, time_us=500), host_time_s=1e6)
+    assert first.time_us == 500
+
+
+def test_hello_of_another_definition() -> None:
+    other = protocol.LAYOUT_CRC ^ 1
+    kind = protocol.FRAMES["hello"]
+    for payload in (
+        hello_payload(layout_crc=other),
+        other.to_bytes(2, "little"),
+        other.to_bytes(2, "little") + bytes(range(200)),
+    ):
+        messages = BoardDecoder().feed(framing.encode(kind.id, 0, payload), 0.0)
+        assert messages == [ForeignHello(other)]
+    # Of this definition by its CRC, but not by its length.
+    messages = BoardDecoder().feed(framing.encode(kind.id, 0, hello_payload()[:-1]), 0.0)
+    assert messages == [ForeignHello(protocol.LAYOUT_CRC)]
+
+
+@pytest.mark.parametrize("frame_type", [0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89])
+def test_frames_of_unknown_type_are_counted(frame_type: int) -> None:
+    decoder = BoardDecoder()
+    assert decoder.feed(framing.encode(frame_type, 0, b"abc"), 0.0) == []
+    assert decoder.stats.unknown == 1
+    assert decoder.stats.line.damaged == 0
+    assert len(scans(decoder, scan_wire(0))) == 1
+
+
+@pytest.mark.parametrize("name", ["ack", "self_test_report", "scan"])
+@pytest.mark.parametrize("change", [-1, 1])
+def test_payloads_of_the_wrong_length_are_counted(name: str, change: int) -> None:
+    kind = protocol.FRAMES[name]
+    payload = scan_payload(5) if name == "scan" else bytes(kind.struct.size)
+    payload = payload[:change] if change < 0 else payload + b"\0"
+    decoder = BoardDecoder()
+    assert decoder.feed(framing.encode(kind.id, 0, payload), 0.0) == []
+    assert decoder.stats.unknown == 1
+    assert decoder.stats.scans == 0
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x01"])
+def test_a_hello_without_layout_is_counted(payload: bytes) -> None:
+    decoder = BoardDecoder()
+    wire = framing.encode(protocol.FRAMES["hello"].id, 0, payload)
+    assert decoder.feed(wire, 0.0) == []
+    assert decoder.stats.unknown == 1
+
+
+def test_a_scan_of_no_cells_does_no_harm() -> None:
+    decoder = BoardDecoder()
+    header = {"scan": 0, "time_us": 0, "dropped": 0, "rx_errors": 0}
+    for rows, columns in [(0, 0), (0, 8), (255, 255)]:
+        payload = SCAN.pack(**header, rows=rows, columns=columns)
+        decoder.feed(framing.encode(SCAN.id, 0, payload), 0.0)
+    assert scans(decoder, scan_wire(0))[0].codes.shape == (1, 2, 4)
+
+
+def test_values_of_a_newer_definition_have_a_name() -> None:
+    wire = framing.encode(protocol.FRAMES["ack"].id, 0, bytes([0x83, 7, 200]))
+    assert BoardDecoder().feed(wire, 0.0) == [Ack(0x83, 7, "unknown_200")]
+
+
+def test_reset_causes_are_named() -> None:
+    (hello,) = BoardDecoder().feed(hello_wire(reset_cause=("power_on", "watchdog")), 0.0)
+    assert isinstance(hello, Hello)
+    assert hello.reset_cause == ("power_on", "watchdog")
+
+
+def test_a_snapshot_does_not_change_later() -> None:
+    decoder = BoardDecoder()
+    decoder.feed(scan_wire(0), 0.0)
+    before = decoder.snapshot()
+    decoder.feed(scan_wire(3) + b"\x05\x05\0", 0.0)
+    assert (before.scans, before.missed, before.line.frames, before.line.damaged) == (1, 0, 1, 0)
+    after = decoder.snapshot()
+    assert (after.scans, after.missed, after.line.frames, after.line.damaged) == (2, 2, 2, 1)
+
+
+def test_codes_and_ratio_of_a_scan() -> None:
+    (scan,) = scans(BoardDecoder(), scan_wire(0))
+    assert (scan.rows, scan.columns) == (1, 2)
+    np.testing.assert_array_equal(scan.codes, np.arange(8).reshape(1, 2, 4))
+    np.testing.assert_array_equal(scan.ratio, (np.arange(8).reshape(1, 2, 4) + 0.5) / 1024)

@@ -1,0 +1,410 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The protocol definition and its golden vectors, which other code than the project's has made."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tokenize
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ohmskin.link import framing, protocol
+from ohmskin.link.messages import (
+    Ack,
+    BoardDecoder,
+    ForeignHello,
+    Hello,
+    Message,
+    Scan,
+    SelfTestReport,
+)
+from places import ROOT
+
+VECTORS = json.loads((ROOT / "protocol" / "vectors.json").read_text(encoding="utf-8"))
+
+each_valid = pytest.mark.parametrize("vector", VECTORS["valid"], ids=lambda v: v["name"])
+each_damaged = pytest.mark.parametrize("vector", VECTORS["damaged"], ids=lambda v: v["name"])
+
+
+def expected_raw(vector: dict[str, Any]) -> framing.RawFrame:
+    content = bytes.fromhex(vector["content"])
+    return framing.RawFrame(content[0], content[1], content[2:])
+
+
+def python_values(fields: dict[str, Any]) -> dict[str, Any]:
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+
+
+# ------------------------------------------------------------------------------ golden vectors
+
+
+@each_valid
+def test_valid_vector_is_decoded(vector: dict[str, Any]) -> None:
+    decoder = framing.Decoder()
+    frames = decoder.feed(bytes.fromhex(vector["wire"]))
+    assert frames == [expected_raw(vector)]
+    assert decoder.stats.frames == 1
+    assert decoder.stats.damaged == 0
+    kind = protocol.FRAMES_BY_ID[frames[0].type]
+    assert kind.unpack(frames[0].payload) == python_values(vector["fields"])
+
+
+@each_valid
+def test_valid_vector_is_encoded_to_the_same_bytes(vector: dict[str, Any]) -> None:
+    content = bytes.fromhex(vector["content"])
+    kind = protocol.FRAMES_BY_ID[content[0]]
+    payload = kind.pack(**python_values(vector["fields"]))
+    if "codes" in vector:
+        rows, columns = vector["fields"]["rows"], vector["fields"]["columns"]
+        codes = np.array(vector["codes"], dtype=np.uint16).reshape(columns, rows, -1)
+        payload += protocol.pack_codes(codes.transpose(1, 0, 2))
+    assert framing.encode(kind.id, content[1], payload).hex() == vector["wire"]
+
+
+@each_valid
+def test_codes_of_a_vector_land_at_their_cell(vector: dict[str, Any]) -> None:
+    for frame in framing.Decoder().feed(bytes.fromhex(vector["wire"])):
+        if "codes" not in vector:
+            continue
+        rows, columns = vector["fields"]["rows"], vector["fields"]["columns"]
+        tail = frame.payload[protocol.FRAMES["scan"].struct.size :]
+        codes = protocol.unpack_codes(tail, rows, columns)
+        assert codes.shape == (rows, columns, 4)
+        for k, code in enumerate(vector["codes"]):
+            cell, reading = divmod(k, 4)
+            column, row = divmod(cell, rows)  # column-major: rows run fastest
+            assert codes[row, column, reading] == code
+
+
+@each_valid
+def test_valid_vector_byte_by_byte(vector: dict[str, Any]) -> None:
+    decoder = framing.Decoder()
+    wire = bytes.fromhex(vector["wire"])
+    frames = [frame for octet in wire for frame in decoder.feed(bytes([octet]))]
+    assert frames == [expected_raw(vector)]
+    assert decoder.stats.damaged == 0
+
+
+@pytest.mark.parametrize("junk", [b"\x07junk", b"\xff" * 40, b"\0\0\0", b"\x01\0\x02\x01\0"])
+@each_valid
+def test_valid_vector_between_junk(vector: dict[str, Any], junk: bytes) -> None:
+    decoder = framing.Decoder()
+    assert decoder.feed(junk + bytes.fromhex(vector["wire"]) + junk) == [expected_raw(vector)]
+    damaged_before = sum(1 for stretch in junk.split(b"\0") if stretch)
+    damaged_after = sum(1 for stretch in junk.split(b"\0")[:-1] if stretch)
+    assert decoder.stats.damaged == damaged_before + damaged_after
+
+
+@each_damaged
+def test_damaged_vector_is_counted_and_the_next_frame_decoded(vector: dict[str, Any]) -> None:
+    good = VECTORS["valid"][-1]
+    wire = bytes.fromhex(vector["wire"])
+    whole, single = framing.Decoder(), framing.Decoder()
+    assert whole.feed(wire) == []
+    assert [f for octet in wire for f in single.feed(bytes([octet]))] == []
+    assert whole.stats == single.stats
+    assert whole.stats.damaged == 1
+    assert whole.feed(bytes.fromhex(good["wire"])) == [expected_raw(good)]
+    assert whole.stats.damaged == 1
+
+
+def test_all_vectors_in_one_stream() -> None:
+    decoder = framing.Decoder()
+    stream, wanted = b"", []
+    for i, good in enumerate(VECTORS["valid"]):
+        stream += bytes.fromhex(VECTORS["damaged"][i % len(VECTORS["damaged"])]["wire"])
+        stream += bytes.fromhex(good["wire"])
+        wanted.append(expected_raw(good))
+    assert decoder.feed(stream) == wanted
+    assert decoder.stats.damaged == len(wanted)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("ack", Ack),
+        ("hello", ForeignHello),  # of a definition of another day
+        ("self_test_report", SelfTestReport),
+        ("scan", Scan),
+    ],
+)
+def test_vectors_of_a_board_become_messages(kind: str, expected: type[Message]) -> None:
+    vectors = [v for v in VECTORS["valid"] if v["name"].startswith(kind)]
+    assert vectors
+    for vector in vectors:
+        decoder = BoardDecoder()
+        (message,) = decoder.feed(bytes.fromhex(vector["wire"]), 12.5)
+        assert type(message) is expected
+        fields = python_values(vector["fields"])
+        if isinstance(message, Scan):
+            assert message.number == fields["scan"]
+            assert message.time_us == fields["time_us"]
+            assert message.host_time_s == 12.5
+            assert (message.rows, message.columns) == (fields["rows"], fields["columns"])
+            in_order = [
+                (message.ratio[row, column, reading] * 1024) - 0.5
+                for column in range(message.columns)
+                for row in range(message.rows)
+                for reading in range(4)
+            ]
+            assert in_order == vector["codes"]
+        elif isinstance(message, ForeignHello):
+            assert message.layout_crc == fields["layout_crc"]
+        else:
+            assert {name: getattr(message, name) for name in fields} == fields
+
+
+def test_a_hello_of_this_definition_becomes_a_message() -> None:
+    vector = next(v for v in VECTORS["valid"] if v["name"] == "hello")
+    fields = python_values(vector["fields"]) | {"layout_crc": protocol.LAYOUT_CRC}
+    kind = protocol.FRAMES["hello"]
+    wire = framing.encode(kind.id, 0, kind.pack(**fields))
+    (hello,) = BoardDecoder().feed(wire, 0.0)
+    assert isinstance(hello, Hello)
+    assert {name: getattr(hello, name) for name in fields} == fields
+    assert hello.version == "0.1.0"
+    assert hello.rate_hz == pytest.approx(16e6 / 177762)
+
+
+def test_vectors_are_those_of_the_cobs_package(tmp_path: Path) -> None:
+    pytest.importorskip("cobs")
+    script = shutil.copy(ROOT / "protocol" / "make_vectors.py", tmp_path)
+    subprocess.run([sys.executable, script], check=True, timeout=60)
+    made = (tmp_path / "vectors.json").read_bytes()
+    assert made == (ROOT / "protocol" / "vectors.json").read_bytes()
+
+
+# -------------------------------------------------------------------------------------- codes
+
+
+@given(st.integers(1, 16), st.integers(1, 16), st.randoms(use_true_random=False))
+def test_codes_are_packed_like_one_long_integer(rows: int, columns: int, random: Any) -> None:
+    in_order = [random.getrandbits(10) for _ in range(rows * columns * 4)]
+    number = sum(code << (10 * i) for i, code in enumerate(in_order))
+    packed = number.to_bytes((len(in_order) * 10 + 7) // 8, "little")
+    codes = np.array(in_order, dtype=np.uint16).reshape(columns, rows, 4).transpose(1, 0, 2)
+    assert protocol.codes_size(rows, columns) == len(packed)
+    assert protocol.pack_codes(codes) == packed
+    np.testing.assert_array_equal(protocol.unpack_codes(packed, rows, columns), codes)
+
+
+@pytest.mark.parametrize("octets", [0, 4, 6, 320])
+def test_codes_of_another_size_are_refused(octets: int) -> None:
+    with pytest.raises(ValueError, match="1x1"):
+        protocol.unpack_codes(bytes(octets), 1, 1)
+
+
+def test_a_code_beyond_ten_bits_is_refused() -> None:
+    with pytest.raises(ValueError, match="1023"):
+        protocol.pack_codes(np.full((2, 2, 4), 1024, dtype=np.uint16))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("set_unit_id", {}, "unit_id"),
+        ("set_unit_id", {"unit_id": 1, "more": 2}, "more"),
+        ("set_unit_id", {"unit_id": -1}, "unit_id is -1"),
+        ("set_unit_id", {"unit_id": 1 << 32}, "4294967295"),
+        ("ack", {"command": 1, "command_sequence": 0, "result": "perhaps"}, "perhaps"),
+        ("start", {"now": 1}, "now"),
+    ],
+)
+def test_wrong_fields_are_refused(name: str, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        protocol.FRAMES[name].pack(**values)
+
+
+@pytest.mark.parametrize("frame", protocol.FRAMES.values(), ids=lambda f: f.name)
+def test_a_payload_of_another_length_is_refused(frame: protocol.Frame) -> None:
+    size = frame.struct.size
+    wrong = [size - 1] if frame.tail else [size - 1, size + 1]
+    for length in wrong:
+        if length >= 0:
+            with pytest.raises(ValueError, match=frame.name):
+                frame.unpack(bytes(length))
+
+
+def test_crc_check_value() -> None:
+    assert protocol.crc16(b"123456789") == 0x29B1
+
+
+# --------------------------------------------------------------------------------- definition
+
+
+@pytest.fixture
+def layout_crc(tmp_path: Path) -> Callable[[str], int]:
+    """A function from the text of a frames.toml to the layout CRC that the host computes of it."""
+    source = ROOT / "host" / "ohmskin" / "link" / "protocol.py"
+
+    def crc_of(definition: str) -> int:
+        (tmp_path / "frames.toml").write_text(definition, encoding="utf-8")
+        copy = tmp_path / "link" / "protocol.py"
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copy(source, copy)
+        spec = importlib.util.spec_from_file_location("protocol_copy", copy)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules["protocol_copy"] = module  # dataclasses look it up
+        try:
+            spec.loader.exec_module(module)
+        finally:
+            del sys.modules["protocol_copy"]
+        return int(module.LAYOUT_CRC)
+
+    return crc_of
+
+
+DEFINITION_TEXT = (ROOT / "protocol" / "frames.toml").read_text(encoding="utf-8")
+
+# Texts that occur once in frames.toml, and what they become.
+CHANGES_OF_MEANING = {
+    "a frame's id": ('name = "save"\nid = 0x86', 'name = "save"\nid = 0x8A'),
+    "a frame's name": ('name = "self_test"\n', 'name = "test_self"\n'),
+    "a frame's sender": ('id = 0x84\nfrom = "host"', 'id = 0x84\nfrom = "board"'),
+    "a field's name": ('name = "settle_asked_us"', 'name = "settle_wanted_us"'),
+    "a field's type": ('name = "dropped", type = "u16"', 'name = "dropped", type = "u32"'),
+    "a field's count": (
+        'name = "code_min", type = "u16", count = "readings_per_cell"',
+        'name = "code_min", type = "u16"',
+    ),
+    "a field's enum": ('type = "u16", flags = "finding"', 'type = "u16", flags = "reset_cause"'),
+    "an enum's value": ('name = "busy", value = 12', 'name = "busy", value = 14'),
+    "an enum's member": ('name = "brown_out", value = 4', 'name = "brownout", value = 4'),
+    "a constant": ("value = 3000\n", "value = 3001\n"),
+    "the CRC": ("crc_initial = 0xFFFF", "crc_initial = 0x0000"),
+}
+CHANGES_OF_TEXT = {
+    "a frame's doc": ('doc = "ask for `hello`"', 'doc = "another text"'),
+    "a field's doc": ('doc = "rows scanned"', 'doc = "another text"'),
+    "an enum's doc": ('doc = "what the firmware was built for"', 'doc = "another text"'),
+    "a member's doc": ('doc = "supply came up"', 'doc = "another text"'),
+    "a constant's doc": ('doc = "slowest scan rate"', 'doc = "another text"'),
+    "a comment": ("# The whole link between", "# Everything between"),
+}
+
+
+def changed(change: tuple[str, str]) -> str:
+    old, new = change
+    assert DEFINITION_TEXT.count(old) == 1
+    return DEFINITION_TEXT.replace(old, new)
+
+
+def test_layout_crc_of_the_definition_itself(layout_crc: Callable[[str], int]) -> None:
+    assert layout_crc(DEFINITION_TEXT) == protocol.LAYOUT_CRC
+
+
+@pytest.mark.parametrize("what", CHANGES_OF_MEANING)
+def test_layout_crc_changes_with(what: str, layout_crc: Callable[[str], int]) -> None:
+    assert layout_crc(changed(CHANGES_OF_MEANING[what])) != protocol.LAYOUT_CRC
+
+
+@pytest.mark.parametrize("what", CHANGES_OF_TEXT)
+def test_layout_crc_does_not_change_with(what: str, layout_crc: Callable[[str], int]) -> None:
+    assert layout_crc(changed(CHANGES_OF_TEXT[what])) == protocol.LAYOUT_CRC
+
+
+def test_layout_crc_changes_with_the_order_of_fields(layout_crc: Callable[[str], int]) -> None:
+    lines = DEFINITION_TEXT.splitlines(keepends=True)
+    at = next(i for i, line in enumerate(lines) if 'name = "version_major"' in line)
+    lines[at], lines[at + 1] = lines[at + 1], lines[at]
+    assert layout_crc("".join(lines)) != protocol.LAYOUT_CRC
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A copy of what protocol/generate.py reads and writes."""
+    no_caches = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "protocol", tmp_path / "protocol", ignore=no_caches)
+    shutil.copytree(ROOT / "host" / "ohmskin", tmp_path / "host" / "ohmskin", ignore=no_caches)
+    (tmp_path / "firmware" / "test").mkdir(parents=True)
+    shutil.copy(ROOT / "firmware" / "test" / "vectors.h", tmp_path / "firmware" / "test")
+    return tmp_path
+
+
+def generate(tree: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return subprocess.run(
+        [sys.executable, tree / "protocol" / "generate.py", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env=environment,
+    )
+
+
+def test_generated_files_are_up_to_date() -> None:
+    done = generate(ROOT, "--check")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("changed_file", "stale"),
+    [
+        ("protocol/frames.h", ["protocol/frames.h"]),
+        ("protocol/FRAMES.md", ["protocol/FRAMES.md"]),
+        ("firmware/test/vectors.h", ["firmware/test/vectors.h"]),
+        ("protocol/frames.toml", ["protocol/frames.h", "protocol/FRAMES.md"]),
+        ("protocol/vectors.json", ["firmware/test/vectors.h"]),
+    ],
+)
+def test_a_stale_generated_file_is_named(tree: Path, changed_file: str, stale: list[str]) -> None:
+    path = tree / changed_file
+    before = path.read_text(encoding="utf-8")
+    after = {
+        ".toml": lambda: before.replace('name = "busy", value = 12', 'name = "busy", value = 14'),
+        ".json": lambda: before.replace('"name": "start"', '"name": "begin"'),
+    }.get(path.suffix, lambda: before + "\n")()
+    assert after != before
+    path.write_text(after, encoding="utf-8")
+    files = sorted(p for p in tree.rglob("*") if p.is_file() and p.suffix != ".pyc")
+    contents = [p.read_bytes() for p in files]
+    done = generate(tree, "--check")
+    assert done.returncode == 1
+    for name in ("protocol/frames.h", "protocol/FRAMES.md", "firmware/test/vectors.h"):
+        assert (name in done.stderr) == (name in stale)
+    assert [p.read_bytes() for p in files] == contents, "--check has changed a file"
+    assert generate(tree).returncode == 0
+    assert generate(tree, "--check").returncode == 0
+
+
+def test_no_protocol_number_is_repeated_in_the_host() -> None:
+    constants = protocol.CONSTANTS
+    # Only where written in hexadecimal; a board's ids are too small to tell.
+    ids = {f.id for f in protocol.FRAMES.values() if f.sender == "host"}
+    bauds = {constants["baud_default"], constants["baud_fast"]}
+    distinctive = {
+        protocol.DEFINITION["framing"]["crc_polynomial"],
+        protocol.LAYOUT_CRC,
+        *(constants[name] for name in ("settle_us_max", "rate_mhz_max", "baud_default")),
+    }
+    repeated = []
+    for path in sorted((ROOT / "host" / "ohmskin").rglob("*.py")):
+        if path.name == "simavr.py":  # talks to the simulator, whose own limits look alike
+            continue
+        with path.open("rb") as source:
+            for token in tokenize.tokenize(source.readline):
+                if token.type != tokenize.NUMBER:
+                    continue
+                value = ast.literal_eval(token.string)
+                if (
+                    value in distinctive
+                    or (value in ids and token.string.lower().startswith("0x"))
+                    or (value in bauds and "baud" in token.line)
+                ):
+                    repeated.append(f"{path.name}:{token.start[0]}: {token.line.strip()}")
+    assert repeated == []

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several boards at once: which are opened, what becomes of those that cannot be, every scan."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_calibrated_device import of_scene
+
+import ohmskin
+from ohmskin import boards
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
+from ohmskin.force.calibrated_device import CalibratedDevice
+from ohmskin.force.force_reader import ForceScan
+from ohmskin.link import session
+from ohmskin.link.serial_port import SerialPort
+
+Serve = Callable[[str], PtyServer]
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+
+def units(*numbers: int, rest: str = "") -> list[str]:
+    return [f"emulator://8x8?unit={number}{rest}" for number in numbers]
+
+
+@pytest.fixture
+def attach(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """A function that says which ports this machine has: path and board of each."""
+
+    def say(*ports: tuple[str, str]) -> None:
+        found = [SerialPort(path, "", board) for path, board in ports]
+        monkeypatch.setattr(boards, "serial_ports", lambda: found)
+
+    return say
+
+
+def test_boards_are_named_by_their_skins() -> None:
+    with ohmskin.open_all(units(7, 3)) as skins:
+        assert len(skins) == 2
+        assert list(skins) == [7, 3]
+        assert skins[3].name == "emulator://8x8?unit=3"
+        assert {unit: skin.info.unit_id for unit, skin in skins.items()} == {7: 7, 3: 3}
+        assert skins[7].latest().codes.shape == (8, 8, 4)
+        with pytest.raises(KeyError):
+            skins[1]
+
+
+def test_they_are_all_closed() -> None:
+    with ohmskin.open_all(units(1, 2)) as skins:
+        devices = list(skins.values())
+    for device in devices:
+        with pytest.raises(DeviceLost, match=device.name.replace("?", r"\?")):
+            device.latest()
+    skins.close()
+
+
+def test_they_need_not_start() -> None:
+    with ohmskin.open_all(units(1, 2), start=False) as skins:
+        time.sleep(0.1)
+        assert [skin.stats.scans for skin in skins.values()] == [0, 0]
+
+
+def test_every_scan_of_every_board_in_order_of_time() -> None:
+    urls = [*units(1, 2), "emulator://4x4?unit=3&rate=200", "emulator://8x8?unit=4&rate=30"]
+    with ohmskin.open_all(urls) as skins:
+        taken = list(itertools.islice(skins.scans(), 400))
+    assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(taken[100:]))
+    for unit in range(1, 5):
+        found = [each.scan for each in taken if each.unit_id == unit]
+        numbers = [scan.number for scan in found]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert [scan.missed for scan in found] == [0] * len(found)
+    rates = Counter(each.unit_id for each in taken[100:])
+    assert rates[3] / rates[1] == pytest.approx(200 / 90, rel=0.05)
+    assert rates[1] / rates[4] == pytest.approx(90 / 30, rel=0.1)
+
+
+def test_a_slow_reader_loses_nothing() -> None:
+    with ohmskin.open_all(units(1, 2)) as skins:
+        scans = skins.scans()
+        taken = [next(scans)]
+        time.sleep(0.7)
+        taken += itertools.islice(scans, 150)
+    for unit in (1, 2):
+        numbers = [each.scan.number for each in taken if each.unit_id == unit]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_times_are_of_the_middle_of_scans_on_one_clock() -> None:
+    with ohmskin.open_all([*units(1), "emulator://8x8?unit=2&rate=45"]) as skins:
+        taken = list(itertools.islice(skins.scans(), 150))
+    for unit, period_s in ((1, 1 / 90), (2, 1 / 45)):
+        found = [each for each in taken if each.unit_id == unit][20:]
+        ages_s = np.array([each.scan.host_time_s - each.time_s for each in found])
+        # The emulator says all of a scan at its end, half a scan after its middle.
+        assert np.median(ages_s) == pytest.approx(period_s / 2, abs=2e-3)
+        steps_s = np.diff([each.time_s for each in found])
+        assert steps_s == pytest.approx(period_s, abs=1e-3)
+        assert 0 <= found[-1].jitter_s < 0.2
+
+
+def test_a_slow_board_has_the_time_of_its_readings() -> None:
+    """Its scan is short, the rest of its period idle."""
+    with ohmskin.open_all(["emulator://4x4?rate=2"]) as skins:
+        found = list(itertools.islice(skins.scans(), 3))
+    # 64 slots of 60,000 cycles at most.
+    middle_s = 64 * 3.7e-3 / 2
+    for each in found:
+        assert each.scan.host_time_s - each.time_s == pytest.approx(0.5 - middle_s, abs=0.02)
+
+
+def test_a_board_that_is_reset_keeps_the_time() -> None:
+    """It begins anew at board time 0; the scans that were lost are counted."""
+    with ohmskin.open_all([*units(1), "emulator://8x8?unit=2&reset=1"]) as skins:
+        taken = list(itertools.islice(skins.scans(), 400))
+        assert skins[2].stats.restarts == 2
+    found = [each for each in taken if each.unit_id == 2]
+    assert sum(b.scan.time_us < a.scan.time_us for a, b in itertools.pairwise(found)) == 2
+    ages_s = [each.scan.host_time_s - each.time_s for each in found]
+    assert min(ages_s) > 0
+    assert np.median(ages_s) == pytest.approx(0.5 / 90, abs=2e-3)
+    assert all(a.time_s < b.time_s for a, b in itertools.pairwise(found))
+
+
+def test_a_board_that_vanishes_ends_the_scans_and_is_named() -> None:
+    urls = [*units(1), "emulator://8x8?unit=2&vanish=0.5"]
+    with (
+        ohmskin.open_all(urls) as skins,
+        pytest.raises(DeviceLost, match=r"emulator://8x8\?unit=2&vanish=0.5 is gone"),
+    ):
+        for _ in skins.scans():
+            pass
+
+
+# ------------------------------------------------------------------------------------- opening
+
+
+def test_the_boards_of_this_machine(pty_board: Serve, attach: Callable[..., None]) -> None:
+    one, two = (pty_board(f"emulator://8x8?unit={unit}").path for unit in (1, 2))
+    attach((one, "uno"), ("/dev/ttyS0", ""), (two, "megaatmega2560"))
+    with ohmskin.open_all() as skins:
+        assert {unit: skin.name for unit, skin in skins.items()} == {1: one, 2: two}
+
+
+def test_what_is_no_skin_is_skipped_in_a_search(
+    pty_board: Serve, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
+    other, skin = (pty_board(f"emulator://8x8?{what}").path for what in ("silent=1", "unit=5"))
+    attach((other, "uno"), (skin, "uno"))
+    with ohmskin.open_all() as skins:
+        assert list(skins) == [5]
+    with pytest.raises(DeviceSilent, match=f"{other} is silent"):
+        ohmskin.open_all([skin, other])
+    attach((other, "uno"))
+    with pytest.raises(PortError, match=f"no skin board answers at {other}"):
+        ohmskin.open_all()
+
+
+def test_a_skin_that_cannot_be_used_is_an_error_of_a_search(
+    pty_board: Serve, attach: Callable[..., None]
+) -> None:
+    old, skin = (pty_board(f"emulator://8x8?{what}").path for what in ("foreign=1", "unit=5"))
+    attach((old, "uno"), (skin, "uno"))
+    with pytest.raises(ProtocolMismatch, match=old):
+        ohmskin.open_all()
+    attach((skin, "uno"))
+    with ohmskin.open(skin), pytest.raises(PortError, match=f"{skin} is busy"):
+        ohmskin.open_all()
+
+
+@pytest.mark.parametrize("urls", [None, []])
+def test_no_board_is_an_error(urls: list[str] | None, attach: Callable[..., None]) -> None:
+    attach(("/dev/ttyS0", ""))
+    with pytest.raises(PortError, match="no skin board found: 'ohmskin ports'"):
+        ohmskin.open_all(urls)
+
+
+def test_one_that_cannot_be_opened_closes_all(pty_board: Serve) -> None:
+    path = pty_board("emulator://8x8?unit=1").path
+    with pytest.raises(PortError, match="no port /dev/ttyACM99"):
+        ohmskin.open_all([path, "/dev/ttyACM99", *units(2)])
+    with ohmskin.open(path) as skin:  # it is free again
+        assert skin.info.scanning == 0
+
+
+def test_two_of_one_unit_are_refused() -> None:
+    urls = [*units(1, 2), "emulator://4x4?unit=2"]
+    with pytest.raises(PortError) as error:
+        ohmskin.open_all(urls)
+    assert str(error.value) == (
+        f"{urls[1]} and {urls[2]} are both unit 2: rename one: "
+        f"ohmskin configure {urls[2]} --unit-id 3 --save"
+    )
+
+
+# -------------------------------------------------------------------------------- calibrations
+
+
+def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:
+    paths = []
+    for unit in (1, 2, 9):
+        paths.append(tmp_path / f"unit{unit}.json")
+        siemens = 20e-6 / unit
+        of_scene("ghost", unit_id=unit, siemens=siemens).save(paths[-1])
+    urls = units(2, 1, rest="&scene=ghost&seed=1")
+    with ohmskin.open_all(urls, calibrations=paths) as skins:
+        assert {unit: skin.calibration.unit_id for unit, skin in skins.items()} == {1: 1, 2: 2}
+        largest = {}
+        for each in itertools.islice(skins.scans(), 20):
+            assert isinstance(each.scan, ForceScan)
+            assert isinstance(skins[each.unit_id], CalibratedDevice)
+            largest[each.unit_id] = np.max(each.scan.force_n)
+    assert largest[2] == pytest.approx(2 * largest[1], rel=0.1)
+
+
+def test_a_board_without_a_calibration_is_an_error() -> None:
+    given = [of_scene("ghost", unit_id=1), of_scene("ghost", unit_id=3)]
+    with pytest.raises(ValueError, match=r"unit=2 is unit 2, of which .* units: 1, 3"):
+        ohmskin.open_all(units(1, 2), calibrations=given)
+
+
+def test_a_calibration_of_another_size_names_the_port() -> None:
+    with pytest.raises(ValueError, match=r"emulator://4x4\?unit=1: .* 8x8 skin"):
+        ohmskin.open_all(["emulator://4x4?unit=1"], calibrations=[of_scene("ghost", unit_id=1)])
+
+
+def test_two_calibrations_of_one_unit_are_refused(tmp_path: Path) -> None:
+    one, path = of_scene("ghost", unit_id=1), tmp_path / "new.json"
+    replace(one, date="2025-04-01").save(path)
+    with pytest.raises(ValueError, match=r"calibration 0 and .*new.json are both of unit 1"):
+        ohmskin.open_all(units(1), calibrations=[one, path])

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ten thousand frames that no skin gives: no exception, and finite numbers where promised."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import readings
+from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.link.codes import quantise, ratio_from_codes
+from studies.trials import skin_at_rest
+
+FRAMES = 400
+SHAPES = ((1, 1), (1, 4), (3, 1), (2, 2), (3, 3))
+KINDS = ("noise", "rails", "one current", "all alike", "one cell at a rail")
+
+
+def frame(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Float:
+    ratio = random.random((*shape, 4))
+    if kind == "rails":
+        return np.round(ratio)
+    if kind == "one current":
+        current = 0.5 * random.random(shape)[..., None]
+        return np.where([True, False, True, False], 1 - current, current)
+    if kind == "all alike":
+        return np.broadcast_to(random.integers(0, 2, 4).astype(float), ratio.shape).copy()
+    if kind == "one cell at a rail":
+        ratio = np.full_like(ratio, [0.9, 0.1, 0.9, 0.1])
+        ratio[tuple(random.integers(shape))] = random.integers(0, 2)
+    return ratio
+
+
+def check(estimator: Estimator, ratio: Float) -> None:
+    found = estimator.estimate(ratio)
+    assert np.isfinite(found.cell_siemens).all()
+    assert np.isfinite(found.cell_siemens_std).all()
+    assert (found.cell_siemens_std > 0).all()
+    assert np.isfinite(found.chi2)
+    assert found.converged == (not found.message)
+    if estimator.name in ("joint", "touch"):
+        assert np.isfinite(found.top_wire_ohm).all()
+        assert np.isfinite(found.bottom_wire_ohm).all()
+
+
+def knowledge_of(shape: tuple[int, int], told: str) -> SkinKnowledge:
+    random = np.random.default_rng(1)
+    if told == "nothing":
+        return SkinKnowledge(*shape, adc_bits=10)
+    rest = (
+        random.random((*shape, 4)) if told == "nonsense" else readings(skin_at_rest(*shape, random))
+    )
+    return SkinKnowledge(
+        *shape,
+        adc_bits=10,
+        rest_ratio=ratio_from_codes(quantise(rest)),
+        nominal_top_wire_ohm=100.0,
+        nominal_bottom_wire_ohm=200.0,
+    )
+
+
+@pytest.mark.parametrize("told", ["all", "nothing", "nonsense"])
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_nonsense_is_answered(method: str, shape: tuple[int, int], told: str) -> None:
+    """2 methods, 5 shapes, 400 frames each of three kinds of knowledge: 12,000."""
+    random = np.random.default_rng([*shape, len(told)])
+    estimator = make_estimator(method, knowledge_of(shape, told))
+    for number in range(FRAMES):
+        check(estimator, frame(KINDS[number % len(KINDS)], shape, random))
+
+
+@pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
+def test_nonsense_on_a_whole_skin_is_answered(method: str) -> None:
+    random = np.random.default_rng(2)
+    estimator = make_estimator(method, knowledge_of((8, 8), "all"))
+    for number in range(50):
+        check(estimator, frame(KINDS[number % len(KINDS)], (8, 8), random))
+
+
+@pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
+@pytest.mark.parametrize("ratio", [0.0, 1.0])
+def test_all_readings_at_a_rail_are_flagged(method: str, ratio: float) -> None:
+    found = make_estimator(method, knowledge_of((4, 4), "all")).estimate(np.full((4, 4, 4), ratio))
+    assert not found.converged
+    assert "readings of most cells disagree" in found.message
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_after_nonsense_a_good_frame_is_answered_as_if_nothing_had_been(method: str) -> None:
+    random = np.random.default_rng(3)
+    knowledge = knowledge_of((8, 8), "all")
+    assert knowledge.rest_ratio is not None
+    used, new = (make_estimator(method, knowledge) for _ in range(2))
+    for number in range(10):
+        used.estimate(frame(KINDS[number % 4], (8, 8), random))
+    after, first = used.estimate(knowledge.rest_ratio), new.estimate(knowledge.rest_ratio)
+    apart = np.abs(after.cell_siemens - first.cell_siemens) / first.cell_siemens_std
+    assert apart.max() < 0.5
+    assert after.converged

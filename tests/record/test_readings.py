@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The readings file: what is read, what is refused and how it is said, what is written."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ohmskin.estimate.methods import METHODS
+from ohmskin.record import readings as readings_module
+from ohmskin.record.readings import Readings, estimate_file, load_readings, save_arrays
+from places import DATA
+
+OUT_SHAPES = {
+    "cell_ohm": 3,
+    "cell_siemens": 3,
+    "cell_siemens_std": 3,
+    "touched": 3,
+    "top_wire_ohm": 3,
+    "bottom_wire_ohm": 3,
+    "converged": 1,
+    "message": 1,
+    "chi2": 1,
+    "iterations": 1,
+    "seconds": 1,
+}
+
+
+def write(path: Path, **arrays: object) -> Path:
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    return path
+
+
+def test_a_reference_file_is_read_whole() -> None:
+    with np.load(DATA / "random_4x6.npz") as reference:
+        readings = load_readings(DATA / "random_4x6.npz")
+        np.testing.assert_array_equal(readings.ratio, reference["ratio"])
+        np.testing.assert_array_equal(readings.rest_ratio, reference["rest_ratio"])
+    knowledge = readings.knowledge(0)
+    assert (knowledge.rows, knowledge.columns) == (4, 6)
+    assert (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) == (30e3, 30e3)
+    assert (knowledge.nominal_top_wire_ohm, knowledge.nominal_bottom_wire_ohm) == (100, 200)
+    assert knowledge.adc_bits is None
+    assert not readings.one_skin_per_frame
+
+
+def test_a_sweep_has_rest_and_wires_of_its_own_per_frame() -> None:
+    readings = load_readings(DATA / "wire_sweep_3x3.npz")
+    assert readings.one_skin_per_frame
+    first, last = readings.knowledge(0), readings.knowledge(4)
+    assert (first.nominal_top_wire_ohm, last.nominal_top_wire_ohm) == (100, 41_000)
+    assert not np.array_equal(first.rest_ratio, last.rest_ratio)  # type: ignore[arg-type]
+
+
+def test_ratio_alone_is_enough(tmp_path: Path) -> None:
+    path = write(tmp_path / "bare.npz", ratio=np.full((2, 3, 4, 4), 0.5), adc_bits=12, junk="text")
+    knowledge = load_readings(path).knowledge(1)
+    assert knowledge.adc_bits == 12
+    assert knowledge.ref_top_ohm == 30e3
+    assert knowledge.rest_ratio is None
+    assert knowledge.nominal_top_wire_ohm is None
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["random_2x2", "cell_sweep_3x3"])
+def test_estimates_have_the_arrays_of_the_format(method: str, name: str) -> None:
+    readings = load_readings(DATA / f"{name}.npz")
+    seen: list[tuple[int, int]] = []
+    out = estimate_file(readings, method, progress=lambda done, of: seen.append((done, of)))
+    frames, rows, columns, _ = readings.ratio.shape
+    assert {name: array.shape for name, array in out.items()} == {
+        name: (frames, rows, columns)[:ndim] for name, ndim in OUT_SHAPES.items()
+    }
+    assert out["touched"].dtype == bool
+    assert out["converged"].dtype == bool
+    assert out["converged"].mean() >= 0.8
+    assert np.isnan(out["top_wire_ohm"]).all() == (method in ("ohm", "matrix"))
+    np.testing.assert_allclose(out["cell_ohm"] * out["cell_siemens"], 1)
+    assert seen == [(frame + 1, frames) for frame in range(frames)]
+
+
+def test_cold_frames_do_not_depend_on_their_order() -> None:
+    readings = load_readings(DATA / "presses_8x8.npz")
+    some, turned = (Readings(readings.ratio[20:32][::step]) for step in (1, -1))
+    forth = estimate_file(some, "matrix", cold=True)
+    back = estimate_file(turned, "matrix", cold=True)
+    warm = estimate_file(some, "matrix")
+    np.testing.assert_array_equal(forth["cell_siemens"], back["cell_siemens"][::-1])
+    np.testing.assert_array_equal(forth["iterations"], back["iterations"][::-1])
+    assert warm["iterations"].sum() < forth["iterations"].sum()
+    np.testing.assert_allclose(warm["cell_siemens"], forth["cell_siemens"], rtol=1e-3)
+
+
+def test_frames_of_one_skin_each_are_estimated_each_afresh() -> None:
+    readings = load_readings(DATA / "cell_sweep_3x3.npz")
+    warm = estimate_file(readings, "matrix")
+    cold = estimate_file(readings, "matrix", cold=True)
+    np.testing.assert_array_equal(warm["cell_siemens"], cold["cell_siemens"])
+
+
+def test_an_unknown_method_is_refused() -> None:
+    with pytest.raises(ValueError, match="choose one of ohm"):
+        estimate_file(Readings(np.full((1, 2, 2, 4), 0.5)), "magic")
+
+
+def refusal_of(path: Path) -> str:
+    try:
+        load_readings(path)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+GOOD = np.full((2, 3, 4, 4), 0.5)
+
+
+def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
+    bad = GOOD.copy()
+    bad[index] = ratio
+    return bad
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({}, "no array 'ratio'"),
+        ({"ratio": GOOD[0]}, r"ratio has shape \(3, 4, 4\)"),
+        ({"ratio": GOOD[..., :3]}, "ratio has shape"),
+        ({"ratio": GOOD[:0]}, "ratio has 0 frames"),
+        ({"ratio": GOOD[:, :0]}, "0x4 cells"),
+        ({"ratio": np.zeros((1, 65, 64, 4))}, "65x64 cells: .* 4096"),
+        (
+            {"ratio": bad_ratio((1, 2, 0, 2), np.nan)},
+            r"ratio, frame 1, of cell \(2, 0\), reading C",
+        ),
+        ({"ratio": bad_ratio((0, 0, 3, 0), 1.5)}, r"ratio, frame 0, of cell \(0, 3\), reading A"),
+        ({"ratio": np.array(["a"])}, "ratio cannot be read: it holds <U1"),
+        ({"ratio": GOOD + 0j}, "ratio cannot be read: it holds complex128"),
+        ({"ratio": np.array([None])}, "ratio cannot be read: .*allow_pickle=False"),
+        ({"ratio": GOOD, "rest_ratio": GOOD[0, :2]}, "rest_ratio has shape"),
+        ({"ratio": GOOD, "rest_ratio": GOOD[:1]}, "rest_ratio has 1 frames, ratio 2"),
+        ({"ratio": GOOD, "rest_ratio": GOOD[0] * 3}, r"rest_ratio of cell \(0, 0\)"),
+        ({"ratio": GOOD, "rest_ratio": bad_ratio((1, 0, 0, 0), 2)}, r"rest_ratio of cell \(0, 0\)"),
+        ({"ratio": GOOD, "ref_top_ohm": np.ones(2)}, "ref_top_ohm has shape"),
+        ({"ratio": GOOD, "ref_bottom_ohm": 0.0}, "ref_bottom_ohm must be positive"),
+        ({"ratio": GOOD, "adc_bits": 10.5}, "adc bits must be"),
+        ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),
+        ({"ratio": GOOD, "nominal_top_wire_ohm": np.ones(3)}, "nominal_top_wire_ohm has shape"),
+        ({"ratio": GOOD, "nominal_bottom_wire_ohm": [1, -1]}, "nominal_bottom_wire_ohm must be"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_name_in_one_line(
+    tmp_path: Path, arrays: dict[str, object], message: str
+) -> None:
+    path = write(tmp_path / "wrong.npz", **arrays)
+    with pytest.raises(ValueError, match=message) as refusal:
+        load_readings(path)
+    assert str(refusal.value).startswith(f"{path}: ")
+    assert "\n" not in str(refusal.value)
+
+
+def test_files_that_are_no_archive_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "missing.npz"
+    with pytest.raises(ValueError, match=r"missing.npz: .*No such file"):
+        load_readings(path)
+    with pytest.raises(ValueError, match=r"cannot be read: Is a directory"):
+        load_readings(tmp_path)
+    path.write_bytes(b"not a zip")
+    with pytest.raises(ValueError, match="not a zip file"):
+        load_readings(path)
+
+
+def test_every_truncation_and_many_damages_are_refused_or_read(tmp_path: Path) -> None:
+    whole = io.BytesIO()
+    np.savez_compressed(whole, ratio=np.random.default_rng(0).random((1, 2, 2, 4)))
+    packed = whole.getvalue()
+    path = tmp_path / "damaged.npz"
+    for length in range(len(packed)):
+        path.write_bytes(packed[:length])
+        with pytest.raises(ValueError, match=r"damaged.npz: "):
+            load_readings(path)
+    refused = 0
+    for position in range(len(packed)):
+        path.write_bytes(packed[:position] + b"\xff" + packed[position + 1 :])
+        message = refusal_of(path)
+        assert "\n" not in message
+        refused += message != ""
+    assert refused > len(packed) / 2
+
+
+def test_an_array_over_the_limit_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, ratio=np.zeros((100, 16, 16, 4)))
+    monkeypatch.setattr(readings_module, "MAX_ARRAY_BYTES", 800_000)
+    assert path.stat().st_size < 10_000
+    with pytest.raises(ValueError, match=r"ratio cannot be read: 819\d\d\d bytes, more than"):
+        load_readings(path)
+
+
+def test_a_header_that_promises_more_than_the_file_holds_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    shape = (10**9, 1, 1, 4)
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": shape}
+    )
+    path = tmp_path / "promise.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("ratio.npy", header.getvalue())
+    with pytest.raises(ValueError, match=r"ratio cannot be read: "):
+        load_readings(path)
+
+
+def test_saved_arrays_come_back_and_nothing_else_is_left(tmp_path: Path) -> None:
+    out = estimate_file(load_readings(DATA / "random_2x2.npz"), "ohm")
+    path = tmp_path / "out.npz"
+    path.write_bytes(b"an older file")
+    save_arrays(path, out)
+    with np.load(path, allow_pickle=False) as saved:
+        assert set(saved.files) == set(OUT_SHAPES)
+        for name, array in out.items():
+            np.testing.assert_array_equal(saved[name], array)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_save_leaves_the_older_file_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "out.npz"
+    path.write_bytes(b"an older file")
+    with pytest.raises(ValueError, match="cell_ohm holds Python objects"):
+        save_arrays(path, {"cell_ohm": np.array([object()])})
+    assert path.read_bytes() == b"an older file"
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(ValueError, match=r"cannot be written: No such file"):
+        save_arrays(tmp_path / "nowhere" / "out.npz", {})

@@ -1,0 +1,565 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings: what is written is read again, whatever ended the writing; replay is the same scans.
+
+Files are read here by the `mcap` library's own readers as well, not by ours alone.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+import ohmskin
+from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.opening import emulated
+from ohmskin.record.export import export
+from ohmskin.record.readings import estimate_file, load_readings
+from ohmskin.record.recorder import FLUSH_EVERY_S, Recorder
+from ohmskin.record.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
+
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+URL = "emulator://3x4?scene=multi&seed=3&rate=400"
+Command = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture(scope="module")
+def hello() -> Hello:
+    with ohmskin.open(URL, start=False) as skin:
+        return skin.info
+
+
+def scan(number: int, rows: int = 3, columns: int = 4, at_s: float | None = None) -> Scan:
+    codes = np.random.default_rng(number).integers(0, 1024, (rows, columns, 4)).astype(np.uint16)
+    at_s = number / 400 if at_s is None else at_s
+    return Scan(codes, number, 2500 * number, at_s, 0)
+
+
+def write(path: Path, hello: Hello, scans: list[Scan]) -> None:
+    with Recorder(path, hello) as recorder:
+        for each in scans:
+            recorder.add(each)
+
+
+def assert_same(found: list[Scan], expected: list[Scan], host_time: bool = True) -> None:
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert one.codes.dtype == other.codes.dtype
+        np.testing.assert_array_equal(one.codes, other.codes)
+        assert (one.number, one.time_us, one.missed) == (other.number, other.time_us, other.missed)
+        assert one.host_time_s == other.host_time_s or not host_time
+
+
+def replayed(path: Path, speed: float = 0) -> list[Scan]:
+    with ohmskin.open(f"replay://{path}?speed={speed}") as skin:
+        return list(skin)
+
+
+# ----------------------------------------------------------------------------- write and read
+
+
+def test_everything_is_read_again(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
+        scans = list(itertools.islice(skin, 50))
+        for each in scans:
+            recorder.add(each)
+        tare = Tare(np.mean([each.ratio for each in scans], axis=0), time.monotonic())
+        others = [Mark("pressed \u00fc", 1.5), ForceSample(0.25, 2.5, 1, 2, "scale")]
+        for other in (tare, *others):
+            recorder.add(other)
+    found = load_recording(path)
+    assert not found.cut_off
+    assert found.hellos == [hello]
+    assert_same(found.scans, scans)
+    np.testing.assert_array_equal(found.tares[0].rest_ratio, tare.rest_ratio)
+    assert [*found.marks, *found.forces] == others
+
+
+def test_other_programs_read_it(tmp_path: Path, hello: Hello) -> None:
+    """The library's seeking reader, with the index; each message fits its schema's properties."""
+    path = tmp_path / "a.mcap"
+    before_ns = time.time_ns()
+    write(path, hello, [scan(n, at_s=time.monotonic()) for n in range(20)])
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 21
+        topics = {channel.topic for channel in summary.channels.values()}
+        assert topics == {f"/skin/{name}" for name in ("hello", "scan", "tare", "mark", "force")}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            definition, content = json.loads(schema.data), json.loads(message.data)
+            assert definition["type"] == "object"
+            assert list(content) == definition["required"] == list(definition["properties"])
+            kinds = {"integer": int, "number": float, "string": str, "array": list}
+            for name, value in content.items():
+                assert type(value) is kinds[definition["properties"][name]["type"]]
+            assert before_ns - 1e6 < message.log_time < time.time_ns() + 1e6
+            if channel.topic == "/skin/scan":
+                expected = scan(content["number"])
+                assert content["codes"] == expected.codes.reshape(-1).tolist()
+
+
+def test_size_on_disk(tmp_path: Path, hello: Hello) -> None:
+    """At most 40 kB/s for 8x8 at 90 Hz, half a second in each chunk."""
+    path = tmp_path / "a.mcap"
+    board, _, _ = emulated("emulator://8x8?scene=moving&noise=1")
+    with Recorder(path, hello) as recorder:
+        for number in range(450):
+            recorder.add(Scan(board.codes_at(number / 90), number, 11_111 * number, number / 90, 0))
+            if number % 45 == 44:
+                recorder._flush()
+    assert path.stat().st_size < 5 * 40_000
+
+
+def test_an_existing_file_is_left_alone(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_text("mine")
+    with pytest.raises(RecordingError, match="there already"):
+        Recorder(path, hello)
+    assert path.read_text() == "mine"
+    with pytest.raises(RecordingError, match="No such file"):
+        Recorder(tmp_path / "nowhere" / "a.mcap", hello)
+
+
+def test_a_closed_recording_takes_no_more(tmp_path: Path, hello: Hello) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", hello)
+    recorder.close()
+    recorder.close()
+    with pytest.raises(RecordingError, match="closed"):
+        recorder.add(scan(0))
+
+
+def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, hello) as recorder:
+        recorder.add(scan(0))
+        time.sleep(FLUSH_EVERY_S + 0.4)
+        found = load_recording(path)
+    assert found.cut_off
+    assert_same(found.scans, [scan(0)])
+
+
+# ------------------------------------------------------------------------------ what ends badly
+
+
+def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
+    path = tmp_path / "a.mcap"
+    process = command("record", URL, str(path))
+    end_s = time.monotonic() + 20
+    while not path.exists() or path.stat().st_size < 20_000:
+        assert time.monotonic() < end_s, "nothing is written"
+        time.sleep(0.01)
+    time.sleep(0.77)
+    process.send_signal(signal.SIGKILL)
+    killed_s = time.monotonic()
+    process.wait(10)
+    found = load_recording(path)
+    assert found.cut_off
+    assert len(found.hellos) == 1
+    numbers = [each.number for each in found.scans]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert killed_s - found.scans[-1].host_time_s < 1.0
+    assert_same(replayed(path), found.scans, host_time=False)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_properly(tmp_path: Path, command: Command, number: signal.Signals) -> None:
+    path = tmp_path / "a.mcap"
+    process = command("record", URL, str(path))
+    while not path.exists() or path.stat().st_size < 10_000:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+    found = load_recording(path)
+    assert not found.cut_off
+    assert f"{len(found.scans)} scans" in out
+
+
+def outcome(path: Path) -> Recording | str:
+    """The recording, or the one line that says why not."""
+    try:
+        return load_recording(path)
+    except RecordingError as exc:
+        text = str(exc)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+    return text
+
+
+def test_cut_off_at_every_byte(tmp_path: Path, hello: Hello) -> None:
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    with Recorder(whole, hello) as recorder:
+        for number in range(6):
+            recorder.add(scan(number))
+            recorder._flush()
+    octets = whole.read_bytes()
+    counts = []
+    for size in range(len(octets)):
+        cut.write_bytes(octets[:size])
+        found = outcome(cut)
+        if isinstance(found, str):
+            assert "cut off" in found
+            assert not counts
+        else:
+            assert_same(found.scans, [scan(n) for n in range(len(found.scans))])
+            counts.append(len(found.scans))
+    assert counts == sorted(counts)
+    assert set(counts) == set(range(7))
+
+
+def test_damage_is_named(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, hello, [scan(n) for n in range(5)])
+    octets = bytearray(path.read_bytes())
+    outcomes = set()
+    for at in range(0, len(octets), 7):
+        octets[at] ^= 0x41
+        path.write_bytes(octets)
+        outcomes.add(type(outcome(path)))
+        octets[at] ^= 0x41
+    assert outcomes == {Recording, str}
+
+
+def foreign(path: Path, topic: str, content: object) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        channel = writer.register_channel(topic, "json", schema)
+        writer.add_message(channel, 0, json.dumps(content).encode(), 0)
+        writer.finish()
+
+
+def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"")
+    with pytest.raises(RecordingError, match="cut off"):
+        load_recording(path)
+    path.write_bytes(os.urandom(5000))
+    with pytest.raises(RecordingError, match="no MCAP file"):
+        load_recording(path)
+    with pytest.raises(RecordingError, match="No such file"):
+        load_recording(tmp_path / "none.mcap")
+    with pytest.raises(RecordingError, match="directory"):
+        load_recording(tmp_path)
+    for topic, content, reason in (
+        ("/camera", {}, "no recording of a skin"),
+        ("/skin/mark", {"host_time_s": 1.0, "text": ""}, "no board says hello"),
+        ("/skin/hello", {}, "layout_crc"),
+        ("/skin/hello", [1], "no JSON object"),
+        ("/skin/scan", {"host_time_s": 1, "rows": 1, "columns": 1, "codes": [1] * 5}, "5 codes"),
+        ("/skin/scan", {"host_time_s": 1, "rows": 1, "columns": 1, "codes": [-1] * 4}, "range"),
+        ("/skin/scan", {"host_time_s": 1, "rows": 10**9, "columns": 9, "codes": []}, "no 10000"),
+    ):
+        foreign(path, topic, content)
+        with pytest.raises(RecordingError, match=reason) as refusal:
+            load_recording(path)
+        assert str(refusal.value).startswith(str(path))
+
+
+class FullDisk(io.FileIO):
+    """A file that takes `room` bytes and no more, the last write in part."""
+
+    room = 0
+
+    def write(self, octets: object) -> int:
+        view = memoryview(octets)  # type: ignore[arg-type]
+        fits = min(len(view), self.room - self.tell())
+        if fits <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(view[:fits])
+
+
+def test_a_full_disk_ends_the_recording(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    file = FullDisk(path, "wb")
+    file.room = 20_000
+
+    def fill() -> None:
+        with Recorder(path, hello, file=file) as recorder:
+            for number in range(10_000):
+                recorder.add(scan(number))
+                if number % 20 == 0:
+                    recorder._flush()
+
+    with pytest.raises(RecordingError, match="No space left on device; what is in"):
+        fill()
+    found = load_recording(path)
+    assert found.cut_off
+    assert len(found.scans) > 50
+    assert_same(found.scans, [scan(n) for n in range(len(found.scans))])
+    assert 15_000 < path.stat().st_size <= 20_000
+
+
+def test_a_file_that_may_not_grow_ends_the_command(tmp_path: Path, command: Command) -> None:
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "a.mcap"
+    process = command("record", URL, str(path))
+    if not hasattr(resource, "prlimit"):
+        pytest.skip("needs prlimit")
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "recording ended after" in err
+    assert load_recording(path).scans
+
+
+# -------------------------------------------------------------------------------------- replay
+
+
+def test_replay_is_the_recording_bit_for_bit(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    with ohmskin.open(f"{URL}&drop=0.05") as skin:
+        scans = list(itertools.islice(skin, 300))
+    assert any(each.missed for each in scans)
+    write(path, hello, scans)
+    assert_same(replayed(path), scans, host_time=False)
+    assert_same(replayed(path, speed=4), scans, host_time=False)
+
+
+def test_a_slow_reader_of_a_fast_replay_loses_nothing(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    scans = [scan(n, rows=1, columns=1) for n in range(3000)]
+    write(path, hello, scans)
+    with ohmskin.open(f"replay://{path}?speed=0") as skin:
+        time.sleep(0.1)
+        found = iter(skin)
+        first = [next(found)]
+        time.sleep(0.3)
+        first += found
+        assert skin.stats.overflowed == 0
+    assert_same(first, scans, host_time=False)
+
+
+def test_latest_of_a_fast_replay_gives_each(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    scans = [scan(n) for n in range(40)]
+    write(path, hello, scans)
+    with ohmskin.open(f"replay://{path}?speed=0") as skin:
+        assert_same([skin.latest() for _ in scans], scans, host_time=False)
+        with pytest.raises(RecordingEnded, match="played to its end"):
+            skin.latest()
+        assert list(skin) == []
+        with pytest.raises(DeviceLost):
+            skin.stop()
+
+
+def test_replay_takes_the_recorded_time(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, hello, [scan(n, at_s=7 + n / 10) for n in range(6)])
+    begin_s = time.monotonic()
+    found = replayed(path, speed=1)
+    assert time.monotonic() - begin_s >= 0.5
+    steps_s = np.diff([each.host_time_s for each in found])
+    assert np.median(steps_s) == pytest.approx(0.1, abs=0.05)
+
+
+def test_replay_shortens_long_pauses(
+    tmp_path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ohmskin.record.replay.LONGEST_PAUSE_S", 0.1)
+    path = tmp_path / "a.mcap"
+    write(path, hello, [scan(0, at_s=0), scan(1, at_s=3600), scan(2, at_s=10)])
+    begin_s = time.monotonic()
+    assert len(replayed(path, speed=1)) == 3
+    assert time.monotonic() - begin_s < 5
+
+
+def test_a_recording_stays_as_it_is(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    scans = [scan(n) for n in range(30)]
+    write(path, hello, scans)
+    with ohmskin.open(f"replay://{path}?speed=0") as skin:
+        assert (skin.info.rows, skin.info.columns, skin.info.board) == (3, 4, "emulated")
+        first = [skin.latest()]
+        uses: list[Callable[[], object]] = [
+            lambda: skin.configure(rows=2),
+            skin.save,
+            skin.self_test,
+            skin.load_defaults,
+            lambda: skin.set_unit_id(1),
+        ]
+        for use in uses:
+            with pytest.raises(CommandRefused, match="is a recording"):
+                use()
+        skin.stop()
+        skin.start()
+        rest = list(skin)
+    # What had come before the pause may be forgotten, as with any board; nothing comes twice.
+    numbers = [each.number for each in first + rest]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == 29
+
+
+def test_a_change_of_size_is_replayed(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
+        scans = list(itertools.islice(skin, 5))
+        for each in scans:
+            recorder.add(each)
+        recorder.add(skin.configure(rows=2))
+        later = list(itertools.islice(skin, 5))
+        for each in later:
+            recorder.add(each)
+    with ohmskin.open(f"replay://{path}?speed=0") as skin:
+        found = list(skin)
+        assert skin.info.rows == 2
+    assert [each.codes.tolist() for each in found] == [s.codes.tolist() for s in scans + later]
+    with pytest.raises(RecordingError, match=r"3x4 cells become 2x4"):
+        export(load_recording(path), tmp_path / "a.npz")
+
+
+def test_wrong_replays(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, hello, [scan(0)])
+    for query in ("speed=-1", "speed=nan", "speed=fast", "baud=9600"):
+        with pytest.raises(PortError, match="speed"):
+            ohmskin.open(f"replay://{path}?{query}")
+    with pytest.raises(RecordingError, match="No such file"):
+        ohmskin.open(f"replay://{tmp_path}/none.mcap")
+    path.unlink()
+    write(path, hello, [scan(0), scan(1, rows=20)])
+    with pytest.raises(RecordingError, match="20x4 cells"):
+        replayed(path)
+
+
+# -------------------------------------------------------------------------------------- export
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    path = tmp_path / "a.mcap"
+    with (
+        ohmskin.open("emulator://3x4?scene=rest&noise=0") as rest,
+        ohmskin.open("emulator://3x4?scene=single&noise=0") as touched,
+        Recorder(path, rest.info) as recorder,
+    ):
+        recorder.add(Tare(rest.latest().ratio, time.monotonic()))
+        for each in itertools.islice(touched, 5):
+            recorder.add(each)
+    return path
+
+
+def test_export_is_estimated(tmp_path: Path, recorded: Path) -> None:
+    out = tmp_path / "a.npz"
+    recording = load_recording(recorded)
+    assert export(recording, out) == 5
+    readings = load_readings(out)
+    expected = [each.ratio for each in recording.scans]
+    np.testing.assert_array_equal(readings.ratio, expected)
+    np.testing.assert_array_equal(readings.rest_ratio, recording.tares[0].rest_ratio)
+    assert (readings.adc_bits, readings.ref_top_ohm) == (10, 30_000)
+    assert estimate_file(readings, "joint")["converged"].all()
+    with np.load(out) as arrays:
+        assert arrays["time_us"].tolist() == [each.time_us for each in recording.scans]
+
+
+def test_export_as_a_table(tmp_path: Path, recorded: Path) -> None:
+    out = tmp_path / "a.csv"
+    recording = load_recording(recorded)
+    export(recording, out)
+    header = out.read_text().splitlines()[0].split(",")
+    assert header[:6] == ["number", "time_us", "host_time_s", "missed", "r0c0a", "r0c0b"]
+    assert header[-1] == "r2c3d"
+    table = np.loadtxt(out, delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(
+        table[:, 4:], [each.codes.reshape(-1) for each in recording.scans]
+    )
+    np.testing.assert_array_equal(table[:, 2], [each.host_time_s for each in recording.scans])
+
+
+def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
+    recording = load_recording(recorded)
+    times_s = [each.host_time_s - recording.scans[0].host_time_s for each in recording.scans]
+    part = export(recording, tmp_path / "a.npz", begin_s=times_s[1], end_s=times_s[3] + 1e-6)
+    assert part in (3, 2)  # the first may fall to rounding
+    with pytest.raises(RecordingError, match="no scans"):
+        export(recording, tmp_path / "b.npz", begin_s=1000)
+    with pytest.raises(ValueError, match="no format"):
+        export(recording, tmp_path / "b.txt")
+    assert not list(tmp_path.glob("b*"))
+
+
+def test_typed_lines_become_marks(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    far, near = os.openpty()
+    host = str(Path(ohmskin.__file__).parents[1])
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "ohmskin",
+            "record",
+            URL,
+            str(path),
+        ],
+        stdin=near,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, "PYTHONPATH": host},
+    )
+    os.close(near)
+    with os.fdopen(far, "wb", buffering=0) as keyboard:
+        while not path.exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        keyboard.write(b"left hand\nright")
+        time.sleep(0.3)
+        keyboard.write(b" hand\n")
+        end_s = time.monotonic() + 20
+        while len(load_recording(path).marks) < 2:
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert [mark.text for mark in load_recording(path).marks] == ["left hand", "right hand"]
+
+
+def test_the_commands(tmp_path: Path, command: Command) -> None:
+    path, out = tmp_path / "a.mcap", tmp_path / "a.npz"
+    quiet = "emulator://3x4?scene=rest"
+    process = command(
+        "record", quiet, str(path), "--scans", "60", "--tare", "0.2", "--mark", "left hand"
+    )
+    text, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (0, "")
+    assert text.startswith(f"{path}: 60 scans, missed 0, ")
+    assert [mark.text for mark in load_recording(path).marks] == ["left hand"]
+    assert sum(isinstance(message, Tare) for message in messages(path)) == 1
+    process = command("export", str(path), str(out))
+    text, err = process.communicate(timeout=30)
+    assert (process.returncode, text, err) == (0, f"{out}: 60 scans\n", "")
+    process = command("stream", f"replay://{path}?speed=0", "--json", "--method", "none")
+    text, err = process.communicate(timeout=30)
+    assert (process.returncode, text.count("\n"), err) == (0, 60, "")
+    path.write_bytes(path.read_bytes()[:100])
+    out.unlink()
+    process = command("export", str(path), str(out))
+    text, err = process.communicate(timeout=30)
+    assert (process.returncode, text, err.count("\n")) == (2, "", 1)
+    assert "cut off" in err
+    assert not out.exists()

@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make chart`: the front, the table, the picture, and what interrupts them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from network import laplacian_readings
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.cli import main as cli
+from ohmskin.estimate.methods import METHODS
+from ohmskin.files import save_whole
+from places import DATA, ROOT
+from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published
+from studies.__main__ import app
+from studies.chart import Plan, Row, Size, pareto_front
+
+TINY = Plan(
+    skins=1,
+    frames=8,
+    warm_up=2,
+    repeats=1,
+    sizes=(Size(2, 2, 3),),
+    methods=("ohm", "matrix", "joint"),
+)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return chart.measure(TINY)
+
+
+def of(rows: list[Row], **what: object) -> list[Row]:
+    return [row for row in rows if all(getattr(row, k) == value for k, value in what.items())]
+
+
+# ------------------------------------------------------------------------------------ the front
+
+
+@pytest.mark.parametrize(
+    ("points", "on_front"),
+    [
+        ([(1, 5), (2, 3), (3, 4), (4, 1)], [True, True, False, True]),
+        ([(1, 1), (2, 2), (1, 2), (2, 1)], [True, False, False, False]),
+        ([(1, 1), (1, 1), (0, 2)], [True, True, True]),
+        ([(1, np.nan), (np.nan, 1), (5, 5)], [False, False, True]),
+        ([], []),
+    ],
+)
+def test_pareto_front(points: list[tuple[float, float]], on_front: list[bool]) -> None:
+    assert pareto_front(points) == on_front
+
+
+def test_pareto_front_of_many_points() -> None:
+    """Against a sweep by time: on the front is what is more accurate than all that is faster."""
+    points = np.random.default_rng(1).random((300, 2))
+    best, expected = np.inf, np.zeros(len(points), bool)
+    for index in np.argsort(points[:, 0]):
+        expected[index] = points[index, 1] < best
+        best = min(best, points[index, 1])
+    assert pareto_front([(x, y) for x, y in points]) == expected.tolist()
+
+
+# --------------------------------------------------------------------------------- measurements
+
+
+def test_all_methods_get_the_same_frames(rows: list[Row]) -> None:
+    for bits in (None, 10):
+        measured = of(rows, scene="random", bits=bits)
+        assert [row.method for row in measured] == list(TINY.methods)
+        assert {row.frames for row in measured} == {6}
+        assert len({row.pressed_cells for row in measured}) == 1
+        for row in measured:
+            assert row.pressed_cells
+            assert row.ms is not None
+            assert row.ms_p90 is not None
+            assert 0 < row.ms <= row.ms_p90
+            assert row.error_percent is not None
+            assert row.error_p90_percent is not None
+            assert 0 <= row.error_percent <= row.error_p90_percent
+
+
+def test_progress_counts_every_frame() -> None:
+    seen: list[tuple[int, int]] = []
+    plan = replace(TINY, methods=("ohm", "matrix"), bits=(10,))
+    chart.measure(plan, lambda done, frames: seen.append((done, frames)))
+    total = 2 * 8 + 2 * 10 * 2
+    assert seen == [(done, total) for done in range(1, total + 1)]
+
+
+def test_limits_are_ordered(rows: list[Row]) -> None:
+    """What is known more exactly leaves less: wires, and readings."""
+    exact, rounded = (of(rows, scene="random", bits=bits)[0] for bits in (None, 10))
+    for row in (exact, rounded):
+        assert row.limit_std_percent is not None
+        assert row.limit_percent is not None
+        assert row.limit_told_percent is not None
+        assert row.limit_told_percent < row.limit_percent < row.limit_std_percent
+    assert exact.limit_std_percent is not None
+    assert rounded.limit_std_percent is not None
+    assert exact.limit_std_percent < rounded.limit_std_percent
+
+
+def test_median_error_of_normal_deviations() -> None:
+    assert chart._median_error([1.0]) == pytest.approx(0.6745, abs=2e-3)
+    random = np.random.default_rng(2)
+    stds = np.exp(random.standard_normal(40))
+    drawn = np.abs(stds * random.standard_normal((20_000, 40)))
+    assert chart._median_error(stds) == pytest.approx(np.median(drawn), rel=1e-2)
+
+
+def test_the_papers_methods_run_on_small_skins_alone() -> None:
+    plan = Plan(skins=1, frames=1)
+    assert plan.methods_for(Size(3, 3, 1)) == list(METHODS)
+    assert {*METHODS} - {*plan.methods_for(Size(4, 4, 1))} == {"lsq", "regularized"}
+
+
+@pytest.mark.parametrize("name", ["cell_sweep", "wire_sweep"])
+def test_sweeps_are_the_papers(name: str) -> None:
+    """Readings of ngspice, made for the same conditions."""
+    with np.load(DATA / f"{name}_3x3.npz") as file:
+        expected, at_rest = file["ratio"], file["rest_ratio"]
+    pairs = published.sweep(name)
+    np.testing.assert_allclose([readings(pressed) for pressed, _ in pairs], expected, atol=1e-7)
+    np.testing.assert_allclose([readings(rest) for _, rest in pairs], at_rest, atol=1e-7)
+
+
+# --------------------------------------------------------------------------- NumPy against CasADi
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which(casadi_circuit.COMPILER) is None, reason="needs a C compiler"
+)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (8, 8)])
+@pytest.mark.parametrize(
+    "name", ["numpy", "casadi", pytest.param("casadi_c", marks=needs_compiler)]
+)
+def test_each_evaluation_is_that_of_the_node_laplacian(shape: tuple[int, int], name: str) -> None:
+    """Its port resistances, and their differences, at two states: the second call is new."""
+    evaluate = casadi_circuit.evaluations(*shape)[name]
+    random = np.random.default_rng(3)
+    cells = shape[0] * shape[1]
+
+    def port_ohm(log_ohm: np.ndarray) -> np.ndarray:
+        cell, top, bottom = np.exp(log_ohm).reshape(3, *shape)
+        skin = Skin(1 / cell, top, bottom)
+        current = (1 - laplacian_readings(skin)[..., 0]) / skin.ref_top_ohm
+        return (1 / current - skin.ref_top_ohm - skin.ref_bottom_ohm).ravel()
+
+    for _ in range(2):
+        log_ohm = np.log(random.uniform([[1e4], [1e2], [2e2]], [[1e5], [1e3], [2e3]], (3, cells)))
+        found, *slopes = evaluate(log_ohm.ravel())
+        np.testing.assert_allclose(found, port_ohm(log_ohm), rtol=1e-9)
+        direction = random.standard_normal((3, cells))
+        ahead, behind = (port_ohm(log_ohm + step * direction) for step in (1e-4, -1e-4))
+        np.testing.assert_allclose(
+            np.hstack(slopes) @ direction.ravel(), (ahead - behind) / 2e-4, rtol=1e-5, atol=1e-1
+        )
+
+
+@needs_compiler
+def test_evaluations_of_numpy_and_casadi_are_in_the_table(rows: list[Row]) -> None:
+    measured = of(rows, scene="linearisation")
+    assert [row.method for row in measured] == ["numpy", "casadi", "casadi_c"]
+    for row in measured:
+        assert (row.rows, row.columns, row.source, row.on_front) == (2, 2, "measured", False)
+        assert row.ms is not None
+        assert row.ms_p90 is not None
+        assert 0 < row.ms <= row.ms_p90
+
+
+def test_without_a_compiler_there_is_no_generated_c_and_that_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(casadi_circuit, "COMPILER", "no-such-compiler")
+    rows = chart._linearisation_rows(Size(2, 2, 0))
+    assert [row.method for row in rows] == ["numpy", "casadi"]
+    assert "no C compiler" in str(chart_table.summary(rows).caption)
+    axes = Figure().add_subplot()
+    chart_figure._evaluation_panel(axes, rows)
+    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert said == ["NumPy", "CasADi", "CasADi's C: no compiler"]
+
+
+# -------------------------------------------------------------------------------------- answers
+
+
+def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
+    table = list(csv.DictReader(io.StringIO(chart_table.csv_text(rows))))
+    evaluations = len(of(rows, scene="linearisation"))
+    assert evaluations >= 2
+    assert len(table) == len(rows) == 2 * 3 + 2 * 3 + evaluations + 2 + 6
+    assert list(table[0]) == [column.name for column in fields(Row)]
+    assert list(table[0])[:6] == ["scene", "source", "rows", "columns", "bits", "method"]
+    for line, row in zip(table, rows, strict=True):
+        assert line["method"] == row.method
+        assert line["bits"] == str(row.bits or "exact")
+        assert line["on_front"] == str(int(row.on_front))
+        assert (line["ms"] == "") == (row.ms is None)
+        if row.error_percent is not None:
+            assert float(line["error_percent"]) == pytest.approx(row.error_percent, rel=1e-3)
+    printed = [line for line in table if line["source"] == "Su2024"]
+    by_place = {(line["scene"], line["method"]): line for line in printed}
+    assert by_place["board", "regularized"]["ms"] == "90"
+    assert by_place["board", "regularized"]["error_percent"] == ""
+    assert by_place["wire_sweep", "regularized"]["rmse_megohm"] == "0.0829"
+    assert by_place["wire_sweep", "regularized"]["ms"] == ""
+
+
+def test_fronts_name_the_fastest_first(rows: list[Row]) -> None:
+    fronts = chart_table.fronts(rows)
+    assert list(fronts) == [
+        *("random 2x2 exact", "random 2x2 10 bit"),
+        *("cell_sweep 3x3 exact", "wire_sweep 3x3 exact"),
+    ]
+    for methods in fronts.values():
+        assert methods[0] == "ohm"
+
+
+def test_frames_without_touches_have_a_row_and_a_picture() -> None:
+    plan = replace(TINY, sizes=(Size(2, 2, 0),), methods=("ohm",), bits=(10,))
+    rows = chart.measure(plan)
+    assert (rows[0].pressed_cells, rows[0].error_percent, rows[0].limit_percent) == (0, None, None)
+    assert not rows[0].on_front
+    assert chart_figure.picture(rows, "a machine").startswith(b"\x89PNG")
+
+
+# --------------------------------------------------------------------------------- command line
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """A function that runs ``python -m studies chart ARGUMENTS`` with a tiny plan."""
+    monkeypatch.setattr(chart, "QUICK", TINY)
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["studies", "chart", "--quick", *arguments])
+        code = 0
+        try:
+            cli.run(app, "studies")
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def test_chart_writes_picture_and_table(
+    run: Callable[..., tuple[int, str, str]], tmp_path: Path, rows: list[Row]
+) -> None:
+    code, out, err = run("--out", str(tmp_path / "new"))
+    assert code == 0
+    answer = json.loads(out)
+    assert answer["quick"]
+    assert answer["fronts"]["random 2x2 10 bit"][0] == "ohm"
+    picture, table = Path(answer["picture"]), Path(answer["table"])
+    assert sorted((tmp_path / "new").iterdir()) == sorted([picture, table])
+    assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    assert picture.stat().st_size > 30_000
+    assert table.read_text().count("\n") == 1 + len(rows)
+    assert "matrix" in err
+
+
+def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert commands.default_folder() == ROOT / "docs"
+    monkeypatch.setattr(commands, "__file__", "/lib/python/site-packages/studies/x.py")
+    assert commands.default_folder() == Path()
+
+
+def test_without_matplotlib_nothing_is_measured(
+    run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setattr(chart, "measure", lambda *_: pytest.fail("measured in vain"))
+    code, out, err = run("--out", str(tmp_path))
+    assert (code, out) == (2, "")
+    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
+
+
+@pytest.mark.parametrize("where", ["measure", "picture"])
+def test_ctrl_c_leaves_the_old_files(
+    run: Callable[..., tuple[int, str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    where: str,
+    rows: list[Row],
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(chart, "measure", lambda *_: rows)
+    monkeypatch.setattr(chart if where == "measure" else chart_figure, where, interrupt)
+    (tmp_path / "speed-accuracy.csv").write_text("old")
+    code, out, err = run("--out", str(tmp_path))
+    assert (code, out) == (130, "")
+    assert "Traceback" not in err
+    assert [path.name for path in tmp_path.iterdir()] == ["speed-accuracy.csv"]
+    assert (tmp_path / "speed-accuracy.csv").read_text() == "old"
+
+
+def test_ctrl_c_is_not_lost_in_ipopt(
+    command: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    """CasADi takes the signal; the frame once was just not converged, and the run went on."""
+    folder = tmp_path / "new"
+    process = command("chart", "--out", str(folder), module="studies")
+    while not folder.exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(1.5)  # by then nearly all time goes into Ipopt, and so for two minutes
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out) == (130, "")
+    assert "Traceback" not in err
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["returned a result with an exception set", "KeyboardInterrupt"])
+def test_ctrl_c_is_told_from_what_casadi_makes_of_it(
+    run: Callable[..., tuple[int, str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    text: str,
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise SystemError(text) from (KeyboardInterrupt() if "result" in text else None)
+
+    monkeypatch.setattr(chart, "measure", interrupt)
+    code, out, err = run("--out", str(tmp_path))
+    assert (code, out) == (130, "")
+    assert "Traceback" not in err
+
+
+def test_ctrl_c_while_saving_leaves_the_old_files(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.write_text("old")
+
+    def interrupted(descriptor: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save_whole({first: b"new", second: b"new"})
+    assert list(tmp_path.iterdir()) == [first]
+    assert first.read_text() == "old"
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no/place: cannot be written: No such file"):
+        save_whole({tmp_path / "no" / "place": b""})

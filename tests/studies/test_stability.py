@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make stability`: the verdict, the faults, the sweep over processes, the files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin
+from ohmskin.cli import main as cli
+from ohmskin.estimate.matrix import MatrixEstimator
+from ohmskin.estimate.methods import METHODS
+from studies import conditions, stability, stability_figure
+from studies.__main__ import app
+from studies.conditions import SWEEPS, Case
+from studies.stability import Plan, Row, Task, Verdict, verdict
+
+TINY = Plan(skins=2, frames=2, paper_skins=0, paper_shape=(2, 2), shape=(3, 3))
+FAST = ("ohm", "matrix")
+SKINS = [(sweep.name, x) for sweep in SWEEPS.values() for x in sweep.values]
+
+
+def tiny_tasks() -> list[Task]:
+    return [task for task in stability.tasks_of(TINY, FAST) if task.sweep in ("stuck", "lines")]
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return stability.measure(tiny_tasks(), jobs=1)
+
+
+# ----------------------------------------------------------------------------------- the verdict
+
+
+@pytest.mark.parametrize(
+    ("cells_us", "std_us", "expected"),
+    [
+        ([200.0, 1.0], [0.0, 0.0], "right"),
+        ([209.0, 1.0], [0.0, 0.0], "right"),  # within 5 %
+        ([200.0, 1.45], [0.0, 0.0], "right"),  # within 0.5 uS
+        ([200.0, 0.0], [9.0, 0.3], "flagged"),  # 1 uS too low, but 3.3 deviations
+        ([211.0, 1.0], [3.0, 0.1], "flagged"),  # 5.5 %, but 3.7 deviations
+        ([211.0, 1.0], [2.0, 0.1], "wrong_unflagged"),  # 5.5 deviations
+        ([189.0, 1.0], [2.0, 0.1], "wrong_unflagged"),  # as much too low
+        ([200.0, 1.6], [9.0, 0.1], "wrong_unflagged"),  # a ghost
+        ([211.0, 1.6], [9.0, 0.1], "wrong_unflagged"),  # one stated, one not
+        ([211.0, 1.0], [np.nan, np.nan], "wrong_unflagged"),  # no deviation is no excuse
+        ([209.0, 1.0], [np.nan, np.nan], "right"),
+        ([1e9, 1.0], [np.inf, 0.1], "flagged"),
+        ([np.nan, 1.0], [9.0, 0.1], "wrong_unflagged"),
+        ([np.nan, 1.0], [np.inf, 0.1], "wrong_unflagged"),
+    ],
+)
+def test_verdict(cells_us: list[float], std_us: list[float], expected: str) -> None:
+    """Truth: a touched cell of 200 microsiemens and one of 1 at rest."""
+    truth, cells, std = (1e-6 * np.array([each]) for each in ([200.0, 1.0], cells_us, std_us))
+    assert verdict(cells, std, True, truth) == expected
+    assert verdict(cells, std, False, truth) == Verdict.FLAGGED
+
+
+# ------------------------------------------------------------------------------------ the faults
+
+
+def readings_by_laplacian(skin: Skin, short: tuple[int, int] | None = None) -> Float:
+    """All readings by a Laplacian of R + C + 2RC nodes with its references, solved port by port."""
+    rows, columns = skin.shape
+    nodes = rows + columns + 2 * rows * columns
+    laplacian = np.zeros((nodes, nodes))
+
+    def join(first: int, second: int, siemens: float) -> None:
+        laplacian[[first, second], [first, second]] += siemens
+        laplacian[[first, second], [second, first]] -= siemens
+
+    def top(i: int, j: int) -> int:
+        return rows + columns + i * columns + j if j >= 0 else i
+
+    def bottom(i: int, j: int) -> int:
+        return top(i, j) + rows * columns if i >= 0 else rows + j
+
+    for i in range(rows):
+        for j in range(columns):
+            join(top(i, j), bottom(i, j), float(skin.cell_siemens[i, j]))
+            join(top(i, j), top(i, j - 1), 1 / float(skin.top_wire_ohm[i, j]))
+            join(bottom(i, j), bottom(i - 1, j), 1 / float(skin.bottom_wire_ohm[i, j]))
+    if short is not None:
+        join(*short, 1 / 0.1)
+    ratio = np.empty((rows, columns, 4))
+    for i in range(rows):
+        for j in range(columns):
+            port = [i, rows + j]
+            to_pins = np.array([1 / skin.ref_top_ohm, 1 / skin.ref_bottom_ohm])
+            driven = laplacian.copy()
+            driven[port, port] += to_pins
+            current = np.zeros((nodes, 2))
+            current[port, [0, 1]] = to_pins  # one pin high at a time
+            by_top, by_bottom = np.linalg.solve(driven, current)[port].T
+            ratio[i, j] = [*by_top, *by_bottom[::-1]]
+    return ratio
+
+
+@pytest.fixture
+def skin() -> Skin:
+    random = np.random.default_rng(5)
+    cell, top, bottom = (
+        middle * np.exp(random.standard_normal((3, 4))) for middle in (2e-5, 300.0, 500.0)
+    )
+    return Skin(cell, top, bottom, 20e3, 40e3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "short"),
+    [
+        ("two rows shorted", (1, 2)),
+        ("two columns shorted", (3 + 2, 3 + 3)),
+        ("row shorted to column", (1, 3 + 2)),
+    ],
+)
+def test_shorted_electrodes(skin: Skin, fault: str, short: tuple[int, int]) -> None:
+    found = conditions._with_line_fault(skin, fault, (1, 2))
+    assert np.abs(found - readings_by_laplacian(skin, short)).max() < 1e-8
+    assert np.abs(found - readings_by_laplacian(skin)).max() > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("fault", "layer", "segment"),
+    [
+        ("row open", "top_wire_ohm", (1, 0)),
+        ("column open", "bottom_wire_ohm", (0, 2)),
+        ("row cut midway", "top_wire_ohm", (1, 2)),
+    ],
+)
+def test_cut_lines(skin: Skin, fault: str, layer: str, segment: tuple[int, int]) -> None:
+    wires = getattr(skin, layer).copy()
+    wires[segment] = 1e12
+    found = conditions._with_line_fault(skin, fault, (1, 2))
+    expected = readings_by_laplacian(replace(skin, **{layer: wires}))
+    assert np.abs(found - expected).max() < 1e-6
+    no_current = np.abs(found - [1, 0, 1, 0]).max(axis=2) < 1e-6
+    dead = {"row open": np.s_[1, :], "column open": np.s_[:, 2], "row cut midway": np.s_[:0]}
+    assert no_current[dead[fault]].all()
+    assert no_current.sum() == no_current[dead[fault]].size
+
+
+def build(sweep: str, x: float | str, frames: int = 3, seed: int = 1) -> Case:
+    return SWEEPS[sweep].build(x, (3, 4), frames, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(("sweep", "x"), SKINS)
+def test_every_condition_gives_readings_of_a_converter(sweep: str, x: float | str) -> None:
+    case, again = build(sweep, x), build(sweep, x)
+    assert case.knowledge.adc_bits == 10
+    assert case.knowledge.rest_ratio is not None
+    judged = [frame for frame in case.frames if frame.cell_siemens is not None]
+    assert len(judged) == 3
+    ratios = [case.knowledge.rest_ratio, *(frame.ratio for frame in case.frames)]
+    for ratio in ratios:
+        codes = 1024 * ratio - 0.5
+        assert np.array_equal(codes, np.round(codes))
+        assert codes.min() >= 0
+        assert codes.max() <= 1023
+    for frame, same in zip(case.frames, again.frames, strict=True):
+        assert np.array_equal(frame.ratio, same.ratio)
+
+
+def test_faults_since_rest_are_in_the_rest_readings() -> None:
+    rest = {
+        fault: build(sweep, fault).knowledge.rest_ratio
+        for sweep, fault in SKINS
+        if str(fault).endswith("since rest")
+    }
+    low, high = 0.5 / 1024, 1023.5 / 1024
+    for fault, ratio in rest.items():
+        assert ratio is not None
+        match fault:
+            case "cell at 0 since rest":
+                assert (ratio == low).all(axis=2).sum() == 1
+            case "row open since rest":
+                dead = (ratio == [high, low, high, low]).all(axis=(1, 2))
+                assert dead.sum() == 1
+            case "two rows shorted since rest":
+                assert (np.diff(ratio, axis=0) == 0).all(axis=(1, 2)).any()
+            case _:
+                pytest.fail(f"what is '{fault}'?")
+
+
+def test_noise_is_as_strong_as_it_says() -> None:
+    exact = np.full((50, 50, 4), 0.5)
+    found = conditions.converted(exact, np.random.default_rng(1), 3.0)
+    assert 1024 * found.std() == pytest.approx(3.0, rel=0.03)
+    assert np.unique(conditions.converted(exact, np.random.default_rng(1), 0.0)).size == 1
+
+
+def test_told_wires_are_the_swept_ones() -> None:
+    assert build("nominal", 0.5).knowledge.nominal_top_wire_ohm == 50
+    assert build("nominal", 2.0).knowledge.nominal_bottom_wire_ohm == 400
+    assert build("wires", 40.0).knowledge.nominal_top_wire_ohm == 200e3
+
+
+def test_frames_before_are_read_and_not_judged() -> None:
+    assert [f.cell_siemens is None for f in build("before", "all open").frames] == 3 * [True, False]
+    assert [frame.afresh for frame in build("before", "none").frames] == [True, True, True]
+
+
+# --------------------------------------------------------------------------------- the measuring
+
+
+def test_the_results_do_not_depend_on_the_number_of_processes(rows: list[Row]) -> None:
+    two = stability.measure(tiny_tasks(), jobs=2)
+    assert stability.csv_text(two) == stability.csv_text(rows)
+
+
+def test_joblib_backend_of_the_caller_is_used(rows: list[Row]) -> None:
+    import joblib
+
+    with joblib.parallel_backend("threading", n_jobs=2):
+        assert stability.measure(tiny_tasks()) == rows
+
+
+def test_progress_counts_every_task() -> None:
+    seen: list[int] = []
+    tasks = tiny_tasks()[:5]
+    stability.measure(tasks, jobs=1, progress=seen.append)
+    assert seen == [1, 2, 3, 4, 5]
+
+
+def test_every_method_meets_every_condition() -> None:
+    tasks = stability.tasks_of(stability.QUICK)
+    met = {(task.sweep, task.x, method) for task in tasks for method in task.methods}
+    assert met == {(*condition, method) for condition in SKINS for method in METHODS}
+    for task in tasks:
+        paper = {"lsq", "regularized"} & set(task.methods)
+        assert task.shape == ((2, 2) if paper else (8, 8))
+
+
+def test_a_method_that_raises_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr(MatrixEstimator, "_solve", fail)
+    [row] = stability.judge(Task("noise", 0.0, ("matrix",), (2, 2), 0, 3))
+    assert row == Row("noise", 0.0, "matrix", frames=3, flagged=3, raised=3)
+
+
+def test_shares_add_up(rows: list[Row]) -> None:
+    for row in rows:
+        assert row.frames == row.right + row.flagged + row.wrong_unflagged == 4
+    shares = stability.shares(rows)
+    assert list(shares) == ["ohm", "matrix"]
+    for share in shares.values():
+        assert sum(share[f"{said}_share"] for said in Verdict) == pytest.approx(1, abs=1e-4)
+        assert share["frames"] == 4 * (len(SWEEPS["stuck"].values) + len(SWEEPS["lines"].values))
+
+
+def test_csv(rows: list[Row]) -> None:
+    table = list(csv.DictReader(io.StringIO(stability.csv_text(rows))))
+    assert list(table[0]) == [
+        *("sweep", "x", "method", "frames", "right", "flagged", "wrong_unflagged")
+    ]
+    assert [(line["sweep"], line["x"], line["method"]) for line in table] == [
+        (sweep, x, method) for sweep, x in SKINS if sweep in ("stuck", "lines") for method in FAST
+    ]
+    for line in table:
+        assert int(line["frames"]) == sum(int(line[said]) for said in Verdict)
+
+
+def test_picture_of_all_sweeps() -> None:
+    rows = [Row(sweep, x, method, 4, 1, 1, 2) for sweep, x in SKINS for method in METHODS]
+    assert stability_figure.picture(rows).startswith(b"\x89PNG")
+
+
+# ---------------------------------------------------------------------------------- command line
+
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """A function that runs ``python -m studies stability ARGUMENTS``, a tiny plan, here."""
+    monkeypatch.setattr(stability, "QUICK", replace(TINY, skins=1, frames=1, shape=(2, 2)))
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        command = ["studies", "stability", "--quick", "--jobs", "1", *arguments]
+        monkeypatch.setattr(sys, "argv", command)
+        code = 0
+        try:
+            cli.run(app, "studies")
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def test_stability_writes_picture_and_table(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("--out", str(tmp_path / "new"))
+    assert code == 0
+    answer = json.loads(out.splitlines()[-1])
+    assert answer["quick"]
+    assert answer["methods"]["ohm"]["frames"] == len(SKINS)
+    picture, table = Path(answer["picture"]), Path(answer["table"])
+    assert sorted((tmp_path / "new").iterdir()) == sorted([picture, table])
+    assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    assert table.read_text().startswith("sweep,x,method,frames,right,flagged,wrong_unflagged\n")
+    assert "wrong and not flagged" in err
+
+
+def test_without_matplotlib_nothing_is_measured(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setattr(stability, "measure", lambda *_, **__: pytest.fail("measured in vain"))
+    code, out, err = run("--out", str(tmp_path))
+    assert (code, out) == (2, "")
+    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
+
+
+def test_ctrl_c_leaves_the_old_files_and_no_process(
+    command: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    (tmp_path / "stability.csv").write_text("old")
+    process = command("stability", "--jobs", "2", "--out", str(tmp_path), module="studies")
+    workers: list[int] = []
+    while len(workers) < 2:
+        assert process.poll() is None
+        time.sleep(0.1)
+        workers = children(process.pid)
+    # A worker that is stopped while it starts prints a traceback, joblib's: let them begin to work.
+    deadline_s = time.monotonic() + 30
+    while max(map(processor_s, workers)) < 1.5:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+        workers = children(process.pid)
+    process.send_signal(signal.SIGINT)  # to it alone: the terminal would tell its workers as well
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130, err
+    assert "picture" not in out
+    assert [path.name for path in tmp_path.iterdir()] == ["stability.csv"]
+    assert (tmp_path / "stability.csv").read_text() == "old"
+    deadline_s = time.monotonic() + 10
+    while any(Path(f"/proc/{worker}").exists() for worker in workers):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+def children(parent: int) -> list[int]:
+    """Processes that `parent` has started."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == parent:
+            found.append(int(status.parent.name))
+    return found
+
+
+def processor_s(process: int) -> float:
+    """Seconds of processor time that a process has used; 0 if it is gone."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_this_process_is_a_child() -> None:
+    assert os.getpid() in children(os.getppid())

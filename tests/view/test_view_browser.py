@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin view`` in a browser: what somebody sees, hears and does at the page."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from test_calibrated_device import of_scene
+
+import ohmskin
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.record.recording import load_recording
+from ohmskin.view.server import make_app
+from ohmskin.view.viewed_boards import ViewedBoards
+
+pytestmark = pytest.mark.browser
+
+GHOST = "emulator://8x8?scene=ghost&seed=1"
+PHONE = {"width": 360, "height": 740}
+LIMIT_MS = 15_000
+
+Panel = Any  # a locator of Playwright's, which is imported only where there is a browser
+
+
+class Server:
+    """``ohmskin view`` as a process; without boards until a page opens one."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        host = str(Path(ohmskin.__file__).parents[1])
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "ohmskin", "view"),
+                *("--http-port", "0", "--no-browser", *arguments),
+            ],
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": host},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().strip()
+
+    def end(self) -> tuple[int, str]:
+        self.process.send_signal(signal.SIGINT)
+        _, err = self.process.communicate(timeout=30)
+        return self.process.returncode, err
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    folder = tmp_path_factory.mktemp("view")
+    of_scene("ghost").save(folder / "skin.json")
+    running = Server(folder, "--calibration", "skin.json")
+    try:
+        yield running
+        assert running.end() == (0, "")
+    finally:
+        running.kill()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        # Chromium's sandbox does not start for root.
+        arguments = [] if os.geteuid() else ["--no-sandbox"]
+        running = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=arguments
+        )
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def new_page(browser: Any, server: Server) -> Iterator[Callable[..., Any]]:
+    """A function that opens the page; no page may ask another host, or complain."""
+    contexts, requests, complaints = [], [], []
+
+    def make(url: str = server.url, **options: Any) -> Any:
+        context = browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **options})
+        context.set_default_timeout(LIMIT_MS)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("request", lambda request: requests.append(request.url))
+        page.on("websocket", lambda socket: requests.append(socket.url.replace("ws:", "http:")))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else 0)
+        page.goto(url)
+        return page
+
+    yield make
+    foreign = [url for url in requests if not url.startswith(server.url)]
+    assert requests
+    for context in contexts:
+        for page in context.pages:
+            close = page.get_by_role("button", name="Close")
+            for left in reversed(range(close.count())):
+                close.first.click()
+                close.nth(left).wait_for(state="detached")
+        context.close()
+    assert foreign == []
+    assert complaints == []
+
+
+@pytest.fixture
+def page(new_page: Callable[..., Any]) -> Any:
+    return new_page()
+
+
+def open_board(page: Any, port: str) -> Panel:
+    """Types a port, and waits for its first scan on the screen."""
+    field = page.get_by_label("Serial port or URL")
+    field.fill(port)
+    field.press("Enter")
+    panel = page.get_by_role("region", name=port, exact=True)
+    has_text(panel, ".status", "scanning")
+    has_text(panel, ".rate", r"\d Hz")
+    return panel
+
+
+def has_text(panel: Panel, query: str, pattern: str) -> str:
+    """Waits until the text is as wanted, and gives it."""
+    found = panel.locator(query)
+    deadline_s = time.monotonic() + LIMIT_MS / 1000
+    while not re.search(pattern, text := found.inner_text()):
+        assert time.monotonic() < deadline_s, f"{query}: {text!r}, not {pattern!r}"
+        panel.page.wait_for_timeout(30)
+    return text
+
+
+def colour(panel: Panel, name: str, row: int, column: int) -> tuple[int, ...]:
+    """Of a cell's upper left part in a heat map: beside digits and outline."""
+    found = panel.locator(f".{name} .cells").evaluate(
+        """(canvas, [row, column]) => {
+            const ratio = canvas.width / canvas.clientWidth;
+            const side = Math.floor((canvas.clientHeight - 20) / 8);
+            const at = (index) => (20 + (index + 0.5) * side) * ratio;
+            return [...canvas.getContext("2d").getImageData(at(column), at(row), 1, 1).data];
+        }""",
+        [row, column],
+    )
+    return tuple(found)
+
+
+def test_the_ghost_is_in_the_raw_reading_and_not_in_the_estimate(page: Any) -> None:
+    panel = open_board(page, GHOST)
+    has_text(panel, ".estimate .count", "by ‘touch’: 3 cells touched")
+    (seeming,) = re.findall(r"\d+", has_text(panel, ".raw .count", "cells"))
+    assert int(seeming) > 3
+    contacts = panel.locator(".contacts tbody tr").all_inner_texts()
+    assert [re.split(r"\t", line)[1] for line in contacts] == ["2.0, 2.0", "2.0, 5.0", "5.0, 2.0"]
+    assert panel.locator(".amount").inner_text() == "force [N]"
+    ghost, untouched = (5, 5), (0, 0)
+    assert colour(panel, "raw", *ghost) != colour(panel, "raw", *untouched)
+    assert colour(panel, "estimate", *ghost) == colour(panel, "estimate", *untouched)
+    assert colour(panel, "estimate", 2, 2) != colour(panel, "estimate", *untouched)
+    has_text(panel, ".latency", r"^\d+ ms$")
+    has_text(panel, ".missed", "^0 scans$")
+    has_text(panel, ".rest", r"calibration\s+2025-03-01")
+    panel.get_by_label("Method").select_option("ohm")
+    has_text(panel, ".estimate .count", "by ‘ohm’: [0-9]{2} cells touched")
+    assert panel.locator(".amount").inner_text() == "rise [µS]"
+    panel.get_by_label("Show").select_option("ohms")
+    has_text(panel, ".value", "kΩ")
+
+
+def test_tare_by_keyboard_is_refused_forced_and_undone(page: Any) -> None:
+    panel = open_board(page, GHOST)
+    tare = panel.get_by_role("button", name="Tare", exact=True)
+    tare.focus()
+    tare.press("Enter")
+    has_text(panel, ".notice", r"cells \(2, 2\), \(2, 5\), \(5, 2\) are touched")
+    panel.get_by_role("button", name="Tare anyway").press("Enter")
+    assert tare.evaluate("button => button === document.activeElement")
+    has_text(panel, ".estimate .count", "0 cells touched")
+    has_text(panel, ".rest", r"tare\s+20")
+    panel.get_by_role("button", name="Undo tare").press("Space")
+    has_text(panel, ".notice", "undone")
+    has_text(panel, ".estimate .count", "3 cells touched")
+    assert panel.get_by_role("button", name="Undo tare").is_disabled()
+
+
+def test_cells_are_chosen_by_keyboard_and_read_as_a_table(page: Any) -> None:
+    panel = open_board(page, GHOST)
+    has_text(panel, ".chosen", r"\(2, 2\)")  # the highest at first
+    cells = panel.locator(".estimate .cells")
+    cells.focus()
+    cells.press("ArrowDown")
+    has_text(panel, ".said", r"cell \(3, 2\): [\d.]+ ± [\d.]+ N")
+    cells.press("ArrowUp")
+    for _ in range(3):
+        cells.press("ArrowRight")
+    has_text(panel, ".said", r"cell \(2, 5\): 1\.2\d ± 0\.0\d N")
+    panel.locator(".raw .cells").click(position={"x": 25, "y": 25})
+    has_text(panel, ".chosen", r"\(0, 0\)")
+    panel.get_by_text("Values as a table").press("Enter")
+    has_text(panel, ".values caption", r"force \[N\]")
+    table = panel.locator(".values tbody tr")
+    assert table.count() == 8
+    assert re.match(r"1\.2\d ± 0\.0\d N", table.nth(2).locator("td").nth(5).inner_text())
+
+
+def test_every_control_has_a_name(page: Any) -> None:
+    panel = open_board(page, GHOST)
+    for control in page.locator("button, select, input, canvas[tabindex]").all():
+        if control.is_visible():
+            name = control.evaluate("e => e.ariaLabel || e.labels?.[0]?.innerText || e.innerText")
+            assert name.strip(), control.evaluate("e => e.outerHTML")
+    assert panel.locator("[role=status]").count() >= 3
+    assert page.evaluate("document.documentElement.lang") == "en"
+
+
+def test_a_recording_is_made_and_marked(page: Any, server: Server) -> None:
+    panel = open_board(page, GHOST)
+    panel.get_by_role("button", name="Record").click()
+    text = has_text(panel, ".file", r"recording to .*\.mcap: [1-9]\d* scans")
+    path = Path(re.findall(r"/.*\.mcap", text)[0])
+    assert path.parent == server.folder.resolve()
+    panel.get_by_label("Mark").fill("first poke")
+    panel.get_by_label("Mark").press("Enter")
+    has_text(panel, ".notice", "marked: first poke")
+    panel.get_by_role("button", name="Stop recording").click()
+    has_text(panel, ".file", "last recording")
+    recording = load_recording(path)
+    assert not recording.cut_off
+    assert [mark.text for mark in recording.marks] == ["first poke"]
+    assert sum(scan.missed for scan in recording.scans[1:]) == 0
+
+
+def test_a_board_that_is_pulled_out_is_said_and_comes_back(
+    page: Any, pty_board: Callable[[str], PtyServer], tmp_path: Path
+) -> None:
+    port = tmp_path / "skin"
+    first = pty_board(GHOST)
+    port.symlink_to(first.path)
+    panel = open_board(page, str(port))
+    first.close()
+    has_text(panel, ".status", "not there, tried again every second: .*(is gone|no port)")
+    assert panel.get_by_role("button", name="Tare", exact=True).is_disabled()
+    second = pty_board(GHOST)
+    port.unlink()
+    port.symlink_to(second.path)
+    has_text(panel, ".status", "^scanning$")
+    has_text(panel, ".estimate .count", "3 cells touched")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_two_boards_on_a_phone(new_page: Callable[..., Any], scheme: str) -> None:
+    page = new_page(viewport=PHONE, color_scheme=scheme, device_scale_factor=2, has_touch=True)
+    one = open_board(page, GHOST)
+    other = open_board(page, "emulator://4x16?scene=multi&seed=3")
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    for panel in (one, other):
+        box = panel.locator(".estimate .cells").bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= PHONE["width"]
+    one.locator(".estimate .cells").tap(position={"x": 25, "y": 25})
+    has_text(one, ".chosen", r"\(0, 0\)")
+    assert "(0, 0)" not in other.locator(".chosen").inner_text()
+    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    lightness = sum(map(int, re.findall(r"\d+", background)[:3])) / 3
+    assert (lightness > 128) == (scheme == "light")
+
+
+def test_what_is_drawn_is_the_newest(page: Any) -> None:
+    panel = open_board(page, GHOST)
+    drawn = panel.evaluate(
+        """(panel) => new Promise((done) => {
+            const all = [];
+            panel.addEventListener("drawn", ({ detail }) => {
+                all.push(detail);
+                if (all.length === 60) done(all);
+            });
+        })"""
+    )
+    numbers = [each["scan"] for each in drawn]
+    assert numbers == sorted(set(numbers))
+    assert sorted(each["latencyMs"] for each in drawn)[30] < 250  # a busy machine
+
+
+def test_a_message_that_is_too_long_ends_the_connection(page: Any, server: Server) -> None:
+    open_board(page, GHOST)
+    code = page.evaluate(
+        """async () => {
+            const [{ number }] = await (await fetch("boards")).json();
+            const place = new URL(`boards/${number}`, location.href);
+            const socket = new WebSocket(place.href.replace("http", "ws"));
+            await new Promise((open) => (socket.onopen = open));
+            const closed = new Promise((close) => (socket.onclose = close));
+            socket.send(JSON.stringify({ do: "mark", text: "x".repeat(20000) }));
+            return (await closed).code;
+        }"""
+    )
+    assert code == 1009  # too big: RFC 6455, 7.4.1
+
+
+def test_a_page_with_a_token(browser: Any) -> None:
+    listening = socket.create_server(("127.0.0.1", 0))
+    url = f"http://127.0.0.1:{listening.getsockname()[1]}/"
+    app = make_app(ViewedBoards([GHOST]), "127.0.0.1", "secret")
+    running = uvicorn.Server(uvicorn.Config(app, ws="wsproto", log_config=None))
+    thread = threading.Thread(target=running.run, args=([listening],))
+    thread.start()
+    context = browser.new_context()
+    try:
+        page = context.new_page()
+        page.set_default_timeout(LIMIT_MS)
+        page.goto(url)
+        assert "with its token" in page.locator("body").inner_text()
+        page.goto(f"{url}?token=secret")
+        panel = page.get_by_role("region", name=GHOST, exact=True)
+        has_text(panel, ".estimate .count", "3 cells touched")
+        panel.get_by_role("button", name="Close").click()
+        panel.wait_for(state="detached")
+        open_board(page, "emulator://4x4")
+    finally:
+        context.close()
+        running.should_exit = True
+        thread.join()
+        listening.close()
+
+
+def test_ctrl_c_leaves_a_whole_recording(
+    browser: Any, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    running = Server(tmp_path, GHOST)
+    request.addfinalizer(running.kill)
+    page = browser.new_page()
+    request.addfinalizer(page.close)
+    page.set_default_timeout(LIMIT_MS)
+    page.goto(running.url)
+    panel = page.get_by_role("region", name=GHOST, exact=True)
+    panel.get_by_role("button", name="Record").click()
+    has_text(panel, ".file", r"[1-9]\d* scans")
+    assert running.end() == (0, "")
+    has_text(panel, ".status", "out of reach")
+    (path,) = tmp_path.glob("*.mcap")
+    recording = load_recording(path)
+    assert not recording.cut_off
+    assert recording.scans
