@@ -20,7 +20,7 @@ from ohmskin.errors import (
     RecordingError,
     TareRefused,
 )
-from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.force.calibrated_device import CalibratedDevice
 from ohmskin.force.calibration import Calibration, load_calibration
@@ -57,6 +57,7 @@ __all__ = [
     "SelfTestReport",
     "SkinKnowledge",
     "TareRefused",
+    "WireOhm",
     "load_calibration",
     "make_estimator",
     "open",

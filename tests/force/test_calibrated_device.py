@@ -15,7 +15,7 @@ import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.levels import LEVEL_METHODS
 from ohmskin.force.calibrated_device import CalibratedDevice
 from ohmskin.force.calibration import Calibration, Rest
@@ -38,8 +38,7 @@ def calibration(
         columns,
         adc_bits=10,
         rest_ratio=rest_ratio,
-        nominal_top_wire_ohm=TOP_WIRE_OHM,
-        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
     )
     force_n = np.arange(1.0, 11.0)
     cells = np.arange(force_n.size) % (rows * columns)
@@ -51,8 +50,7 @@ def calibration(
         rest=Rest.of(method, knowledge, "2025-03-01"),
         model=found.model_,
         indenter_area_m2=1e-4,
-        nominal_top_wire_ohm=TOP_WIRE_OHM,
-        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
     )
 
 

@@ -13,9 +13,9 @@ from ohmskin.calibrate.alignment import Alignment, align
 from ohmskin.calibrate.force_log import ForceLog
 from ohmskin.calibrate.press_table import PressTable
 from ohmskin.calibrate.presses import LevelHistory, Presses, find_presses
+from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.levels import VOLTAGE, LevelMeter
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.force_reader import knowledge_of
 from ohmskin.force.regression import ForceRegression
 from ohmskin.link.messages import Hello, Scan
 
@@ -24,8 +24,8 @@ from ohmskin.link.messages import Hello, Scan
 class Bench:
     """What a calibration is made with: the board, the untouched skin, the tool, the method.
 
-    rest_ratio (R, C, 4). indenter_area_m2: of the tool's contact. nominal_..._wire_ohm: one wire
-    segment of each layer, None where it is not known. date: ISO 8601.
+    rest_ratio (R, C, 4). indenter_area_m2: of the tool's contact. nominal_wire_ohm: of one wire
+    segment of each layer. date: ISO 8601.
     """
 
     board: Hello
@@ -33,18 +33,16 @@ class Bench:
     method: str
     indenter_area_m2: float
     date: str
-    nominal_top_wire_ohm: float | None = None
-    nominal_bottom_wire_ohm: float | None = None
+    nominal_wire_ohm: WireOhm = NO_WIRES
 
     def meter(self) -> LevelMeter:
         """A meter that is told all this."""
         return LevelMeter(
             self.method,
-            knowledge_of(
+            SkinKnowledge.of(
                 self.board,
                 self.rest_ratio,
-                self.nominal_top_wire_ohm,
-                self.nominal_bottom_wire_ohm,
+                self.nominal_wire_ohm,
             ),
         )
 
@@ -76,8 +74,7 @@ class Bench:
             rest=Rest(self.date, self.rest_ratio, np.maximum(self.meter().rest(), 0.0)),
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
-            nominal_top_wire_ohm=self.nominal_top_wire_ohm,
-            nominal_bottom_wire_ohm=self.nominal_bottom_wire_ohm,
+            nominal_wire_ohm=self.nominal_wire_ohm,
         )
         return calibration, found.message_
 

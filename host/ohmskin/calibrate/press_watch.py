@@ -12,8 +12,8 @@ from rich.text import Text
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
+from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.levels import LevelMeter
-from ohmskin.force.force_reader import knowledge_of
 from ohmskin.link.messages import Hello, Scan
 
 # Looks at so many scans alone, whatever their rate: an estimate takes time, the recording goes on.
@@ -62,7 +62,7 @@ class PressWatch:
     def _look(self, scan: Scan) -> None:
         if self._meter is None:
             rest_ratio = np.asarray(np.mean(self._untouched, axis=0))
-            self._meter = LevelMeter(_METHOD, knowledge_of(self._board, rest_ratio))
+            self._meter = LevelMeter(_METHOD, SkinKnowledge.of(self._board, rest_ratio))
             self._untouched.clear()
         found = self._meter.read(scan.ratio)
         pressed = pressed_cells(found.level - self._meter.rest(), found.estimate.touched)

@@ -20,10 +20,10 @@ from rich.text import Text
 
 import ohmskin
 from ohmskin.cli import show
-from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.force.calibrated_device import CalibratedDevice
-from ohmskin.force.force_reader import ForceScan, knowledge_of
+from ohmskin.force.force_reader import ForceScan
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
@@ -68,7 +68,7 @@ def stream(
                 skin.tare(tare_s)
         elif method != "none":
             rest_ratio = skin.mean_ratio(tare_s) if tare_s else None
-            knowledge = knowledge_of(skin.info, rest_ratio)
+            knowledge = SkinKnowledge.of(skin.info, rest_ratio)
             estimator = make_estimator(method or _DEFAULT_METHOD, knowledge)
         with suppress(KeyboardInterrupt):
             if as_json:

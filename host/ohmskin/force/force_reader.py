@@ -13,25 +13,6 @@ from ohmskin.force.contacts import Contact, ContactTracker
 from ohmskin.link.messages import Hello, Scan
 
 
-def knowledge_of(
-    board: Hello,
-    rest_ratio: Float | None = None,
-    nominal_top_wire_ohm: float | None = None,
-    nominal_bottom_wire_ohm: float | None = None,
-) -> SkinKnowledge:
-    """What an estimator is told of the skin at this board; `SkinKnowledge` says what is what."""
-    return SkinKnowledge(
-        board.rows,
-        board.columns,
-        ref_top_ohm=board.ref_top_ohm,
-        ref_bottom_ohm=board.ref_bottom_ohm,
-        adc_bits=board.adc_bits,
-        rest_ratio=rest_ratio,
-        nominal_top_wire_ohm=nominal_top_wire_ohm,
-        nominal_bottom_wire_ohm=nominal_bottom_wire_ohm,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class ForceScan(Scan):
     """A scan, and the forces that it shows.
@@ -70,11 +51,10 @@ class ForceReader:
         return replace(self.calibration, tare=rest)
 
     def _knowledge(self, rest_ratio: Float) -> SkinKnowledge:
-        return knowledge_of(
+        return SkinKnowledge.of(
             self._board,
             rest_ratio,
-            self.calibration.nominal_top_wire_ohm,
-            self.calibration.nominal_bottom_wire_ohm,
+            self.calibration.nominal_wire_ohm,
         )
 
     def measure(self, ratio: Float) -> Level:

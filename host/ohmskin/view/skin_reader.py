@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.errors import TareRefused
-from ohmskin.estimate.base import Estimate, Estimator
+from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.estimate.ohm import OhmEstimator
 from ohmskin.force.calibrated_device import now, touched_cells
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import MEMORY_US, Contact, ContactTracker
-from ohmskin.force.force_reader import ForceReader, knowledge_of
+from ohmskin.force.force_reader import ForceReader
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.view.shown import Counts, Shown
 
@@ -159,11 +159,10 @@ class SkinReader:
     def _remake(self) -> None:
         calibration, rest = self._calibration, self.rest
         rest_ratio = None if rest is None else rest[0]
-        knowledge = knowledge_of(
+        knowledge = SkinKnowledge.of(
             self.board,
             rest_ratio,
-            None if calibration is None else calibration.nominal_top_wire_ohm,
-            None if calibration is None else calibration.nominal_bottom_wire_ohm,
+            WireOhm() if calibration is None else calibration.nominal_wire_ohm,
         )
         self._raw = make_estimator(OhmEstimator.name, knowledge)
         self._tracker = ContactTracker()
