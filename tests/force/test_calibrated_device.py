@@ -17,9 +17,8 @@ from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.levels import LEVEL_METHODS
-from ohmskin.force.calibrated_device import CalibratedDevice
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.force_reader import ForceScan
+from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.force.regression import ForceRegression
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
@@ -175,7 +174,7 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
                 recorder.add(board.undo_tare())
     assert len(load_recording(path).tares) == 2
     with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
-        assert isinstance(board, CalibratedDevice)
+        assert isinstance(board, CalibratedSkin)
         assert_same_forces(live, list(board))
     # The tare was of consequence.
     with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ohmskin.view.viewed_boards import MOST_BOARDS, ViewedBoards
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 from test_calibrated_device import NEWTON_SIEMENS, of_scene
@@ -31,7 +32,6 @@ from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import server, viewed_board
 from ohmskin.view.server import make_app
-from ohmskin.view.viewed_boards import MOST_BOARDS, ViewedBoards
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?scene=rest&seed=1"

@@ -18,13 +18,13 @@ from typing import Any
 
 import pytest
 import uvicorn
+from ohmskin.view.viewed_boards import ViewedBoards
 from test_calibrated_device import of_scene
 
 import ohmskin
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.record.recording import load_recording
 from ohmskin.view.server import make_app
-from ohmskin.view.viewed_boards import ViewedBoards
 
 pytestmark = pytest.mark.browser
 

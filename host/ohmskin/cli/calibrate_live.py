@@ -39,7 +39,7 @@ from ohmskin.cli.calibrate_parts import (
 from ohmskin.cli.record import record_scans, stop_signals
 from ohmskin.errors import DeviceLost, RecordingError
 from ohmskin.estimate.levels import VOLTAGE
-from ohmskin.force.calibrated_device import TARE_S
+from ohmskin.force.reader import TARE_S
 from ohmskin.force.regression import MIN_PRESSES
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan

@@ -25,8 +25,8 @@ from ohmskin.calibrate.presses import Presses
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.base import WireOhm
 from ohmskin.estimate.levels import LEVEL_METHODS
-from ohmskin.force.calibrated_device import now
 from ohmskin.force.calibration import Calibration
+from ohmskin.force.reader import now
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
 
