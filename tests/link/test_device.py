@@ -20,7 +20,7 @@ import ohmskin
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
-from ohmskin.link import device, feed, framing, protocol, session
+from ohmskin.link import device, feed, framing, protocol
 from ohmskin.link.messages import Scan
 
 SCENE = "scene=multi&seed=3"

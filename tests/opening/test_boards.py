@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_calibrated_device import of_scene
 
 import ohmskin
-from ohmskin import boards
+from calibrations import of_scene
+from ohmskin import opening
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
@@ -36,7 +36,7 @@ def attach(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def say(*ports: tuple[str, str]) -> None:
         found = [SerialPort(path, "", board) for path, board in ports]
-        monkeypatch.setattr(boards, "serial_ports", lambda: found)
+        monkeypatch.setattr(opening, "serial_ports", lambda: found)
 
     return say
 

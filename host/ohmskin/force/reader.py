@@ -157,7 +157,9 @@ class SkinReader:
         tare = self._in_file(rest)
         if tare is None:
             tare = Rest.of(calibration.method, self._knowledge(rest), rest.date)
-        return replace(calibration, tare=None if tare is calibration.rest else tare)
+        if tare is calibration.rest:
+            tare = None
+        return calibration if tare is calibration.tare else replace(calibration, tare=tare)
 
     def use(self, method: str) -> None:
         """Go on with another method, from the next scan on. Raises ValueError for no such."""
