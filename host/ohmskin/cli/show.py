@@ -32,6 +32,17 @@ def forces_table(force_n: Float, title: str) -> Table:
     return _table(force_n, title, FULL_SCALE_N / 100, FULL_SCALE_N)
 
 
+def grid(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
+    """Texts of all cells, row by row, under the numbers of columns and beside those of rows."""
+    table = Table(title=title, box=None)
+    table.add_column("", justify="right", style="dim")
+    for column in range(len(cells[0])):
+        table.add_column(str(column), justify="right")
+    for row, texts in enumerate(cells):
+        table.add_row(str(row), *texts)
+    return table
+
+
 def _table(values: Float, title: str, low: float, high: float) -> Table:
     """Colours on a logarithmic scale from `low` to `high`."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
