@@ -19,6 +19,7 @@ from ohmskin.link.clock import BoardClock, scan_times_s
 from ohmskin.link.device import Device
 from ohmskin.link.line_delay import line_delay_s, scan_s
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.session import Session
 from ohmskin.opening import open_link
 
 HZ = 90.0
@@ -254,7 +255,7 @@ def errors_against_simulator() -> tuple[Float, int]:
     """Of 200 scans' times [s]; and the milliseconds that the simulator dropped."""
     link, _ = open_link("simavr://uno?scene=ghost")
     assert isinstance(link, SimavrLink)
-    with Device(link) as device:
+    with Device(Session(link)) as device:
         sim = link._sim
         sim.hold_log(True)
         found, offsets_s = [], []
