@@ -18,9 +18,9 @@ from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.force_reader import ForceScan
 from ohmskin.link.clock import BoardClock
 from ohmskin.link.device import Device
-from ohmskin.link.line_delay import line_delay_s, scan_s
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import serial_ports
+from ohmskin.link.timing import line_delay_s, scan_s
 from ohmskin.opening import CalibrationLike
 
 DeviceT = TypeVar("DeviceT", bound=Device)

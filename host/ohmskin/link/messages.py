@@ -36,6 +36,7 @@ class Hello:
     ref_bottom_ohm: int
     rate_asked_mhz: int
     scan_cycles: int
+    slot_cycles: int
     clock_hz: int
     settle_asked_us: int
     settle_us: int
