@@ -30,7 +30,7 @@ from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link import protocol, session
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
-from ohmskin.link.usb_latency import latency_ms, latency_timer_file
+from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
 
