@@ -31,10 +31,10 @@ from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import protocol
 from ohmskin.link.clock import BoardClock
 from ohmskin.link.device import Device
-from ohmskin.link.line_delay import line_delay_s, scan_s
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import Link, SerialLink, serial_ports
 from ohmskin.link.session import Session
+from ohmskin.link.timing import line_delay_s, scan_s
 
 if TYPE_CHECKING:
     from ohmskin.emulate.board import EmulatedBoard

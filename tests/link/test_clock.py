@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lockstep import Rig
+from lockstep import first_holds
 from ohmskin.arrays import Float
 from ohmskin.emulate.simavr import CPU_HZ
 from ohmskin.emulate.simavr_link import SimavrLink
 from ohmskin.link.clock import BoardClock, scan_times_s
 from ohmskin.link.device import Device
-from ohmskin.link.line_delay import line_delay_s, scan_s
-from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
+from ohmskin.link.timing import line_delay_s, scan_s
 from ohmskin.opening import open_link
 
 HZ = 90.0
@@ -178,53 +178,6 @@ def test_scan_times_bridge_a_pause() -> None:
 # ------------------------------------------------------------------------ the firmware's clock
 
 
-def starts_s(rig_holds: NDArray[np.void]) -> Float:
-    """When each scan's first reading was held, on the simulator's clock [s]."""
-    second = (rig_holds["row"] == 0) & (rig_holds["column"] == 0)
-    second &= rig_holds["configuration"] == 1
-    return rig_holds["cycle"][np.flatnonzero(second) - 1] / CPU_HZ
-
-
-@pytest.mark.simavr
-@pytest.mark.parametrize(
-    "scan",
-    [
-        {},
-        {"rows": 4, "columns": 4},
-        {"rows": 16, "columns": 16, "rate_mhz": 20_000},
-        {"rate_mhz": 30_000, "settle_us": 40},
-    ],
-)
-def test_the_line_delay_is_that_of_the_firmware(scan: dict[str, int]) -> None:
-    random = np.random.default_rng(1)
-    step_s = 25e-6
-    with Rig("uno") as rig:
-        rig.run(0.3)
-        rig.hello()
-        rig.start_scan(**scan)
-        board = Hello(**rig.hello())
-        numbers, left_s, modelled_s = [], [], []
-        while len(left_s) < 20:
-            before = len(rig.scans)
-            rig.run(step_s)
-            if len(rig.scans) > before:
-                now_s = rig.sim.stats()["cycles"] / CPU_HZ
-                received = rig.scans[-1]
-                header = received.header
-                numbers.append(header["scan"])
-                left_s.append(now_s - step_s / 2)
-                found = Scan(received.codes, header["scan"], header["time_us"], 0.0, 0)
-                modelled_s.append(scan_s(board) + line_delay_s(found, board))
-                # Codes with few zeros, and with many.
-                rig.sim.set_table(random.random((16, 16, 4)) ** random.integers(1, 9))
-        took_s = np.array(left_s) - starts_s(rig.holds())[numbers]
-    error_s = (took_s - modelled_s)[2:]  # at first, acks go before scans
-    spread_s = np.ptp(took_s[2:])
-    print(f"{scan}: error {1e6 * np.abs(error_s).max():.0f} us of {1e6 * spread_s:.0f} us")
-    assert np.abs(error_s).max() < 0.4e-3
-    assert spread_s > 1e-3
-
-
 def timed(device: Device, clock: BoardClock) -> Iterator[tuple[Scan, float]]:
     board = device.info
     took_us = 1e6 * scan_s(board)
@@ -264,7 +217,8 @@ def errors_against_simulator() -> tuple[Float, int]:
             if count % 3 == 0:
                 cycles = sim.stats()["cycles"]
                 offsets_s.append(time.monotonic() - cycles / CPU_HZ)
-        begun_s = starts_s(sim.drain_hold_log())
+        holds = sim.drain_hold_log()
+        begun_s = holds["cycle"][first_holds(holds)] / CPU_HZ
         dropped = sim.stats()["late_slices"]
     board_s, at_s = np.array(found).T
     # The board's clock begins at boot, the simulator's at power-on.
