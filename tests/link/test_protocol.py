@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ohmskin.link import framing, protocol
@@ -188,6 +188,7 @@ def test_vectors_are_those_of_the_cobs_package(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------- codes
 
 
+@settings(max_examples=40)
 @given(st.integers(1, 16), st.integers(1, 16), st.randoms(use_true_random=False))
 def test_codes_are_packed_like_one_long_integer(rows: int, columns: int, random: Any) -> None:
     in_order = [random.getrandbits(10) for _ in range(rows * columns * 4)]
