@@ -8,7 +8,6 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
-from ohmskin.boards import Boards, BoardScan, open_all
 from ohmskin.errors import (
     CommandRefused,
     DeviceLost,
@@ -20,16 +19,15 @@ from ohmskin.errors import (
     RecordingError,
     TareRefused,
 )
-from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.force.calibrated_device import CalibratedDevice
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.contacts import Contact
-from ohmskin.force.force_reader import ForceScan
+from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link.clock import BoardClock
 from ohmskin.link.device import Device
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.opening import open
+from ohmskin.opening import Boards, BoardScan, open, open_all
 
 __all__ = [
     "METHODS",
@@ -37,7 +35,7 @@ __all__ = [
     "BoardScan",
     "BoardStats",
     "Boards",
-    "CalibratedDevice",
+    "CalibratedSkin",
     "Calibration",
     "CommandRefused",
     "Contact",
@@ -57,6 +55,7 @@ __all__ = [
     "SelfTestReport",
     "SkinKnowledge",
     "TareRefused",
+    "WireOhm",
     "load_calibration",
     "make_estimator",
     "open",

@@ -16,7 +16,7 @@ import pytest
 
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 
 pytestmark = pytest.mark.ngspice
@@ -163,8 +163,7 @@ def test_a_finger_is_estimated(
         8,
         adc_bits=10,
         rest_ratio=rest_ratio,
-        nominal_top_wire_ohm=100.0,
-        nominal_bottom_wire_ohm=200.0,
+        nominal_wire_ohm=WireOhm(100.0, 200.0),
     )
     estimator = make_estimator(method, knowledge)
     found = [estimator.estimate(frame) for frame in ratio]

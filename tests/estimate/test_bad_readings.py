@@ -8,7 +8,7 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimator, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from studies.trials import skin_at_rest, touch
@@ -64,8 +64,7 @@ def knowledge_of(shape: tuple[int, int], told: str) -> SkinKnowledge:
         *shape,
         adc_bits=10,
         rest_ratio=ratio_from_codes(quantise(rest)),
-        nominal_top_wire_ohm=100.0,
-        nominal_bottom_wire_ohm=200.0,
+        nominal_wire_ohm=WireOhm(100.0, 200.0),
     )
 
 

@@ -85,7 +85,7 @@ def _wires(text: str) -> tuple[float, float]:
 def _wires_of(calibration: Calibration | None) -> tuple[float, float] | None:
     if calibration is None:
         return None
-    top, bottom = calibration.nominal_top_wire_ohm, calibration.nominal_bottom_wire_ohm
+    top, bottom = calibration.nominal_wire_ohm
     return (top, bottom) if top and bottom else None
 
 

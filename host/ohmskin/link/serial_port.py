@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import errno
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import serial
 from serial.tools import list_ports
@@ -39,14 +39,6 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Give the port back. May be called again."""
-
-
-@runtime_checkable
-class PausableLink(Link, Protocol):
-    """A link whose scans can wait, such as those of a file."""
-
-    def pause(self, paused: bool) -> None:
-        """Hold scans back while nobody takes them. It begins paused."""
 
 
 class SerialLink:
