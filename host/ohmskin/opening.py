@@ -30,10 +30,11 @@ from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import protocol
 from ohmskin.link.clock import BoardClock
-from ohmskin.link.device import Board, Device
-from ohmskin.link.line_delay import line_delay_s, scan_s
+from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import Link, SerialLink, serial_ports
+from ohmskin.link.session import Session
+from ohmskin.link.timing import line_delay_s, scan_s
 
 if TYPE_CHECKING:
     from ohmskin.emulate.board import EmulatedBoard
@@ -115,11 +116,10 @@ def open_device(url: str, *, start: bool = True) -> Device:
 
         options = _options(url, query, ("speed",))
         try:
-            return Replay(place, float(options.get("speed", "1")), url, start=start)
+            return Device(Replay(place, float(options.get("speed", "1")), url), start=start)
         except ValueError as exc:
             raise PortError(f"{url}: {exc}") from exc
-    link, baud = open_link(url)
-    return Board(link, start=start, baud=baud)
+    return Device(Session(*open_link(url)), start=start)
 
 
 def open_link(url: str) -> tuple[Link, int | None]:

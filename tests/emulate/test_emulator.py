@@ -340,6 +340,7 @@ def test_emulator_and_firmware_answer_alike(board: str) -> None:
             assert asked_for(kept) == asked_for(modelled)
             assert (asked_for(kept) == wanted) >= (result == "ok"), change
             assert modelled.rate_hz == pytest.approx(kept.rate_hz, rel=0.002), change
+            assert modelled.slot_cycles == pytest.approx(kept.slot_cycles, rel=0.05), change
             assert modelled.settle_us == pytest.approx(kept.settle_us, rel=0.05, abs=1), change
         print(f"{board}: {len(CONFIGURATIONS)} configurations: {results}")
         assert len(CONFIGURATIONS) >= 60

@@ -35,6 +35,16 @@ def elf_of(board: str) -> Path:
     return ROOT / ".pio" / "build" / board / "firmware.elf"
 
 
+def first_holds(holds: NDArray[np.void]) -> NDArray[np.intp]:
+    """Where in a log of holds each scan begins.
+
+    Reading b of the first cell comes once a scan, right after the scan's first hold; idle slots lie
+    before that.
+    """
+    second = (holds["row"] == 0) & (holds["column"] == 0) & (holds["configuration"] == 1)
+    return np.flatnonzero(second) - 1
+
+
 @dataclass(frozen=True)
 class ReceivedScan:
     """A `scan` frame: its header's fields, and its codes, shape (rows, columns, readings)."""
@@ -199,12 +209,10 @@ class Rig:
     def check(self) -> Check:
         """Compare every received scan since `start_scan`; the scan's size must not have changed.
 
-        Which hold belongs to which reading follows from the order of a scan: reading b of the first
-        cell comes once a scan, right after the scan's first hold; idle slots lie before that.
+        Which hold belongs to which reading follows from the order of a scan.
         """
         holds = self.holds()
-        second = (holds["row"] == 0) & (holds["column"] == 0) & (holds["configuration"] == 1)
-        first = np.flatnonzero(second) - 1
+        first = first_holds(holds)
         starts = holds["cycle"][first].astype(np.int64)
         if not self.scans:
             return Check(0, 0, starts)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,17 @@ def foreign(path: Path, topic: str, content: object) -> None:
         channel = writer.register_channel(topic, "json", schema)
         writer.add_message(channel, 0, json.dumps(content).encode(), 0)
         writer.finish()
+
+
+def test_an_old_recording_does_not_say_how_long_a_slot_is(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "old.mcap"
+    content = {**asdict(hello), "host_time_s": 1.0}
+    del content["slot_cycles"]
+    readings = hello.rows * hello.columns * 4
+    for scan_cycles, slot_cycles in ((177_762, 177_762 // readings), (10**7, 60_000)):
+        foreign(path, "/skin/hello", {**content, "scan_cycles": scan_cycles})
+        (found,) = load_recording(path).hellos
+        assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
 
 
 def test_foreign_files(tmp_path: Path, hello: Hello) -> None:

@@ -27,8 +27,7 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli import show
-from ohmskin.cli.record import until_stopped
+from ohmskin.cli.record import cell_table, until_stopped
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
@@ -262,7 +261,7 @@ def _finish(
         for row in zip(model.held_out_rmse, presses.counts, model.pooled, strict=True)
     ]
     title = "held-out error [N], of so many presses; *: no curve of its own"
-    _out.print(show.grid(table, title))
+    _out.print(cell_table(table, title))
     if message:
         _out.print(message)
     if calibration.nominal_wire_ohm.both is None:

@@ -29,7 +29,7 @@ from ohmskin.errors import (
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan, SelfTestReport
-from ohmskin.link.usb_latency import latency_ms, latency_timer_file
+from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
 PRESS_S: Final = 1.0  # of scans with the same cells pressed
 WAIT_S: Final = 30.0  # for a person

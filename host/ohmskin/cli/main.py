@@ -22,7 +22,6 @@ from threadpoolctl import threadpool_limits
 import ohmskin
 from ohmskin.cli import demo as demonstration
 from ohmskin.cli import record as recordings
-from ohmskin.cli import show
 from ohmskin.cli import stream as streaming
 from ohmskin.cli.calibrate import calibrate
 from ohmskin.cli.doctor import doctor
@@ -281,7 +280,7 @@ def demo(
     wide = Console(width=_WIDTH) if not _out.is_terminal else _out
     demonstration.report(result, wide)
     try:
-        show.save_picture(picture, result.panels, result.title)
+        demonstration.save_picture(picture, result.panels, result.title)
     except OhmskinError as exc:
         _out.print(f"no picture: {exc}", markup=False)
     else:

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
@@ -19,11 +19,11 @@ import numpy as np
 import typer
 from rich.console import Console, Group
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli import show
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.messages import Scan
@@ -208,7 +208,18 @@ class PressDisplay:
             ]
             for row, counts in enumerate(self.counts)
         ]
-        return Group(Text(head), show.grid(counts, "presses of each cell"))
+        return Group(Text(head), cell_table(counts, "presses of each cell"))
+
+
+def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
+    """A text for each cell, row by row, beside the numbers of rows and columns."""
+    table = Table("", *map(str, range(len(cells[0]))), box=None, title=title)
+    for row, texts in enumerate(cells):
+        table.add_row(str(row), *texts)
+    for column in table.columns:
+        column.justify = "right"
+    table.columns[0].style = "dim"
+    return table
 
 
 @contextmanager

@@ -9,17 +9,19 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
 from numpy.typing import ArrayLike
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
 import ohmskin
-from ohmskin.cli import show
+from ohmskin.arrays import Float
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import ForceScan, SkinReader
@@ -27,7 +29,13 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
 _out = Console()
-_DISPLAY_EVERY_S = 0.1
+# Conductance at which a table's colours end: a cell of 5 kOhm [microsiemens].
+FULL_SCALE_US: Final = 200.0
+# Force at which a table's colours end [N].
+FULL_SCALE_N: Final = 10.0
+_COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
+# Time between two pictures in a terminal [s]; every scan is counted all the same.
+_DISPLAY_EVERY_S: Final = 0.1
 
 
 def stream(
@@ -144,7 +152,6 @@ def _show_scans(skin: Device, reader: SkinReader | None, count: int, seconds: fl
                 first = scan  # or the board has restarted
             elif scan.time_us > first.time_us:
                 rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
-            # Every scan is counted, but a terminal shows ten pictures a second.
             if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
                 shown_s = scan.host_time_s
                 live.update(_picture(skin, reader, scan, rate_hz), refresh=True)
@@ -158,17 +165,17 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan, rate_hz: float
     )
     if reader is None:
         title = f"{skin.name}: reading B in thousandths of Vdd"
-        return Group(Text(title), show.cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
+        return Group(Text(title), cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
     found = reader.read(scan)
     if not found.estimate.converged:
         caption += f"  not converged: {found.estimate.message}"
     if reader.has_forces:
         title = f"{skin.name}: force by '{reader.method}' [N]"
-        table = show.forces_table(found.force_n, "")
+        table = forces_table(found.force_n, "")
         caption = f"{_contact_line(found)}\n{caption}"
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
-        table = show.cells_table(found.estimate.cell_siemens, "")
+        table = cells_table(found.estimate.cell_siemens, "")
     return Group(Text(title), table, Text(caption))
 
 
@@ -180,3 +187,38 @@ def _contact_line(scan: ForceScan) -> str:
         f"at ({each.row:.1f}, {each.column:.1f})"
         for each in scan.contacts
     )
+
+
+def cells_table(cell_siemens: Float, title: str) -> Table:
+    """Conductances [S], shape (rows, columns), as a table in microsiemens, coloured by value."""
+    return _table(1e6 * cell_siemens, title, 1.0, FULL_SCALE_US)
+
+
+def forces_table(force_n: Float, title: str) -> Table:
+    """Forces [N], shape (rows, columns), as a table, coloured by value."""
+    return _table(force_n, title, FULL_SCALE_N / 100, FULL_SCALE_N)
+
+
+def _table(values: Float, title: str, low: float, high: float) -> Table:
+    """Colours on a logarithmic scale from `low` to `high`."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
+    table.add_column("", justify="right", style="dim")
+    for column in range(values.shape[1]):
+        table.add_column(str(column), justify="right", min_width=3, header_style="dim")
+    for row, cells in enumerate(values):
+        styled = (Text(_short(value), style=_colour(value, low, high)) for value in cells)
+        table.add_row(str(row), *styled)
+    return table
+
+
+def _short(value: float) -> str:
+    if not np.isfinite(value):
+        return "?"
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
+
+
+def _colour(value: float, low: float, high: float) -> str:
+    if not value > low:
+        return _COLOURS[0]
+    share = np.log(value / low) / np.log(high / low)
+    return _COLOURS[int(np.clip(share * len(_COLOURS), 0, len(_COLOURS) - 1))]

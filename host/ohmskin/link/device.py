@@ -1,25 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gives scans, as programs see it: `Device`, and the board at a port, `Board`."""
+"""What gives scans, as programs see it: a board, or a recording that is played."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.errors import CommandRefused, DeviceLost
+from ohmskin.errors import DeviceLost
 from ohmskin.files import Closing
 from ohmskin.link import protocol
 from ohmskin.link.feed import ScanFeed
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.link.serial_port import Link
-from ohmskin.link.session import COMMAND_TRIES, Session, configuration
+from ohmskin.link.session import COMMAND_TRIES, configuration
 
 # A device that should scan and is silent for so long counts as lost [s].
 SILENCE_TIMEOUT_S = 5.0
+
+
+class Source(Protocol):
+    """What a `Device` is made of: a board's `Session`, or a recording.
+
+    feed: its scans. report: of the last self-test. want_scans: it is to scan. commands: held for
+    as long as one command, or a few that belong together, take.
+    """
+
+    feed: ScanFeed
+    commands: threading.RLock
+    report: SelfTestReport | None
+    want_scans: bool
+
+    @property
+    def hello(self) -> Hello:
+        """What it has last said of itself."""
+
+    @property
+    def stats(self) -> BoardStats:
+        """Counts since the connection was made, as a copy."""
+
+    def command(self, name: str, **values: protocol.Value) -> None:
+        """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
+
+    def refresh(self) -> Hello:
+        """Ask for `hello` anew."""
+
+    def close(self) -> None:
+        """Give the port or file back. May be called again."""
 
 
 class Device(Closing):
@@ -30,26 +60,28 @@ class Device(Closing):
     several threads. ``with`` closes a device, and so does `close`.
     """
 
-    def __init__(self, feed: ScanFeed) -> None:
-        self._feed = feed
+    def __init__(self, source: Source, *, start: bool = True) -> None:
+        self._source = source
+        self._feed = source.feed
+        self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
+        if start:
+            try:
+                self.start()
+            except BaseException:
+                self.close()
+                raise
+
+    # ------------------------------------------------------------------------------- reading
 
     @property
-    @abstractmethod
     def info(self) -> Hello:
         """What the board has last said of itself."""
+        return self._source.hello
 
     @property
-    @abstractmethod
     def stats(self) -> BoardStats:
         """Counts since the connection was made, as a copy."""
-
-    @abstractmethod
-    def start(self) -> None:
-        """Start scanning. Does nothing when the device scans already."""
-
-    @abstractmethod
-    def stop(self) -> None:
-        """Stop scanning, after a whole scan."""
+        return self._source.stats
 
     @property
     def name(self) -> str:
@@ -100,6 +132,28 @@ class Device(Closing):
 
     # ------------------------------------------------------------------------------ commands
 
+    def start(self) -> None:
+        """Start scanning. Does nothing when the device scans already."""
+        source = self._source
+        with source.commands:
+            if source.want_scans:
+                return
+            for _ in range(COMMAND_TRIES):
+                self._restore()
+                self._feed.forget_newest()
+                source.command("start")
+                # The hello of a reset that came in between was read before this ack.
+                if self._is_as_wanted():
+                    break
+                source.command("stop")
+            source.want_scans = True
+
+    def stop(self) -> None:
+        """Stop scanning, after a whole scan."""
+        with self._source.commands:
+            self._source.want_scans = False
+            self._source.command("stop")
+
     def configure(
         self,
         *,
@@ -119,102 +173,6 @@ class Device(Closing):
         :raises CommandRefused: a value out of range, or too much for the rate; nothing changes.
             A recording refuses this and all commands below.
         """
-        raise self._refusal("configure")
-
-    def set_unit_id(self, unit_id: int) -> None:
-        """Name this skin; `save` makes the name last."""
-        raise self._refusal("set_unit_id")
-
-    def save(self) -> None:
-        """Keep configuration and unit id in the board's EEPROM.
-
-        :raises CommandRefused: the EEPROM is worn out.
-        """
-        raise self._refusal("save")
-
-    def load_defaults(self) -> Hello:
-        """Return to the built-in configuration; the EEPROM keeps what it holds until `save`."""
-        raise self._refusal("load_defaults")
-
-    def self_test(self) -> SelfTestReport:
-        """Read both sense nodes with each drive at all multiplexer inputs, and judge them."""
-        raise self._refusal("self_test")
-
-    def _refusal(self, command: str) -> CommandRefused:
-        return CommandRefused(
-            command, "recorded", f"{self.name} is a recording, which stays as it is"
-        )
-
-
-class Board(Device):
-    """The board at a `Link`.
-
-    start: let it scan at once. baud: speed of the line to change to.
-
-    :raises DeviceSilent: nothing that is a skin board answers.
-    :raises ProtocolMismatch: the board was built from another protocol definition.
-    :raises DeviceLost: the port went away meanwhile.
-    """
-
-    def __init__(self, link: Link, *, start: bool = True, baud: int | None = None) -> None:
-        self._session = Session(link)
-        super().__init__(self._session.feed)
-        self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
-        try:
-            if baud is not None and baud != self.info.baud:
-                self._session.command("set_baud", baud=baud)
-                link.set_baud(baud)
-                self._session.refresh()
-            if start:
-                self.start()
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def info(self) -> Hello:
-        """See `Device.info`."""
-        return self._session.hello
-
-    @property
-    def stats(self) -> BoardStats:
-        """See `Device.stats`."""
-        return self._session.stats
-
-    # ------------------------------------------------------------------------------ commands
-
-    def start(self) -> None:
-        """See `Device.start`."""
-        session = self._session
-        with session.commands:
-            if session.want_scans:
-                return
-            for _ in range(COMMAND_TRIES):
-                self._restore()
-                self._feed.forget_newest()
-                session.command("start")
-                # The hello of a reset that came in between was read before this ack.
-                if self._is_as_wanted():
-                    break
-                session.command("stop")
-            session.want_scans = True
-
-    def stop(self) -> None:
-        """See `Device.stop`."""
-        with self._session.commands:
-            self._session.want_scans = False
-            self._session.command("stop")
-
-    def configure(
-        self,
-        *,
-        rows: int | None = None,
-        columns: int | None = None,
-        rate_hz: float | None = None,
-        settle_us: int | None = None,
-        adc_prescaler: str | None = None,
-    ) -> Hello:
-        """See `Device.configure`."""
         given = {
             "rows": rows,
             "columns": columns,
@@ -225,45 +183,48 @@ class Board(Device):
         with self._paused():
             wanted = configuration(self.info)
             wanted.update({name: value for name, value in given.items() if value is not None})
-            self._session.command("configure", **wanted)
+            self._source.command("configure", **wanted)
             self._wanted = wanted
-            self._session.refresh()
+            self._source.refresh()
             self._restore()
             return self.info
 
     def set_unit_id(self, unit_id: int) -> None:
-        """See `Device.set_unit_id`."""
-        with self._session.commands:
-            self._session.command("set_unit_id", unit_id=unit_id)
-            self._session.refresh()
+        """Name this skin; `save` makes the name last."""
+        with self._source.commands:
+            self._source.command("set_unit_id", unit_id=unit_id)
+            self._source.refresh()
 
     def save(self) -> None:
-        """See `Device.save`."""
-        self._session.command("save")
+        """Keep configuration and unit id in the board's EEPROM.
+
+        :raises CommandRefused: the EEPROM is worn out.
+        """
+        self._source.command("save")
 
     def load_defaults(self) -> Hello:
-        """See `Device.load_defaults`."""
+        """Return to the built-in configuration; the EEPROM keeps what it holds until `save`."""
         with self._paused():
-            self._session.command("load_defaults")
+            self._source.command("load_defaults")
             self._wanted = None
-            return self._session.refresh()
+            return self._source.refresh()
 
     def self_test(self) -> SelfTestReport:
-        """See `Device.self_test`."""
-        session = self._session
+        """Read both sense nodes with each drive at all multiplexer inputs, and judge them."""
+        source = self._source
         with self._paused():
-            session.report = None
-            session.command("self_test")
-            if session.report is None:
+            source.report = None
+            source.command("self_test")
+            if source.report is None:
                 raise DeviceLost(f"{self.name}: the report of the self-test was lost: try again")
-            return session.report
+            return source.report
 
     @contextmanager
     def _paused(self) -> Iterator[None]:
         """Hold the scan for commands that are refused meanwhile, and go on whatever they did."""
-        session = self._session
-        with session.commands:
-            was_scanning = session.want_scans
+        source = self._source
+        with source.commands:
+            was_scanning = source.want_scans
             if was_scanning:
                 self.stop()
             try:
@@ -280,11 +241,11 @@ class Board(Device):
         for _ in range(COMMAND_TRIES):
             if self._is_as_wanted() or self._wanted is None:
                 return
-            self._session.command("configure", **self._wanted)
-            self._session.refresh()
+            self._source.command("configure", **self._wanted)
+            self._source.refresh()
 
     # ------------------------------------------------------------------------------- closing
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
-        self._session.close()
+        self._source.close()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The conversation with a board: one thread reads, and commands wait for their answers.
 
-Programs use `ohmskin.link.device.Board`, which is made of a session.
+Programs use `ohmskin.link.device.Device`, which has a session.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ class Session:
     """A board at a `Link` that has said hello.
 
     feed: its scans; everything here waits on its condition. hello, report: what the board has said
-    last. want_scans: the board is to scan; a board that was reset is started again.
+    last. want_scans: the board is to scan; a board that was reset is started again. baud: speed of
+    the line to change to.
 
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
     :raises DeviceLost: the port went away meanwhile.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link, baud: int | None = None) -> None:
         self.link = link
         self.feed = ScanFeed(link.name)
         self.commands = threading.RLock()
-        """Held for as long as one command, or a few that belong together, take."""
         self.report: SelfTestReport | None = None
         self.want_scans = False
         self._decoder = BoardDecoder()
@@ -66,6 +66,10 @@ class Session:
         self._thread.start()
         try:
             self._connect()
+            if baud is not None and baud != self.hello.baud:
+                self.command("set_baud", baud=baud)
+                link.set_baud(baud)
+                self.refresh()
         except BaseException:
             self.close()
             raise

@@ -21,11 +21,17 @@ import time
 from dataclasses import replace
 from typing import Final
 
-from ohmskin.errors import DeviceLost, OhmskinError, PortError, RecordingEnded, RecordingError
+from ohmskin.errors import (
+    CommandRefused,
+    DeviceLost,
+    OhmskinError,
+    PortError,
+    RecordingEnded,
+    RecordingError,
+)
 from ohmskin.link import protocol
-from ohmskin.link.device import Device
 from ohmskin.link.feed import ScanFeed
-from ohmskin.link.messages import BoardStats, Hello, Scan
+from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 from ohmskin.record.recording import Tare, messages
 
 # Longest time between two scans of a replay [s]: shorter than the silence of a lost board.
@@ -34,22 +40,23 @@ LONGEST_PAUSE_S: Final = 2.0
 _LOOK_EVERY_S: Final = 0.2
 
 
-class Replay(Device):
+class Replay:
     """Plays the recording `path`, `speed` times as fast as it came; 0: as fast as it is taken.
 
-    name: as it was opened.
+    It is a `Source` for a `Device`. name: as it was opened.
 
     :raises RecordingError: it cannot be read.
     :raises PortError: it was made with another converter than this protocol knows.
     :raises ValueError: a negative speed.
     """
 
-    def __init__(
-        self, path: str, speed: float = 1.0, name: str = "", *, start: bool = True
-    ) -> None:
+    def __init__(self, path: str, speed: float = 1.0, name: str = "") -> None:
         if not 0 <= speed < float("inf"):
             raise ValueError(f"speed must be 0 or more, not {speed}")
-        super().__init__(ScanFeed(name or f"replay://{path}"))
+        self.feed = ScanFeed(name or f"replay://{path}")
+        self.commands = threading.RLock()
+        self.report: SelfTestReport | None = None
+        self.want_scans = False
         self._speed = speed
         self._messages = messages(path)
         hello = next(self._messages)
@@ -63,45 +70,46 @@ class Replay(Device):
             )
         self._hello = hello
         self._stats = BoardStats()
-        self._running = start
+        self._running = False
         self._last: tuple[float, float] | None = None  # when a scan was due, and was recorded [s]
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._play, name=f"play {path}", daemon=True)
         self._thread.start()
 
     @property
-    def info(self) -> Hello:
-        """See `Device.info`: as recorded before the scan that was played last."""
+    def hello(self) -> Hello:
+        """What the recording says of its board, as of the scan that was played last."""
+        return self._hello
+
+    def refresh(self) -> Hello:
+        """See `hello`."""
         return self._hello
 
     @property
     def stats(self) -> BoardStats:
-        """See `Device.stats`: of the scans that were played."""
-        with self._feed.changed:
-            return replace(self._stats, overflowed=self._feed.overflowed)
+        """Counts of the scans that were played, as a copy."""
+        with self.feed.changed:
+            return replace(self._stats, overflowed=self.feed.overflowed)
 
-    def start(self) -> None:
-        """See `Device.start`: the replay goes on."""
-        self._run(True)
+    def command(self, name: str, **values: protocol.Value) -> None:
+        """Start or stop.
 
-    def stop(self) -> None:
-        """See `Device.stop`: the replay pauses."""
-        self._run(False)
-
-    def _run(self, running: bool) -> None:
-        with self._feed.changed:
-            if running == self._running:
-                return
-            if self._feed.failure is not None:
-                raise self._feed.failure
-            self._running, self._last = running, None
-            self._feed.changed.notify_all()
+        :raises CommandRefused: a recording can do nothing else.
+        """
+        if name not in ("start", "stop"):
+            reason = f"{self.feed.name} is a recording, which stays as it is"
+            raise CommandRefused(name, "recorded", reason)
+        with self.feed.changed:
+            if self.feed.failure is not None:
+                raise self.feed.failure
+            self._running, self._last = name == "start", None
+            self.feed.changed.notify_all()
 
     # --------------------------------------------------------------------------- the thread
 
     def _play(self) -> None:
-        rest_ratio = None
-        error: OhmskinError = RecordingEnded(f"{self.name} has been played to where it was cut off")
+        rest_ratio, name = None, self.feed.name
+        error: OhmskinError = RecordingEnded(f"{name} has been played to where it was cut off")
         try:
             for message in self._messages:
                 if isinstance(message, Scan):
@@ -115,22 +123,24 @@ class Replay(Device):
                 elif isinstance(message, Tare):
                     rest_ratio = message.rest_ratio
                 elif message is None:
-                    error = RecordingEnded(f"{self.name} has been played to its end")
+                    error = RecordingEnded(f"{name} has been played to its end")
         except RecordingError as exc:
             error = exc
-        self._feed.fail(error)
+        self.feed.fail(error)
 
     def _publish(self, scan: Scan) -> None:
         if int(scan.codes.max()) >> protocol.ADC_BITS:
-            raise RecordingError(f"{self.name}: scan {scan.number} has a code beyond the converter")
-        with self._feed.changed:
+            raise RecordingError(
+                f"{self.feed.name}: scan {scan.number} has a code beyond the converter"
+            )
+        with self.feed.changed:
             self._stats.scans += 1
             self._stats.missed += scan.missed
-            self._feed.publish(replace(scan, host_time_s=time.monotonic()))
+            self.feed.publish(replace(scan, host_time_s=time.monotonic()))
 
     def _wait_for_readers(self) -> bool:
         """Wait until a scan may come: whether it may, or the replay was closed."""
-        feed = self._feed
+        feed = self.feed
         with feed.changed:
             while not self._closing.is_set():
                 waits = self._speed == 0 and feed.is_behind
@@ -156,11 +166,11 @@ class Replay(Device):
     def close(self) -> None:
         """End the replay. May be called again."""
         self._closing.set()
-        with self._feed.changed:
+        with self.feed.changed:
             self._running = False
-            self._feed.changed.notify_all()
+            self.feed.changed.notify_all()
         self._thread.join()
         self._messages.close()
-        self._feed.forget_newest()
-        if self._feed.failure is None or isinstance(self._feed.failure, RecordingEnded):
-            self._feed.fail(DeviceLost(f"{self.name} was closed"))
+        self.feed.forget_newest()
+        if self.feed.failure is None or isinstance(self.feed.failure, RecordingEnded):
+            self.feed.fail(DeviceLost(f"{self.feed.name} was closed"))

@@ -26,7 +26,7 @@ from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import open_device
 from ohmskin.record.recording import Mark, Tare
 from ohmskin.view.board_recording import BoardRecording
-from ohmskin.view.shown import Counts, Shown
+from ohmskin.view.shown import Shown
 
 # The paper's programmes take minutes for a frame of 8x8.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
@@ -241,14 +241,18 @@ class ViewedBoard(Closing):
                 rate, seen = _Rate(), _SeenTime()
                 while not self._closing.is_set():
                     scan = skin.latest()
-                    counts = self._counts(skin, rate.of(scan))
-                    # A method takes a good part of a core: not while nobody looks.
+                    rate_hz, running = rate.of(scan), self._running()
                     self.shown = None
+                    # An estimate takes a good part of a core: none is made while nobody looks.
                     if self._watchers:
-                        found = reader.read(seen.at(scan))
-                        has_forces = reader.has_forces
                         self.shown = Shown(
-                            found, raw.estimate(scan.ratio), reader.method, has_forces, counts
+                            reader.read(seen.at(scan)),
+                            raw.estimate(scan.ratio),
+                            reader.method,
+                            reader.has_forces,
+                            skin.stats,
+                            rate_hz,
+                            0 if running is None else running.scans,
                         )
                     if self._status != "scanning":
                         self._status, self._text = "scanning", ""
@@ -275,16 +279,6 @@ class ViewedBoard(Closing):
                 self._note = ""
                 return reader
         return SkinReader(board)
-
-    def _counts(self, skin: Device, rate_hz: float) -> Counts:
-        stats, recording = skin.stats, self._running()
-        return Counts(
-            rate_hz,
-            stats.missed,
-            stats.line.damaged,
-            stats.restarts,
-            0 if recording is None else recording.scans,
-        )
 
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""

@@ -24,31 +24,24 @@ from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate
 from ohmskin.force.contacts import Contact
 from ohmskin.force.reader import ForceScan
-
-
-@dataclass(frozen=True)
-class Counts:
-    """What is counted since the board was connected, and its scan rate [Hz] of late."""
-
-    rate_hz: float
-    missed: int
-    damaged: int
-    restarts: int
-    recorded: int
+from ohmskin.link.messages import BoardStats
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
     """One scan of a page. raw: by the method `ohm`, what the electrodes read, ghosts included.
 
-    method: that of `found`. has_forces: there are newtons.
+    method: that of `found`. has_forces: there are newtons. stats: of the connection. rate_hz: the
+    scan rate of late [Hz]. recorded: scans in the recording that goes on, if one does.
     """
 
     found: ForceScan
     raw: Estimate
     method: str
     has_forces: bool
-    counts: Counts
+    stats: BoardStats
+    rate_hz: float
+    recorded: int
 
     @cached_property
     def message(self) -> bytes:
@@ -68,7 +61,7 @@ class Shown:
         return struct.pack("<I", len(header)) + header + values.tobytes()
 
     def _header(self, planes: list[str]) -> dict[str, Any]:
-        scan, estimate, counts = self.found, self.found.estimate, self.counts
+        scan, estimate, stats = self.found, self.found.estimate, self.stats
         return {
             "scan": scan.number,
             "host_time_s": scan.host_time_s,
@@ -80,11 +73,11 @@ class Shown:
             "iterations": estimate.iterations,
             "estimate_s": estimate.seconds,
             "text": estimate.message,
-            "rate_hz": counts.rate_hz,
-            "missed": counts.missed,
-            "damaged": counts.damaged,
-            "restarts": counts.restarts,
-            "recorded": counts.recorded,
+            "rate_hz": self.rate_hz,
+            "missed": stats.missed,
+            "damaged": stats.line.damaged,
+            "restarts": stats.restarts,
+            "recorded": self.recorded,
             "contacts": [[each.identity, *map(_number, _numbers(each))] for each in scan.contacts],
         }
 
