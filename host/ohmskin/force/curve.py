@@ -137,11 +137,15 @@ class ForceModel:
 
 
 def force_by(
-    kind: ArrayLike, slope: ArrayLike, exponent: ArrayLike, intercept: ArrayLike, x: Float
+    kind: str | NDArray[np.str_],
+    slope: float | Float,
+    exponent: float | Float,
+    intercept: float | Float,
+    x: Float,
 ) -> Float:
     """F of the module's equations [N], before forces below 0 are cut, shape of x."""
     power = slope * np.maximum(x, 0.0) ** exponent
-    return np.where(np.equal(kind, POWER), power, slope * x + intercept)
+    return np.where(np.asarray(kind) == POWER, power, slope * x + intercept)
 
 
 def spread(force: Callable[[Float], Float], x: Float, dx: Float) -> Float:

@@ -44,7 +44,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from itertools import product
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -189,7 +189,7 @@ def _square_of_s(residual: Float, coefficients: int) -> float:
     return float(residual @ residual) / freedom if freedom > 0 else 0.0
 
 
-def _correlation(covariance: Float) -> float:
+def _correlation(covariance: NDArray[np.floating[Any]]) -> float:
     scale = float(np.sqrt(covariance[0, 0] * covariance[1, 1]))
     return float(np.clip(covariance[0, 1] / scale, -1.0, 1.0)) if scale > 0 else 0.0
 
