@@ -16,7 +16,7 @@ from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
-from ohmskin.estimate.levels import LEVEL_METHODS
+from ohmskin.estimate.methods import LEVEL_METHODS
 from ohmskin.force.calibrated_device import CalibratedDevice
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.force_reader import ForceScan

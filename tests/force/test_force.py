@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.stats import linregress
 
-from ohmskin.estimate.levels import voltage_level
+from ohmskin.estimate.ohm import voltage_level
 from ohmskin.force.curve import LINEAR, POWER, ForceModel
 from ohmskin.force.regression import ForceRegression
 from ohmskin.record.readings import estimate_file

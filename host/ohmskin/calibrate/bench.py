@@ -13,8 +13,8 @@ from ohmskin.calibrate.alignment import Alignment, align
 from ohmskin.calibrate.force_log import ForceLog
 from ohmskin.calibrate.press_table import PressTable
 from ohmskin.calibrate.presses import LevelHistory, Presses, find_presses
-from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
-from ohmskin.estimate.levels import VOLTAGE, LevelMeter
+from ohmskin.estimate.base import NO_WIRES, Estimator, SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.regression import ForceRegression
 from ohmskin.link.messages import Hello, Scan
@@ -35,16 +35,10 @@ class Bench:
     date: str
     nominal_wire_ohm: WireOhm = NO_WIRES
 
-    def meter(self) -> LevelMeter:
-        """A meter that is told all this."""
-        return LevelMeter(
-            self.method,
-            SkinKnowledge.of(
-                self.board,
-                self.rest_ratio,
-                self.nominal_wire_ohm,
-            ),
-        )
+    def estimator(self) -> Estimator:
+        """An estimator that is told all this."""
+        known = SkinKnowledge.of(self.board, self.rest_ratio, self.nominal_wire_ohm)
+        return make_estimator(self.method, known)
 
     def calibration(self, presses: Presses) -> tuple[Calibration, str]:
         """The calibration, and which cells have no curve of their own.
@@ -71,7 +65,7 @@ class Bench:
             unit_id=self.board.unit_id,
             date=self.date,
             method=self.method,
-            rest=Rest(self.date, self.rest_ratio, np.maximum(self.meter().rest(), 0.0)),
+            rest=Rest(self.date, self.rest_ratio, np.maximum(self.estimator().rest_level(), 0.0)),
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
             nominal_wire_ohm=self.nominal_wire_ohm,
@@ -90,13 +84,13 @@ def measure(
                 f"scan {scan.number} is {scan.rows}x{scan.columns}, the untouched skin was "
                 f"{expected[0]}x{expected[1]}"
             )
-    meter, history = bench.meter(), LevelHistory.empty(scans)
-    rest = meter.rest()
+    estimator, history = bench.estimator(), LevelHistory.empty(scans)
+    rest = estimator.rest_level()
     for index, scan in enumerate(scans):
-        found = meter.read(scan.ratio)
+        found = estimator.estimate(scan.ratio)
         history.rise[index] = found.level - rest
         history.rise_std[index] = found.level_std
-        history.touched[index] = found.estimate.touched
+        history.touched[index] = found.touched
         progress(index + 1)
     return history
 
@@ -129,7 +123,7 @@ def presses_from_table(bench: Bench, table: PressTable) -> Presses:
     cells = table.row * columns + table.column
     return Presses(
         cells=cells,
-        rise=table.conductance - bench.meter().rest().flat[cells],
+        rise=table.conductance - bench.estimator().rest_level().flat[cells],
         rise_std=table.conductance_std,
         force_n=table.force_n,
         press=np.arange(cells.size),

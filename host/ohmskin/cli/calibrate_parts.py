@@ -24,7 +24,7 @@ from ohmskin.calibrate.press_table import PressTable
 from ohmskin.calibrate.presses import Presses
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.base import WireOhm
-from ohmskin.estimate.levels import LEVEL_METHODS
+from ohmskin.estimate.methods import LEVEL_METHODS
 from ohmskin.force.calibrated_device import now
 from ohmskin.force.calibration import Calibration
 from ohmskin.link.messages import Hello

@@ -126,18 +126,22 @@ class SkinKnowledge:
 class Estimate:
     """The answer for one frame, with its evidence.
 
-    cell_siemens_std: rounding is uniform, not normal: about 58 % of cells lie within one standard
-    deviation and 98 % within two. It covers the readings' noise, not what the method neglects.
-    NaN where the method gives none.
-    cell_siemens, cell_siemens_std, touched, top_wire_ohm, bottom_wire_ohm: shape (R, C), wires NaN
-    where the method does not estimate them. chi2: sum of squared residuals of all readings over
-    the variance of one, divided by their number (about 1 or less when the model holds).
-    message: empty if converged, else why not, or what is wrong with
-    the readings (`port_readings`). seconds: wall time of this frame.
+    cell_siemens, cell_siemens_std (R, C) [S]: rounding is uniform, not normal: about 58 % of cells
+    lie within one standard deviation and 98 % within two. The deviation covers the readings' noise,
+    not what the method neglects. It is NaN where the method gives none.
+    level, level_std (R, C): what a force is read from. They equal cell_siemens and
+    cell_siemens_std [S] for all methods but `voltage` [1].
+    touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C): NaN where the method estimates no wires.
+    chi2: the sum of the squared residuals of all readings over the variance of one, divided by
+    their number. It is about 1 or less when the model holds.
+    message: empty if the method converged and the readings can be trusted, else why not.
+    seconds: wall time of this frame.
     """
 
     cell_siemens: Float
     cell_siemens_std: Float
+    level: Float
+    level_std: Float
     touched: NDArray[np.bool_]
     top_wire_ohm: Float
     bottom_wire_ohm: Float
@@ -212,6 +216,13 @@ class Estimator(ABC):
             self.reset()
         return self._rest
 
+    def rest_level(self) -> Float:
+        """`Estimate.level` of the rest readings, (R, C). Raises ValueError if none are known."""
+        rest = self.rest()
+        if rest is None or self.knowledge.rest_ratio is None:
+            raise ValueError("the readings of the untouched skin are not known")
+        return self._level(self.knowledge.rest_ratio, rest)[0]
+
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
@@ -229,10 +240,13 @@ class Estimator(ABC):
         found = self._solve(ports)
         message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)
+        level, level_std = self._level(readings, found)
         unknown = np.full((known.rows, known.columns), np.nan)
         return Estimate(
             cell_siemens=found.cell_siemens,
             cell_siemens_std=found.cell_siemens_std,
+            level=level,
+            level_std=level_std,
             touched=touched,
             top_wire_ohm=unknown if found.top_wire_ohm is None else found.top_wire_ohm,
             bottom_wire_ohm=unknown if found.bottom_wire_ohm is None else found.bottom_wire_ohm,
@@ -242,6 +256,10 @@ class Estimator(ABC):
             message=message,
             seconds=time.perf_counter() - started,
         )
+
+    def _level(self, ratio: Float, found: Solution) -> tuple[Float, Float]:
+        """`Estimate.level` of readings (R, C, 4) that gave this solution, and its deviation."""
+        return found.cell_siemens, found.cell_siemens_std
 
     def _touched(self, found: Solution) -> NDArray[np.bool_]:
         if self._rest is None:

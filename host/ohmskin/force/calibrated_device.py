@@ -106,7 +106,7 @@ class CalibratedDevice(Device):
         rest_ratio = self.mean_ratio(seconds)
         reader = ForceReader(self.info, self.calibration)
         if not force:
-            touched = reader.measure(rest_ratio).estimate.touched
+            touched = reader.measure(rest_ratio).touched
             if touched.any():
                 raise TareRefused(
                     f"{touched_cells(touched)}: take everything off the skin, or force the tare if "

@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
-from ohmskin.estimate.levels import LEVEL_METHODS, LevelMeter
+from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import whole_file
 from ohmskin.force.curve import ForceModel
 from ohmskin.record.readings import MAX_CELLS
@@ -81,7 +81,7 @@ class Rest:
     def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
         """What `method` makes of the rest readings in `knowledge`."""
         # A reading below its offset is a cell of no conductance, within the noise.
-        level = np.maximum(LevelMeter(method, knowledge).rest(), 0.0)
+        level = np.maximum(make_estimator(method, knowledge).rest_level(), 0.0)
         return cls(date, np.asarray(knowledge.rest_ratio), level)
 
 
@@ -155,9 +155,8 @@ class Calibration:
     def predict(self, level: ArrayLike, level_std: ArrayLike) -> tuple[Float, Float]:
         """Force and its standard deviation [N], (R, C): by `model`, of level - untouched.level.
 
-        level, level_std (R, C): `cell_siemens` and `cell_siemens_std` of an estimate by `method`
-        [S]; for `voltage` `voltage_level` of the readings and the std of one reading [1]. The error
-        of rest is in every press alike, so the curves hold it already. Raises ValueError.
+        level, level_std (R, C): those of an `Estimate` by `method`, [S], or [1] for `voltage`. The
+        error of rest is in every press alike, so the curves hold it already. Raises ValueError.
         """
         levels = np.asarray(level, dtype=np.float64)
         at_rest = self.untouched.level

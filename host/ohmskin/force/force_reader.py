@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate, SkinKnowledge
-from ohmskin.estimate.levels import Level, LevelMeter
+from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
 from ohmskin.link.messages import Hello, Scan
@@ -43,7 +43,8 @@ class ForceReader:
         """Go on with another tare. Raises ValueError as the constructor."""
         calibration.check(calibration.unit_id, self._board.rows, self._board.columns)
         self.calibration = calibration
-        self._meter = LevelMeter(calibration.method, self._knowledge(calibration.untouched.ratio))
+        knowledge = self._knowledge(calibration.untouched.ratio)
+        self._estimator = make_estimator(calibration.method, knowledge)
 
     def tared(self, rest_ratio: Float, date: str) -> Calibration:
         """The calibration with these readings of the untouched skin (R, C, 4) as its tare."""
@@ -57,15 +58,15 @@ class ForceReader:
             self.calibration.nominal_wire_ohm,
         )
 
-    def measure(self, ratio: Float) -> Level:
+    def measure(self, ratio: Float) -> Estimate:
         """What readings (R, C, 4) show, without forces."""
-        return self._meter.read(ratio)
+        return self._estimator.estimate(ratio)
 
     def read(self, scan: Scan) -> ForceScan:
         """The forces of a scan. Raises ValueError if it is of other cells."""
-        found = self.measure(scan.ratio)
-        force_n, force_n_std = self.calibration.predict(found.level, found.level_std)
-        touched = found.estimate.touched
+        estimate = self.measure(scan.ratio)
+        force_n, force_n_std = self.calibration.predict(estimate.level, estimate.level_std)
+        touched = estimate.touched
         return ForceScan(
             scan.codes,
             scan.number,
@@ -75,5 +76,5 @@ class ForceReader:
             force_n=force_n,
             force_n_std=force_n_std,
             contacts=self._tracker.update(scan.time_us, touched, force_n, force_n_std),
-            estimate=found.estimate,
+            estimate=estimate,
         )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
-from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.methods import METHODS, PAPER_METHODS, make_estimator
 from ohmskin.estimate.ohm import OhmEstimator
 from ohmskin.force.calibrated_device import now, touched_cells
 from ohmskin.force.calibration import Calibration
@@ -22,8 +22,7 @@ from ohmskin.force.force_reader import ForceReader
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.view.shown import Counts, Shown
 
-# The paper's programmes take minutes for a frame of 8x8.
-LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
+LIVE_METHODS: Final = tuple(name for name in METHODS if name not in PAPER_METHODS)
 DEFAULT_METHOD: Final = "joint"
 
 
@@ -144,7 +143,7 @@ class SkinReader:
 
     def _read(self, ratio: Float) -> Estimate:
         if self._forces is not None:
-            return self._forces.measure(ratio).estimate
+            return self._forces.measure(ratio)
         assert self._estimator is not None
         return self._estimator.estimate(ratio)
 
