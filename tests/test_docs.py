@@ -13,7 +13,6 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-import typer.main
 from mkdocs.exceptions import PluginError
 
 import ohmskin
@@ -55,11 +54,12 @@ def words(line: str) -> list[str]:
 
 def found(arguments: list[str]) -> tuple[Any, list[str]]:
     """The command that the line names, and what is left of the line."""
-    command: Any = typer.main.get_command(app)
+    command: Any = app
     left = list(arguments)
     while hasattr(command, "commands") and left and not left[0].startswith("-"):
         assert left[0] in command.commands, f"no command {left[0]!r}"
         command = command.commands[left.pop(0)]
+        command = command.load() if hasattr(command, "load") else command
     return command, left
 
 

@@ -8,7 +8,9 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
-from ohmskin.boards import Boards, BoardScan, open_all
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from ohmskin.errors import (
     CommandRefused,
     DeviceLost,
@@ -20,16 +22,19 @@ from ohmskin.errors import (
     RecordingError,
     TareRefused,
 )
-from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
-from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.force.calibrated_device import CalibratedDevice
-from ohmskin.force.calibration import Calibration, load_calibration
-from ohmskin.force.contacts import Contact
-from ohmskin.force.force_reader import ForceScan
-from ohmskin.link.clock import BoardClock
-from ohmskin.link.device import Device
-from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.opening import open
+
+if TYPE_CHECKING:
+    from ohmskin.boards import Boards, BoardScan, open_all
+    from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
+    from ohmskin.estimate.methods import METHODS, make_estimator
+    from ohmskin.force.calibrated_device import CalibratedDevice
+    from ohmskin.force.calibration import Calibration, load_calibration
+    from ohmskin.force.contacts import Contact
+    from ohmskin.force.force_reader import ForceScan
+    from ohmskin.link.clock import BoardClock
+    from ohmskin.link.device import Device
+    from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+    from ohmskin.opening import open
 
 __all__ = [
     "METHODS",
@@ -64,3 +69,30 @@ __all__ = [
     "open_all",
 ]
 __version__ = "0.1.0"
+
+# Where a name is from. Its module is imported when the name is first asked for.
+_MODULES = {
+    "boards": ("Boards", "BoardScan", "open_all"),
+    "estimate.base": ("Estimate", "Estimator", "SkinKnowledge", "WireOhm"),
+    "estimate.methods": ("METHODS", "make_estimator"),
+    "force.calibrated_device": ("CalibratedDevice",),
+    "force.calibration": ("Calibration", "load_calibration"),
+    "force.contacts": ("Contact",),
+    "force.force_reader": ("ForceScan",),
+    "link.clock": ("BoardClock",),
+    "link.device": ("Device",),
+    "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
+    "opening": ("open",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            globals()[name] = found = getattr(import_module(f"ohmskin.{module}"), name)
+            return found
+    raise AttributeError(f"module 'ohmskin' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
