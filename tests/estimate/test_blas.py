@@ -13,9 +13,11 @@ from threadpoolctl import threadpool_info
 
 import ohmskin
 
-# Two threads estimate: the first ends while the second is still at work. Twice.
+# Two threads estimate: the first begins, the second begins, the first ends, the second ends. Both
+# threads live on meanwhile. All of it twice.
 PROGRAM = """
-import threading
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 import numpy as np, scipy.linalg
 from threadpoolctl import threadpool_info
 from ohmskin.estimate.base import SkinKnowledge
@@ -25,25 +27,28 @@ def blas_threads():
     return {lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"}
 
 class Waits(OhmEstimator):
+    def __init__(self):
+        super().__init__(SkinKnowledge(2, 2))
+        self.has_begun, self.may_end = Event(), Event()
+
     def _solve(self, ports):
-        both_inside.wait()
-        seen.append(blas_threads())
-        both_inside.wait()
-        if threading.current_thread() is second:
-            first.join()
-            seen.append(blas_threads())
+        self.has_begun.set()
+        assert self.may_end.wait(10)
+        assert blas_threads() == {1}
         return super()._solve(ports)
 
-def work():
-    Waits(SkinKnowledge(2, 2)).estimate(np.tile([0.9, 0.1, 0.9, 0.1], (2, 2, 1)))
-
+frame = np.tile([0.9, 0.1, 0.9, 0.1], (2, 2, 1))
 assert blas_threads() == {2}
-for _ in range(2):
-    seen, both_inside = [], threading.Barrier(2)
-    first, second = threading.Thread(target=work), threading.Thread(target=work)
-    first.start(), second.start(), second.join()
-    assert seen == [{1}, {1}, {1}], seen
-    assert blas_threads() == {2}
+with ThreadPoolExecutor(2) as pool:
+    for _ in range(2):
+        estimators, results = (Waits(), Waits()), []
+        for estimator in estimators:
+            results.append(pool.submit(estimator.estimate, frame))
+            assert estimator.has_begun.wait(10)
+        for estimator, result in zip(estimators, results):
+            estimator.may_end.set()
+            result.result()
+        assert blas_threads() == {2}
 """
 
 
