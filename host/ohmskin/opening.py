@@ -22,7 +22,7 @@ from ohmskin.arrays import Float
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard, EmulatorLink
 from ohmskin.emulate.line_faults import FAULTS, Faults
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.simavr_link import SimavrLink
+from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
 from ohmskin.errors import PortError
 from ohmskin.force.calibrated_device import CalibratedDevice

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lockstep import first_holds
+from lockstep import CPU_HZ, LockstepSim, first_holds
 from ohmskin.arrays import Float
-from ohmskin.emulate.simavr import CPU_HZ
-from ohmskin.emulate.simavr_link import SimavrLink
+from ohmskin.emulate import simavr
 from ohmskin.link.clock import BoardClock, scan_times_s
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -186,12 +185,13 @@ def timed(device: Device, clock: BoardClock) -> Iterator[tuple[Scan, float]]:
 
 
 @pytest.mark.simavr
-def test_times_are_those_of_the_simulator() -> None:
+def test_times_are_those_of_the_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its clock and the host's are compared by asking it for its cycles, over a pipe.
 
     It runs a millisecond at a time, so its bytes come up to one early. Where the machine was so
     busy that it dropped time, it is asked again.
     """
+    monkeypatch.setattr(simavr, "SkinSim", LockstepSim)
     for _ in range(4):
         error_s, dropped = errors_against_simulator()
         if not dropped:
@@ -206,9 +206,8 @@ def test_times_are_those_of_the_simulator() -> None:
 def errors_against_simulator() -> tuple[Float, int]:
     """Of 200 scans' times [s]; and the milliseconds that the simulator dropped."""
     link, _ = open_link("simavr://uno?scene=ghost")
-    assert isinstance(link, SimavrLink)
     with Device(link) as device:
-        sim = link._sim
+        sim = link.sim
         sim.hold_log(True)
         found, offsets_s = [], []
         for count, (scan, at_s) in enumerate(itertools.islice(timed(device, BoardClock()), 200)):
