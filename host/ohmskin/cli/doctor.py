@@ -6,6 +6,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -13,7 +15,14 @@ import typer
 from rich.console import Console
 
 import ohmskin
-from ohmskin.cli.doctor_words import answer, request, title, verdict, wires_in_words, words_of
+from ohmskin.cli.doctor_words import (
+    FIELDS,
+    answer,
+    measured_in_words,
+    request,
+    verdict,
+    words_of,
+)
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Severity, found
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
@@ -64,10 +73,11 @@ def doctor(
     wire_ohm = _wires(wires) if wires else _wires_of(told)
     with _terminal() as (progress, ask):
         diagnosis = diagnose(port, told, wire_ohm, progress, ask if press else None)
+    page = as_object(port, diagnosis)
     if as_json:
-        print(json.dumps(as_object(port, diagnosis)))  # noqa: T201
+        print(json.dumps(page, default=asdict))  # noqa: T201
     else:
-        _print(port, diagnosis)
+        _print(page)
     if diagnosis.worse:
         raise SystemExit(1)
 
@@ -134,7 +144,7 @@ def diagnose(
     try:
         device = ohmskin.open(port, start=False)
     except (DeviceSilent, DeviceLost, ProtocolMismatch, PortError) as exc:
-        return Diagnosis((_unanswered(port, exc),))
+        return Diagnosis([_unanswered(port, exc)])
     with device:
         board = device.info
         evidence = Evidence(board, wire_ohm=wire_ohm, host_version=ohmskin.__version__)
@@ -230,48 +240,31 @@ def _unanswered(port: str, error: OhmskinError) -> Finding:
 
 def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
     """What ``--json`` prints."""
-    findings = [
-        {
-            "id": finding.kind.id,
-            "severity": finding.kind.severity,
-            **words_of(finding)._asdict(),
-            "rows": finding.rows,
-            "columns": finding.columns,
-            "cells": finding.cells,
-            "values": finding.values,
-        }
-        for finding in diagnosis.findings
-    ]
+    findings = []
+    for finding in diagnosis.findings:
+        kind, data = finding.kind, {"place": asdict(finding.place), "values": finding.values}
+        findings.append({"id": kind.id, "severity": kind.severity, **words_of(finding), **data})
     return {
         "port": port,
         "sound": not diagnosis.worse,
         "verdict": verdict(diagnosis),
         "findings": findings,
-        "measured": _measured(diagnosis),
+        "measured": measured_in_words(diagnosis),
     }
 
 
-def _measured(diagnosis: Diagnosis) -> dict[str, Any]:
-    if diagnosis.wires is None:
-        return dict(diagnosis.measured)
-    wires, lines = wires_in_words(diagnosis.wires)
-    return {**diagnosis.measured, "wires": wires, "wires_of_lines": lines}
-
-
-def _print(port: str, diagnosis: Diagnosis) -> None:
-    def line(text: str, **style: str) -> None:
-        _out.print(text, markup=False, highlight=False, **style)
-
-    line(f"{port}: {verdict(diagnosis)}")
-    for number, finding in enumerate(diagnosis.findings, start=1):
-        kind, words = finding.kind, words_of(finding)
-        line(f"\n{number}. ", end="")
-        line(f"{kind.severity}, {title(kind)}: {words.where}", style=_COLOURS[kind.severity])
-        for label, text in zip(("measured", "expected", "what to do"), words[1:], strict=True):
-            line(f"   {label:<10}  {text}")
-    measured = _measured(diagnosis)
-    if measured:
-        line("")
-    for name, value in measured.items():
+def _print(page: dict[str, Any]) -> None:
+    """What `as_object` has, for people."""
+    show = partial(_out.print, markup=False, highlight=False)
+    show(f"{page['port']}: {page['verdict']}")
+    for number, finding in enumerate(page["findings"], start=1):
+        severity, name = finding["severity"], finding["id"].replace("_", " ")
+        show(f"\n{number}. ", end="")
+        show(f"{severity}, {name}: {finding['where']}", style=_COLOURS[severity])
+        for field in FIELDS[1:]:
+            show(f"   {field.replace('_', ' '):<10}  {finding[field]}")
+    if page["measured"]:
+        show("")
+    for name, value in page["measured"].items():
         shown = ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
-        line(f"{name:<18}  {shown}")
+        show(f"{name:<18}  {shown}")

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import Finding, Kind, cells_of, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, cells_of, found, lines_of
 from ohmskin.doctor.signal import mean_std_lsb
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -86,7 +86,7 @@ class Circuit:
     R_bottom, None where nothing conducts.
     """
 
-    findings: tuple[Finding, ...]
+    findings: list[Finding]
     touched: Bool
     wrong: Bool
     cell_siemens: Float
@@ -123,15 +123,15 @@ def examine_circuit(
     nothing = np.zeros(current.shape, dtype=np.bool_)
     if dark.all():
         finding = found(Kind.NOTHING_CONDUCTS, cell_count=dark.size)
-        return Circuit((finding,), nothing, ~nothing, np.full(dark.shape, np.nan), None)
+        return Circuit([finding], nothing, ~nothing, np.full(dark.shape, np.nan), None)
     no_row, no_column = dark.all(axis=1), dark.all(axis=0)
     findings = []
-    for kind, lines, count, cells in (
-        (Kind.OPEN_ROW, {"rows": lines_of(no_row)}, rows, columns),
-        (Kind.OPEN_COLUMN, {"columns": lines_of(no_column)}, columns, rows),
+    for kind, place, count, cells in (
+        (Kind.OPEN_ROW, Place(rows=lines_of(no_row)), rows, columns),
+        (Kind.OPEN_COLUMN, Place(columns=lines_of(no_column)), columns, rows),
     ):
-        if any(lines.values()):
-            findings.append(found(kind, **lines, line_count=count, cells_per_line=cells))
+        if place != WHOLE_SKIN:
+            findings.append(found(kind, place, line_count=count, cells_per_line=cells))
     out = no_row[:, None] | no_column
     siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
     shorted = nothing.copy()
@@ -140,11 +140,11 @@ def examine_circuit(
         row_groups = _shorted(current, siemens, std, out)
         column_groups = _shorted(current.T, siemens.T, std, out.T)
         for group in row_groups:
-            findings.append(found(Kind.SHORT_ROWS, rows=tuple(group)))
+            findings.append(found(Kind.SHORT_ROWS, Place(rows=tuple(group))))
             shorted[group] = True
             no_row[group[1:]] = True
         for group in column_groups:
-            findings.append(found(Kind.SHORT_COLUMNS, columns=tuple(group)))
+            findings.append(found(Kind.SHORT_COLUMNS, Place(columns=tuple(group))))
             shorted[:, group] = True
             no_column[group[1:]] = True
         if shorted.any():
@@ -154,7 +154,7 @@ def examine_circuit(
     touched, bad, cell_findings = _judge_cells(siemens, siemens_std, judged, wire_ohm, moved)
     ratio, ratio_findings = _references(shown[~dark], board, mean_std_lsb(noise_lsb, scans))
     findings += cell_findings + ratio_findings
-    return Circuit(tuple(findings), touched, out | shorted | bad, siemens, ratio)
+    return Circuit(findings, touched, out | shorted | bad, siemens, ratio)
 
 
 def _cells(mean_codes: Float, board: Hello, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
@@ -209,15 +209,17 @@ def _judge_cells(
         doubt = CLEAR_STDS * std if high.any() else 0.0
         dead = np.asarray(judged & ~hidden & (siemens + doubt < DEAD_SHARE * usual))
     if dead.any():
-        share = float(np.max(siemens[dead] / usual))
-        findings.append(found(Kind.DEAD_CELL, cells=cells_of(dead), share_of_usual=share))
+        percent = 100 * float(np.max(siemens[dead] / usual))
+        findings.append(
+            found(Kind.DEAD_CELL, Place(cells=cells_of(dead)), percent_of_usual=percent)
+        )
     rows, columns = siemens.shape
     top, bottom = wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
     saturated = high & (siemens * (WIRE_SPREAD * path_ohm + SHORTED_OHM) > 1)
     if saturated.any():
-        cells, ohm = cells_of(saturated), float(np.max(1 / siemens[saturated]))
-        findings.append(found(Kind.SATURATED_CELL, cells=cells, cell_ohm=ohm, rest_ohm=1 / rest))
+        place, ohm = Place(cells=cells_of(saturated)), float(np.max(1 / siemens[saturated]))
+        findings.append(found(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest))
     return high & ~saturated, dead | saturated, findings
 
 
@@ -239,7 +241,14 @@ def _references(lit: Float, board: Hello, mean_std: float) -> tuple[float, list[
     nominal = board.ref_top_ohm / board.ref_bottom_ohm
     # Of A and D, one rounds as the other; the same of B and C.
     ratio_std = mean_std * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
-    if abs(ratio / nominal - 1) < RATIO_TOLERANCE + RATIO_STDS * ratio_std:
+    off = ratio / nominal - 1
+    if abs(off) < RATIO_TOLERANCE + RATIO_STDS * ratio_std:
         return ratio, []
-    refs = {"ref_top_ohm": board.ref_top_ohm, "ref_bottom_ohm": board.ref_bottom_ohm}
-    return ratio, [found(Kind.REFERENCE_RATIO, ratio=ratio, **refs)]
+    finding = found(
+        Kind.REFERENCE_RATIO,
+        ratio=ratio,
+        off_percent=100 * off,
+        ref_top_ohm=board.ref_top_ohm,
+        ref_bottom_ohm=board.ref_bottom_ohm,
+    )
+    return ratio, [finding]

@@ -12,20 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Wires, cells_of, found
+from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, cells_of, found
 from ohmskin.doctor.signal import (
     SOUND_NOISE_LSB,
     RestScans,
     examine_settling,
     examine_signal,
     mean_std_lsb,
-    with_hum_of,
 )
 from ohmskin.doctor.wires import CornerScans, measure_untouched
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
@@ -66,8 +65,8 @@ def examine(evidence: Evidence) -> Diagnosis:
     board, stats = evidence.board, evidence.stats
     usual = RestScans.of(board, evidence.scans)
     rates_hz = None if usual is None else _rates_hz(evidence.scans)
-    findings = [*_of_board(evidence), *_of_line(evidence, rates_hz)]
-    measured: dict[str, Any] = {
+    diagnosis = Diagnosis([*_of_board(evidence), *_of_line(evidence, rates_hz)])
+    diagnosis.measured = {
         "board": board.board,
         "unit_id": board.unit_id,
         "rows": board.rows,
@@ -79,74 +78,60 @@ def examine(evidence: Evidence) -> Diagnosis:
         "restarts": stats.restarts,
         "rate_hz": None if rates_hz is None else round(rates_hz[0], 3),
     }
-    wires = None if usual is None else _examine_skin(evidence, usual, findings, measured)
-    return Diagnosis(tuple(findings), measured, wires)
+    if usual is not None:
+        _examine_skin(evidence, usual, diagnosis)
+    order = list(Kind)
+    diagnosis.findings.sort(key=lambda finding: order.index(finding.kind))
+    return diagnosis
 
 
-def _examine_skin(
-    evidence: Evidence, usual: RestScans, findings: list[Finding], measured: dict[str, Any]
-) -> Wires | None:
-    """Adds what the scans show to findings and figures; the wires, unless faults hide them."""
+def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
+    """Adds what the scans show: signal, circuit, and the wires if nothing hides them."""
     board, wire_ohm = evidence.board, evidence.wire_ohm or WIRE_OHM
-    signal, best = examine_signal(usual), usual
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
-    if settled is not None and not signal.moved.any():
+    signal, best = examine_signal(usual, settled), usual
+    moves = bool(signal.moved.any())
+    if settled is not None and not moves:
         unsettled, most_lsb = examine_settling(usual, settled)
-        findings += unsettled
-        measured["settling_lsb"] = round(most_lsb, 2)
-        signal = with_hum_of(signal, settled, board)
+        diagnosis.findings += unsettled
+        diagnosis.measured["settling_lsb"] = round(most_lsb, 2)
         best = settled if unsettled else usual
-    scans, moves = len(best.codes), bool(signal.moved.any())
-    circuit = examine_circuit(best.mean, signal.noise_lsb, scans, board, wire_ohm, moved=moves)
-    findings += signal.findings + circuit.findings
+    scans, noise_lsb = len(best.codes), signal.noise_lsb
+    circuit = examine_circuit(best.mean, noise_lsb, scans, board, wire_ohm, moved=moves)
+    diagnosis.findings += signal.findings + circuit.findings
     known = circuit.cell_siemens[np.isfinite(circuit.cell_siemens)]
-    measured |= {
-        "noise_lsb": round(signal.noise_lsb, 3),
+    diagnosis.measured |= {
+        "noise_lsb": round(noise_lsb, 3),
         "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
         "hum_lsb": round(signal.hum_lsb, 2),
-        "hum_not_visible": list(signal.hum_hidden),
+        "hum_not_visible": list(signal.hidden_hz),
         "reference_ratio": circuit.reference_ratio and round(circuit.reference_ratio, 4),
         "cell_ohm": float(f"{1 / np.median(known):.3g}") if known.size else None,
     }
     touched = circuit.touched if circuit.touched.any() else signal.moved
     if touched.any():
-        findings.append(found(Kind.TOUCHED, cells=cells_of(touched), moves=moves))
-    if touched.any() or circuit.wrong.any():
-        return None
-    wires, changed = _examine_wires(evidence, best, signal.noise_lsb, wire_ohm)
-    findings += changed
-    return wires
+        diagnosis.findings.append(found(Kind.TOUCHED, Place(cells=cells_of(touched)), moves=moves))
+    elif not circuit.wrong.any():
+        _examine_wires(evidence, best, noise_lsb, diagnosis)
 
 
 def _examine_wires(
-    evidence: Evidence, rest: RestScans, noise_lsb: float, wire_ohm: tuple[float, float]
-) -> tuple[Wires, list[Finding]]:
-    """What is known of the wires, and which of them are not as they were told to be."""
-    scans, earlier = len(rest.codes), evidence.rest_ratio
+    evidence: Evidence, rest: RestScans, noise_lsb: float, diagnosis: Diagnosis
+) -> None:
+    """Adds the wires. They are at fault only if nominal ones or an earlier rest were told."""
+    scans, earlier, told = len(rest.codes), evidence.rest_ratio, evidence.wire_ohm is not None
+    diagnosis.nominal_ohm = wire_ohm = evidence.wire_ohm or WIRE_OHM
     mean_std = mean_std_lsb(noise_lsb, scans)
     untouched = measure_untouched(rest.mean, mean_std, evidence.board, wire_ohm, earlier)
-    pressed = None
+    diagnosis.untouched = untouched if earlier is not None else untouched[:2]
     if evidence.presses is not None:
-        pressed = tuple(evidence.presses.measure(rest.mean, scans, noise_lsb, wire_ohm))
-    told = evidence.wire_ohm is not None
+        diagnosis.pressed = evidence.presses.measure(rest.mean, scans, noise_lsb, wire_ohm)
     changed = [each for each in untouched if each.differs and (told or earlier is not None)]
     if told and not changed:
-        changed = [each for each in pressed or () if each.differs]
-    findings = [
-        found(
-            Kind.WIRES,
-            rows=each.rows,
-            columns=each.columns,
-            layers=each.layers,
-            share=each.share,
-            share_std=each.std,
-            top_ohm=wire_ohm[0],
-            bottom_ohm=wire_ohm[1],
-        )
-        for each in changed
-    ]
-    shown = untouched[:2] if earlier is None else untouched
-    return Wires(wire_ohm, tuple(shown), pressed), findings
+        changed = [each for each in diagnosis.pressed or () if each.differs]
+    for each in changed:
+        finding = found(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
+        diagnosis.findings.append(finding)
 
 
 # --------------------------------------------------------------------------- board and line

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-Cell = tuple[int, int]
+Cell = tuple[int, int]  # row, column
 
 
 class Severity(StrEnum):
@@ -44,9 +44,9 @@ class Kind(Enum):
     OPEN_COLUMN = "open_column", _FAULT, "line_count cells_per_line"
     SHORT_ROWS = "short_rows", _FAULT, ""
     SHORT_COLUMNS = "short_columns", _FAULT, ""
-    DEAD_CELL = "dead_cell", _FAULT, "share_of_usual"
-    SATURATED_CELL = "saturated_cell", _FAULT, "cell_ohm rest_ohm"
-    REFERENCE_RATIO = "reference_ratio", _FAULT, "ratio ref_top_ohm ref_bottom_ohm"
+    DEAD_CELL = "dead_cell", _FAULT, "percent_of_usual"
+    SATURATED_CELL = "saturated_cell", _FAULT, "cell_ohm rest_megohm"
+    REFERENCE_RATIO = "reference_ratio", _FAULT, "ratio off_percent ref_top_ohm ref_bottom_ohm"
     SETTLING = "settling", _FAULT, "change_lsb most_lsb settle_us longer_us needed_us"
     RESET_CAUSE = "reset_cause", _WARNING, "cause"
     RESTARTED = "restarted", _WARNING, "restarts causes"
@@ -56,7 +56,7 @@ class Kind(Enum):
     RATE = "rate", _WARNING, "rate_hz asked_hz"
     HUM = "hum", _WARNING, "mains_hz amplitude_lsb most_lsb rate_hz seen_hz"
     NOISE = "noise", _WARNING, "noise_lsb sound_lsb adc_lsb"
-    WIRES = "wires", _WARNING, "layers share share_std top_ohm bottom_ohm"
+    WIRES = "wires", _WARNING, "share nominal_ohm"
     TOUCHED = "touched", _NOTE, "moves"
     VERSION = "version", _NOTE, "firmware host"
     USB_LATENCY = "usb_latency", _NOTE, "timer_ms file"
@@ -68,37 +68,16 @@ class Kind(Enum):
         self.names = frozenset(names.split())
 
 
-_ORDER: Final = {kind: number for number, kind in enumerate(Kind)}
-
-
 @dataclass(frozen=True)
-class Finding:
-    """One thing found, and where: lines and cells by number. No line and no cell: the whole skin.
+class Place:
+    """Lines and cells of a skin by number; all of them empty: the whole skin."""
 
-    values: what describes it, by the names that `kind` lists; others are a ValueError.
-    """
-
-    kind: Kind
-    rows: tuple[int, ...]
-    columns: tuple[int, ...]
-    cells: tuple[Cell, ...]
-    values: Mapping[str, Any]
-
-    def __post_init__(self) -> None:
-        if self.values.keys() != self.kind.names:
-            raise ValueError(f"{self.kind.id} has {set(self.kind.names)}, not {set(self.values)}")
+    rows: tuple[int, ...] = ()
+    columns: tuple[int, ...] = ()
+    cells: tuple[Cell, ...] = ()
 
 
-def found(
-    kind: Kind,
-    *,
-    rows: tuple[int, ...] = (),
-    columns: tuple[int, ...] = (),
-    cells: tuple[Cell, ...] = (),
-    **values: Any,
-) -> Finding:
-    """A finding with these values."""
-    return Finding(kind, rows, columns, cells, values)
+WHOLE_SKIN: Final = Place()
 
 
 def lines_of(where: NDArray[np.bool_]) -> tuple[int, ...]:
@@ -107,64 +86,68 @@ def lines_of(where: NDArray[np.bool_]) -> tuple[int, ...]:
 
 
 def cells_of(where: NDArray[np.bool_]) -> tuple[Cell, ...]:
-    """Row and column of each cell that is true in `where` (R, C)."""
+    """Each cell that is true in `where` (R, C)."""
     return tuple((int(row), int(column)) for row, column in np.argwhere(where))
 
 
 @dataclass(frozen=True)
-class WireShare:
-    """Wire resistance over the nominal one, of some lines or of whole layers, and its deviation.
+class Finding:
+    """One thing found. values: what describes it, by the names that `kind` lists, and no others."""
 
-    layers: "top", "bottom", or both. rows, columns: the lines; none of them for whole layers.
-    known: the deviation is small enough to tell the share. differs: the wires are clearly not
-    nominal, and no other share tells it already.
+    kind: Kind
+    place: Place
+    values: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.values.keys() != self.kind.names:
+            raise ValueError(f"{self.kind.id} has {set(self.kind.names)}, not {set(self.values)}")
+
+
+def found(kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> Finding:
+    """A finding with these values."""
+    return Finding(kind, place, values)
+
+
+@dataclass(frozen=True)
+class WireShare:
+    """Wire resistance over the nominal one, and its deviation.
+
+    layers: "top", "bottom", or both. place: lines, or the whole layers. known: the deviation is
+    small enough to tell the share. differs: the wires are clearly not nominal, and no other share
+    tells it already.
     """
 
     layers: tuple[str, ...]
+    place: Place
     share: float
     std: float
     known: bool
     differs: bool
-    rows: tuple[int, ...] = ()
-    columns: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Wires:
-    """All that is known of the wires. nominal_ohm: a segment of the top and the bottom layer.
-
-    untouched: shares of both layers, then of each line if an earlier rest was told. pressed: the
-    share of both layers together, then of each row and column that were measured; None if nobody
-    was asked to press, empty if no three corners were pressed.
-    """
-
-    nominal_ohm: tuple[float, float]
-    untouched: tuple[WireShare, ...]
-    pressed: tuple[WireShare, ...] | None
-
-    @property
-    def known(self) -> bool:
-        """Whether the wires of a layer are known."""
-        layers = self.untouched[:2] if self.pressed is None else self.pressed[:1]
-        return any(each.known for each in layers)
-
-
-@dataclass(frozen=True)
+@dataclass
 class Diagnosis:
-    """Findings in the order of their kinds, figures by name, and the wires where they were judged.
+    """All that was found. Findings stand in the order of their kinds.
 
-    A figure that could not be had is None.
+    measured: figures by name, None for one that could not be had. nominal_ohm: wires of a segment,
+    top and bottom. untouched: shares of both layers, then of each line if an earlier rest was told;
+    empty if touches or faults hide the wires. pressed: the share of all wires that presses show,
+    then of each row and column; None if nobody was asked to press.
     """
 
-    findings: tuple[Finding, ...]
-    measured: Mapping[str, Any] = field(default_factory=dict)
-    wires: Wires | None = None
-
-    def __post_init__(self) -> None:
-        in_order = sorted(self.findings, key=lambda finding: _ORDER[finding.kind])
-        object.__setattr__(self, "findings", tuple(in_order))
+    findings: list[Finding] = field(default_factory=list)
+    measured: dict[str, Any] = field(default_factory=dict)
+    nominal_ohm: tuple[float, float] = (0.0, 0.0)
+    untouched: list[WireShare] = field(default_factory=list)
+    pressed: list[WireShare] | None = None
 
     @property
-    def worse(self) -> tuple[Finding, ...]:
+    def worse(self) -> list[Finding]:
         """The findings that are more than notes: with any, the skin is not sound."""
-        return tuple(each for each in self.findings if each.kind.severity is not Severity.NOTE)
+        return [each for each in self.findings if each.kind.severity is not Severity.NOTE]
+
+    @property
+    def wires_hidden(self) -> bool:
+        """Whether the wires were judged, but are not known of any layer."""
+        layers = self.untouched[:2] if self.pressed is None else self.pressed[:1]
+        return bool(self.untouched) and not any(each.known for each in layers)

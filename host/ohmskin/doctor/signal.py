@@ -19,9 +19,10 @@ Hum of amplitude a has |c(f)| = a at every reading. Noise of deviation s alone h
 4 s^2 sum w^2. Hum is found where P is far above that of the noise and above that of frequencies
 beside it, and where the amplitude is large enough to matter.
 
-One reading at scan rate r sees the frequency f as |f - k r|, k the nearest whole number, so that two
-mains may look alike. But the readings of one scan are taken at different times, and with the right
-f their c(f) exp(-2 pi i f d) have one phase. Mains that are seen at almost 0 Hz look like drift.
+One reading at scan rate r sees the frequency f as |f - k r|, with k the nearest whole number, so
+that two mains may look alike. But the readings of one scan are taken at different times, and with
+the right f their c(f) exp(-2 pi i f d) have one phase. Mains that are seen at almost 0 Hz look like
+drift.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.doctor.findings import Finding, Kind, cells_of, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, cells_of, found, lines_of
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS, ENUMS
 from ohmskin.link.scan_times import SELECT_S, reading_offsets_s
@@ -66,13 +67,13 @@ NOISY_CELL_LSB: Final = 1.0  # LSB, of a line or cell: more, because the worst o
 NOISY_SHARE: Final = 1.7  # of a line or cell over the others: three times the power
 
 BLOCKS: Final = 8  # parts of the scans whose means are compared: 0.3 s, shorter than a touch
-MOVED_LSB: Final = 3.0  # LSB from one mean to another: temperature changes them by less
+MOVED_LSB: Final = 3.0  # LSB from one mean to another: the lightest touch changes some 15
 CLEAR_STDS: Final = 6.0  # deviations of a clear difference: up to 1024 readings are looked at
 
 UNSETTLED_LSB: Final = 1.0  # LSB, change with a longer settle time that matters: one code
 SETTLED_NOISE_LSB: Final = 0.5  # LSB, least scatter: codes that do not scatter hide so much
 LONGER: Final = 4  # settle time of the second look: of what was left, its fourth power is left
-LEAST_LONGER_US: Final = 100  # microseconds, at least: ten time constants of 1 nF behind 10 kOhm
+LEAST_LONGER_US: Final = 100  # microseconds, at least: ten time constants of 10 us
 NOT_LONGER: Final = 1.2  # a settle time that is longer by less shows nothing new
 LEAST_LOOK_HZ: Final = 4.0  # Hz of the second look, unless the board is slower: six scans
 
@@ -100,9 +101,11 @@ class RestScans:
         return np.asarray(self.codes.mean(axis=0))
 
     @property
-    def seconds(self) -> float:
-        """Time from the first scan to the last [s]."""
-        return float(np.ptp(self.time_s))
+    def hidden_hz(self) -> tuple[float, ...]:
+        """Mains that these scans cannot show [Hz]."""
+        if len(self.codes) < LEAST_SCANS:
+            return MAINS_HZ
+        return _hidden_hz(self.board.rate_hz, float(np.ptp(self.time_s)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,21 +125,23 @@ class Hum:
 class Signal:
     """What scans show besides their means.
 
-    noise_lsb: of a reading, without hum. hum_lsb: amplitude, 0 for none. hum_hidden: mains that
-    these scans cannot show [Hz]. moved: cells that changed meanwhile, (R, C).
+    noise_lsb: of a reading, without hum. hum_lsb: amplitude, 0 for none. hidden_hz: mains that the
+    scans cannot show. moved: cells that changed meanwhile, (R, C).
     """
 
-    findings: tuple[Finding, ...]
+    findings: list[Finding]
     noise_lsb: float
     hum_lsb: float
-    hum_hidden: tuple[float, ...]
+    hidden_hz: tuple[float, ...]
     moved: Bool
 
 
-def examine_signal(scans: RestScans) -> Signal:
-    """Hum, the noise that is left without it, and what moved meanwhile."""
-    enough = len(scans.codes) >= LEAST_SCANS
-    hum = find_hum(scans)
+def examine_signal(scans: RestScans, other: RestScans | None = None) -> Signal:
+    """Hum, the noise that is left without it, and what moved meanwhile.
+
+    other: scans at another rate, which may show a hum that these hide.
+    """
+    hum, hidden_hz = find_hum(scans), scans.hidden_hz
     rest = scans.codes - scans.mean
     if hum is not None:
         turn = np.exp(2j * np.pi * hum.frequency_hz * scans.time_s)
@@ -144,29 +149,14 @@ def examine_signal(scans: RestScans) -> Signal:
     # Differences from scan to scan: what moves slowly is no noise.
     variance = np.mean(np.diff(rest, axis=0) ** 2, axis=0) / 2
     moved = _moved(rest, variance)
+    if other is not None and hidden_hz and hum is None and not moved.any():
+        hum = find_hum(other)
+        hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
     findings = [] if hum is None else [_hum_finding(hum, scans.board)]
-    if enough and not moved.any():
+    if len(scans.codes) >= LEAST_SCANS and not moved.any():
         findings += _noise(np.sqrt(variance.mean(axis=2)))
-    return Signal(
-        tuple(findings),
-        noise_lsb=float(np.median(variance.mean(axis=2)) ** 0.5),
-        hum_lsb=0.0 if hum is None else hum.lsb,
-        hum_hidden=_hidden_hz(scans.board.rate_hz, scans.seconds) if enough else MAINS_HZ,
-        moved=moved,
-    )
-
-
-def with_hum_of(signal: Signal, other: RestScans, board: Hello) -> Signal:
-    """`signal` of a board, with the hum that its scan rate hides and scans of another rate show."""
-    if not signal.hum_hidden or signal.hum_lsb:
-        return signal
-    hum = find_hum(other)
-    still = examine_signal(other).hum_hidden
-    hidden = tuple(mains_hz for mains_hz in signal.hum_hidden if mains_hz in still)
-    if hum is None:
-        return replace(signal, hum_hidden=hidden)
-    findings = (*signal.findings, _hum_finding(hum, board))
-    return replace(signal, findings=findings, hum_lsb=hum.lsb, hum_hidden=hidden)
+    noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
+    return Signal(findings, noise_lsb, 0.0 if hum is None else hum.lsb, hidden_hz, moved)
 
 
 def mean_std_lsb(noise_lsb: float, scans: int) -> float:
@@ -196,6 +186,7 @@ class _Spectrum:
         self._window = window / window.sum()
         self._weighted = self._window[:, None] * rest.reshape(len(rest), -1)
         self._time_s = scans.time_s
+        self.seconds = float(np.ptp(scans.time_s))
         self._shape = rest.shape[1:]
         self.noise = 4 * float((rest**2).mean()) * float(np.sum(self._window**2))
 
@@ -224,12 +215,12 @@ class _Spectrum:
 
 def find_hum(scans: RestScans) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen."""
-    if len(scans.codes) < LEAST_SCANS or not np.ptp(scans.codes, axis=0).any():
+    if not np.ptp(scans.codes, axis=0).any():
         return None
     spectrum = _Spectrum(scans)
-    hidden = _hidden_hz(scans.board.rate_hz, scans.seconds)
-    visible = [mains_hz for mains_hz in MAINS_HZ if mains_hz not in hidden]
-    heard = [_hum_at(mains_hz, spectrum, scans.seconds) for mains_hz in visible]
+    heard = [
+        _hum_at(mains_hz, spectrum) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz
+    ]
     match [hum for hum in heard if hum is not None]:
         case [one, other]:
             return _the_right_one(one, other, spectrum, reading_offsets_s(scans.board))
@@ -237,13 +228,13 @@ def find_hum(scans: RestScans) -> Hum | None:
             return some[0] if some else None
 
 
-def _hum_at(mains_hz: float, spectrum: _Spectrum, seconds: float) -> Hum | None:
+def _hum_at(mains_hz: float, spectrum: _Spectrum) -> Hum | None:
     """Hum near one of the mains, if it matters and stands out."""
     frequency_hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=spectrum.power)
     power = spectrum.power(frequency_hz)
     share, sine = spectrum.sine(frequency_hz)
     lsb = max(share * (power - spectrum.noise), 0.0) ** 0.5
-    beside = np.median([spectrum.power(frequency_hz + far / seconds) for far in BESIDE])
+    beside = np.median([spectrum.power(frequency_hz + far / spectrum.seconds) for far in BESIDE])
     over_noise = power > spectrum.noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
     if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
         return Hum((mains_hz,), frequency_hz, sine, lsb)
@@ -285,7 +276,7 @@ def _hum_finding(hum: Hum, board: Hello) -> Finding:
     worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
     return found(
         Kind.HUM,
-        cells=cells_of(worst),
+        Place(cells=cells_of(worst)),
         mains_hz=hum.mains_hz,
         amplitude_lsb=hum.lsb,
         most_lsb=HUM_LSB,
@@ -320,8 +311,8 @@ def _noise(cell_lsb: Float) -> list[Finding]:
         lsb = float(cell_lsb.max())
     elif usual <= NOISY_LSB:
         return []
-    told = {"noise_lsb": lsb, "sound_lsb": SOUND_NOISE_LSB, "adc_lsb": ADC_NOISE_LSB}
-    return [found(Kind.NOISE, rows=rows, columns=columns, cells=cells, **told)]
+    place, sound = Place(rows, columns, cells), SOUND_NOISE_LSB
+    return [found(Kind.NOISE, place, noise_lsb=lsb, sound_lsb=sound, adc_lsb=ADC_NOISE_LSB)]
 
 
 # ------------------------------------------------------------------------------------ settling
@@ -370,7 +361,7 @@ def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding
     needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
     finding = found(
         Kind.SETTLING,
-        cells=() if cells.mean() > 0.5 else cells_of(cells),
+        WHOLE_SKIN if cells.mean() > 0.5 else Place(cells=cells_of(cells)),
         change_lsb=float(change.max()),
         most_lsb=UNSETTLED_LSB,
         settle_us=settle_us,

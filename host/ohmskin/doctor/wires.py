@@ -63,7 +63,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
 from ohmskin.doctor.circuit import matrix_estimator
-from ohmskin.doctor.findings import Cell, WireShare, cells_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare, cells_of
 from ohmskin.doctor.signal import rounding_std_lsb
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
@@ -137,54 +137,39 @@ def measure_untouched(
     model = port_sensitivity(cell, *(np.full(shape, ohm) for ohm in wire_ohm))
     now_ohm, noise_ohm = _port_ohm(ratio, mean_std, board)
     expected_ohm = model.port_ohm if rest_ratio is None else _port_ohm(rest_ratio, 0.0, board)[0]
+    z, by_cell = now_ohm - expected_ohm, model.by_cell
     by_wire = model.by_wires().reshape(-1, 2, rows, columns)
     slopes = np.concatenate(
         [by_wire.sum(axis=(2, 3)), by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1
     )
-    prior = np.array([LAYER_STD] * 2 + [LINE_STD] * (rows + columns))
-    fit = _Untouched(now_ohm - expected_ohm, slopes, model.by_cell, noise_ohm, prior)
-    shares = []
-    for layer, name in enumerate(LAYERS):
-        more, std = fit.sum_of([layer], prior)
-        differs = abs(more) > max(CHANGED, CLEAR_STDS * std)
-        shares.append(WireShare((name,), 1 + more, std, std < KNOWN, differs))
-    for number in range(rows + columns):
-        # Each line in turn may be unlike the others of its layer.
-        odd = prior.copy()
-        odd[2 + number] = ODD_LINE_STD
-        layer = int(number >= rows)
-        more, std = fit.sum_of([layer, 2 + number], odd)
-        differs = abs(more) > max(LINE_CHANGED, CLEAR_STDS * std) and not shares[layer].differs
-        line = ((), (number - rows,)) if layer else ((number,), ())
-        shares.append(WireShare((LAYERS[layer],), 1 + more, std, std < KNOWN, differs, *line))
-    return shares
+    alike = np.array([LAYER_STD] * 2 + [LINE_STD] * (rows + columns))
+    common = COMMON_STD * by_cell.sum(axis=1)
+    for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
+        # The smallest scatter of cells that, with all else, explains the readings.
+        but_wires = np.outer(common, common) + np.diag(noise_ohm**2)
+        but_wires += float(cell_std) ** 2 * by_cell @ by_cell.T
+        if z @ np.linalg.solve(but_wires + (slopes * alike**2) @ slopes.T, z) < len(z):
+            break
 
-
-class _Untouched:
-    """Generalised least squares of x: see the symbols above."""
-
-    def __init__(
-        self, z: Float, slopes: Float, by_cell: Float, noise_ohm: Float, prior: Float
-    ) -> None:
-        self._z, self._slopes = z, slopes
-        common = by_cell.sum(axis=1)
-        known = COMMON_STD**2 * np.outer(common, common) + np.diag(noise_ohm**2)
-        for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
-            # The smallest scatter of cells that, with all else, explains the readings.
-            self._but_wires = known + float(cell_std) ** 2 * by_cell @ by_cell.T
-            if z @ np.linalg.solve(self._covariance(prior), z) < len(z):
-                break
-
-    def _covariance(self, prior: Float) -> Float:
-        return self._but_wires + (self._slopes * prior) @ (self._slopes * prior).T
-
-    def sum_of(self, which: list[int], prior: Float) -> tuple[float, float]:
-        """Sum of some of x, and its deviation, with these deviations before the readings."""
-        spread = self._slopes * prior**2
-        gain = np.linalg.solve(self._covariance(prior), spread)
+    shares: list[WireShare] = []
+    for at in range(len(alike)):
+        line, layer = at - 2, at
+        place, prior, least = WHOLE_SKIN, alike, CHANGED
+        if line >= 0:
+            layer = int(line >= rows)
+            place = Place(columns=(line - rows,)) if layer else Place(rows=(line,))
+            # Each line in turn may be unlike the others of its layer.
+            prior = np.where(np.arange(len(alike)) == at, ODD_LINE_STD, alike)
+            least = np.inf if shares[layer].differs else LINE_CHANGED
+        spread = slopes * prior**2
+        gain = np.linalg.solve(but_wires + spread @ slopes.T, spread)
         posterior = np.diag(prior**2) - spread.T @ gain
-        variance = float(posterior[np.ix_(which, which)].sum())
-        return float((gain.T @ self._z)[which].sum()), max(variance, 0.0) ** 0.5
+        summed = sorted({layer, at})
+        more = float((gain.T @ z)[summed].sum())
+        std = max(float(posterior[np.ix_(summed, summed)].sum()), 0.0) ** 0.5
+        differs = abs(more) > max(least, CLEAR_STDS * std)
+        shares.append(WireShare((LAYERS[layer],), place, 1 + more, std, std < KNOWN, differs))
+    return shares
 
 
 # --------------------------------------------------------------------------- pressed corners
@@ -196,10 +181,7 @@ def suggested_corners(rows: int, columns: int) -> Corners:
     :raises ValueError: a skin of one row or column has no rectangle.
     """
     if min(rows, columns) < 2:
-        raise ValueError(
-            f"the wires of a {rows}x{columns} skin cannot be measured by pressing it: there is no "
-            "rectangle"
-        )
+        raise ValueError(f"a {rows}x{columns} skin has no rectangle to press: leave out --press")
     row, column = (max(0, count - 1 - max(2, count // 2 - 1)) for count in (rows, columns))
     return (row, column), (row, columns - 1), (rows - 1, column)
 
@@ -307,12 +289,12 @@ def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
     mean, mean_std = float(np.average(y, weights=std**-2.0)), float(np.sum(std**-2.0) ** -0.5)
     alike = bool(np.all(np.abs(y - mean) < PRESSED_CLEAR_STDS * std))
 
-    def share(y: float, std: float, tells: bool, *lines: tuple[int, ...]) -> WireShare:
+    def share(y: float, std: float, tells: bool, place: Place = WHOLE_SKIN) -> WireShare:
         clear = abs(y) > max(float(np.log(1 + CHANGED)), PRESSED_CLEAR_STDS * std)
         known, times = std <= KNOWN, float(np.exp(y))
-        return WireShare(LAYERS, times, times * std, known, tells and known and clear, *lines)
+        return WireShare(LAYERS, place, times, times * std, known, tells and known and clear)
 
-    each = [share(y, std, not alike, (row,), (column,)) for (row, column), y, std in found]
+    each = [share(y, std, not alike, Place((row,), (column,))) for (row, column), y, std in found]
     return [share(mean, mean_std, alike), *each]
 
 
@@ -366,12 +348,9 @@ def _pressed_fit(
 
 def _free(shape: tuple[int, ...], corners: Corners) -> Bool:
     """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
-    row, column = np.indices(shape)
-
-    def around(cell: Cell) -> Bool:
-        return np.asarray((np.abs(row - cell[0]) <= 1) & (np.abs(column - cell[1]) <= 1))
-
-    free = around(corners[0]) | around(corners[1]) | around(corners[2])
-    free &= ~around(moved_across(corners)[0])
+    cells = np.array([*corners, moved_across(corners)[0]])
+    rows, columns = np.indices(shape)[..., None]
+    near = np.maximum(np.abs(rows - cells[:, 0]), np.abs(columns - cells[:, 1])) <= 1
+    free = near[..., :3].any(axis=-1) & ~near[..., 3]
     free[tuple(np.transpose(corners))] = True
-    return free
+    return np.asarray(free)
