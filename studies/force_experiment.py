@@ -28,10 +28,9 @@ from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.press import PressModel
-from ohmskin.estimate.levels import VOLTAGE, voltage_level
-from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.force.curve_fit import Scatter, fit_power
-from ohmskin.force.regression import ForceRegression
+from ohmskin.estimate.methods import METHODS, PAPER_METHODS, VOLTAGE, make_estimator
+from ohmskin.estimate.ohm import voltage_level
+from ohmskin.force.regression import ForceRegression, fit_power
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 
 Progress = Callable[[int, int], None]
@@ -44,7 +43,7 @@ REGRESSIONS: Final = (LINE, SQUARES, CHOICE)
 _EXPONENTS: Final = np.geomspace(0.1, 50, 81)
 EVERY_GROUP: Final = "mean"
 # Ipopt gives up on most frames of one touch, after 0.2 and 0.3 s.
-SLOW: Final = ("lsq", "regularized")
+SLOW: Final = PAPER_METHODS
 FAST: Final = (VOLTAGE, *(name for name in METHODS if name not in SLOW), TRUTH)
 ALL: Final = (VOLTAGE, *METHODS, TRUTH)
 OURS: Final = ("joint", "touch")
@@ -169,7 +168,7 @@ def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], 
         # In units of each cell's largest rise: a siemens to the power of 50 is no number.
         unit = np.array([x[cell == k].max() for k in range(rows * columns)])
         curves = [
-            fit_power(x[cell == k] / unit[k], force_n[cell == k], Scatter(), _EXPONENTS)
+            fit_power(x[cell == k] / unit[k], force_n[cell == k], exponents=_EXPONENTS)
             for k in range(rows * columns)
         ]
         if None not in curves:

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
-from test_calibrated_device import calibration
 
 import ohmskin
 from bench_board import Bench, examined
+from calibrations import calibration
 from command_line import Done, assert_one_line
 from ohmskin.cli import doctor as doctor_command
 from ohmskin.doctor.examine import Examined, examine

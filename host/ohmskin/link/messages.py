@@ -98,6 +98,7 @@ class Scan:
     since the board was started. time_us: board time at the scan's start [us], without wraps, from
     the board's start. host_time_s: `time.monotonic()` when its last byte was read [s]. missed:
     scans made since the one before this that never came, dropped there or damaged on the way.
+    rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
     """
 
     codes: NDArray[np.uint16]
@@ -105,6 +106,7 @@ class Scan:
     time_us: int
     host_time_s: float
     missed: int
+    rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
 
     @property
     def ratio(self) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import errno
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol, runtime_checkable
+from typing import Final, Protocol
 
 import serial
 from serial.tools import list_ports
@@ -50,14 +50,6 @@ class Link(Protocol):
         """Give the port back. May be called again."""
 
 
-@runtime_checkable
-class PausableLink(Link, Protocol):
-    """A link whose scans can wait, such as those of a file."""
-
-    def pause(self, paused: bool) -> None:
-        """Hold scans back while nobody takes them. It begins paused."""
-
-
 class SerialLink:
     """A serial port, opened for this program alone.
 
@@ -71,7 +63,7 @@ class SerialLink:
                 path, baud, timeout=READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as exc:
-            raise PortError(_explain(path, exc)) from exc
+            raise PortError(*_explain(path, exc)) from exc
 
     def read(self) -> bytes:
         """See `Link.read`: waits for one byte, then takes all there are."""
@@ -101,21 +93,23 @@ class SerialLink:
         self._port.close()
 
 
-def _explain(path: str, exc: Exception) -> str:
+def _explain(path: str, exc: Exception) -> tuple[str, str]:
+    """Problem and remedy."""
     number = getattr(exc, "errno", None)
     text = str(exc)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFound" in text:
-        return f"no port {path}: 'ohmskin ports' lists the ports there are"
+        return f"no port {path}", "'ohmskin ports' lists the ports there are"
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return f"{path} is busy: close the other program that uses it"
+        return f"{path} is busy", "close the other program that uses it"
     if number in (errno.EACCES, errno.EPERM) or "PermissionError" in text:
         return (
-            f"no permission for {path}: on Linux run 'sudo usermod -aG dialout $USER' and log in "
-            "again; on Windows close the other program that uses it"
+            f"no permission for {path}",
+            "on Linux run 'sudo usermod -aG dialout $USER' and log in again; on Windows close the "
+            "other program that uses it",
         )
     if number in (errno.ENOTTY, errno.EINVAL):
-        return f"{path} is no serial port: 'ohmskin ports' lists the ports there are"
-    return f"cannot open {path}: {text}"
+        return f"{path} is no serial port", "'ohmskin ports' lists the ports there are"
+    return f"cannot open {path}: {text}", ""
 
 
 @dataclass(frozen=True)
