@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, cells_of, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS, ENUMS
 from ohmskin.link.scan_times import SELECT_S, reading_offsets_s
@@ -276,7 +276,7 @@ def _hum_finding(hum: Hum, board: Hello) -> Finding:
     worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
     return found(
         Kind.HUM,
-        Place(cells=cells_of(worst)),
+        Place.of_cells(worst),
         mains_hz=hum.mains_hz,
         amplitude_lsb=hum.lsb,
         most_lsb=HUM_LSB,
@@ -303,7 +303,7 @@ def _noise(cell_lsb: Float) -> list[Finding]:
     limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
     rows, columns = lines_of(row_lsb > limit), lines_of(column_lsb > limit)
-    cells = () if rows or columns else cells_of(cell_lsb > limit)
+    cells = () if rows or columns else Place.of_cells(cell_lsb > limit).cells
     lsb = usual
     if rows or columns:
         lsb = float(max(row_lsb.max(), column_lsb.max()))
@@ -361,7 +361,7 @@ def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding
     needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
     finding = found(
         Kind.SETTLING,
-        WHOLE_SKIN if cells.mean() > 0.5 else Place(cells=cells_of(cells)),
+        WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
         change_lsb=float(change.max()),
         most_lsb=UNSETTLED_LSB,
         settle_us=settle_us,
