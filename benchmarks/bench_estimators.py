@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import Readings, estimate_file, load_readings
@@ -205,8 +205,7 @@ def finger_figures(method: str) -> dict[str, float]:
         8,
         adc_bits=10,
         rest_ratio=ratio_from_codes(quantise(scene.rest_ratio)),
-        nominal_top_wire_ohm=TOP_WIRE_OHM,
-        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
     )
     estimator = make_estimator(method, knowledge)
     taken, relative, away = [], [], []

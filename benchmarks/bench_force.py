@@ -42,7 +42,7 @@ from ohmskin.calibrate.bench import Bench
 from ohmskin.calibrate.presses import Presses
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.force_reader import ForceReader, ForceScan
+from ohmskin.force.reader import ForceReader, ForceScan
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.readings import load_readings

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.methods import METHODS
-from ohmskin.estimate.paper import PaperEstimator
+from ohmskin.estimate.methods import METHODS, PAPER_METHODS
 from ohmskin.record.readings import estimate_file
 from studies import casadi_circuit, published
 from studies.information import information_limit
@@ -80,7 +79,7 @@ class Plan:
         return [
             method
             for method in self.methods
-            if size.cells <= PAPER_CELLS or not issubclass(METHODS[method], PaperEstimator)
+            if size.cells <= PAPER_CELLS or method not in PAPER_METHODS
         ]
 
 

@@ -27,7 +27,7 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.emulate.skin_faults import cut, joined_readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link.codes import DEFAULT_ADC_BITS, quantise, ratio_from_codes
 from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest, touch
 
@@ -107,8 +107,7 @@ def _case(
             columns,
             adc_bits=DEFAULT_ADC_BITS,
             rest_ratio=rest_ratio,
-            nominal_top_wire_ohm=wire_ohm[0],
-            nominal_bottom_wire_ohm=wire_ohm[1],
+            nominal_wire_ohm=WireOhm(wire_ohm[0], wire_ohm[1]),
         ),
         tuple(frames),
     )

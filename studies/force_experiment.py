@@ -28,8 +28,8 @@ from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.press import PressModel
-from ohmskin.estimate.levels import VOLTAGE, voltage_level
-from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.methods import METHODS, PAPER_METHODS, VOLTAGE, make_estimator
+from ohmskin.estimate.ohm import voltage_level
 from ohmskin.force.curve_fit import Scatter, fit_power
 from ohmskin.force.regression import ForceRegression
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
@@ -44,7 +44,7 @@ REGRESSIONS: Final = (LINE, SQUARES, CHOICE)
 _EXPONENTS: Final = np.geomspace(0.1, 50, 81)
 EVERY_GROUP: Final = "mean"
 # Ipopt gives up on most frames of one touch, after 0.2 and 0.3 s.
-SLOW: Final = ("lsq", "regularized")
+SLOW: Final = PAPER_METHODS
 FAST: Final = (VOLTAGE, *(name for name in METHODS if name not in SLOW), TRUTH)
 ALL: Final = (VOLTAGE, *METHODS, TRUTH)
 OURS: Final = ("joint", "touch")

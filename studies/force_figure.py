@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ohmskin.estimate.levels import VOLTAGE, voltage_level
-from ohmskin.estimate.methods import METHODS
+from ohmskin.estimate.methods import METHODS, VOLTAGE
+from ohmskin.estimate.ohm import voltage_level
 from studies.chart_figure import method_style, require_matplotlib
 from studies.force_experiment import CHOICE, EVERY_GROUP, TRUTH, Row, learn, rises
 from studies.force_limits import ALONE, BESIDE, PRESSED_CELL, SmallestForce

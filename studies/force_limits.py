@@ -15,8 +15,8 @@ from threadpoolctl import threadpool_limits
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.emulate.press import PressModel
-from ohmskin.estimate.levels import VOLTAGE, voltage_level
-from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.methods import VOLTAGE, make_estimator
+from ohmskin.estimate.ohm import voltage_level
 from ohmskin.link import protocol
 from studies.force_experiment import FAST, REGRESSIONS, SLOW, TRUTH, Progress, learn, rises
 from studies.force_trial import (

@@ -18,7 +18,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard
 from ohmskin.emulate.press import LEAVE_S, PressModel, robot_presses
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link import protocol
 from ohmskin.link.framing import encode
 from ohmskin.link.messages import BoardDecoder, Scan
@@ -81,8 +81,7 @@ def knowledge_of(rest_ratio: Float) -> SkinKnowledge:
         columns,
         adc_bits=protocol.ADC_BITS,
         rest_ratio=rest_ratio,
-        nominal_top_wire_ohm=TOP_WIRE_OHM,
-        nominal_bottom_wire_ohm=BOTTOM_WIRE_OHM,
+        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
     )
 
 

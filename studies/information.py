@@ -78,7 +78,7 @@ def information_limit(
     free = pressed.ravel()
     if rest_std is None:
         rest_std = UNKNOWN_REST_STD if knowledge.rest_ratio is None else REST_STD
-    nominal = (knowledge.nominal_top_wire_ohm, knowledge.nominal_bottom_wire_ohm)
+    nominal = knowledge.nominal_wire_ohm
     if layer_std is None:
         layer_std = UNKNOWN_LAYER_STD if None in nominal else LAYER_STD
 

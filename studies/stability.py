@@ -25,8 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate, Estimator
-from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.estimate.paper import PaperEstimator
+from ohmskin.estimate.methods import METHODS, PAPER_METHODS, make_estimator
 from studies.conditions import SWEEPS, Case, Shape
 
 # An error within either counts as none: a share of the truth, the least rise called a touch.
@@ -131,7 +130,7 @@ def tasks_of(plan: Plan, methods: Iterable[str] = METHODS) -> list[Task]:
     papers: list[str] = []
     others: list[str] = []
     for method in methods:
-        (papers if issubclass(METHODS[method], PaperEstimator) else others).append(method)
+        (papers if method in PAPER_METHODS else others).append(method)
     conditions = [(sweep.name, x) for sweep in SWEEPS.values() for x in sweep.values]
     # The paper's two apart, too: each takes seconds.
     longest = [
@@ -158,7 +157,7 @@ def judge(task: Task) -> list[Row]:
 
 def _judge_method(task: Task, method: str, case: Case) -> Row:
     knowledge = case.knowledge
-    if issubclass(METHODS[method], PaperEstimator):
+    if method in PAPER_METHODS:
         # It serves these methods for `touched` alone, and costs them a second.
         knowledge = replace(knowledge, rest_ratio=None)
     estimator = make_estimator(method, knowledge)

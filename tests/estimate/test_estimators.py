@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ohmskin.circuit.skin import Skin, ratio_from_current, readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import solve_ports
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -321,8 +321,8 @@ def test_an_unknown_method_is_answered_with_the_known_ones() -> None:
         ({"adc_bits": 0}, "adc bits"),
         ({"rest_ratio": np.ones((2, 2))}, "rest_ratio has shape"),
         ({"rest_ratio": np.full((2, 2, 4), 2.0)}, r"rest_ratio of cell \(0, 0\)"),
-        ({"nominal_top_wire_ohm": -1.0}, "nominal_top_wire_ohm"),
-        ({"nominal_bottom_wire_ohm": np.nan}, "nominal_bottom_wire_ohm"),
+        ({"nominal_wire_ohm": WireOhm(-1.0)}, "nominal_top_wire_ohm"),
+        ({"nominal_wire_ohm": WireOhm(bottom=np.nan)}, "nominal_bottom_wire_ohm"),
     ],
 )
 def test_impossible_knowledge_is_refused(wrong: dict[str, object], message: str) -> None:

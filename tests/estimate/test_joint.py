@@ -14,7 +14,7 @@ from ohmskin.circuit.skin import (
     port_sensitivity,
     readings,
 )
-from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm
 from ohmskin.estimate.joint import JointEstimator
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import LAYER_STD, SEGMENT_STD
@@ -45,8 +45,10 @@ def estimates(name: str, bits: int | None) -> list[tuple[Estimate, dict[str, Flo
             columns,
             adc_bits=bits,
             rest_ratio=rounded(rest if rest.ndim == 3 else rest[frame], bits),
-            nominal_top_wire_ohm=of_frame(data["nominal_top_wire_ohm"], frame),
-            nominal_bottom_wire_ohm=of_frame(data["nominal_bottom_wire_ohm"], frame),
+            nominal_wire_ohm=WireOhm(
+                of_frame(data["nominal_top_wire_ohm"], frame),
+                of_frame(data["nominal_bottom_wire_ohm"], frame),
+            ),
         )
         estimate = make_estimator("joint", knowledge).estimate(rounded(data["ratio"][frame], bits))
         truth = {"siemens": 1 / data["cell_ohm"][frame], "rest": 1 / data["rest_ohm"]}
@@ -192,8 +194,7 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
         4,
         adc_bits=10,
         rest_ratio=rounded(readings(rest), 10),
-        nominal_top_wire_ohm=100.0,
-        nominal_bottom_wire_ohm=200.0,
+        nominal_wire_ohm=WireOhm(100.0, 200.0),
     )
     estimator = JointEstimator(knowledge)
     measured = rounded(readings(touched), 10)

@@ -11,7 +11,7 @@ import pytest
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.emulate.scenes import Scene
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.rest_network import RestNetwork, TouchedNetwork
 from ohmskin.estimate.wires import FADE, WireBelief
@@ -30,8 +30,7 @@ def knowledge_of(rest: Skin) -> SkinKnowledge:
         *rest.shape,
         adc_bits=10,
         rest_ratio=ten_bits(readings(rest)),
-        nominal_top_wire_ohm=100.0,
-        nominal_bottom_wire_ohm=200.0,
+        nominal_wire_ohm=WireOhm(100.0, 200.0),
     )
 
 
@@ -163,8 +162,7 @@ def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
         8,
         adc_bits=10,
         rest_ratio=ten_bits(scene.rest_ratio),
-        nominal_top_wire_ohm=100.0,
-        nominal_bottom_wire_ohm=200.0,
+        nominal_wire_ohm=WireOhm(100.0, 200.0),
     )
     estimator = make_estimator(method, knowledge)
     errors, away, converged = [], [], []

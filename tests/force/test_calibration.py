@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
 from ohmskin.force.curve import POWER
 from ohmskin.force.regression import ForceRegression
@@ -49,7 +49,7 @@ def calibration(pressed: int = 5) -> Calibration:
         rest=rest(2, "2025-03-01T11:50:00+00:00"),
         model=found.model_,
         indenter_area_m2=1e-4,
-        nominal_top_wire_ohm=100.0,
+        nominal_wire_ohm=WireOhm(100.0),
     )
 
 

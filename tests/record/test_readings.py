@@ -43,7 +43,7 @@ def test_a_reference_file_is_read_whole() -> None:
     knowledge = readings.knowledge(0)
     assert (knowledge.rows, knowledge.columns) == (4, 6)
     assert (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) == (30e3, 30e3)
-    assert (knowledge.nominal_top_wire_ohm, knowledge.nominal_bottom_wire_ohm) == (100, 200)
+    assert knowledge.nominal_wire_ohm == (100, 200)
     assert knowledge.adc_bits is None
     assert not readings.one_skin_per_frame
 
@@ -52,7 +52,7 @@ def test_a_sweep_has_rest_and_wires_of_its_own_per_frame() -> None:
     readings = load_readings(DATA / "wire_sweep_3x3.npz")
     assert readings.one_skin_per_frame
     first, last = readings.knowledge(0), readings.knowledge(4)
-    assert (first.nominal_top_wire_ohm, last.nominal_top_wire_ohm) == (100, 41_000)
+    assert (first.nominal_wire_ohm.top, last.nominal_wire_ohm.top) == (100, 41_000)
     assert not np.array_equal(first.rest_ratio, last.rest_ratio)  # type: ignore[arg-type]
 
 
@@ -62,7 +62,7 @@ def test_ratio_alone_is_enough(tmp_path: Path) -> None:
     assert knowledge.adc_bits == 12
     assert knowledge.ref_top_ohm == 30e3
     assert knowledge.rest_ratio is None
-    assert knowledge.nominal_top_wire_ohm is None
+    assert knowledge.nominal_wire_ohm.top is None
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -150,7 +150,7 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD, "adc_bits": 10.5}, "adc bits must be"),
         ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),
         ({"ratio": GOOD, "nominal_top_wire_ohm": np.ones(3)}, "nominal_top_wire_ohm has shape"),
-        ({"ratio": GOOD, "nominal_bottom_wire_ohm": [1, -1]}, "nominal_bottom_wire_ohm must be"),
+        ({"ratio": GOOD, "nominal_bottom_wire_ohm": [1, -1]}, "nominal_bottom_wire_ohm is -1"),
     ],
 )
 def test_a_wrong_file_is_refused_by_name_in_one_line(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.prior import (
     LAYER_STD,
     REST_STD,
@@ -19,7 +19,7 @@ from ohmskin.estimate.prior import (
 )
 from studies.information import PRESSED_STD, information_limit
 
-NOMINAL = {"nominal_top_wire_ohm": 100.0, "nominal_bottom_wire_ohm": 200.0}
+NOMINAL = {"nominal_wire_ohm": WireOhm(100.0, 200.0)}
 
 
 def skin_of(rows: int, columns: int, pressed: int, seed: int) -> tuple[Skin, NDArray[np.bool_]]:

@@ -204,9 +204,9 @@ def test_noise_is_as_strong_as_it_says() -> None:
 
 
 def test_told_wires_are_the_swept_ones() -> None:
-    assert build("nominal", 0.5).knowledge.nominal_top_wire_ohm == 50
-    assert build("nominal", 2.0).knowledge.nominal_bottom_wire_ohm == 400
-    assert build("wires", 40.0).knowledge.nominal_top_wire_ohm == 200e3
+    assert build("nominal", 0.5).knowledge.nominal_wire_ohm.top == 50
+    assert build("nominal", 2.0).knowledge.nominal_wire_ohm.bottom == 400
+    assert build("wires", 40.0).knowledge.nominal_wire_ohm.top == 200e3
 
 
 def test_frames_before_are_read_and_not_judged() -> None:

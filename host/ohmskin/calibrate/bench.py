@@ -13,9 +13,9 @@ from ohmskin.calibrate.alignment import Alignment, align
 from ohmskin.calibrate.force_log import ForceLog
 from ohmskin.calibrate.press_table import PressTable
 from ohmskin.calibrate.presses import LevelHistory, Presses, find_presses
-from ohmskin.estimate.levels import VOLTAGE, LevelMeter
+from ohmskin.estimate.base import NO_WIRES, Estimator, SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.force_reader import knowledge_of
 from ohmskin.force.regression import ForceRegression
 from ohmskin.link.messages import Hello, Scan
 
@@ -24,8 +24,8 @@ from ohmskin.link.messages import Hello, Scan
 class Bench:
     """What a calibration is made with: the board, the untouched skin, the tool, the method.
 
-    rest_ratio (R, C, 4). indenter_area_m2: of the tool's contact. nominal_..._wire_ohm: one wire
-    segment of each layer, None where it is not known. date: ISO 8601.
+    rest_ratio (R, C, 4). indenter_area_m2: of the tool's contact. nominal_wire_ohm: of one wire
+    segment of each layer. date: ISO 8601.
     """
 
     board: Hello
@@ -33,20 +33,12 @@ class Bench:
     method: str
     indenter_area_m2: float
     date: str
-    nominal_top_wire_ohm: float | None = None
-    nominal_bottom_wire_ohm: float | None = None
+    nominal_wire_ohm: WireOhm = NO_WIRES
 
-    def meter(self) -> LevelMeter:
-        """A meter that is told all this."""
-        return LevelMeter(
-            self.method,
-            knowledge_of(
-                self.board,
-                self.rest_ratio,
-                self.nominal_top_wire_ohm,
-                self.nominal_bottom_wire_ohm,
-            ),
-        )
+    def estimator(self) -> Estimator:
+        """An estimator that is told all this."""
+        known = SkinKnowledge.of(self.board, self.rest_ratio, self.nominal_wire_ohm)
+        return make_estimator(self.method, known)
 
     def calibration(self, presses: Presses) -> tuple[Calibration, str]:
         """The calibration, and which cells have no curve of their own.
@@ -73,11 +65,10 @@ class Bench:
             unit_id=self.board.unit_id,
             date=self.date,
             method=self.method,
-            rest=Rest(self.date, self.rest_ratio, np.maximum(self.meter().rest(), 0.0)),
+            rest=Rest(self.date, self.rest_ratio, np.maximum(self.estimator().rest_level(), 0.0)),
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
-            nominal_top_wire_ohm=self.nominal_top_wire_ohm,
-            nominal_bottom_wire_ohm=self.nominal_bottom_wire_ohm,
+            nominal_wire_ohm=self.nominal_wire_ohm,
         )
         return calibration, found.message_
 
@@ -93,13 +84,13 @@ def measure(
                 f"scan {scan.number} is {scan.rows}x{scan.columns}, the untouched skin was "
                 f"{expected[0]}x{expected[1]}"
             )
-    meter, history = bench.meter(), LevelHistory.empty(scans)
-    rest = meter.rest()
+    estimator, history = bench.estimator(), LevelHistory.empty(scans)
+    rest = estimator.rest_level()
     for index, scan in enumerate(scans):
-        found = meter.read(scan.ratio)
+        found = estimator.estimate(scan.ratio)
         history.rise[index] = found.level - rest
         history.rise_std[index] = found.level_std
-        history.touched[index] = found.estimate.touched
+        history.touched[index] = found.touched
         progress(index + 1)
     return history
 
@@ -132,7 +123,7 @@ def presses_from_table(bench: Bench, table: PressTable) -> Presses:
     cells = table.row * columns + table.column
     return Presses(
         cells=cells,
-        rise=table.conductance - bench.meter().rest().flat[cells],
+        rise=table.conductance - bench.estimator().rest_level().flat[cells],
         rise_std=table.conductance_std,
         force_n=table.force_n,
         press=np.arange(cells.size),

@@ -12,8 +12,8 @@ from rich.text import Text
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.estimate.levels import LevelMeter
-from ohmskin.force.force_reader import knowledge_of
+from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.messages import Hello, Scan
 
 # Looks at so many scans alone, whatever their rate: an estimate takes time, the recording goes on.
@@ -33,7 +33,7 @@ class PressWatch:
         self._board = board
         self._rest_s = rest_s
         self._untouched: list[Float] = []
-        self._meter: LevelMeter | None = None
+        self._estimator: Estimator | None = None
         self._on = OnSkin()
         self._first_s = self._looked_s = float("-inf")
         self._elapsed_s = 0.0
@@ -60,12 +60,13 @@ class PressWatch:
         return True
 
     def _look(self, scan: Scan) -> None:
-        if self._meter is None:
+        if self._estimator is None:
             rest_ratio = np.asarray(np.mean(self._untouched, axis=0))
-            self._meter = LevelMeter(_METHOD, knowledge_of(self._board, rest_ratio))
+            known = SkinKnowledge.of(self._board, rest_ratio)
+            self._estimator = make_estimator(_METHOD, known)
             self._untouched.clear()
-        found = self._meter.read(scan.ratio)
-        pressed = pressed_cells(found.level - self._meter.rest(), found.estimate.touched)
+        found = self._estimator.estimate(scan.ratio)
+        pressed = pressed_cells(found.level - self._estimator.rest_level(), found.touched)
         if self._on.see(scan.host_time_s, pressed) and len(self._on.cells) == 1:
             self.counts[self._on.cells[0]] += 1
 

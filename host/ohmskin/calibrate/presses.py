@@ -72,7 +72,7 @@ class LevelHistory:
 
     @classmethod
     def empty(cls, scans: list[Scan]) -> Self:
-        """Room for what a meter will say of these scans."""
+        """Room for what an estimator will say of these scans."""
         shape = (len(scans), *scans[0].codes.shape[:2])
         return cls(
             scan_times_s(scans), np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)

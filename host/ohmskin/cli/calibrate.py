@@ -23,7 +23,7 @@ from ohmskin.cli.calibrate_parts import (
     from_recording,
     from_table,
 )
-from ohmskin.force.calibrated_device import TARE_S
+from ohmskin.force.reader import TARE_S
 
 calibrate = typer.Typer(
     no_args_is_help=True,

@@ -38,8 +38,8 @@ from ohmskin.cli.calibrate_parts import (
 )
 from ohmskin.cli.record import record_scans, stop_signals
 from ohmskin.errors import DeviceLost, RecordingError
-from ohmskin.estimate.levels import VOLTAGE
-from ohmskin.force.calibrated_device import TARE_S
+from ohmskin.estimate.methods import VOLTAGE
+from ohmskin.force.reader import TARE_S
 from ohmskin.force.regression import MIN_PRESSES
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -101,7 +101,7 @@ def weights(
             with naming(kept.path):
                 presses_from_table(bench, kept.table)  # raises for another skin's
         kept.drop(again)
-        rest_us = 1e6 * bench.meter().rest()
+        rest_us = 1e6 * bench.estimator().rest_level()
         _out.print(f"rest: {rest_us.min():.2f} to {rest_us.max():.2f} microsiemens")
         left = _guided(skin, bench, kept, missing, len(asked)) if missing else 0
     if left:
@@ -115,15 +115,15 @@ def weights(
 
 def _guided(skin: Device, bench: Bench, kept: _KeptPresses, missing: list[Ask], total: int) -> int:
     """Ask for what is missing; returns how much still is when it was interrupted."""
-    guide, meter = Guide(missing), bench.meter()
-    rest, left = meter.rest(), len(missing)
+    guide, estimator = Guide(missing), bench.estimator()
+    rest, left = estimator.rest_level(), len(missing)
     with stop_signals() as (may_interrupt, is_stopped), _Voice(total).speaking() as voice:
         while not is_stopped():
             may_interrupt(True)
             scan = skin.latest()
             may_interrupt(False)
-            found = meter.read(scan.ratio)
-            event = guide.feed(1e-6 * scan.time_us, found.level - rest, found.estimate.touched)
+            found = estimator.estimate(scan.ratio)
+            event = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
             if event.had is not None:
                 kept.add(event.had, float(rest[event.had.ask.row, event.had.ask.column]))
                 left -= 1

@@ -23,9 +23,10 @@ from ohmskin.calibrate.number_table import naming
 from ohmskin.calibrate.press_table import PressTable
 from ohmskin.calibrate.presses import Presses
 from ohmskin.errors import RecordingError
-from ohmskin.estimate.levels import LEVEL_METHODS
-from ohmskin.force.calibrated_device import now
+from ohmskin.estimate.base import WireOhm
+from ohmskin.estimate.methods import LEVEL_METHODS
 from ohmskin.force.calibration import Calibration
+from ohmskin.force.reader import now
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
 
@@ -80,8 +81,7 @@ class Wanted:
             method=self.method,
             indenter_area_m2=1e-6 * self.indenter_mm2,
             date=now(),
-            nominal_top_wire_ohm=self.top_wire_ohm,
-            nominal_bottom_wire_ohm=self.bottom_wire_ohm,
+            nominal_wire_ohm=WireOhm(self.top_wire_ohm, self.bottom_wire_ohm),
         )
 
 
@@ -131,7 +131,7 @@ def finish(
     _out.print(_report(calibration, presses))
     if message:
         _out.print(message)
-    if calibration.nominal_top_wire_ohm is None or calibration.nominal_bottom_wire_ohm is None:
+    if calibration.nominal_wire_ohm.both is None:
         _out.print(
             "wires are not told (--top-wire, --bottom-wire): forces' standard deviations are wide"
         )

@@ -38,7 +38,7 @@ from ohmskin.errors import (
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
-from ohmskin.link.usb_latency import latency_ms, latency_timer_file
+from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
 WAIT_S: Final = 30.0  # seconds for a person to press where they are asked to
 LONGEST: Final = 2.0  # times as long as usual, at most, where scans are slow
@@ -95,7 +95,7 @@ def _wires(text: str) -> tuple[float, float]:
 def _wires_of(calibration: Calibration | None) -> tuple[float, float] | None:
     if calibration is None:
         return None
-    top, bottom = calibration.nominal_top_wire_ohm, calibration.nominal_bottom_wire_ohm
+    top, bottom = calibration.nominal_wire_ohm
     return (top, bottom) if top and bottom else None
 
 

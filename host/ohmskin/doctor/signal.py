@@ -37,8 +37,8 @@ from numpy.typing import ArrayLike, NDArray
 from ohmskin.arrays import Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import CONSTANTS, ENUMS
-from ohmskin.link.scan_times import SELECT_S, reading_offsets_s
+from ohmskin.link.protocol import CONSTANTS
+from ohmskin.link.timing import reading_offsets_s, slot_s
 
 Bool = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
@@ -324,14 +324,12 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     The settle time is longer, where it can be; the rate is one at which no mains stands still.
     """
     readings = board.rows * board.columns * board.readings_per_cell
-    slot_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ))
-    most_us = min(CONSTANTS["settle_us_max"], int(slot_us - 1e6 * SELECT_S))
+    spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
+    most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
     longer_us = min(max(LONGER * board.settle_us, LEAST_LONGER_US), most_us)
     if not _is_longer(longer_us, board.settle_us) and not _hidden_hz(board.rate_hz, REST_S):
         return None
-    prescaler = ENUMS["adc_prescaler"].values.get(board.adc_prescaler, 0)
-    conversion_us = 1e6 * 14 * prescaler / board.clock_hz
-    slot_us = max(longer_us + 1e6 * SELECT_S, conversion_us)
+    slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
     rates_hz = np.linspace(0.7, 1.0, 31) * fastest_hz
     best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(each, rate_hz) for each in MAINS_HZ))

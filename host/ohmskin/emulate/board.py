@@ -283,6 +283,7 @@ class EmulatedBoard:
             ref_bottom_ohm=self._refs_ohm[1],
             rate_asked_mhz=self._settings["rate_mhz"],
             scan_cycles=self._plan["scan_cycles"],
+            slot_cycles=self._plan["slot_cycles"],
             clock_hz=CLOCK_HZ,
             settle_asked_us=self._settings["settle_us"],
             settle_us=min(self._plan["settle_us"], 0xFFFF),

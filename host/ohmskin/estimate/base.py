@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +25,10 @@ from ohmskin.circuit.skin import (
     current_std,
     ratio_from_current,
 )
+from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.link.codes import check_adc_bits, ratio_std
+from ohmskin.link.messages import Hello
 
 # No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
 MIN_CELL_SIEMENS: Final = 1e-9
@@ -36,13 +38,34 @@ TOUCH_SIEMENS: Final = 0.5e-6
 TOUCH_STDS: Final = 4.0
 
 
+class WireOhm(NamedTuple):
+    """Nominal resistance of one wire segment of each layer [ohm]; None where it is not known."""
+
+    top: float | None = None
+    bottom: float | None = None
+
+    def check(self) -> None:
+        """Raise ValueError, naming the layer, for a resistance that is not finite or below 0."""
+        for layer, ohm in self._asdict().items():
+            if ohm is not None and not (np.isfinite(ohm) and ohm >= 0):
+                raise ValueError(f"nominal_{layer}_wire_ohm is {ohm}, it must be finite and >= 0")
+
+    @property
+    def both(self) -> tuple[float, float] | None:
+        """Top and bottom; None unless both are known."""
+        return None if self.top is None or self.bottom is None else (self.top, self.bottom)
+
+
+NO_WIRES: Final = WireOhm()
+
+
 @dataclass(frozen=True, eq=False)
 class SkinKnowledge:
     """What is known of a skin before a frame is read.
 
     rows, columns: its size. ref_top_ohm, ref_bottom_ohm [ohm]. adc_bits: resolution of the
     readings, None when they are exact. rest_ratio: readings (R, C, 4) of the untouched skin.
-    nominal_top_wire_ohm, nominal_bottom_wire_ohm: one wire segment of each layer [ohm].
+    nominal_wire_ohm: one wire segment of each layer [ohm], as far as it is known.
     Raises ValueError for a value that cannot be.
     """
 
@@ -52,8 +75,7 @@ class SkinKnowledge:
     ref_bottom_ohm: float = DEFAULT_REF_OHM
     adc_bits: int | None = None
     rest_ratio: Float | None = None
-    nominal_top_wire_ohm: float | None = None
-    nominal_bottom_wire_ohm: float | None = None
+    nominal_wire_ohm: WireOhm = NO_WIRES
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -65,10 +87,25 @@ class SkinKnowledge:
             rest = check_ratio(self.rest_ratio, self.rows, self.columns, name="rest_ratio").copy()
             rest.setflags(write=False)
             object.__setattr__(self, "rest_ratio", rest)
-        for layer in ("top", "bottom"):
-            ohm = getattr(self, f"nominal_{layer}_wire_ohm")
-            if ohm is not None and not (np.isfinite(ohm) and ohm >= 0):
-                raise ValueError(f"nominal_{layer}_wire_ohm must be finite and >= 0, not {ohm}")
+        self.nominal_wire_ohm.check()
+
+    @classmethod
+    def of(
+        cls,
+        board: Hello,
+        rest_ratio: Float | None = None,
+        nominal_wire_ohm: WireOhm = NO_WIRES,
+    ) -> Self:
+        """What is known of the skin at this board."""
+        return cls(
+            board.rows,
+            board.columns,
+            board.ref_top_ohm,
+            board.ref_bottom_ohm,
+            board.adc_bits,
+            rest_ratio,
+            nominal_wire_ohm,
+        )
 
     @property
     def ratio_std(self) -> float:
@@ -85,29 +122,27 @@ class SkinKnowledge:
         """Both reference resistors in series [ohm]: all that limits a shorted port's current."""
         return self.ref_top_ohm + self.ref_bottom_ohm
 
-    @property
-    def wire_ohm(self) -> tuple[float, float] | None:
-        """Nominal wire segments, top and bottom [ohm]; None unless both are told."""
-        top, bottom = self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm
-        return None if top is None or bottom is None else (top, bottom)
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The answer for one frame, with its evidence.
 
-    cell_siemens_std: rounding is uniform, not normal: about 58 % of cells lie within one standard
-    deviation and 98 % within two. It covers the readings' noise, not what the method neglects.
-    NaN where the method gives none.
-    cell_siemens, cell_siemens_std, touched, top_wire_ohm, bottom_wire_ohm: shape (R, C), wires NaN
-    where the method does not estimate them. chi2: sum of squared residuals of all readings over
-    the variance of one, divided by their number (about 1 or less when the model holds).
-    message: empty if converged, else why not, or what is wrong with
-    the readings (`port_readings`). seconds: wall time of this frame.
+    cell_siemens, cell_siemens_std (R, C) [S]: rounding is uniform, not normal: about 58 % of cells
+    lie within one standard deviation and 98 % within two. The deviation covers the readings' noise,
+    not what the method neglects. It is NaN where the method gives none.
+    level, level_std (R, C): what a force is read from. They equal cell_siemens and
+    cell_siemens_std [S] for all methods but `voltage` [1].
+    touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C): NaN where the method estimates no wires.
+    chi2: the sum of the squared residuals of all readings over the variance of one, divided by
+    their number. It is about 1 or less when the model holds.
+    message: empty if the method converged and the readings can be trusted, else why not.
+    seconds: wall time of this frame.
     """
 
     cell_siemens: Float
     cell_siemens_std: Float
+    level: Float
+    level_std: Float
     touched: NDArray[np.bool_]
     top_wire_ohm: Float
     bottom_wire_ohm: Float
@@ -159,7 +194,7 @@ class Estimator(ABC):
             (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm),
             knowledge.adc_bits,
             knowledge.rest_ratio,
-            knowledge.wire_ohm,
+            knowledge.nominal_wire_ohm.both,
         )
         self._rest: Solution | None = None
 
@@ -178,9 +213,17 @@ class Estimator(ABC):
     def rest(self) -> Solution | None:
         """This method's own answer to the rest readings; None where they are not known."""
         if self._rest is None and self.knowledge.rest_ratio is not None:
-            self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
+            with one_blas_thread:
+                self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
             self.reset()
         return self._rest
+
+    def rest_level(self) -> Float:
+        """`Estimate.level` of the rest readings, (R, C). Raises ValueError if none are known."""
+        rest = self.rest()
+        if rest is None or self.knowledge.rest_ratio is None:
+            raise ValueError("the readings of the untouched skin are not known")
+        return self._level(self.knowledge.rest_ratio, rest)[0]
 
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
@@ -195,14 +238,18 @@ class Estimator(ABC):
         readings = check_ratio(ratio, known.rows, known.columns)
         self.rest()
         started = time.perf_counter()
-        ports = self._reader.read(readings)
-        found = self._solve(ports)
+        with one_blas_thread:
+            ports = self._reader.read(readings)
+            found = self._solve(ports)
         message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)
+        level, level_std = self._level(readings, found)
         unknown = np.full((known.rows, known.columns), np.nan)
         return Estimate(
             cell_siemens=found.cell_siemens,
             cell_siemens_std=found.cell_siemens_std,
+            level=level,
+            level_std=level_std,
             touched=touched,
             top_wire_ohm=unknown if found.top_wire_ohm is None else found.top_wire_ohm,
             bottom_wire_ohm=unknown if found.bottom_wire_ohm is None else found.bottom_wire_ohm,
@@ -212,6 +259,10 @@ class Estimator(ABC):
             message=message,
             seconds=time.perf_counter() - started,
         )
+
+    def _level(self, ratio: Float, found: Solution) -> tuple[Float, Float]:
+        """`Estimate.level` of readings (R, C, 4) that gave this solution, and its deviation."""
+        return found.cell_siemens, found.cell_siemens_std
 
     def _touched(self, found: Solution) -> NDArray[np.bool_]:
         if self._rest is None:

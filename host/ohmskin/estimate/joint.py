@@ -59,9 +59,7 @@ class JointEstimator(Estimator):
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
         self._shape = (knowledge.rows, knowledge.columns)
-        self._belief = WireBelief(
-            *self._shape, knowledge.nominal_top_wire_ohm, knowledge.nominal_bottom_wire_ohm
-        )
+        self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: TouchedFit | None = None
         self._before: Float | None = None

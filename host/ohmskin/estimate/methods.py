@@ -1,40 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimators: from readings to cell conductances. `METHODS` lists them by name."""
+"""The estimators by name. A method's module is imported when one is made."""
 
 from __future__ import annotations
 
-from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge
-from ohmskin.estimate.joint import JointEstimator
-from ohmskin.estimate.matrix import MatrixEstimator
-from ohmskin.estimate.ohm import OhmEstimator
-from ohmskin.estimate.paper import LsqEstimator, RegularizedEstimator
-from ohmskin.estimate.touch import TouchEstimator
+from importlib import import_module
+from typing import Final
 
-METHODS: dict[str, type[Estimator]] = {
-    method.name: method
-    for method in (
-        OhmEstimator,
-        MatrixEstimator,
-        LsqEstimator,
-        RegularizedEstimator,
-        JointEstimator,
-        TouchEstimator,
-    )
+from ohmskin.estimate.base import Estimator, SkinKnowledge
+
+_WHERE: Final = {
+    "ohm": ("ohm", "OhmEstimator"),
+    "matrix": ("matrix", "MatrixEstimator"),
+    "lsq": ("paper", "LsqEstimator"),
+    "regularized": ("paper", "RegularizedEstimator"),
+    "joint": ("joint", "JointEstimator"),
+    "touch": ("touch", "TouchEstimator"),
+    "voltage": ("ohm", "VoltageEstimator"),
 }
+# Its levels are no conductances.
+VOLTAGE: Final = "voltage"
+# All that a force can be read by.
+LEVEL_METHODS: Final = tuple(_WHERE)
+# All that estimate conductances of their own.
+METHODS: Final = tuple(name for name in LEVEL_METHODS if name != VOLTAGE)
+# The paper's programmes: they take minutes for a frame of 8x8 cells.
+PAPER_METHODS: Final = ("lsq", "regularized")
 
 
 def make_estimator(method: str, knowledge: SkinKnowledge) -> Estimator:
-    """The estimator called `method`. Raises ValueError, with the names there are, if none is."""
-    if method not in METHODS:
-        raise ValueError(f"no method '{method}': choose one of {', '.join(METHODS)}")
-    return METHODS[method](knowledge)
+    """The estimator called `method`, one of `LEVEL_METHODS`.
 
-
-__all__ = [
-    "METHODS",
-    "Estimate",
-    "Estimator",
-    "OhmEstimator",
-    "SkinKnowledge",
-    "make_estimator",
-]
+    Raises ValueError, with the names there are, for any other name.
+    """
+    if method not in _WHERE:
+        raise ValueError(f"no method '{method}': choose one of {', '.join(LEVEL_METHODS)}")
+    module, name = _WHERE[method]
+    estimator: type[Estimator] = getattr(import_module(f"ohmskin.estimate.{module}"), name)
+    return estimator(knowledge)

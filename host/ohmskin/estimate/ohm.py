@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Method `ohm`: a port's resistance is the cell's, as if there were no other path and no wire.
+"""Methods `ohm` and `voltage`: a port's resistance is that of its cell.
+
+Neither another path through the skin nor a wire is thought of.
 
 Symbols: I (R, C) port current per Vdd [S], R = R_top + R_bottom [ohm], g (R, C) cells [S].
 
     g = 1 / (1/I - R) = I / (1 - I R) ,    std(g) = (dg/dI) std(I) = (1 + g R)^2 std(I)
 
 This is the paper's naive estimate. It sees ghosts: three pressed corners of a rectangle make the
-fourth look pressed.
+fourth look pressed. `voltage` is the paper's baseline for forces: it reads a force from the mean
+voltage over the reference resistors, and for all else it is `ohm`.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, Estimator, Solution
 from ohmskin.estimate.port_readings import PortReadings
 
@@ -56,3 +61,26 @@ class OhmEstimator(Estimator):
             chi2=self._chi2(ports.ratio, cell / (1.0 + cell * ref_ohm)),
             message=message,
         )
+
+
+class VoltageEstimator(OhmEstimator):
+    """`ohm`, but `Estimate.level` is `voltage_level` of the readings [1]."""
+
+    name = "voltage"
+
+    def _level(self, ratio: Float, found: Solution) -> tuple[Float, Float]:
+        level = voltage_level(ratio)
+        return level, np.full_like(level, self.knowledge.ratio_std)
+
+
+def voltage_level(ratio: ArrayLike) -> Float:
+    """The mean voltage over the reference resistors: (..., 4) [V/Vdd] to (...) [1].
+
+    It is the mean over the configurations of sign (y - offset), and it grows with the cell's
+    conductance. All four readings round alike, so its standard deviation is that of one reading
+    (`SkinKnowledge.ratio_std`). Raises ValueError for another shape.
+    """
+    readings = np.asarray(ratio, dtype=np.float64)
+    if readings.ndim < 1 or readings.shape[-1] != READING_SIGN.size:
+        raise ValueError(f"ratio has shape {readings.shape}, it must end in {READING_SIGN.size}")
+    return np.asarray((readings - READING_OFFSET) @ READING_SIGN / READING_SIGN.size)

@@ -37,8 +37,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
-from ohmskin.estimate.base import SkinKnowledge, check_ratio
-from ohmskin.estimate.levels import LEVEL_METHODS, LevelMeter
+from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
+from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import whole_file
 from ohmskin.force.curve import ForceModel
 from ohmskin.record.readings import MAX_CELLS
@@ -81,7 +81,7 @@ class Rest:
     def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
         """What `method` makes of the rest readings in `knowledge`."""
         # A reading below its offset is a cell of no conductance, within the noise.
-        level = np.maximum(LevelMeter(method, knowledge).rest(), 0.0)
+        level = np.maximum(make_estimator(method, knowledge).rest_level(), 0.0)
         return cls(date, np.asarray(knowledge.rest_ratio), level)
 
 
@@ -98,8 +98,7 @@ class Calibration:
     rest: Rest
     model: ForceModel
     indenter_area_m2: float
-    nominal_top_wire_ohm: float | None = None
-    nominal_bottom_wire_ohm: float | None = None
+    nominal_wire_ohm: WireOhm = NO_WIRES
     tare: Rest | None = None
 
     def __post_init__(self) -> None:
@@ -118,10 +117,7 @@ class Calibration:
             raise ValueError(f"{self.rows}x{self.columns} cells, more than {MAX_CELLS}")
         if not (np.isfinite(self.indenter_area_m2) and self.indenter_area_m2 > 0):
             raise ValueError(f"indenter_area_m2 is {self.indenter_area_m2}, it must be above 0")
-        for name in _WIRES:
-            ohm = getattr(self, name)
-            if ohm is not None and not (np.isfinite(ohm) and ohm >= 0):
-                raise ValueError(f"{name} is {ohm}, it must be finite and >= 0")
+        self.nominal_wire_ohm.check()
 
     @property
     def rows(self) -> int:
@@ -159,9 +155,8 @@ class Calibration:
     def predict(self, level: ArrayLike, level_std: ArrayLike) -> tuple[Float, Float]:
         """Force and its standard deviation [N], (R, C): by `model`, of level - untouched.level.
 
-        level, level_std (R, C): `cell_siemens` and `cell_siemens_std` of an estimate by `method`
-        [S]; for `voltage` `voltage_level` of the readings and the std of one reading [1]. The error
-        of rest is in every press alike, so the curves hold it already. Raises ValueError.
+        level, level_std (R, C): those of an `Estimate` by `method`, [S], or [1] for `voltage`. The
+        error of rest is in every press alike, so the curves hold it already. Raises ValueError.
         """
         levels = np.asarray(level, dtype=np.float64)
         at_rest = self.untouched.level
@@ -175,8 +170,10 @@ class Calibration:
         Raises ValueError if it cannot be written.
         """
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
-        for name in ("unit_id", "date", "method", "rows", "columns", *_WIRES, "indenter_area_m2"):
+        for name in ("unit_id", "date", "method", "rows", "columns"):
             content[name] = getattr(self, name)
+        content |= dict(zip(_WIRES, self.nominal_wire_ohm, strict=True))
+        content["indenter_area_m2"] = self.indenter_area_m2
         for name in _RESTS:
             content[name] = _rest_content(getattr(self, name))
         for name in _MODEL_FIELDS:
@@ -264,9 +261,7 @@ def _from_content(content: dict[str, Any]) -> Calibration:
     if min(shape) < 1 or max(shape) > MAX_CELLS or shape[0] * shape[1] > MAX_CELLS:
         raise ValueError(f"rows and columns: not 1 to {MAX_CELLS} cells")
     arrays = {name: _array(name, content[name], shape) for name in _MODEL_FIELDS}
-    wires = {
-        name: None if content[name] is None else _number(name, content[name]) for name in _WIRES
-    }
+    wires = (None if content[name] is None else _number(name, content[name]) for name in _WIRES)
     return Calibration(
         unit_id=content["unit_id"],
         date=content["date"],
@@ -275,7 +270,7 @@ def _from_content(content: dict[str, Any]) -> Calibration:
         tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
         model=ForceModel(**arrays),
         indenter_area_m2=_number("indenter_area_m2", content["indenter_area_m2"]),
-        **wires,
+        nominal_wire_ohm=WireOhm(*wires),
     )
 
 

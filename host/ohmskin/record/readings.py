@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, READINGS_PER_CELL
-from ohmskin.estimate.base import Estimate, SkinKnowledge, check_ratio
+from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import whole_file
 
@@ -105,8 +105,10 @@ class Readings:
             ref_bottom_ohm=self.ref_bottom_ohm,
             adc_bits=self.adc_bits,
             rest_ratio=rest[frame] if rest is not None and rest.ndim == 4 else rest,
-            nominal_top_wire_ohm=_of_frame(self.nominal_top_wire_ohm, frame),
-            nominal_bottom_wire_ohm=_of_frame(self.nominal_bottom_wire_ohm, frame),
+            nominal_wire_ohm=WireOhm(
+                _of_frame(self.nominal_top_wire_ohm, frame),
+                _of_frame(self.nominal_bottom_wire_ohm, frame),
+            ),
         )
 
 

@@ -35,7 +35,7 @@ class BoardRecording(Closing):
         try:
             if tare is not None:
                 self._recorder.add(tare)
-            self._scans = Device.__iter__(skin)
+            self._scans = iter(skin)
         except BaseException:
             self._recorder.close()
             raise
