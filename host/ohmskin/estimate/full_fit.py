@@ -46,26 +46,18 @@ from ohmskin.estimate.prior import (
 )
 
 MAX_ITERATIONS: Final = 40
-# How often a step that goes too far is halved.
-MAX_HALVINGS: Final = 8
-# The longest step of a log resistance.
-MAX_STEP: Final = 1.5
-# The step that moves no reading and no cell by more than this share of its deviation is the last;
-# so is one up to `NEARLY` if the next can be foreseen to be.
+MAX_HALVINGS: Final = 8  # of a step that goes too far
+MAX_STEP: Final = 1.5  # of a log resistance
+# A step that moves no reading and no cell by more than this share of its deviation is the last. So
+# is one of up to NEARLY deviations if it can be foreseen that the next will be such a step.
 CLOSE: Final = 0.3
 NEARLY: Final = 3.0
-# Wires are in the model for the readings that they can move by this share of the noise.
-HEAVY: Final = 0.01
-# Wires are not what they were believed if their chi-square is above this for each touched cell.
-BENT: Final = 9.0
-# With more than this share of touched cells, no other is known to be at rest. Each of them may
-# have risen by so much (`LIGHT_TOUCH`) over its conductance at rest.
-CROWDED: Final = 0.3
-LIGHT_TOUCH: Final = 10.0
-# Wires learn from readings whose variance by the wires is above this share of the noise's, and of
-# these from the best.
-LESSON: Final = 0.25
-MAX_LESSON: Final = 32
+HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
+BENT: Final = 9.0  # chi-square of the wires for each touched cell: above it they have changed
+CROWDED: Final = 0.3  # share of touched cells: above it no other cell is known to be at rest
+LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
+LESSON: Final = 0.25  # share of the noise's variance: wires learn from what they move by more
+MAX_LESSON: Final = 32  # readings that wires learn from, the best
 _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
 
 

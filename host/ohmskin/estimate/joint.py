@@ -46,25 +46,16 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.sparse_fit import SparseFit, Touched
 
-# A frame whose level is below this share of the level so far shows rest better.
-LOWER_LEVEL: Final = 0.8
-# Other touches that are tried for a frame that leaves a doubt.
-MAX_DOUBTS: Final = 4
-# Chi-square per port above which no resistances explain the readings: of rounding alone it is 1.
-MISFIT: Final = 1.5
-# A cell that conducts this much less than at rest is at fault: the log, in deviations of the prior.
-LOSS: Final = 0.5
-LOSS_STDS: Final = 6.0
-# A frame is news of the wires if the log of a resistance changed by this.
-NEWS: Final = 0.5
-# A cell beyond this many deviations of the prior is touched beyond doubt.
-CLEAR: Final = 12.0
-# The hardest touch that a fit starts from.
-HIGHEST_START_SIEMENS: Final = 1e-2
-# `touch` is enough up to this share of touched cells, and up to this deviation of the log of their
-# conductance: beyond it the circuit is far from linear.
-MOST_TOUCHED: Final = 0.2
-WIDEST_LOG_STD: Final = 0.3
+LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
+MAX_DOUBTS: Final = 4  # other touches that are tried for a frame
+MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
+LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
+LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
+NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
+CLEAR: Final = 12.0  # deviations of the prior: a cell beyond them is touched beyond doubt
+HIGHEST_START_SIEMENS: Final = 1e-2  # the hardest touch that a fit starts from
+MOST_TOUCHED: Final = 0.2  # share of the cells up to which `touch` is enough
+WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
 BENT_MESSAGE: Final = "the wires changed since they were learned: they are learned anew"
 
 

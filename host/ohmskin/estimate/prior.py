@@ -36,57 +36,36 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
 from ohmskin.circuit.skin import path_ohm
 
-# Deviations are of the log of a resistance.
-
-# An untouched cell, before any is read.
-UNTOUCHED_OHM: Final = 1e6
+# Deviations (..._STD) are of the log of a resistance.
+UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
 UNTOUCHED_STD: Final = 1.0
-# A cell about the level of all cells, where the rest readings are not known.
-UNKNOWN_REST_STD: Final = 0.3
-# This share of the ports, those of the least current, is untouched where rest is not known.
-REST_QUANTILE: Final = 0.2
-# The drift of a cell since the rest readings.
-REST_STD: Final = 0.05
-# Exponent of the density of touched cells.
-TAIL: Final = 1.0
-
-# A wire segment of a layer of which nothing is known, and what all its segments share.
-UNKNOWN_WIRE_OHM: Final = 150.0
-UNKNOWN_LAYER_STD: Final = 1.5
-# What all segments of a layer share, by stretch and temperature, where they are known.
-LAYER_STD: Final = 0.25
-# What each segment has of its own.
-SEGMENT_STD: Final = 0.1
-
-# The hardest touch, and how far beyond it a cell may be.
-HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0
+UNKNOWN_REST_STD: Final = 0.3  # of a cell whose rest readings are not known, about all cells' level
+REST_QUANTILE: Final = 0.2  # of the ports, taken for untouched ones where rest is not known
+REST_STD: Final = 0.05  # drift of a cell since the rest readings
+TAIL: Final = 1.0  # exponent of the density of touched cells
+HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 HARDEST_LOG_OHM: Final = float(np.log(300.0))
-WALL_STD: Final = 0.3
-# A cell further from rest than this many deviations of the prior is touched, and then nothing is
-# known of it up to so large a deviation.
-TOUCHED: Final = 2.0
-UNLIMITED_STD: Final = 3.0
-# A cell that the prior holds at rest may be touched all the same, where readings say little of it:
-# a rise that must not go unnoticed, and how many of its own deviations make it worth a try.
-HIDDEN: Final = 0.3
-DOUBT: Final = 2.0
+WALL_STD: Final = 0.3  # how far beyond the hardest touch a cell may be
+# A cell that the prior holds at rest may be touched all the same, where readings say little of it.
+TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
+UNLIMITED_STD: Final = 3.0  # what is not known of such a cell
+HIDDEN: Final = 0.3  # a rise that must not go unnoticed
+DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
 
-# The share of the knowledge of the wires that fades with each lesson, because skins bend.
-FADE: Final = 0.1
-# A skin has been bent if the last few lessons together (each counts this share of the next one) ask
-# for a change of a layer by so many of their deviations: three times what they scatter by, for
-# lessons state their noise on the safe side.
+UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
+UNKNOWN_LAYER_STD: Final = 1.5  # what all segments of such a layer share
+LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
+SEGMENT_STD: Final = 0.1  # what each segment has of its own
+FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
+# Lessons, the last few together, that ask for a change of a layer by ALARM standard deviations say
+# that the skin has been bent. Each lesson counts by the share MEMORY of the next one.
 MEMORY: Final = 0.8
-ALARM: Final = 1.6
-# The most columns of U; the least informative are forgotten, and all below this share of
-# SEGMENT_STD^2.
-MAX_DIRECTIONS: Final = 32
-_LEAST_DIRECTION: Final = 1e-3
-# Log resistances of wires stay between these.
-LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))
+ALARM: Final = 1.6  # three times what they scatter by: lessons state their noise on the safe side
+MAX_DIRECTIONS: Final = 32  # columns of U; the least informative are forgotten
+_LEAST_DIRECTION: Final = 1e-3  # of SEGMENT_STD^2: not worth a column
+LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 
-# What wires learn from: J, z and N.
-Lesson = tuple[Float, Float, Float]
+Lesson = tuple[Float, Float, Float]  # what wires learn from: J, z and N
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,33 +60,24 @@ from ohmskin.estimate.prior import (
 
 Cells = NDArray[np.intp]
 
-# Touches for each row and column, on average. With more, the skin is not at rest any more.
-MOST_PER_LINE: Final = 2
-# A cell is added for a residual above this, in its standard deviation.
-DEMAND: Final = 4.0
-# A cell is added only if it needs this share of the largest rise in its row and column.
-SHARE: Final = 0.5
-# A cell that rises by less is at rest; in deviations of the prior.
-LEAST_RISE: Final = 2.0
-# Rounds of adding cells, and steps in each.
-MAX_ROUNDS: Final = 8
-MAX_STEPS: Final = 8
-# The longest step of a log conductance.
-MAX_STEP: Final = 1.5
-# The step that is below this share of every standard deviation is the last.
-CLOSE: Final = 0.1
-# Wires matter to a reading that they may move by this share of its noise (`HEAVY`). The next ones
-# count, too, as far as the lower share (`LIGHT`) and the largest number (`MAX_HEAVY`) allow:
-# together they tell a bend that none tells alone.
+MOST_PER_LINE: Final = 2  # touches a row and column; with more, the skin is not at rest any more
+DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
+SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
+LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
+MAX_ROUNDS: Final = 8  # of adding cells
+MAX_STEPS: Final = 8  # in a round
+MAX_STEP: Final = 1.5  # of a log conductance
+CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
+# Wires matter to a reading that they may move by the share HEAVY of its noise. The next ones, down
+# to the share LIGHT and up to MAX_HEAVY in all, tell a bend together that none tells alone.
 HEAVY: Final = 0.5
 LIGHT: Final = 0.03
 MAX_HEAVY: Final = 24
-# Wires hide a cell at rest if their deviation on the way to it is above this share of the cell.
-HIDING: Final = 0.1
-# The network is solved anew for a relative change of the wires on the way to a cell by this.
-REBUILD: Final = 0.05
-# No touches explain readings whose chi-square is too high by this many of its deviations.
-CONTRADICTION: Final = 3.0
+HIDING: Final = (
+    0.1  # deviation of the wires to a cell at rest, over the cell: above it they hide it
+)
+REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
+CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 _NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
