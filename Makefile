@@ -26,8 +26,8 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware test-firmware check-firmware sim \
-        test-host chart stability experiments bench-firmware bench-host bench-estimators bench-force bench-view bench-boards clean \
-        distclean
+        test-host chart stability experiments bench-firmware bench-import bench-host bench-estimators bench-force bench-view \
+        bench-boards clean distclean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -93,6 +93,9 @@ experiments: setup ## the paper's experiments with force, simulated: docs/force-
 
 bench-firmware: setup firmware sim ## measure the firmware in the simulator
 	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_firmware.py
+
+bench-import: setup-host ## measure what importing the package and asking for its help cost
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_import.py
 
 bench-host: setup-host ## measure decoding, latency and load of the host
 	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_host.py

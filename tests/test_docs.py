@@ -13,7 +13,6 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-import typer.main
 from mkdocs.exceptions import PluginError
 
 import ohmskin
@@ -62,7 +61,7 @@ PAGES = [
     )
 ]
 every_page = pytest.mark.parametrize("page", PAGES, ids=[page.path.name for page in PAGES])
-COMMANDS: Any = typer.main.get_command(app)
+COMMANDS: Any = app
 
 
 def found(arguments: list[str]) -> tuple[Any, list[str]]:
@@ -71,6 +70,7 @@ def found(arguments: list[str]) -> tuple[Any, list[str]]:
     while hasattr(command, "commands") and left and not left[0].startswith("-"):
         assert left[0] in command.commands, f"no command {left[0]!r}"
         command = command.commands[left.pop(0)]
+        command = command.load() if hasattr(command, "load") else command
     return command, left
 
 

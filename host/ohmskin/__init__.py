@@ -8,6 +8,9 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from ohmskin.errors import (
     CommandRefused,
     DeviceLost,
@@ -19,15 +22,17 @@ from ohmskin.errors import (
     RecordingError,
     TareRefused,
 )
-from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
-from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.force.calibration import Calibration, load_calibration
-from ohmskin.force.contacts import Contact
-from ohmskin.force.reader import CalibratedSkin, ForceScan
-from ohmskin.link.clock import BoardClock
-from ohmskin.link.device import Device
-from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.opening import Boards, BoardScan, open, open_all
+
+if TYPE_CHECKING:
+    from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
+    from ohmskin.estimate.methods import METHODS, make_estimator
+    from ohmskin.force.calibration import Calibration, load_calibration
+    from ohmskin.force.contacts import Contact
+    from ohmskin.force.reader import CalibratedSkin, ForceScan
+    from ohmskin.link.clock import BoardClock
+    from ohmskin.link.device import Device
+    from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+    from ohmskin.opening import Boards, BoardScan, open, open_all
 
 __all__ = [
     "METHODS",
@@ -62,3 +67,28 @@ __all__ = [
     "open_all",
 ]
 __version__ = "0.1.0"
+
+# Where a name is from. Its module is imported when the name is first asked for.
+_MODULES = {
+    "estimate.base": ("Estimate", "Estimator", "SkinKnowledge", "WireOhm"),
+    "estimate.methods": ("METHODS", "make_estimator"),
+    "force.calibration": ("Calibration", "load_calibration"),
+    "force.contacts": ("Contact",),
+    "force.reader": ("CalibratedSkin", "ForceScan"),
+    "link.clock": ("BoardClock",),
+    "link.device": ("Device",),
+    "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
+    "opening": ("BoardScan", "Boards", "open", "open_all"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            globals()[name] = found = getattr(import_module(f"ohmskin.{module}"), name)
+            return found
+    raise AttributeError(f"module 'ohmskin' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -221,7 +221,7 @@ def _scene(
 
 
 def _simavr(url: str, place: str, query: str) -> tuple[Link, int | None]:
-    from ohmskin.emulate.simavr_link import SimavrLink
+    from ohmskin.emulate.simavr import SimavrLink
 
     options = _options(url, query, (*_SCENE_KEYS, "rows", "columns", "elf", "baud", "tau_us"))
     try:

@@ -20,7 +20,7 @@ import serial
 
 import ohmskin
 from command_line import Done, assert_one_line
-from ohmskin.cli import main as cli
+from ohmskin.cli.main import app
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.skin_faults import SKIN_FAULTS
@@ -54,7 +54,7 @@ def finish(process: subprocess.Popen[str], limit_s: float = 30.0) -> Done:
 
 
 def test_ports(run: Callable[..., Done], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "serial_ports", list)
+    monkeypatch.setattr("ohmskin.cli.board.serial_ports", list)
     done = run("ports")
     assert done.code == 0
     assert "no serial ports" in done.out
@@ -383,7 +383,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
 def test_an_error_is_one_line(
     what: str, run: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "serial_ports", list)
+    monkeypatch.setattr("ohmskin.cli.board.serial_ports", list)
     arguments, words = WRONG[what]
     done = run(*arguments)
     if what == "unplugged":
@@ -471,7 +471,4 @@ def test_help_names_every_command(run: Callable[..., Done]) -> None:
     assert (done.code, done.err) == (0, "")
     for name in OPTIONS:
         assert f" {name} " in done.out
-    assert sorted(OPTIONS) == sorted(
-        [command.callback.__name__ for command in cli.app.registered_commands]
-        + [group.name for group in cli.app.registered_groups]
-    )
+    assert sorted(OPTIONS) == sorted(app.commands)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from lockstep import LockstepSim, elf_of
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.simavr import SkinSim
 from ohmskin.errors import PortError
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
@@ -49,7 +49,7 @@ class Firmware:
     """The built firmware in lock-step: simulated time passes only in `exchange`."""
 
     def __init__(self, board: str) -> None:
-        self.sim = SkinSim(board, ROOT / ".pio" / "build" / board / "firmware.elf")
+        self.sim = LockstepSim(board, elf_of(board))
         self.sim.set_table(Scene().ratio(0.0))
 
     def exchange(self, octets: bytes, seconds: float) -> bytes:

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import ohmskin
+from lockstep import LockstepSim
+from ohmskin.emulate import simavr
 from ohmskin.emulate.board import EmulatorLink
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.simavr_link import SimavrLink
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import device, framing, protocol, session
 from ohmskin.link.codes import quantise
@@ -127,16 +128,16 @@ def test_a_reset_board_goes_on_as_it_was_configured() -> None:
 
 @pytest.mark.simavr
 @pytest.mark.parametrize("baud", [500_000, 1_000_000])
-def test_a_reset_of_the_firmware(baud: int) -> None:
+def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its line speed is that of the start again, too; the simulated line follows the board's."""
+    monkeypatch.setattr(simavr, "SkinSim", LockstepSim)
     link, _ = open_link("simavr://uno")
-    assert isinstance(link, SimavrLink)
     with ohmskin.Device(Session(link, baud)) as skin:
         kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
         scans = iter(skin)
         for _ in range(20):
             assert next(scans).codes.shape == (3, 7, 4)
-        link._sim.reset()
+        link.sim.reset()
         until = next(scan for scan in scans if skin.stats.restarts)
         for scan in itertools.islice(scans, 20):
             assert scan.codes.shape == (3, 7, 4)

@@ -10,13 +10,16 @@ from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN, Skin, ratio_from_
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.matrix import MatrixEstimator
 from ohmskin.estimate.paper import (
+    MAX_ITERATIONS,
     STEP_3,
+    TOP_IS_HIGH,
     LsqEstimator,
     PaperEstimator,
     RegularizedEstimator,
+    Start,
     initial_states,
+    program_for,
 )
-from ohmskin.estimate.paper_program import MAX_ITERATIONS, TOP_IS_HIGH, Start, program_for
 from ohmskin.link.codes import quantise, ratio_from_codes
 from places import DATA
 
@@ -241,7 +244,7 @@ def test_it_never_prints(capfd: pytest.CaptureFixture[str]) -> None:
         estimator.estimate(np.zeros((2, 2, 4)))
     # Not even when there is no number to start from.
     x = np.full((16, 20), np.nan)
-    weights = (STEP_3.alpha, STEP_3.beta, STEP_3.lambda_)
-    found = program_for(2, 2).solve(np.full((2, 2, 4), 0.5), (0.03, 0.03), weights, x, STEP_3.start)
+    half, start = np.full((2, 2, 4), 0.5), STEP_3.start
+    found = program_for(2, 2).solve(half, (0.03, 0.03), STEP_3.weights, x, start)
     assert not found.success
     assert capfd.readouterr() == ("", "")

@@ -17,8 +17,7 @@ from firmware_helpers import (
     numbers,
     reset,
 )
-from lockstep import CODES, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of, first_holds
-from ohmskin.emulate.simavr import CPU_HZ
+from lockstep import CODES, CPU_HZ, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of, first_holds
 from ohmskin.link import protocol
 
 pytestmark = pytest.mark.simavr

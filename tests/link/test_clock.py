@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lockstep import Rig, first_holds
+from lockstep import CPU_HZ, Rig, first_holds
 from ohmskin.arrays import Float
-from ohmskin.emulate.simavr import CPU_HZ
 from ohmskin.link.clock import BoardClock, scan_times_s
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.timing import line_delay_s, scan_s

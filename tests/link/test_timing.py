@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lockstep import Rig, first_holds
+from lockstep import CPU_HZ, Rig, first_holds
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import EmulatedBoard
-from ohmskin.emulate.simavr import CPU_HZ
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
 from ohmskin.link.timing import line_delay_s, reading_offsets_s, scan_s, slot_s
 

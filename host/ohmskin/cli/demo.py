@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on an emulated skin: scan, estimate, and compare with the truth."""
+"""``ohmskin demo``: the main job on an emulated skin, compared with the truth."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -27,6 +28,26 @@ from ohmskin.link.messages import BoardStats
 
 URL: Final = "emulator://8x8?scene=ghost&seed=1"
 _METHODS: Final = ("ohm", "joint")
+_WIDTH: Final = 160
+_out = Console()
+
+
+def demo(
+    seconds: Annotated[float, typer.Option(help="how long to scan")] = 3.0,
+    port: Annotated[str, typer.Option(help="an emulator:// URL")] = URL,
+    picture: Annotated[Path, typer.Option(help="PNG to write")] = Path("ohmskin-demo.png"),
+) -> None:
+    """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
+    result = run(port, seconds)
+    # Three tables stand side by side where nothing says how wide the output is.
+    wide = Console(width=_WIDTH) if not _out.is_terminal else _out
+    report(result, wide)
+    try:
+        save_picture(picture, result.panels, result.title)
+    except OhmskinError as exc:
+        _out.print(f"no picture: {exc}", markup=False)
+    else:
+        _out.print(f"picture: {picture}")
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from ohmskin.circuit.skin import (
     current_std,
     ratio_from_current,
 )
+from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
@@ -212,7 +213,8 @@ class Estimator(ABC):
     def rest(self) -> Solution | None:
         """This method's own answer to the rest readings; None where they are not known."""
         if self._rest is None and self.knowledge.rest_ratio is not None:
-            self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
+            with one_blas_thread:
+                self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
             self.reset()
         return self._rest
 
@@ -236,8 +238,9 @@ class Estimator(ABC):
         readings = check_ratio(ratio, known.rows, known.columns)
         self.rest()
         started = time.perf_counter()
-        ports = self._reader.read(readings)
-        found = self._solve(ports)
+        with one_blas_thread:
+            ports = self._reader.read(readings)
+            found = self._solve(ports)
         message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)
         level, level_std = self._level(readings, found)

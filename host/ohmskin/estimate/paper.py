@@ -1,25 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Methods `lsq` and `regularized`: the paper's Algorithm 1, after step 3 and to its end.
+"""Methods `lsq` and `regularized`: the paper's Algorithm 1, up to its step 3 and up to its end.
 
     step 2   R^t, R^b = 0, R^c from Ohm's law, V^t, V^b from a circuit simulation
     step 3   minimise Cost_lsq = 1e6 Cost_f + 1e6 Cost_c
     step 4   minimise Cost_reg = Cost_f + Cost_c + 1e9 Cost_r, from the result of step 3
 
-`paper_program` has the symbols, the costs and the constraints; docs/paper.md what can be expected
-of them. Every state has resistances of its own: reported is their mean over all 4RC states.
-Resistances are megohm, conductances microsiemens, potentials volts per Vdd.
+Symbols (inside: megohm, microsiemens, and volts per Vdd)
+
+============== ============ ==================================================================
+symbol         shape        meaning
+============== ============ ==================================================================
+N              RC           cells
+k                           configuration A, B, C or D
+kP             5N           circuit state of one measurement: log R^t, log R^b, log R^c, V^t, V^b
+R^t, R^b, R^c  (R, C)       top wire, bottom wire, cell resistance                [megohm]
+V^t, V^b       (R, C)       potential of the top and the bottom node of each cell [Vdd]
+x              20 N^2       all states: cells in column-major order, A to D for each cell
+y              4N           the readings in the order of the states
+============== ============ ==================================================================
+
+Each state has 2N + 1 equality constraints. With currents written as voltage differences over
+resistances (Ohm's law), Kirchhoff's current law holds at each of the 2N nodes; and the measurement:
+the sensed electrode is at y, and the current through its reference resistor enters the skin,
+
+    A:  (y - V^t[i,0]) / R^t[i,0] = (1 - y) / R_top ,
+
+B, C and D alike with the electrode and the supply exchanged. The other selected electrode is
+reached through R^b[0,j] + R_bottom. All are multiplied by the reference resistor: they are ratios.
+
+    Cost_f = sum over cells   |AP - BP|^2 + |CP - DP|^2
+    Cost_c = sum over consecutive cells and over k   |kQ - kQ'|^2 ,   Q = R^t, R^b, R^c
+    Cost_r = sum over states   |R^t|^2 + |R^b|^2
+    minimised: alpha Cost_f + beta Cost_c + lambda Cost_r
+
+The costs are in megohm as the paper has them; only the variables are logarithms. Every state has
+resistances of its own: reported is their mean over all 4N states. CasADi writes the program, Ipopt
+solves it. Source: section IV.D to IV.G of the paper. docs/paper.md says which readings of the text
+were taken and why, and what can be expected of the answers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from enum import Enum
+from functools import lru_cache
+from typing import Any, ClassVar, Final
 
+import casadi
 import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
     CONFIGURATIONS,
+    READING_OFFSET,
+    READING_SENSES_TOP,
     READINGS_PER_CELL,
     Skin,
     current_from_ratio,
@@ -27,41 +61,83 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
-from ohmskin.estimate.paper_program import TOP_IS_HIGH, Optimum, Start, program_for
 from ohmskin.estimate.port_readings import PortReadings
 
 OHM_PER_MEGOHM: Final = 1e6
+# The top pin is high where the sensed electrode is the top one and on the source side, or neither.
+TOP_IS_HIGH: Final = (READING_OFFSET > 0) == READING_SENSES_TOP
 
 # 20 N^2 variables: 64 cells take 1.9 GB and 25 s a step.
 MAX_CELLS: Final = 64
+# Resistances are believed to lie within these bounds [megohm].
+MIN_MEGOHM: Final = 1e-6
+MAX_MEGOHM: Final = 20.0
+MAX_ITERATIONS: Final = 300
+# Of the optimality error.
+TOLERANCE: Final = 1e-6
+# Of Kirchhoff's and Ohm's laws, as a ratio to Vdd.
+CIRCUIT_TOLERANCE: Final = 1e-9
+# Step 2's cells lie within these bounds [megohm].
 _START_CELL_MEGOHM: Final = (2e-6, 15.0)
-# Ports whose resistance is outside have no solution within the bounds, or none but on them.
+# A port of less resistance [megohm] has no solution within the bounds, or none but on them.
 _LEAST_PORT_MEGOHM: Final = 1e-5
+# Nor has a skin whose cells all have more than this [megohm].
 _MOST_CELL_MEGOHM: Final = 18.0
-# Beyond such a port by this many standard deviations a reading is at fault.
+# A reading is at fault if it is beyond such a port by this many standard deviations.
 _FAULT_STDS: Final = 5.0
-# The states' mean must give back the readings to this (root mean square): if not, the states are
-# different circuits, and their mean is none of them.
+# The states' mean must give back the readings to this (root mean square, of Vdd): if not, the
+# states are different circuits, and their mean is none of them.
 MISFIT_RATIO: Final = 1e-3
-# A solution with a resistance near its bound is a poor start for the next frame.
+# A solution with a resistance this near its bound is a poor start for the next frame [megohm].
 _POOR_START_MEGOHM: Final = 10.0
-# A frame any of whose readings changed by more than this starts afresh.
+# A frame starts afresh if any of its readings changed by more than this since the last [Vdd].
 _JUMP_RATIO: Final = 0.02
+
+
+class Start(Enum):
+    """Where a solution starts from, which decides how Ipopt's barrier starts."""
+
+    CIRCUIT = "a simulated circuit: a weak barrier, so that the answer stays near it"
+    STEP_3 = "another program's solution: the usual barrier"
+    PREVIOUS = "this program's solution of the frame before, with its multipliers"
+
+
+_IPOPT: Final[dict[str, Any]] = {
+    "print_level": 0,
+    "sb": "yes",
+    "max_iter": MAX_ITERATIONS,
+    "tol": TOLERANCE,
+    "constr_viol_tol": CIRCUIT_TOLERANCE,
+    "mu_strategy": "adaptive",
+    "mu_oracle": "probing",
+    # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
+    "nlp_scaling_method": "none",
+}
+_IPOPT_START: Final[dict[Start, dict[str, Any]]] = {
+    Start.CIRCUIT: {"bound_mult_init_val": 1e-6},
+    Start.STEP_3: {},
+    # The multipliers of bounds that do not hold stay as weak as they were, or the states drift.
+    Start.PREVIOUS: {"warm_start_init_point": "yes", "warm_start_mult_bound_push": 1e-6},
+}
+# What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
+# without callbacks: numbers that are none end as Invalid_Number_Detected.
+_INTERRUPTED: Final = ("User_Requested_Stop", "NonIpopt_Exception_Thrown")
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of Algorithm 1: its number and the weights of its objective."""
+    """One step of Algorithm 1. weights: alpha, beta and lambda of its objective."""
 
     number: int
-    alpha: float
-    beta: float
-    lambda_: float
+    weights: tuple[float, float, float]
     start: Start
 
 
-STEP_3: Final = Step(3, 1e6, 1e6, 0.0, Start.CIRCUIT)
-STEP_4: Final = Step(4, 1.0, 1.0, 1e9, Start.STEP_3)
+STEP_3: Final = Step(3, (1e6, 1e6, 0.0), Start.CIRCUIT)
+STEP_4: Final = Step(4, (1.0, 1.0, 1e9), Start.STEP_3)
+
+
+# -------------------------------------------------------------------------------- the estimators
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +148,6 @@ class _Answer:
     optima: tuple[Optimum, ...]
     skin: Skin
     model_ratio: Float
-
-    @property
-    def iterations(self) -> int:
-        return sum(optimum.iterations for optimum in self.optima)
 
     @property
     def misfit_ratio(self) -> float:
@@ -126,18 +198,13 @@ class PaperEstimator(Estimator):
         self._previous = None
 
     def _solve(self, ports: PortReadings) -> Solution:
-        ratio = ports.ratio
-        known = self.knowledge
-        feasible, message = self._feasible(ratio)
-        answer: _Answer | None = None
-        iterations = 0
-        before = self._previous
+        feasible, message = self._feasible(ports.ratio)
+        before, answers = self._previous, []
         if before is not None and np.abs(feasible - before.ratio).max() < _JUMP_RATIO:
-            answer = self._answer(feasible, before.optima)
-            iterations = answer.iterations
-        if answer is None or not answer.is_good_start:
-            answer = self._answer(feasible, ())
-            iterations += answer.iterations
+            answers.append(self._answer(feasible, before.optima))
+        if not answers or not answers[0].is_good_start:
+            answers.append(self._answer(feasible, ()))
+        answer = answers[-1]
         self._previous = answer if answer.is_good_start else None
         last = answer.optima[-1]
         if not last.success:
@@ -147,44 +214,38 @@ class PaperEstimator(Estimator):
                 f"Ipopt ends with {last.status}, but in states of different circuits: their mean "
                 f"misses the readings by {answer.misfit_ratio:.2g} of Vdd"
             )
-        residual = (ratio - answer.model_ratio) / known.ratio_std
+        residual = (ports.ratio - answer.model_ratio) / self.knowledge.ratio_std
         found = answer.skin
         return Solution(
             cell_siemens=found.cell_siemens,
             cell_siemens_std=np.full(found.shape, np.nan),
             chi2=float(np.mean(residual**2)),
-            iterations=iterations,
+            iterations=sum(optimum.iterations for each in answers for optimum in each.optima),
             message=message,
             top_wire_ohm=found.top_wire_ohm,
             bottom_wire_ohm=found.bottom_wire_ohm,
         )
 
     def _answer(self, ratio: Float, previous: tuple[Optimum, ...]) -> _Answer:
+        """Steps 2 to the last one, or without step 2 from the optima of the previous frame."""
         known = self.knowledge
-        optima = self._run(ratio, previous)
-        layers = optima[-1].megohm.mean(axis=0).reshape(3, known.columns, known.rows)
-        top, bottom, cell = (OHM_PER_MEGOHM * layer.T for layer in layers)
-        skin = Skin(1.0 / cell, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
-        return _Answer(ratio, optima, skin, readings(skin))
-
-    def _run(self, ratio: Float, previous: tuple[Optimum, ...]) -> tuple[Optimum, ...]:
-        """Steps 2 to the last one, or without step 2 if there is a previous frame."""
         optima: list[Optimum] = []
         for place, step in enumerate(self.steps):
             before = previous[place] if previous else None
-            start = Start.PREVIOUS if before is not None else step.start
             if before is not None:
-                x = before.x
-            elif optima and np.isfinite(optima[-1].x).all():
-                x = optima[-1].x
+                x, start = before.x, Start.PREVIOUS
+            elif optima:
+                x, start = optima[-1].x, step.start
             else:
                 x = initial_states(ratio, self._reference_megohm, self.start_wire_megohm)
-            weights = (step.alpha, step.beta, step.lambda_)
-            optimum = self._program.solve(ratio, self._reference_megohm, weights, x, start, before)
-            if not np.isfinite(optimum.x).all():
-                optimum = _given_up(optimum, x)
-            optima.append(optimum)
-        return tuple(optima)
+                start = step.start
+            optima.append(
+                self._program.solve(ratio, self._reference_megohm, step.weights, x, start, before)
+            )
+        layers = optima[-1].megohm.mean(axis=0).reshape(3, known.columns, known.rows)
+        top, bottom, cell = (OHM_PER_MEGOHM * layer.T for layer in layers)
+        skin = Skin(1.0 / cell, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
+        return _Answer(ratio, tuple(optima), skin, readings(skin))
 
     def _feasible(self, ratio: Float) -> tuple[Float, str]:
         """The readings within what some circuit within the bounds allows; what was wrong, if."""
@@ -221,6 +282,9 @@ class RegularizedEstimator(PaperEstimator):
     steps = (STEP_3, STEP_4)
 
 
+# ------------------------------------------------------------------------------------- step 2
+
+
 def initial_states(
     ratio: Float, reference_megohm: tuple[float, float], wire_megohm: float
 ) -> Float:
@@ -233,56 +297,195 @@ def initial_states(
     current = current_from_ratio(ratio, *reference_megohm)
     cell = np.clip(1.0 / current - sum(reference_megohm), *_START_CELL_MEGOHM)
     wire = np.full(cells, wire_megohm)
-    resistances = np.concatenate([wire, wire, cell.T.ravel()])
     states = np.empty((cells, READINGS_PER_CELL, 5 * cells))
-    states[..., : 3 * cells] = np.log(resistances)
-    high_top = _simulate(cell, reference_megohm, wire_megohm)
+    states[..., : 3 * cells] = np.log(np.concatenate([wire, wire, cell.T.ravel()]))
+    high_top = _potentials(cell, reference_megohm, wire_megohm)
     # Exchanging high and low mirrors every potential.
     for k in range(READINGS_PER_CELL):
         states[:, k, 3 * cells :] = high_top if TOP_IS_HIGH[k] else 1.0 - high_top
     return states.reshape(READINGS_PER_CELL * cells, 5 * cells)
 
 
-def _simulate(cell: Float, reference_megohm: tuple[float, float], wire_megohm: float) -> Float:
+def _potentials(cell: Float, reference_megohm: tuple[float, float], wire_megohm: float) -> Float:
     """Node potentials V^t, V^b with the top pin high, shape (N, 2N), cells in column-major order.
 
     Solves the 2N-node Laplacian [microsiemens] once for each selected cell.
     """
     rows, columns = cell.shape
     cells = rows * columns
-    laplacian = np.zeros((2, columns, rows, 2, columns, rows))
-
-    def join(first: tuple[int, int, int], second: tuple[int, int, int], siemens: float) -> None:
-        for a, b in ((first, second), (second, first)):
-            laplacian[a + a] += siemens
-            laplacian[a + b] -= siemens
-
-    for i in range(rows):
-        for j in range(columns):
-            join((0, j, i), (1, j, i), 1.0 / cell[i, j])
-            if j:
-                join((0, j, i), (0, j - 1, i), 1.0 / wire_megohm)
-            if i:
-                join((1, j, i), (1, j, i - 1), 1.0 / wire_megohm)
-    system = np.repeat(laplacian.reshape(1, 2 * cells, 2 * cells), cells, axis=0)
+    node = np.arange(2 * cells).reshape(2, columns, rows)
+    laplacian = np.zeros((2 * cells, 2 * cells))
+    for one, other, megohm in (
+        (node[0], node[1], cell.T),
+        (node[0, 1:], node[0, :-1], wire_megohm),
+        (node[1, :, 1:], node[1, :, :-1], wire_megohm),
+    ):
+        for first, second in ((one, other), (other, one)):
+            laplacian[first, first] += 1.0 / megohm
+            laplacian[first, second] -= 1.0 / megohm
+    system = np.repeat(laplacian[None], cells, axis=0)
     injected = np.zeros((cells, 2 * cells, 1))
     selected = np.arange(cells)
     column, row = np.divmod(selected, rows)
     by_top, by_bottom = (1.0 / (wire_megohm + ohm) for ohm in reference_megohm)
-    at_top, at_bottom = row, cells + column * rows
+    at_top, at_bottom = node[0, 0, row], node[1, column, 0]
     system[selected, at_top, at_top] += by_top
     system[selected, at_bottom, at_bottom] += by_bottom
     injected[selected, at_top, 0] = by_top
     return np.asarray(np.linalg.solve(system, injected)[..., 0], dtype=np.float64)
 
 
-def _given_up(optimum: Optimum, x: Float) -> Optimum:
-    """The start in place of a solution that is not a number."""
-    return Optimum(
-        x=x,
-        bound_multipliers=np.zeros_like(optimum.bound_multipliers),
-        constraint_multipliers=np.zeros_like(optimum.constraint_multipliers),
-        iterations=optimum.iterations,
-        status=optimum.status or "Invalid_Number_Detected",
-        success=False,
-    )
+# -------------------------------------------------------------------------------- the program
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """What Ipopt returned. x: shape (4N, 5N), a state per row. Multipliers serve a warm start."""
+
+    x: Float
+    bound_multipliers: Float
+    constraint_multipliers: Float
+    iterations: int
+    status: str
+    success: bool
+
+    @property
+    def megohm(self) -> Float:
+        """R^t, R^b, R^c of all states [megohm], shape (4N, 3N)."""
+        resistances: Float = np.exp(self.x[:, : 3 * (self.x.shape[1] // 5)])
+        return resistances
+
+
+class Program:
+    """The program for one size of skin; readings, references and weights are its parameters."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        cells = rows * columns
+        y = casadi.SX.sym("y", READINGS_PER_CELL * cells)
+        references = casadi.SX.sym("ref", 2)
+        weights = casadi.SX.sym("weights", 3)
+        states = [
+            _State(rows, columns, number, y[number], references) for number in range(y.shape[0])
+        ]
+        cost_f, cost_c = _discrepancies(states)
+        cost_r = sum(casadi.sumsqr(state.wires) for state in states)
+        problem = {
+            "x": casadi.vertcat(*(state.variables for state in states)),
+            "f": weights[0] * cost_f + weights[1] * cost_c + weights[2] * cost_r,
+            "g": casadi.vertcat(*(state.laws for state in states)),
+            "p": casadi.vertcat(y, references, weights),
+        }
+        self._solvers = {start: _make_solver(problem, start) for start in Start}
+        is_resistance = np.arange(5 * cells) < 3 * cells
+        least = np.where(is_resistance, np.log(MIN_MEGOHM), -np.inf)
+        most = np.where(is_resistance, np.log(MAX_MEGOHM), np.inf)
+        self._bounds = {
+            "lbx": np.tile(least, len(states)),
+            "ubx": np.tile(most, len(states)),
+            "lbg": 0.0,
+            "ubg": 0.0,
+        }
+
+    def solve(
+        self,
+        ratio: Float,
+        reference_megohm: tuple[float, float],
+        weights: tuple[float, float, float],
+        x: Float,
+        start: Start,
+        previous: Optimum | None = None,
+    ) -> Optimum:
+        """Minimise from the states x (4N, 5N), which are the answer if Ipopt's has no numbers.
+
+        ratio: (R, C, 4); reference_megohm: top, bottom; weights: alpha, beta, lambda. `previous`,
+        for `Start.PREVIOUS`, brings the multipliers.
+        """
+        arguments = dict(self._bounds)
+        if previous is not None:
+            arguments["lam_x0"] = previous.bound_multipliers
+            arguments["lam_g0"] = previous.constraint_multipliers
+        solver = self._solvers[start]
+        # Column-major: rows run fastest, then columns.
+        y = ratio.transpose(1, 0, 2).ravel()
+        found = solver(x0=x.ravel(), p=np.concatenate([y, reference_megohm, weights]), **arguments)
+        report = solver.stats()
+        if report["return_status"] in _INTERRUPTED:
+            raise KeyboardInterrupt
+        states = np.array(found["x"]).reshape(x.shape)
+        is_finite = bool(np.isfinite(states).all())
+        return Optimum(
+            x=states if is_finite else x,
+            bound_multipliers=np.array(found["lam_x"]).ravel(),
+            constraint_multipliers=np.array(found["lam_g"]).ravel(),
+            iterations=int(report["iter_count"]),
+            status=str(report["return_status"]) or "Invalid_Number_Detected",
+            success=bool(report["success"]) and is_finite,
+        )
+
+
+@lru_cache(maxsize=4)
+def program_for(rows: int, columns: int) -> Program:
+    """The program for this size, built once in a process."""
+    return Program(rows, columns)
+
+
+def _make_solver(problem: dict[str, Any], start: Start) -> Any:
+    options = {f"ipopt.{name}": value for name, value in (_IPOPT | _IPOPT_START[start]).items()}
+    quiet = {"print_time": False, "show_eval_warnings": False, "error_on_fail": False}
+    # Sensitivities to the parameters are not needed, and warn where Ipopt gave up.
+    quiet["calc_lam_p"] = False
+    return casadi.nlpsol(f"paper_{start.name.lower()}", "ipopt", problem, options | quiet)
+
+
+class _State:
+    """One measurement's circuit: its variables, its resistances [megohm] and its laws."""
+
+    def __init__(self, rows: int, columns: int, number: int, y: Any, references: Any) -> None:
+        cells = rows * columns
+        cell, k = divmod(number, READINGS_PER_CELL)
+        column, row = divmod(cell, rows)
+        self.variables = casadi.SX.sym(f"P{number}", 5 * cells)
+        logarithms, self.potentials = casadi.vertsplit(self.variables, [0, 3 * cells, 5 * cells])
+        self.resistances = casadi.exp(logarithms)
+        self.wires = self.resistances[: 2 * cells]
+
+        def layers(values: Any) -> list[Any]:
+            parts = casadi.vertsplit(values, cells)
+            return [casadi.reshape(part, rows, columns) for part in parts]
+
+        # The paper's constraints use the inverse of resistance.
+        by_top, by_bottom, by_cell = layers(casadi.exp(-logarithms))
+        top, bottom = layers(self.potentials)
+        of_top, of_bottom, _ = layers(self.resistances)
+        # Of the row and of the column: the first wire segment, the potential behind it, the supply.
+        first, inner = (of_top[row, 0], of_bottom[0, column]), (top[row, 0], bottom[0, column])
+        supply = (1.0, 0.0) if TOP_IS_HIGH[k] else (0.0, 1.0)
+        sensed, other = (0, 1) if READING_SENSES_TOP[k] else (1, 0)
+        into: list[Any] = [0.0, 0.0]
+        into[sensed] = (y - inner[sensed]) / first[sensed]
+        into[other] = (supply[other] - inner[other]) / (first[other] + references[other])
+        measured = into[sensed] - (supply[sensed] - y) / references[sensed]
+        # Kirchhoff: the currents into each node, zero in a circuit. `lsq` ends elsewhere if their
+        # terms come in another order, because its answer depends on rounding.
+        through = by_cell * (top - bottom)
+        into_top, into_bottom = -through, casadi.SX(through)
+        into_top[row, 0] += into[0]
+        into_bottom[0, column] += into[1]
+        into_top[:, 1:] += by_top[:, 1:] * (top[:, :-1] - top[:, 1:])
+        into_top[:, :-1] += by_top[:, 1:] * (top[:, 1:] - top[:, :-1])
+        into_bottom[1:, :] += by_bottom[1:, :] * (bottom[:-1, :] - bottom[1:, :])
+        into_bottom[:-1, :] += by_bottom[1:, :] * (bottom[1:, :] - bottom[:-1, :])
+        nodes = casadi.horzcat(casadi.vec(into_top.T), casadi.vec(into_bottom.T))
+        self.laws = references[0] * casadi.vertcat(casadi.vec(nodes.T), measured)
+
+
+def _discrepancies(states: list[_State]) -> tuple[Any, Any]:
+    """Cost_f and Cost_c: states that should agree, of one cell and of consecutive cells."""
+    cost_f: Any = 0.0
+    cost_c: Any = 0.0
+    for first, second in zip(states[::2], states[1::2], strict=True):
+        cost_f += casadi.sumsqr(first.resistances - second.resistances)
+        cost_f += casadi.sumsqr(first.potentials - second.potentials)
+    for before, after in zip(states, states[READINGS_PER_CELL:], strict=False):
+        cost_c += casadi.sumsqr(before.resistances - after.resistances)
+    return cost_f, cost_c

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure what importing the package and asking for its help cost: processor time of a process.
+
+    make bench-import
+    .venv/bin/python benchmarks/bench_import.py --runs 25
+
+Each is divided by the time of a process that imports what every host program needs anyway:
+numpy, scipy.linalg and serial. The programs take turns, and the median of the ratios' parts counts.
+Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
+missed.
+
+reference_ms    user and system time of `import numpy, scipy.linalg, serial` [ms]
+import_ratio    `import ohmskin`: names load their modules when they are first asked for
+open_ratio      `import ohmskin`, and a board is opened and asked for a scan: an emulated one
+help_ratio      `ohmskin --help`
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+
+from bars import at_most, report
+
+REFERENCE = ("-c", "import numpy, scipy.linalg, serial")
+OPEN = "import ohmskin\nwith ohmskin.open('emulator://2x2') as skin: skin.latest()"
+PROGRAMS = {
+    "import_ratio": ("-c", "import ohmskin"),
+    "open_ratio": ("-c", OPEN),
+    "help_ratio": ("-m", "ohmskin", "--help"),
+}
+BARS = (at_most("import_ratio", 1.6), at_most("help_ratio", 2.6))
+
+
+def cpu_s(arguments: tuple[str, ...]) -> float:
+    """User and system time of one run of Python [s]."""
+    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args)
+    return used.ru_utime + used.ru_stime
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="measure what importing the package costs")
+    parser.add_argument("--runs", type=int, default=9, help="of each program")
+    runs = parser.parse_args().runs
+    programs = {"reference": REFERENCE, **PROGRAMS}
+    for arguments in programs.values():
+        cpu_s(arguments)  # its first run compiles modules
+    times = [{name: cpu_s(program) for name, program in programs.items()} for _ in range(runs)]
+    median = {name: statistics.median(run[name] for run in times) for name in programs}
+    figures: dict[str, float | None] = {"reference_ms": round(1e3 * median["reference"], 1)}
+    figures |= {name: round(median[name] / median["reference"], 2) for name in PROGRAMS}
+    all_met = report(figures, BARS)
+    print(json.dumps(figures))
+    return 0 if all_met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

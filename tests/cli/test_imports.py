@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is loaded when: the package and its help are light, and methods load what they need."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ohmskin
+from ohmskin.cli.main import app
+
+# What takes long to load, and only some commands or methods need.
+HEAVY = {
+    *("casadi", "mcap", "matplotlib", "typer", "rich", "starlette", "joblib", "threadpoolctl"),
+    *("scipy.signal", "scipy.sparse", "scipy.optimize", "scipy.ndimage"),
+}
+HELP = """
+from ohmskin.cli.main import app
+app(["--help"], prog_name="ohmskin", standalone_mode=False)
+"""
+JOINT = """
+import numpy as np, ohmskin
+estimator = ohmskin.make_estimator("joint", ohmskin.SkinKnowledge(2, 2))
+assert estimator.estimate(np.tile([0.9, 0.1, 0.9, 0.1], (2, 2, 1))).converged
+"""
+
+
+def loaded_after(program: str) -> set[str]:
+    """Modules that a process of its own has loaded at the end of this program."""
+    path = Path(ohmskin.__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\nimport sys; print(*sys.modules, file=sys.stderr)"],
+        env={**os.environ, "PYTHONPATH": str(path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("program", "allowed"),
+    [
+        ("import ohmskin", set()),
+        (HELP, {"typer", "rich"}),
+        (JOINT, {"threadpoolctl"}),
+    ],
+    ids=["package", "help", "joint"],
+)
+def test_nothing_heavy_is_loaded(program: str, allowed: set[str]) -> None:
+    assert loaded_after(program) & HEAVY == allowed
+
+
+def test_only_a_paper_method_loads_casadi() -> None:
+    program = "import ohmskin\nmake = ohmskin.make_estimator\nknown = ohmskin.SkinKnowledge(1, 1)\n"
+    others = [name for name in ohmskin.METHODS if name not in ("lsq", "regularized")]
+    assert len(others) == 4
+    assert "casadi" not in loaded_after(program + f"for name in {others}: make(name, known)")
+    assert "casadi" in loaded_after(program + "make('lsq', known)")
+
+
+def test_every_public_name_is_found() -> None:
+    for name in ohmskin.__all__:
+        assert name in dir(ohmskin)
+        assert getattr(ohmskin, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'oepn'"):
+        _ = ohmskin.oepn
+
+
+@pytest.mark.parametrize("name", app.commands)
+def test_the_list_of_commands_says_what_a_command_says_of_itself(name: str) -> None:
+    listed = app.commands[name]
+    own = listed.load().help.split("\n\n")[0]
+    assert listed.help == " ".join(own.split())
