@@ -63,7 +63,7 @@ class SerialLink:
                 path, baud, timeout=READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as exc:
-            raise PortError(_explain(path, exc)) from exc
+            raise PortError(*_explain(path, exc)) from exc
 
     def read(self) -> bytes:
         """See `Link.read`: waits for one byte, then takes all there are."""
@@ -93,21 +93,23 @@ class SerialLink:
         self._port.close()
 
 
-def _explain(path: str, exc: Exception) -> str:
+def _explain(path: str, exc: Exception) -> tuple[str, str]:
+    """Problem and remedy."""
     number = getattr(exc, "errno", None)
     text = str(exc)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFound" in text:
-        return f"no port {path}: 'ohmskin ports' lists the ports there are"
+        return f"no port {path}", "'ohmskin ports' lists the ports there are"
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return f"{path} is busy: close the other program that uses it"
+        return f"{path} is busy", "close the other program that uses it"
     if number in (errno.EACCES, errno.EPERM) or "PermissionError" in text:
         return (
-            f"no permission for {path}: on Linux run 'sudo usermod -aG dialout $USER' and log in "
-            "again; on Windows close the other program that uses it"
+            f"no permission for {path}",
+            "on Linux run 'sudo usermod -aG dialout $USER' and log in again; on Windows close the "
+            "other program that uses it",
         )
     if number in (errno.ENOTTY, errno.EINVAL):
-        return f"{path} is no serial port: 'ohmskin ports' lists the ports there are"
-    return f"cannot open {path}: {text}"
+        return f"{path} is no serial port", "'ohmskin ports' lists the ports there are"
+    return f"cannot open {path}: {text}", ""
 
 
 @dataclass(frozen=True)

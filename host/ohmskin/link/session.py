@@ -174,7 +174,8 @@ class Session:
         if isinstance(self._hello, ForeignHello):
             raise ProtocolMismatch(
                 f"{self.link.name}: board speaks layout 0x{self._hello.layout_crc:04X}, this host "
-                f"0x{protocol.LAYOUT_CRC:04X}: flash it with 'ohmskin flash'"
+                f"0x{protocol.LAYOUT_CRC:04X}",
+                "flash it with 'ohmskin flash'",
             )
         if self.hello.scanning:
             self.command("stop")
