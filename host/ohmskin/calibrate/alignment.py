@@ -90,7 +90,7 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
         )
     x, in_x = _edges(time_s, rises, "the skin's rise")
     y, in_y = _edges(log.time_s, log.force_n, "the force")
-    r, shared = _correlations(x, in_x, y, in_y)
+    r, shared = correlations(x, in_x, y, in_y)
     shorter_s = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * STEP_S
     enough = shared * STEP_S >= max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s)
     if not enough.any():
@@ -145,10 +145,13 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, NDArray[np.b
     return np.where(inside, np.gradient(smooth, STEP_S), 0.0), inside
 
 
-def _correlations(
+def correlations(
     x: Float, in_x: NDArray[np.bool_], y: Float, in_y: NDArray[np.bool_]
 ) -> tuple[Float, Float]:
-    """r and n of all lags, the first being 1 - Y; r is 0 where either does not vary."""
+    """r and n (K,) of all lags, the first being 1 - Y; r is 0 where either does not vary.
+
+    x, y: edges; in_x, in_y: where there are edges, not gaps.
+    """
     from scipy.signal import correlate
 
     mask_x, mask_y = in_x.astype(np.float64), in_y.astype(np.float64)
