@@ -46,7 +46,7 @@ from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, solve, solve_lower
-from ohmskin.circuit.skin import by_wires, factorised, impedance_of, path_ohm
+from ohmskin.circuit.skin import by_wires, factorised, impedance_of
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     DOUBT,
@@ -173,18 +173,15 @@ class Touched:
 class SparseFit:
     """Fits the frames of a skin (R, C), each by itself."""
 
-    def __init__(
-        self, shape: tuple[int, int], prior: CellPrior, belief: WireBelief, ref_ohm: float
-    ) -> None:
-        self._known = shape, prior, belief, ref_ohm
+    def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self._belief = belief
-        self._base: _Base | None = None
+        self._base = _Base(prior, belief, ref_ohm)
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
         """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
-        base = self._base
-        if base is None or base.path_change(self._belief.mean) > REBUILD:
-            self._base = base = _Base(*self._known)
+        base, now = self._base, self._belief.path_ohm(self._belief.mean)
+        if np.abs(now / base.path_ohm - 1.0).max() > REBUILD:
+            self._base = base = _Base(base.prior, self._belief, base.ref_ohm)
         fit = _Frame(base, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
         fit.settle(_NO_CELLS, np.zeros(0))
@@ -202,31 +199,24 @@ class SparseFit:
 class _Base:
     """What does not change from frame to frame: the untouched skin with wires as believed."""
 
-    def __init__(
-        self, shape: tuple[int, int], prior: CellPrior, belief: WireBelief, ref_ohm: float
-    ) -> None:
+    def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self.log_wires = belief.mean
-        top, bottom = np.exp(belief.mean).reshape(2, *shape)
         rest_log = -prior.expected
         self.least_log = rest_log + LEAST_RISE * prior.std
         self.prior = prior
         self.ref_ohm = ref_ohm
-        self.net = net = RestNetwork(np.exp(rest_log).reshape(shape), top, bottom)
+        rest_siemens = np.exp(rest_log).reshape(belief.shape)
+        self.net = net = RestNetwork(rest_siemens, *belief.layers(belief.mean))
         self.current = 1.0 / (net.port_ohm + ref_ohm)
         by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
         wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
         self.slack += belief.variance(wires * (self.current**2)[:, None])
-        self.path_ohm = path_ohm(top, bottom).ravel()
+        self.path_ohm = belief.path_ohm(belief.mean)
         self.wire_std = float(belief.std().max())
         # Wires this uncertain are no small noise beside a cell at rest.
         self.hides = bool(np.any(self.path_ohm * self.wire_std * net.cell_siemens > HIDING))
-
-    def path_change(self, log_wires: Float) -> float:
-        """Largest relative change of the wire between a cell and its electrodes."""
-        now = path_ohm(*np.exp(log_wires).reshape(2, *self.net.shape)).ravel()
-        return float(np.abs(now / self.path_ohm - 1.0).max())
 
 
 class _Frame:
