@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
-from ohmskin.circuit.skin import path_ohm
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
@@ -184,7 +183,8 @@ class WireBelief:
 
     def path_ohm(self, log_wires: Float) -> Float:
         """Wire between each cell and its electrodes [ohm], (RC,)."""
-        return path_ohm(*self.layers(log_wires)).ravel()
+        top, bottom = self.layers(log_wires)
+        return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
 
     def learn(self, slopes: Float, residual: Float, noise: Float) -> bool:
         """One Kalman step; True if lessons say that the skin was bent: what was learned is dropped.
