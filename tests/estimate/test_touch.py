@@ -13,8 +13,8 @@ from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.rest_network import RestNetwork, TouchedNetwork
-from ohmskin.estimate.wires import FADE, WireBelief
+from ohmskin.estimate.prior import FADE, WireBelief
+from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import estimate_file, load_readings
 from places import DATA

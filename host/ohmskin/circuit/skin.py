@@ -136,6 +136,12 @@ def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
     return coupling.reshape(rows * columns, rows * columns)
 
 
+def path_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
+    """Wire between each cell and its electrodes, (R, C) [ohm]."""
+    path: Float = np.cumsum(top_wire_ohm, axis=1) + np.cumsum(bottom_wire_ohm, axis=0)
+    return path
+
+
 def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tuple[Float, Float]:
     """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
 

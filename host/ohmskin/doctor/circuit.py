@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, cells_of, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
 from ohmskin.doctor.signal import mean_std_lsb
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -210,15 +210,13 @@ def _judge_cells(
         dead = np.asarray(judged & ~hidden & (siemens + doubt < DEAD_SHARE * usual))
     if dead.any():
         percent = 100 * float(np.max(siemens[dead] / usual))
-        findings.append(
-            found(Kind.DEAD_CELL, Place(cells=cells_of(dead)), percent_of_usual=percent)
-        )
+        findings.append(found(Kind.DEAD_CELL, Place.of_cells(dead), percent_of_usual=percent))
     rows, columns = siemens.shape
     top, bottom = wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
     saturated = high & (siemens * (WIRE_SPREAD * path_ohm + SHORTED_OHM) > 1)
     if saturated.any():
-        place, ohm = Place(cells=cells_of(saturated)), float(np.max(1 / siemens[saturated]))
+        place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
         findings.append(found(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest))
     return high & ~saturated, dead | saturated, findings
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, cells_of, found
+from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, found
 from ohmskin.doctor.signal import (
     SOUND_NOISE_LSB,
     RestScans,
@@ -110,7 +110,7 @@ def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) ->
     }
     touched = circuit.touched if circuit.touched.any() else signal.moved
     if touched.any():
-        diagnosis.findings.append(found(Kind.TOUCHED, Place(cells=cells_of(touched)), moves=moves))
+        diagnosis.findings.append(found(Kind.TOUCHED, Place.of_cells(touched), moves=moves))
     elif not circuit.wrong.any():
         _examine_wires(evidence, best, noise_lsb, diagnosis)
 

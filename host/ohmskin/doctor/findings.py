@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,11 @@ class Place:
     columns: tuple[int, ...] = ()
     cells: tuple[Cell, ...] = ()
 
+    @classmethod
+    def of_cells(cls, where: NDArray[np.bool_]) -> Self:
+        """Each cell that is true in `where` (R, C)."""
+        return cls(cells=tuple((int(row), int(column)) for row, column in np.argwhere(where)))
+
 
 WHOLE_SKIN: Final = Place()
 
@@ -83,11 +88,6 @@ WHOLE_SKIN: Final = Place()
 def lines_of(where: NDArray[np.bool_]) -> tuple[int, ...]:
     """Number of each line that is true in `where` (R,) or (C,)."""
     return tuple(map(int, np.flatnonzero(where)))
-
-
-def cells_of(where: NDArray[np.bool_]) -> tuple[Cell, ...]:
-    """Each cell that is true in `where` (R, C)."""
-    return tuple((int(row), int(column)) for row, column in np.argwhere(where))
 
 
 @dataclass(frozen=True)

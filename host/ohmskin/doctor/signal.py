@@ -35,9 +35,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, cells_of, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import CONSTANTS, ENUMS
+from ohmskin.link.protocol import CONSTANTS
 from ohmskin.link.timing import reading_offsets_s, slot_s
 
 Bool = NDArray[np.bool_]
@@ -276,7 +276,7 @@ def _hum_finding(hum: Hum, board: Hello) -> Finding:
     worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
     return found(
         Kind.HUM,
-        Place(cells=cells_of(worst)),
+        Place.of_cells(worst),
         mains_hz=hum.mains_hz,
         amplitude_lsb=hum.lsb,
         most_lsb=HUM_LSB,
@@ -303,7 +303,7 @@ def _noise(cell_lsb: Float) -> list[Finding]:
     limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
     rows, columns = lines_of(row_lsb > limit), lines_of(column_lsb > limit)
-    cells = () if rows or columns else cells_of(cell_lsb > limit)
+    cells = () if rows or columns else Place.of_cells(cell_lsb > limit).cells
     lsb = usual
     if rows or columns:
         lsb = float(max(row_lsb.max(), column_lsb.max()))
@@ -324,15 +324,12 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     The settle time is longer, where it can be; the rate is one at which no mains stands still.
     """
     readings = board.rows * board.columns * board.readings_per_cell
-    slot_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ))
-    select_us = 1e6 * slot_s(board) - board.settle_us  # until the pins of a slot have changed
-    most_us = min(CONSTANTS["settle_us_max"], int(slot_us - select_us))
+    spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
+    most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
     longer_us = min(max(LONGER * board.settle_us, LEAST_LONGER_US), most_us)
     if not _is_longer(longer_us, board.settle_us) and not _hidden_hz(board.rate_hz, REST_S):
         return None
-    prescaler = ENUMS["adc_prescaler"].values.get(board.adc_prescaler, 0)
-    conversion_us = 1e6 * 14 * prescaler / board.clock_hz
-    slot_us = max(longer_us + select_us, conversion_us)
+    slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
     rates_hz = np.linspace(0.7, 1.0, 31) * fastest_hz
     best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(each, rate_hz) for each in MAINS_HZ))
@@ -362,7 +359,7 @@ def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding
     needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
     finding = found(
         Kind.SETTLING,
-        WHOLE_SKIN if cells.mean() > 0.5 else Place(cells=cells_of(cells)),
+        WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
         change_lsb=float(change.max()),
         most_lsb=UNSETTLED_LSB,
         settle_us=settle_us,

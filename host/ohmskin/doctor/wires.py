@@ -63,7 +63,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
 from ohmskin.doctor.circuit import matrix_estimator
-from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare, cells_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
 from ohmskin.doctor.signal import rounding_std_lsb
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
@@ -235,7 +235,7 @@ class CornerScans:
         if scan.codes.shape[:2] != (self._board.rows, self._board.columns):
             return
         siemens = self._matrix.estimate(scan.ratio).cell_siemens
-        self.pressed = cells_of(siemens > PRESSED_SIEMENS)
+        self.pressed = Place.of_cells(siemens > PRESSED_SIEMENS).cells
         corners = pressed_corners(siemens)
         self.hold = corners is not None and corners != self._first
         if corners is None:

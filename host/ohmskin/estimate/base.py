@@ -189,13 +189,7 @@ class Estimator(ABC):
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         self.knowledge = knowledge
-        self._reader = PortReader(
-            (knowledge.rows, knowledge.columns),
-            (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm),
-            knowledge.adc_bits,
-            knowledge.rest_ratio,
-            knowledge.nominal_wire_ohm.both,
-        )
+        self._reader = PortReader(knowledge)
         self._rest: Solution | None = None
 
     @abstractmethod

@@ -67,31 +67,24 @@ OHM_PER_MEGOHM: Final = 1e6
 # The top pin is high where the sensed electrode is the top one and on the source side, or neither.
 TOP_IS_HIGH: Final = (READING_OFFSET > 0) == READING_SENSES_TOP
 
-# 20 N^2 variables: 64 cells take 1.9 GB and 25 s a step.
-MAX_CELLS: Final = 64
-# Resistances are believed to lie within these bounds [megohm].
-MIN_MEGOHM: Final = 1e-6
+MAX_CELLS: Final = 64  # 20 N^2 variables: 64 cells take 1.9 GB and 25 s a step
+MIN_MEGOHM: Final = 1e-6  # of any resistance, and the highest: what is believed
 MAX_MEGOHM: Final = 20.0
 MAX_ITERATIONS: Final = 300
-# Of the optimality error.
-TOLERANCE: Final = 1e-6
-# Of Kirchhoff's and Ohm's laws, as a ratio to Vdd.
-CIRCUIT_TOLERANCE: Final = 1e-9
-# Step 2's cells lie within these bounds [megohm].
-_START_CELL_MEGOHM: Final = (2e-6, 15.0)
-# A port of less resistance [megohm] has no solution within the bounds, or none but on them.
+TOLERANCE: Final = 1e-6  # of the optimality error
+CIRCUIT_TOLERANCE: Final = 1e-9  # of Kirchhoff's and Ohm's laws, as a ratio to Vdd
+_START_CELL_MEGOHM: Final = (2e-6, 15.0)  # the least and the highest cell of step 2
+# Ports of less resistance, or of cells with more, have no solution within the bounds, or on them.
 _LEAST_PORT_MEGOHM: Final = 1e-5
-# Nor has a skin whose cells all have more than this [megohm].
 _MOST_CELL_MEGOHM: Final = 18.0
-# A reading is at fault if it is beyond such a port by this many standard deviations.
-_FAULT_STDS: Final = 5.0
+_FAULT_STDS: Final = 5.0  # a reading that is further from such ports is at fault
 # The states' mean must give back the readings to this (root mean square, of Vdd): if not, the
 # states are different circuits, and their mean is none of them.
 MISFIT_RATIO: Final = 1e-3
-# A solution with a resistance this near its bound is a poor start for the next frame [megohm].
-_POOR_START_MEGOHM: Final = 10.0
-# A frame starts afresh if any of its readings changed by more than this since the last [Vdd].
-_JUMP_RATIO: Final = 0.02
+_POOR_START_MEGOHM: Final = 10.0  # nearer to its bound, a solution is a poor start for the next
+_JUMP_RATIO: Final = (
+    0.02  # of a reading since the last frame, of Vdd: above it a frame starts afresh
+)
 
 
 class Start(Enum):

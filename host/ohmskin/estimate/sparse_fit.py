@@ -7,8 +7,13 @@ Symbols
 ====== ======== ================================================================== ==========
 symbol shape    meaning                                                            unit
 ====== ======== ================================================================== ==========
-k               cells in the model; all others are as at rest
-x      (k,)     their log conductances                                             log S
+rho0   (RC,)    port resistance of the untouched skin                              ohm
+H      (RC, RC) voltage over cell e per current through port p                     ohm
+M      (RC, RC) voltage over cell e per current forced through cell f from outside ohm
+d      (k,)     what the touches add to the conductance of k cells                 S
+q      (k, RC)  current that the added conductance draws, per port current         1
+v      (RC, RC) voltage over cell e per current through port p, cells touched      ohm
+x      (k,)     log conductances of the k cells in the model, others are at rest   log S
 I      (RC,)    port currents per Vdd                                              S
 s      (RC,)    their noise: of the readings, of cells at rest and wires           S
 r      (RC,)    residual (I_read - I) / s                                          1
@@ -17,11 +22,17 @@ Jw     (m, 2RC) dI / dw / s, w the log wire resistances, at the m ports they mat
 N      (m, m)   1 + Jw P Jw^T, P the covariance of w                               1
 ====== ======== ================================================================== ==========
 
-The untouched skin is solved once (`rest_network`). A frame starts from no touched cells.
-Gauss-Newton steps on x minimise |r|^2 and the prior of the cells. Where a reading then shows more
-current than the model explains, the cells that would explain most in their row and column are
-added, until no reading asks for one; a cell that falls back to rest is taken out. The last steps
-know that wires are known to P only, and weigh the readings by N^-1.
+The untouched skin is solved once. Added conductances are a change of rank k (Woodbury):
+
+    q = (diag(1/d) + M_kk)^-1 H_k ,   rho = rho0 - sum_k H_k q ,   v = H - M_k^T q ,
+
+over the touched cells v_k = q / d. All derivatives follow: d rho / d g_e = -v_e^2 (Tellegen).
+
+A frame starts from no touched cells. Gauss-Newton steps on x minimise |r|^2 and the prior of the
+cells. Where a reading then shows more current than the model explains, the cells that would explain
+most in their row and column are added, until no reading asks for one; a cell that falls back to
+rest is taken out. The last steps know that wires are known to P only, and weigh the readings by
+N^-1.
 """
 
 from __future__ import annotations
@@ -30,84 +41,162 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, solve, solve_lower
-from ohmskin.circuit.skin import by_wires
+from ohmskin.circuit.skin import by_wires, factorised, impedance_of, path_ohm
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
-from ohmskin.estimate.prior import DOUBT, HIDDEN, HIGHEST_TOUCH_SIEMENS, UNLIMITED_STD, CellPrior
-from ohmskin.estimate.rest_network import Cells, RestNetwork, TouchedNetwork
-from ohmskin.estimate.wires import Lesson, WireBelief
+from ohmskin.estimate.prior import (
+    DOUBT,
+    HIDDEN,
+    HIGHEST_TOUCH_SIEMENS,
+    UNLIMITED_STD,
+    CellPrior,
+    Lesson,
+    WireBelief,
+)
 
-MOST_PER_LINE: Final = 2  # touches; with more, the skin is not at rest any more
-DEMAND: Final = 4.0  # residual, in its standard deviation, that a cell is added for
-SHARE: Final = 0.5  # of the largest rise in its row and column, to be added with it
-LEAST_RISE: Final = 2.0  # in deviations of the prior: a cell that rises less is at rest
-MAX_ROUNDS: Final = 8
-MAX_STEPS: Final = 8  # per round
+Cells = NDArray[np.intp]
+
+MOST_PER_LINE: Final = 2  # touches a row and column; with more, the skin is not at rest any more
+DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
+SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
+LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
+MAX_ROUNDS: Final = 8  # of adding cells
+MAX_STEPS: Final = 8  # in a round
 MAX_STEP: Final = 1.5  # of a log conductance
-CLOSE: Final = 0.1  # a step below this share of every standard deviation is the last
-HEAVY: Final = 0.5  # wires matter to a reading that they may move by this share of its noise,
-LIGHT: Final = 0.03  # and to the next, down to this share,
-MAX_HEAVY: Final = 24  # up to so many in all: together they tell a bend that none tells alone
-HIDING: Final = 0.1  # deviation of a path's wires, over a cell at rest, beyond which wires hide it
-REBUILD: Final = 0.05  # relative change of a path's wires for which the network is solved anew
-CONTRADICTION: Final = 3.0  # deviations of the chi-square of the readings that wires matter to
+CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
+# Wires matter to a reading that they may move by the share HEAVY of its noise. The next ones, down
+# to the share LIGHT and up to MAX_HEAVY in all, tell a bend together that none tells alone.
+HEAVY: Final = 0.5
+LIGHT: Final = 0.03
+MAX_HEAVY: Final = 24
+HIDING: Final = (
+    0.1  # deviation of the wires to a cell at rest, over the cell: above it they hide it
+)
+REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
+CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 _NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
+
+
+class RestNetwork:
+    """rho0, H and M of cells (R, C) [S] that all conduct, and wires (R, C) [ohm]."""
+
+    def __init__(self, cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> None:
+        self.shape = rows, columns = cell_siemens.shape
+        self.cell_siemens = cell_siemens.ravel()
+        self.top_wire_ohm, self.bottom_wire_ohm = top_wire_ohm, bottom_wire_ohm
+        root = np.sqrt(cell_siemens)
+        factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
+        impedance, self.port_ohm = impedance_of(half, rows)
+        # With L of the factor, L' = L^-1 sqrt(g): cell currents x are L'^T half V of the electrode
+        # potentials V, and L'^T (1 - half Z half^T) L' of voltages inserted in series with cells.
+        inverse = solve_lower(factor, np.diag(root.ravel()))
+        cell_ohm = 1.0 / self.cell_siemens
+        potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(
+            rows + columns, -1
+        )
+        self.port_volt = (inverse.T @ (half @ potential)) * cell_ohm[:, None]
+        between = half @ impedance @ half.T
+        between *= -1.0
+        between.ravel()[:: len(cell_ohm) + 1] += 1.0
+        in_series = inverse.T @ between @ inverse
+        self.cell_volt = -cell_ohm[:, None] * in_series * cell_ohm
+        self.cell_volt.ravel()[:: len(cell_ohm) + 1] += cell_ohm
+        self.own_port_volt = np.diagonal(self.port_volt).copy()
+        self.own_cell_volt = np.diagonal(self.cell_volt).copy()
+
+    def by_wires(self, cell_current: Float) -> Float:
+        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents (m, RC)."""
+        current = cell_current.reshape(-1, *self.shape)
+        return by_wires(current, self.top_wire_ohm, self.bottom_wire_ohm)
+
+
+class TouchedNetwork:
+    """A `RestNetwork` with conductances `added` (k,) > 0 [S] at `cells` (k,).
+
+    port_ohm: rho (RC,). volt: v of the touched cells (k, RC).
+    """
+
+    def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
+        self._rest = rest
+        self._cells = cells
+        self._added = added
+        self._coupling = rest.cell_volt[cells]
+        port_volt = rest.port_volt[cells]
+        system = rest.cell_volt[cells[:, None], cells]
+        system.ravel()[:: len(cells) + 1] += 1.0 / added
+        self._system = system
+        _, self._current, _ = lapack.dposv(system, port_volt, lower=1)
+        self.volt = self._current / added[:, None]
+        self.port_ohm = rest.port_ohm - np.einsum("ij,ij->j", port_volt, self._current)
+
+    def own_volt(self) -> tuple[Float, Float]:
+        """Diagonals of v and of the touched M, (RC,): each cell at its own port, and alone."""
+        _, drawn, _ = lapack.dposv(self._system, self._coupling, lower=1)
+        port = self._rest.own_port_volt - np.einsum("ij,ij->j", self._coupling, self._current)
+        cell = self._rest.own_cell_volt - np.einsum("ij,ij->j", self._coupling, drawn)
+        return port, cell
+
+    def cell_current(self, ports: Cells) -> Float:
+        """Current through all cells per current through some ports, (m, RC)."""
+        rest = self._rest
+        volt: Float = rest.port_volt[:, ports] - self._coupling.T @ self._current[:, ports]
+        siemens = rest.cell_siemens.copy()
+        siemens[self._cells] += self._added
+        volt *= siemens[:, None]
+        return volt.T
 
 
 @dataclass(frozen=True, eq=False)
 class Touched:
     """What was found: cells (k,), their log conductance and its standard deviation (k,).
 
-    doubtful: a touch may hide at another cell. contradicted: no touches explain the readings.
-    current: what the model predicts, wires corrected (RC,) [S]. lesson: what the wires can learn
+    current: what the model predicts, wires corrected (RC,) [S]. doubtful: a touch may hide at
+    another cell. contradicted: no touches explain the readings. lesson: what the wires can learn
     from: Jw, r and N of the m ports, the touched cells in N as noise without limit.
     """
 
     cells: Cells
     log_siemens: Float
     log_std: Float
-    doubtful: bool
     current: Float
+    doubtful: bool
     contradicted: bool
     steps: int
     lesson: Lesson
 
 
-class TouchedFit:
+class SparseFit:
     """Fits the frames of a skin (R, C), each by itself."""
 
     def __init__(
         self, shape: tuple[int, int], prior: CellPrior, belief: WireBelief, ref_ohm: float
     ) -> None:
-        self._shape = shape
-        self._prior = prior
+        self._known = shape, prior, belief, ref_ohm
         self._belief = belief
-        self._ref_ohm = ref_ohm
         self._base: _Base | None = None
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
         """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
         base = self._base
         if base is None or base.path_change(self._belief.mean) > REBUILD:
-            self._base = base = _Base(self._shape, self._prior, self._belief, self._ref_ohm)
-        fit = _Fit(base, current, current_std)
+            self._base = base = _Base(*self._known)
+        fit = _Frame(base, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
         fit.settle(_NO_CELLS, np.zeros(0))
         for _ in range(MAX_ROUNDS):
             asked, rise = fit.asked_for()
             if not asked.size:
-                break
-            if fit.cells.size + asked.size > MOST_PER_LINE * sum(self._shape):
+                return fit.finish(self._belief)
+            if fit.cells.size + asked.size > MOST_PER_LINE * sum(base.net.shape):
                 return None
             added = np.log(base.net.cell_siemens[asked] + rise)
             fit.settle(np.concatenate([fit.cells, asked]), np.concatenate([fit.log_siemens, added]))
-        else:
-            return None
-        return fit.finish(self._belief)
+        return None
 
 
 class _Base:
@@ -118,28 +207,29 @@ class _Base:
     ) -> None:
         self.log_wires = belief.mean
         top, bottom = np.exp(belief.mean).reshape(2, *shape)
-        self.rest_log = -prior.expected
-        self.least_log = self.rest_log + LEAST_RISE * prior.std
+        rest_log = -prior.expected
+        self.least_log = rest_log + LEAST_RISE * prior.std
         self.prior = prior
         self.ref_ohm = ref_ohm
-        self.net = net = RestNetwork(np.exp(self.rest_log).reshape(shape), top, bottom)
+        self.net = net = RestNetwork(np.exp(rest_log).reshape(shape), top, bottom)
         self.current = 1.0 / (net.port_ohm + ref_ohm)
         by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
-        by_wires = net.by_wires() * (self.current**2)[:, None]
+        wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
-        self.slack += belief.variance(by_wires)
-        self.path_ohm = self.net.path_ohm(self.log_wires)
+        self.slack += belief.variance(wires * (self.current**2)[:, None])
+        self.path_ohm = path_ohm(top, bottom).ravel()
         self.wire_std = float(belief.std().max())
         # Wires this uncertain are no small noise beside a cell at rest.
         self.hides = bool(np.any(self.path_ohm * self.wire_std * net.cell_siemens > HIDING))
 
     def path_change(self, log_wires: Float) -> float:
         """Largest relative change of the wire between a cell and its electrodes."""
-        return float(np.abs(self.net.path_ohm(log_wires) / self.path_ohm - 1.0).max())
+        now = path_ohm(*np.exp(log_wires).reshape(2, *self.net.shape)).ravel()
+        return float(np.abs(now / self.path_ohm - 1.0).max())
 
 
-class _Fit:
+class _Frame:
     """One frame: the cells in the model, and all that follows from them."""
 
     def __init__(self, base: _Base, current: Float, current_std: Float) -> None:
@@ -168,21 +258,17 @@ class _Fit:
 
     def settle(self, cells: Cells, log_siemens: Float) -> None:
         """Steps from here until none matters; cells that fall back to rest leave."""
-        least = self._base.least_log[cells]
-        self._place(cells, np.maximum(log_siemens, least))
+        self._place(cells, np.maximum(log_siemens, self._base.least_log[cells]))
         for _ in range(MAX_STEPS):
             if not self.cells.size:
                 return
             slopes = self._slopes()
-            normal, step = self._step(slopes @ slopes.T, slopes @ self._residual)
-            moved = np.minimum(self.log_siemens + np.clip(step, -MAX_STEP, MAX_STEP), _HIGHEST_LOG)
+            moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
+            moved = np.minimum(moved, _HIGHEST_LOG)
             stays = moved > self._base.least_log[self.cells]
-            if stays.all():
-                self._place(self.cells, moved)
-                if (step * step * np.diagonal(normal)).max() < CLOSE**2:
-                    return
-            else:
-                self._place(self.cells[stays], moved[stays])
+            self._place(self.cells[stays], moved[stays])
+            if is_last and stays.all():
+                return
 
     def _slopes(self) -> Float:
         """J, (k, RC)."""
@@ -191,15 +277,18 @@ class _Fit:
         weight = self._current**2 / self._std
         return np.asarray(volt * volt * self._siemens[:, None] * weight)
 
-    def _step(self, normal: Float, pull: Float) -> tuple[Float, Float]:
-        """Normal matrix, with the prior about rest, and the step it makes of `pull`."""
-        prior, cells = self._base.prior, self.cells
-        centre, variance = prior.normal(-self.log_siemens, cells)
+    def _stepped(self, normal: Float, pull: Float) -> tuple[Float, bool]:
+        """x after the step of J J^T and J r (k,), and whether that is the last that matters.
+
+        The prior about rest is added onto the normal matrix J J^T.
+        """
+        centre, variance = self._base.prior.normal(-self.log_siemens, self.cells)
         away, precision = self.log_siemens + centre, 1.0 / variance
-        normal.ravel()[:: cells.size + 1] += precision
+        normal.ravel()[:: self.cells.size + 1] += precision
         _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
         self.steps += 1
-        return normal, step
+        is_last = (step * step * np.diagonal(normal)).max() < CLOSE**2
+        return self.log_siemens + np.clip(step, -MAX_STEP, MAX_STEP), bool(is_last)
 
     def asked_for(self) -> tuple[Cells, Float]:
         """Cells that readings ask for, and the conductance that each, alone, would need [S].
@@ -208,12 +297,11 @@ class _Fit:
         need at least `SHARE` of the largest rise in their row and column: a ghost needs less, as
         its current passes three touches in series.
         """
-        base = self._base
+        base, net = self._base, self._base.net
         asks = self._residual > DEMAND
         asks[self.cells] = False
         if not asks.any():
             return _NO_CELLS, np.zeros(0)
-        net = base.net
         port_volt, cell_volt, port_ohm = net.own_port_volt, net.own_cell_volt, net.port_ohm
         if self._touched is not None:
             port_volt, cell_volt = self._touched.own_volt()
@@ -228,58 +316,47 @@ class _Fit:
         return asked, rise[asked]
 
     def finish(self, belief: WireBelief) -> Touched:
-        """The last steps, with wires known to their covariance only."""
+        """The last steps, with wires known to their covariance only, and what they leave."""
         base, cells = self._base, self.cells
         if not cells.size:
-            nothing = np.zeros((0, belief.mean.size)), np.zeros(0), np.zeros((0, 0))
-            none, less = np.zeros(0), bool(self._residual.min() < -DEMAND)
-            return Touched(cells, none, none, False, self._current, less, 0, nothing)
-        assert self._touched is not None
-        move = (self._current**2 - base.current**2) * base.path_ohm * base.wire_std
-        weight = move / self._std
-        least = np.partition(weight, -MAX_HEAVY)[-MAX_HEAVY] if weight.size > MAX_HEAVY else 0.0
-        heavy = weight > np.clip(least, LIGHT, HEAVY)
-        heavy[cells] = True
-        ports = np.flatnonzero(heavy)
-        light = ~heavy
+            none = np.zeros(0)
+            lesson = np.zeros((0, belief.mean.size)), none, np.zeros((0, 0))
+            less = bool(self._residual.min() < -DEMAND)
+            return Touched(cells, none, none, self._current, False, less, 0, lesson)
+        heavy = self._moved_by_wires()
+        ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
         covariance = belief.seen(wires)
         np.einsum("ii->i", covariance)[:] += 1.0
-        unit = np.sqrt(np.diagonal(covariance))
         factor = cholesky(covariance)
         offset = wires @ (belief.mean - base.log_wires)
-        for last in (False, True):
+        for _ in range(2):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
-            both = np.concatenate([slopes[:, ports], residual[None, :]])
-            whitened = solve_lower(factor, both.T)
-            free = slopes[:, light]
+            whitened = solve_lower(factor, np.vstack([slopes[:, ports], residual]).T)
             own, rest = whitened[:, :-1], whitened[:, -1]
-            normal, step = self._step(
-                free @ free.T + own.T @ own, free @ self._residual[light] + rest @ own
-            )
-            least = base.least_log[cells]
-            moved = np.clip(
-                self.log_siemens + np.clip(step, -MAX_STEP, MAX_STEP), least, _HIGHEST_LOG
-            )
-            small = (step * step * np.diagonal(normal)).max() < CLOSE**2
-            self._place(cells, moved)
-            if small or last:
+            free = slopes[:, light]
+            normal = free @ free.T + own.T @ own
+            pull = free @ self._residual[light] + rest @ own
+            moved, is_last = self._stepped(normal, pull)
+            self._place(cells, np.clip(moved, base.least_log[cells], _HIGHEST_LOG))
+            if is_last:
                 break
         residual = self._residual[ports] - offset
         left = solve(factor, residual)
         spare = ports.size - cells.size  # degrees of freedom
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
-        heavy_slopes = slopes[:, ports]
-        noise = UNLIMITED_STD**2 * (heavy_slopes.T @ heavy_slopes)
+        of_touches = slopes[:, ports]
+        noise = UNLIMITED_STD**2 * (of_touches.T @ of_touches)
         noise.ravel()[:: ports.size + 1] += 1.0
+        unit = np.sqrt(np.diagonal(covariance))
         return Touched(
             cells=cells,
             log_siemens=self.log_siemens,
             log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
-            doubtful=base.hides or self._doubtful(ports, residual, unit),
             current=current,
+            doubtful=base.hides or self._doubtful(ports, residual, unit),
             contradicted=bool(
                 residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1)
                 or self._residual[light].min(initial=0.0) < -DEMAND
@@ -287,6 +364,16 @@ class _Fit:
             steps=self.steps,
             lesson=(wires, residual, noise),
         )
+
+    def _moved_by_wires(self) -> NDArray[np.bool_]:
+        """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
+        base = self._base
+        move = (self._current**2 - base.current**2) * base.path_ohm * base.wire_std
+        weight = move / self._std
+        least = np.partition(weight, -MAX_HEAVY)[-MAX_HEAVY] if weight.size > MAX_HEAVY else 0.0
+        heavy: NDArray[np.bool_] = weight > np.clip(least, LIGHT, HEAVY)
+        heavy[self.cells] = True
+        return heavy
 
     def _sharpened(self, ports: Cells) -> Float:
         """Jw (m, 2RC); takes the drift of cells at rest from the touched network at these ports."""
@@ -300,7 +387,7 @@ class _Fit:
         slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
         self._loose_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
         self._place(self.cells, self.log_siemens)
-        wires = by_wires(currents.reshape(-1, *net.shape), net.top_wire_ohm, net.bottom_wire_ohm)
+        wires = net.by_wires(currents)
         wires *= -(square / self._std[ports])[:, None]
         return wires
 
