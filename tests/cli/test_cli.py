@@ -290,8 +290,8 @@ def test_ctrl_c_while_opening(command: Command, silent_port: tuple[int, str]) ->
 def test_ctrl_c_ends_a_stream(
     command: Command, pty_board: Callable[[str], PtyServer], arguments: tuple[str, ...]
 ) -> None:
-    server = pty_board(EMULATED)
     for pause_s in (0.3, 3.0, 20.0):  # a busy machine shows nothing in the first
+        server = pty_board(EMULATED)  # one that does not scan yet
         process = command("stream", server.path, *arguments)
         while server._board.next_scan_s is None:
             assert process.poll() is None
