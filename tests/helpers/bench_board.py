@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ohmskin.cli.doctor import gather
+from ohmskin.cli.doctor import Ask, gather
 from ohmskin.doctor.examine import Evidence
 from ohmskin.emulate.line_faults import Faults
 from ohmskin.files import Closing
@@ -62,10 +62,10 @@ class Bench(Closing):
         self.ask("self_test")
         return next(each for each in self._messages if isinstance(each, SelfTestReport))
 
-    def configure(self, *, rate_hz: float, settle_us: int, **others: protocol.Value) -> Hello:
-        wanted = configuration(self.info) | {"rate_mhz": protocol.rate_mhz(rate_hz), **others}
-        self.ask("configure", **{**wanted, "settle_us": settle_us})
-        assert self.info.settle_asked_us == settle_us
+    def configure(self, *, rate_hz: float, **others: protocol.Value) -> Hello:
+        wanted = configuration(self.info) | {"rate_mhz": protocol.rate_mhz(rate_hz)} | others
+        self.ask("configure", **wanted)
+        assert configuration(self.info) == wanted
         return self.info
 
     def stop(self) -> None:
@@ -74,10 +74,13 @@ class Bench(Closing):
     def close(self) -> None:
         pass
 
+    def evidence(self, ask: Ask | None = None) -> Evidence:
+        """All that the doctor reads."""
+        read = Evidence(self.info)
+        gather(self, read, ask=ask)
+        return read
+
 
 def evidence(url: str, **told: object) -> Evidence:
     """What the doctor reads of the board at an `emulator://` URL, and what it is told besides."""
-    bench = Bench(url)
-    read = Evidence(bench.info)
-    gather(bench, read)
-    return replace(read, **told)
+    return replace(Bench(url).evidence(), **told)

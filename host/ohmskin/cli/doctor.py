@@ -70,7 +70,9 @@ def doctor(
     sound; 1: something is wrong.
     """
     told = None if calibration is None else load_calibration(calibration)
-    wire_ohm = _wires(wires) if wires else _wires_of(told)
+    wire_ohm = None if told is None else told.nominal_wire_ohm.both
+    if wires:
+        wire_ohm = _wires(wires)
     with _terminal() as (progress, ask):
         diagnosis = diagnose(port, told, wire_ohm, progress, ask if press else None)
     page = as_object(port, diagnosis)
@@ -90,13 +92,6 @@ def _wires(text: str) -> tuple[float, float]:
     if not (0 < top < float("inf") and 0 < bottom < float("inf")):
         raise ValueError(f"--wires must be above 0 ohm, not '{text}'")
     return top, bottom
-
-
-def _wires_of(calibration: Calibration | None) -> tuple[float, float] | None:
-    if calibration is None:
-        return None
-    top, bottom = calibration.nominal_wire_ohm
-    return (top, bottom) if top and bottom else None
 
 
 @contextmanager
@@ -147,7 +142,9 @@ def diagnose(
         return Diagnosis([_unanswered(port, exc)])
     with device:
         board = device.info
-        evidence = Evidence(board, wire_ohm=wire_ohm, host_version=ohmskin.__version__)
+        evidence = Evidence(board, host_version=ohmskin.__version__)
+        # Wires of no resistance are none that could have changed.
+        evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
         if calibration is not None:
             calibration.check(board.unit_id, board.rows, board.columns)
             evidence.rest_ratio = calibration.rest.ratio

@@ -28,7 +28,7 @@ references included, changes none of them and cannot be known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -38,7 +38,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
 from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
 from ohmskin.doctor.signal import mean_std_lsb
-from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello
@@ -91,12 +91,6 @@ class Circuit:
     wrong: Bool
     cell_siemens: Float
     reference_ratio: float | None
-
-
-def matrix_estimator(board: Hello, rows: int, columns: int) -> Estimator:
-    """The method `matrix` for so many lines of a board."""
-    refs = (board.ref_top_ohm, board.ref_bottom_ohm)
-    return make_estimator("matrix", SkinKnowledge(rows, columns, *refs, adc_bits=board.adc_bits))
 
 
 def examine_circuit(
@@ -161,7 +155,8 @@ def _cells(mean_codes: Float, board: Hello, no_row: Bool, no_column: Bool) -> tu
     """Conductances and their deviations, (R, C) [S], NaN in the lines that are left out."""
     kept = np.ix_(~no_row, ~no_column)
     ratio = ratio_from_codes(mean_codes[kept], board.adc_bits)
-    estimate = matrix_estimator(board, *ratio.shape[:2]).estimate(ratio)
+    rest_of_board = replace(board, rows=ratio.shape[0], columns=ratio.shape[1])
+    estimate = make_estimator("matrix", SkinKnowledge.of(rest_of_board)).estimate(ratio)
     siemens, std = np.full((2, *mean_codes.shape[:2]), np.nan)
     siemens[kept], std[kept] = estimate.cell_siemens, estimate.cell_siemens_std
     return siemens, std

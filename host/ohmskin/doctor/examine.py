@@ -27,6 +27,7 @@ from ohmskin.doctor.signal import (
     mean_std_lsb,
 )
 from ohmskin.doctor.wires import CornerScans, measure_untouched
+from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 RATE_TOLERANCE: Final = 0.005  # of the rate that was asked for: a ceramic resonator is off by that
@@ -79,7 +80,8 @@ def examine(evidence: Evidence) -> Diagnosis:
         "rate_hz": None if rates_hz is None else round(rates_hz[0], 3),
     }
     if usual is not None:
-        _examine_skin(evidence, usual, diagnosis)
+        with one_blas_thread:
+            _examine_skin(evidence, usual, diagnosis)
     order = list(Kind)
     diagnosis.findings.sort(key=lambda finding: order.index(finding.kind))
     return diagnosis

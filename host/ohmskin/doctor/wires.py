@@ -62,9 +62,10 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
-from ohmskin.doctor.circuit import matrix_estimator
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
 from ohmskin.doctor.signal import rounding_std_lsb
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -75,7 +76,7 @@ Bool = NDArray[np.bool_]
 LAYERS: Final = ("top", "bottom")
 
 # What is told. Shares are over the nominal wires, deviations of pressed ones those of logs.
-KNOWN: Final = 0.15  # largest deviation of a share that is told: half of what is a change
+KNOWN: Final = 0.15  # largest deviation of a share that is told: well below a change
 CHANGED: Final = 0.25  # a change that matters: estimators expect smaller ones of every layer
 LINE_CHANGED: Final = 0.75  # a change of one line that matters: it moves fewer cells
 CLEAR_STDS: Final = 5.0  # deviations of a clear change: up to 34 shares are looked at
@@ -128,8 +129,8 @@ def measure_untouched(
     """
     shape = rows, columns = mean_codes.shape[:2]
     ratio = ratio_from_codes(mean_codes, board.adc_bits)
-    known_ratio = ratio if rest_ratio is None else rest_ratio
-    cell = matrix_estimator(board, rows, columns).estimate(known_ratio).cell_siemens
+    matrix = make_estimator("matrix", SkinKnowledge.of(board))
+    cell = matrix.estimate(ratio if rest_ratio is None else rest_ratio).cell_siemens
     if rest_ratio is None:
         cell = np.full(shape, float(np.exp(np.mean(np.log(cell)))))
     else:
@@ -181,7 +182,7 @@ def suggested_corners(rows: int, columns: int) -> Corners:
     :raises ValueError: a skin of one row or column has no rectangle.
     """
     if min(rows, columns) < 2:
-        raise ValueError(f"a {rows}x{columns} skin has no rectangle to press: leave out --press")
+        raise ValueError(f"a {rows}x{columns} skin has no rectangle whose corners could be pressed")
     row, column = (max(0, count - 1 - max(2, count // 2 - 1)) for count in (rows, columns))
     return (row, column), (row, columns - 1), (rows - 1, column)
 
@@ -223,7 +224,7 @@ class CornerScans:
         self.pressed: tuple[Cell, ...] = ()
         self.hold = self.again = self.done = False
         self._board = board
-        self._matrix = matrix_estimator(board, board.rows, board.columns)
+        self._matrix = make_estimator("matrix", SkinKnowledge.of(board))
         self._codes: defaultdict[Corners, list[Float]] = defaultdict(list)
         self._first: Corners | None = None
 

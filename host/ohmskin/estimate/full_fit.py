@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
-from ohmskin.circuit.skin import path_ohm, port_sensitivity
+from ohmskin.circuit.skin import port_sensitivity
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     DOUBT,
@@ -102,31 +102,25 @@ class FullFit:
 
     def __init__(
         self,
-        shape: tuple[int, int],
-        ref_ohm: float,
         prior: CellPrior,
         belief: WireBelief,
+        ref_ohm: float,
         current: Float,
         current_std: Float,
+        starts: list[Float],
     ) -> None:
-        self._shape = shape
-        self._ref_ohm = ref_ohm
-        self._prior = prior
-        self._belief = belief
-        self._current = current
-        self._weight = 1.0 / current_std
+        """Minimise from the best of some starts; `message` says if that did not converge."""
+        self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
+        self._current, self._weight = current, 1.0 / current_std
         self.iterations = 0
         self.message = ""
-
-    def run(self, starts: list[Float]) -> None:
-        """Minimise from the best of some starts; `message` says if that did not converge."""
         self._minimise(starts)
         self._conclude()
 
     def _evaluate(self) -> None:
         """Slopes and cost at the present state."""
-        top, bottom = np.exp(self.wires).reshape(2, *self._shape)
-        circuit = port_sensitivity(np.exp(-self.cell).reshape(self._shape), top, bottom)
+        cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
+        circuit = port_sensitivity(cell_siemens, *self._belief.layers(self.wires))
         modelled = 1.0 / (circuit.port_ohm + self._ref_ohm)
         slope = -self._weight * modelled**2
         centre, variance = self._prior.normal(self.cell)
@@ -135,7 +129,7 @@ class FullFit:
         by_cell *= slope[:, None]
         by_cell *= cell_std
         # All wires in series with a port bound what they can do to it.
-        heavy = np.flatnonzero(path_ohm(top, bottom).ravel() * slope < -HEAVY)
+        heavy = np.flatnonzero(self._belief.path_ohm(self.wires) * slope < -HEAVY)
         by_wires = circuit.by_wires(heavy)
         by_wires *= slope[heavy, None]
         residual = (self._current - modelled) * self._weight

@@ -129,9 +129,10 @@ class JointEstimator(Estimator):
         current: what they predict (RC,) [S]. wider: what the deviations are multiplied with.
         """
         cell, cell_std = cells
-        paths = self._belief.paths(wires, self._shape)
-        std, std_down = siemens_std(-cell, cell_std, *paths, self.knowledge.ref_ohm)
-        top, bottom = np.exp(wires).reshape(2, *self._shape)
+        path_ohm = self._belief.path_ohm(wires)
+        path_std = self._belief.std().reshape(2, -1).mean(axis=0)
+        std, std_down = siemens_std(-cell, cell_std, path_ohm, path_std, self.knowledge.ref_ohm)
+        top, bottom = self._belief.layers(wires)
         return Solution(
             cell_siemens=np.exp(-cell).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
@@ -147,9 +148,7 @@ class JointEstimator(Estimator):
         self, prior: CellPrior, current: Float, current_std: Float, starts: list[Float]
     ) -> FullFit:
         ref_ohm = self.knowledge.ref_ohm
-        fit = FullFit(self._shape, ref_ohm, prior, self._belief, current, current_std)
-        fit.run(starts)
-        return fit
+        return FullFit(prior, self._belief, ref_ohm, current, current_std, starts)
 
     def _best_fit(
         self, prior: CellPrior, current: Float, current_std: Float, starts: list[Float]
@@ -239,7 +238,7 @@ class JointEstimator(Estimator):
         else:
             expected, std = self._at_rest(self._reader.read(known.rest_ratio))
         self._prior = CellPrior(expected, std, TAIL)
-        self._finder = SparseFit(self._shape, self._prior, self._belief, known.ref_ohm)
+        self._finder = SparseFit(self._prior, self._belief, known.ref_ohm)
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:

@@ -88,11 +88,15 @@ _JUMP_RATIO: Final = (
 
 
 class Start(Enum):
-    """Where a solution starts from, which decides how Ipopt's barrier starts."""
+    """Where a solution starts from, with Ipopt's options for it: they decide how barriers start."""
 
-    CIRCUIT = "a simulated circuit: a weak barrier, so that the answer stays near it"
-    STEP_3 = "another program's solution: the usual barrier"
-    PREVIOUS = "this program's solution of the frame before, with its multipliers"
+    # A simulated circuit: the barrier is weak, so that the answer stays near it.
+    CIRCUIT = (("bound_mult_init_val", 1e-6),)
+    # Another program's solution.
+    STEP_3 = ()
+    # This program's solution of the frame before, with its multipliers. Those of bounds that do not
+    # hold stay as weak as they were, or the states drift.
+    PREVIOUS = (("warm_start_init_point", "yes"), ("warm_start_mult_bound_push", 1e-6))
 
 
 _IPOPT: Final[dict[str, Any]] = {
@@ -105,12 +109,6 @@ _IPOPT: Final[dict[str, Any]] = {
     "mu_oracle": "probing",
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
-}
-_IPOPT_START: Final[dict[Start, dict[str, Any]]] = {
-    Start.CIRCUIT: {"bound_mult_init_val": 1e-6},
-    Start.STEP_3: {},
-    # The multipliers of bounds that do not hold stay as weak as they were, or the states drift.
-    Start.PREVIOUS: {"warm_start_init_point": "yes", "warm_start_mult_bound_push": 1e-6},
 }
 # What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
 # without callbacks: numbers that are none end as Invalid_Number_Detected.
@@ -360,7 +358,16 @@ class Program:
         states = [
             _State(rows, columns, number, y[number], references) for number in range(y.shape[0])
         ]
-        cost_f, cost_c = _discrepancies(states)
+        # States that should agree: of one cell, and of consecutive cells.
+        cost_f = sum(
+            casadi.sumsqr(getattr(first, values) - getattr(second, values))
+            for first, second in zip(states[::2], states[1::2], strict=True)
+            for values in ("resistances", "potentials")
+        )
+        cost_c = sum(
+            casadi.sumsqr(before.resistances - after.resistances)
+            for before, after in zip(states, states[READINGS_PER_CELL:], strict=False)
+        )
         cost_r = sum(casadi.sumsqr(state.wires) for state in states)
         problem = {
             "x": casadi.vertcat(*(state.variables for state in states)),
@@ -423,10 +430,10 @@ def program_for(rows: int, columns: int) -> Program:
 
 
 def _make_solver(problem: dict[str, Any], start: Start) -> Any:
-    options = {f"ipopt.{name}": value for name, value in (_IPOPT | _IPOPT_START[start]).items()}
-    quiet = {"print_time": False, "show_eval_warnings": False, "error_on_fail": False}
-    # Sensitivities to the parameters are not needed, and warn where Ipopt gave up.
-    quiet["calc_lam_p"] = False
+    options = {f"ipopt.{name}": value for name, value in (_IPOPT | dict(start.value)).items()}
+    # Sensitivities to the parameters (lam_p) are not needed, and warn where Ipopt gave up.
+    silent = ("print_time", "show_eval_warnings", "error_on_fail", "calc_lam_p")
+    quiet = dict.fromkeys(silent, False)
     return casadi.nlpsol(f"paper_{start.name.lower()}", "ipopt", problem, options | quiet)
 
 
@@ -470,15 +477,3 @@ class _State:
         into_bottom[:-1, :] += by_bottom[1:, :] * (bottom[1:, :] - bottom[:-1, :])
         nodes = casadi.horzcat(casadi.vec(into_top.T), casadi.vec(into_bottom.T))
         self.laws = references[0] * casadi.vertcat(casadi.vec(nodes.T), measured)
-
-
-def _discrepancies(states: list[_State]) -> tuple[Any, Any]:
-    """Cost_f and Cost_c: states that should agree, of one cell and of consecutive cells."""
-    cost_f: Any = 0.0
-    cost_c: Any = 0.0
-    for first, second in zip(states[::2], states[1::2], strict=True):
-        cost_f += casadi.sumsqr(first.resistances - second.resistances)
-        cost_f += casadi.sumsqr(first.potentials - second.potentials)
-    for before, after in zip(states, states[READINGS_PER_CELL:], strict=False):
-        cost_c += casadi.sumsqr(before.resistances - after.resistances)
-    return cost_f, cost_c

@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
-from ohmskin.circuit.skin import path_ohm
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
@@ -118,15 +117,15 @@ class WireBelief:
     def __init__(
         self, rows: int, columns: int, nominal_top: float | None, nominal_bottom: float | None
     ) -> None:
-        cells = rows * columns
+        self.shape = (rows, columns)
+        self._cells = rows * columns
         told = nominal_top is not None and nominal_bottom is not None
-        self._cells = cells
         self._layer_std = LAYER_STD if told else UNKNOWN_LAYER_STD
         nominal = [
             np.log(max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3))
             for ohm in (nominal_top, nominal_bottom)
         ]
-        self._nominal = np.repeat(nominal, cells)
+        self._nominal = np.repeat(nominal, self._cells)
         self.reset()
 
     def reset(self) -> None:
@@ -177,10 +176,15 @@ class WireBelief:
         variance = SEGMENT_STD**2 + self._layer_std**2 - np.sum(self._learned**2, axis=1)
         return np.asarray(np.sqrt(np.maximum(variance, 1e-12)))
 
-    def paths(self, log_wires: Float, shape: tuple[int, int]) -> tuple[Float, Float]:
-        """Wire between each cell and its electrodes [ohm], and the deviation of its log, (RC,)."""
-        path = path_ohm(*np.exp(log_wires).reshape(2, *shape))
-        return path.ravel(), self.std().reshape(2, -1).mean(axis=0)
+    def layers(self, log_wires: Float) -> tuple[Float, Float]:
+        """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
+        top, bottom = np.exp(log_wires).reshape(2, *self.shape)
+        return top, bottom
+
+    def path_ohm(self, log_wires: Float) -> Float:
+        """Wire between each cell and its electrodes [ohm], (RC,)."""
+        top, bottom = self.layers(log_wires)
+        return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
 
     def learn(self, slopes: Float, residual: Float, noise: Float) -> bool:
         """One Kalman step; True if lessons say that the skin was bent: what was learned is dropped.

@@ -46,7 +46,7 @@ from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, solve, solve_lower
-from ohmskin.circuit.skin import by_wires, factorised, impedance_of, path_ohm
+from ohmskin.circuit.skin import admittance_of, by_wires, factorised, impedance_of, port_potential
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     DOUBT,
@@ -79,27 +79,26 @@ HIDING: Final = (
 REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
 CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
-_NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
 
 class RestNetwork:
     """rho0, H and M of cells (R, C) [S] that all conduct, and wires (R, C) [ohm]."""
 
     def __init__(self, cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> None:
-        self.shape = rows, columns = cell_siemens.shape
+        self.shape = cell_siemens.shape
+        rows = self.shape[0]
         self.cell_siemens = cell_siemens.ravel()
         self.top_wire_ohm, self.bottom_wire_ohm = top_wire_ohm, bottom_wire_ohm
         root = np.sqrt(cell_siemens)
         factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
-        impedance, self.port_ohm = impedance_of(half, rows)
+        impedance, port_ohm = impedance_of(admittance_of(half), rows)
+        self.port_ohm = port_ohm.ravel()
         # With L of the factor, L' = L^-1 sqrt(g): cell currents x are L'^T half V of the electrode
         # potentials V, and L'^T (1 - half Z half^T) L' of voltages inserted in series with cells.
         inverse = solve_lower(factor, np.diag(root.ravel()))
         cell_ohm = 1.0 / self.cell_siemens
-        potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(
-            rows + columns, -1
-        )
-        self.port_volt = (inverse.T @ (half @ potential)) * cell_ohm[:, None]
+        by_port = half @ port_potential(impedance, rows)
+        self.port_volt = (inverse.T @ by_port) * cell_ohm[:, None]
         between = half @ impedance @ half.T
         between *= -1.0
         between.ravel()[:: len(cell_ohm) + 1] += 1.0
@@ -173,99 +172,85 @@ class Touched:
 class SparseFit:
     """Fits the frames of a skin (R, C), each by itself."""
 
-    def __init__(
-        self, shape: tuple[int, int], prior: CellPrior, belief: WireBelief, ref_ohm: float
-    ) -> None:
-        self._known = shape, prior, belief, ref_ohm
-        self._belief = belief
-        self._base: _Base | None = None
+    def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
+        self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
+        self.least_log = -prior.expected + LEAST_RISE * prior.std
+        self._solve_rest()
 
-    def find(self, current: Float, current_std: Float) -> Touched | None:
-        """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
-        base = self._base
-        if base is None or base.path_change(self._belief.mean) > REBUILD:
-            self._base = base = _Base(*self._known)
-        fit = _Frame(base, current, current_std)
-        # Never from the frame before: that keeps cells in the model that no reading asks for.
-        fit.settle(_NO_CELLS, np.zeros(0))
-        for _ in range(MAX_ROUNDS):
-            asked, rise = fit.asked_for()
-            if not asked.size:
-                return fit.finish(self._belief)
-            if fit.cells.size + asked.size > MOST_PER_LINE * sum(base.net.shape):
-                return None
-            added = np.log(base.net.cell_siemens[asked] + rise)
-            fit.settle(np.concatenate([fit.cells, asked]), np.concatenate([fit.log_siemens, added]))
-        return None
-
-
-class _Base:
-    """What does not change from frame to frame: the untouched skin with wires as believed."""
-
-    def __init__(
-        self, shape: tuple[int, int], prior: CellPrior, belief: WireBelief, ref_ohm: float
-    ) -> None:
+    def _solve_rest(self) -> None:
+        """The untouched skin, with wires as they are believed now."""
+        prior, belief = self.prior, self.belief
         self.log_wires = belief.mean
-        top, bottom = np.exp(belief.mean).reshape(2, *shape)
-        rest_log = -prior.expected
-        self.least_log = rest_log + LEAST_RISE * prior.std
-        self.prior = prior
-        self.ref_ohm = ref_ohm
-        self.net = net = RestNetwork(np.exp(rest_log).reshape(shape), top, bottom)
-        self.current = 1.0 / (net.port_ohm + ref_ohm)
+        rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
+        self.net = net = RestNetwork(rest_siemens, *belief.layers(belief.mean))
+        self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
         wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
         self.slack += belief.variance(wires * (self.current**2)[:, None])
-        self.path_ohm = path_ohm(top, bottom).ravel()
+        self.path_ohm = belief.path_ohm(belief.mean)
         self.wire_std = float(belief.std().max())
         # Wires this uncertain are no small noise beside a cell at rest.
         self.hides = bool(np.any(self.path_ohm * self.wire_std * net.cell_siemens > HIDING))
 
-    def path_change(self, log_wires: Float) -> float:
-        """Largest relative change of the wire between a cell and its electrodes."""
-        now = path_ohm(*np.exp(log_wires).reshape(2, *self.net.shape)).ravel()
-        return float(np.abs(now / self.path_ohm - 1.0).max())
+    def find(self, current: Float, current_std: Float) -> Touched | None:
+        """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
+        path_change = np.abs(self.belief.path_ohm(self.belief.mean) / self.path_ohm - 1.0)
+        if path_change.max() > REBUILD:
+            self._solve_rest()
+        frame = _Frame(self, current, current_std)
+        # Never from the frame before: that keeps cells in the model that no reading asks for.
+        frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
+        for _ in range(MAX_ROUNDS):
+            asked, rise = frame.asked_for()
+            if not asked.size:
+                return frame.finish()
+            cells = np.concatenate([frame.cells, asked])
+            if cells.size > MOST_PER_LINE * sum(self.net.shape):
+                return None
+            added = np.log(self.net.cell_siemens[asked] + rise)
+            frame.settle(cells, np.concatenate([frame.log_siemens, added]))
+        return None
 
 
 class _Frame:
     """One frame: the cells in the model, and all that follows from them."""
 
-    def __init__(self, base: _Base, current: Float, current_std: Float) -> None:
-        self._base = base
+    def __init__(self, skin: SparseFit, current: Float, current_std: Float) -> None:
+        self._skin = skin
         self._measured = current
         self._reading_std = current_std
-        self._loose_std = np.sqrt(current_std**2 + base.slack)
-        self._target_ohm = 1.0 / np.maximum(current, 1e-12) - base.ref_ohm
+        self._loose_std = np.sqrt(current_std**2 + skin.slack)
+        self._target_ohm = 1.0 / np.maximum(current, 1e-12) - skin.ref_ohm
         self.steps = 0
 
     def _place(self, cells: Cells, log_siemens: Float) -> None:
         """Take these cells for the touched ones: network, currents, residual."""
-        base = self._base
+        skin = self._skin
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
         self._std = self._loose_std
         self._touched: TouchedNetwork | None = None
-        self._current = base.current
+        self._current = skin.current
         if cells.size:
-            added = self._siemens - base.net.cell_siemens[cells]
-            self._touched = TouchedNetwork(base.net, cells, added)
-            self._current = 1.0 / (self._touched.port_ohm + base.ref_ohm)
+            added = self._siemens - skin.net.cell_siemens[cells]
+            self._touched = TouchedNetwork(skin.net, cells, added)
+            self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
             self._std = self._loose_std.copy()
             self._std[cells] = self._reading_std[cells]
         self._residual = (self._measured - self._current) / self._std
 
     def settle(self, cells: Cells, log_siemens: Float) -> None:
         """Steps from here until none matters; cells that fall back to rest leave."""
-        self._place(cells, np.maximum(log_siemens, self._base.least_log[cells]))
+        self._place(cells, np.maximum(log_siemens, self._skin.least_log[cells]))
         for _ in range(MAX_STEPS):
             if not self.cells.size:
                 return
             slopes = self._slopes()
             moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
             moved = np.minimum(moved, _HIGHEST_LOG)
-            stays = moved > self._base.least_log[self.cells]
+            stays = moved > self._skin.least_log[self.cells]
             self._place(self.cells[stays], moved[stays])
             if is_last and stays.all():
                 return
@@ -282,7 +267,7 @@ class _Frame:
 
         The prior about rest is added onto the normal matrix J J^T.
         """
-        centre, variance = self._base.prior.normal(-self.log_siemens, self.cells)
+        centre, variance = self._skin.prior.normal(-self.log_siemens, self.cells)
         away, precision = self.log_siemens + centre, 1.0 / variance
         normal.ravel()[:: self.cells.size + 1] += precision
         _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
@@ -297,17 +282,17 @@ class _Frame:
         need at least `SHARE` of the largest rise in their row and column: a ghost needs less, as
         its current passes three touches in series.
         """
-        base, net = self._base, self._base.net
+        skin, net = self._skin, self._skin.net
         asks = self._residual > DEMAND
         asks[self.cells] = False
         if not asks.any():
-            return _NO_CELLS, np.zeros(0)
+            return np.flatnonzero(asks), np.zeros(0)
         port_volt, cell_volt, port_ohm = net.own_port_volt, net.own_cell_volt, net.port_ohm
         if self._touched is not None:
             port_volt, cell_volt = self._touched.own_volt()
             port_ohm = self._touched.port_ohm
         # From rho = target for one cell more.
-        target = np.maximum(self._target_ohm, 0.5 * base.path_ohm)
+        target = np.maximum(self._target_ohm, 0.5 * skin.path_ohm)
         need = port_volt**2 / np.maximum(port_ohm - target, 1e-9) - cell_volt
         rise = np.where(asks, 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS), 0.0)
         map_ = rise.reshape(net.shape)
@@ -315,21 +300,21 @@ class _Frame:
         asked = np.flatnonzero((map_ > 0) & (map_ >= SHARE * rival))
         return asked, rise[asked]
 
-    def finish(self, belief: WireBelief) -> Touched:
+    def finish(self) -> Touched:
         """The last steps, with wires known to their covariance only, and what they leave."""
-        base, cells = self._base, self.cells
+        skin, cells = self._skin, self.cells
         if not cells.size:
             none = np.zeros(0)
-            lesson = np.zeros((0, belief.mean.size)), none, np.zeros((0, 0))
+            lesson = np.zeros((0, 2 * skin.current.size)), none, np.zeros((0, 0))
             less = bool(self._residual.min() < -DEMAND)
             return Touched(cells, none, none, self._current, False, less, 0, lesson)
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
-        covariance = belief.seen(wires)
+        covariance = skin.belief.seen(wires)
         np.einsum("ii->i", covariance)[:] += 1.0
         factor = cholesky(covariance)
-        offset = wires @ (belief.mean - base.log_wires)
+        offset = wires @ (skin.belief.mean - skin.log_wires)
         for _ in range(2):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
@@ -339,7 +324,7 @@ class _Frame:
             normal = free @ free.T + own.T @ own
             pull = free @ self._residual[light] + rest @ own
             moved, is_last = self._stepped(normal, pull)
-            self._place(cells, np.clip(moved, base.least_log[cells], _HIGHEST_LOG))
+            self._place(cells, np.clip(moved, skin.least_log[cells], _HIGHEST_LOG))
             if is_last:
                 break
         residual = self._residual[ports] - offset
@@ -356,7 +341,7 @@ class _Frame:
             log_siemens=self.log_siemens,
             log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
             current=current,
-            doubtful=base.hides or self._doubtful(ports, residual, unit),
+            doubtful=skin.hides or self._doubtful(ports, residual, unit),
             contradicted=bool(
                 residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1)
                 or self._residual[light].min(initial=0.0) < -DEMAND
@@ -367,8 +352,8 @@ class _Frame:
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
-        base = self._base
-        move = (self._current**2 - base.current**2) * base.path_ohm * base.wire_std
+        skin = self._skin
+        move = (self._current**2 - skin.current**2) * skin.path_ohm * skin.wire_std
         weight = move / self._std
         least = np.partition(weight, -MAX_HEAVY)[-MAX_HEAVY] if weight.size > MAX_HEAVY else 0.0
         heavy: NDArray[np.bool_] = weight > np.clip(least, LIGHT, HEAVY)
@@ -378,12 +363,12 @@ class _Frame:
     def _sharpened(self, ports: Cells) -> Float:
         """Jw (m, 2RC); takes the drift of cells at rest from the touched network at these ports."""
         assert self._touched is not None
-        base, net = self._base, self._base.net
+        skin, net = self._skin, self._skin.net
         currents = self._touched.cell_current(ports)
         square = self._current[ports] ** 2
         by_cell = currents * currents / net.cell_siemens
         by_cell[:, self.cells] = 0.0
-        by_cell *= base.prior.std
+        by_cell *= skin.prior.std
         slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
         self._loose_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
         self._place(self.cells, self.log_siemens)
@@ -397,7 +382,7 @@ class _Frame:
         What its own reading says of it: rise of its conductance over rest, and deviation.
         """
         assert self._touched is not None
-        net = self._base.net
+        net = self._skin.net
         volt, _ = self._touched.own_volt()
         slope = (self._current * volt) ** 2 * net.cell_siemens / self._std
         left, unit = self._residual.copy(), np.ones(volt.size)

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin doctor`` as a command: what it asks for, what it prints, what it leaves behind."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import serial
+from rich.console import Console
+
+import ohmskin
+from bench_board import Bench
+from calibrations import calibration
+from command_line import Done, assert_one_line
+from ohmskin.cli import doctor as doctor_command
+from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.scenes import Scene
+from ohmskin.link import session
+
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def benches(monkeypatch: pytest.MonkeyPatch) -> list[Bench]:
+    """The boards that the doctor opens, in simulated time."""
+    opened: list[Bench] = []
+
+    def connect(url: str, **_: object) -> Bench:
+        opened.append(Bench(url))
+        return opened[-1]
+
+    monkeypatch.setattr(ohmskin, "open", connect)
+    return opened
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For boards in real time."""
+    monkeypatch.setattr(doctor_command, "REST_S", 0.2)
+    monkeypatch.setattr(doctor_command, "SETTLED_S", 0.05)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_sound_board_takes_less_than_ten_seconds(run: Run, benches: list[Bench]) -> None:
+    done = run("doctor", "emulator://8x8")
+    assert (done.code, done.err) == (0, "")
+    assert done.out.startswith("emulator://8x8: sound: nothing is wrong that an untouched")
+    assert benches[0].now_s < 5  # and a second or two to connect
+
+
+@pytest.mark.usefixtures("benches")
+def test_page_and_json(run: Run) -> None:
+    url = "emulator://8x8?open_row=3&dead=1,2"
+    done = run("doctor", url)
+    assert (done.code, done.err) == (1, "")
+    lines = done.out.splitlines()
+    assert lines[0] == f"{url}: not sound: 2 findings, first open row (row 3)"
+    assert done.out.index("1. fault, open row: row 3") < done.out.index("2. fault, dead cell")
+    assert "   what to do  check connector, crimp" in done.out
+    done = run("doctor", url, "--json")
+    answer = json.loads(done.out)
+    assert (done.code, done.err) == (1, "")
+    assert done.out.count("\n") == 1
+    assert answer["sound"] is False
+    assert [each["id"] for each in answer["findings"]] == ["open_row", "dead_cell"]
+    for each in answer["findings"]:
+        for name in ("severity", "where", "measured", "expected", "what_to_do"):
+            assert each[name]
+    row, cell = answer["findings"]
+    assert row["place"]["rows"] == [3]
+    assert row["values"] == {"line_count": 8, "cells_per_line": 8}
+    assert cell["place"]["cells"] == [[1, 2]]
+    assert answer["measured"]["rows"] == 8
+
+
+def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[Bench]) -> None:
+    arguments = ("emulator://8x8?scene=corners&wires=1.5", "--wires", "100,200", "--press")
+    done = run("doctor", *arguments, "--json")
+    assert benches[0].now_s < 10
+    assert done.code == 1
+    [finding] = json.loads(done.out)["findings"]
+    assert (finding["id"], finding["where"]) == ("wires", "rows and columns")
+    assert finding["values"]["share"]["share"] == pytest.approx(1.5, rel=0.15)
+    # Where no terminal is, each request is said once.
+    assert done.err.splitlines() == [
+        "press firmly, at once: (4, 4) (4, 7) (7, 4)",
+        "now (2, 5) (5, 2) (5, 5)",
+    ]
+
+
+@pytest.mark.usefixtures("benches")
+def test_a_terminal_shows_progress_and_what_is_pressed(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    status = Console.status
+
+    def watched(console: Console, text: str) -> object:
+        shown = status(console, text)
+        shown.update = said.append  # type: ignore[method-assign, assignment]
+        return shown
+
+    monkeypatch.setattr(Console, "status", watched)
+    monkeypatch.setattr("sys.stderr", Terminal())
+    assert run("doctor", "emulator://4x4?scene=corners", "--press").code == 0
+    first = "press firmly, at once: (1, 1) (1, 3) (3, 1)"
+    assert list(dict.fromkeys(said)) == [
+        "self-test",
+        "scanning the untouched skin for 2.5 s",
+        "scanning with a longer settle time",
+        f"{first}; pressed: nothing",
+        f"{first}; hold still",
+        "now (1, 2) (2, 1) (2, 2); pressed: (1, 1) (1, 2) (2, 1)",
+        "now (1, 2) (2, 1) (2, 2); hold still",
+    ]
+
+
+def test_nobody_presses(run: Run, benches: list[Bench]) -> None:
+    answer = json.loads(run("doctor", "emulator://2x3?rate=10", "--press", "--json").out)
+    assert answer["sound"] is True
+    assert answer["measured"]["wires"] == "not known: no three corners of a rectangle were pressed"
+    assert benches[0].now_s < 40
+
+
+@pytest.mark.usefixtures("benches")
+def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
+    assert_one_line(run("doctor", "emulator://8x8?speed=1"), "no option 'speed'")
+    assert_one_line(run("doctor", "emulator://8x8", "--wires", "100"), "two numbers")
+    assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "above 0")
+    assert_one_line(run("doctor", "emulator://8x8", "--calibration", "/no/such.json"), "/no/such")
+    assert_one_line(run("doctor", "emulator://1x4", "--press"), "1x4", "no rectangle")
+    calibration(Scene("rest", 2, 3).rest_ratio).save(tmp_path / "skin.json")
+    path = str(tmp_path / "skin.json")
+    assert_one_line(run("doctor", "emulator://8x8", "--calibration", path), "2x3", "8x8")
+
+
+@pytest.mark.usefixtures("benches")
+def test_a_calibration_is_compared_with(run: Run, tmp_path: Path) -> None:
+    calibration(Scene("rest", 8, 8, seed=5).rest_ratio).save(tmp_path / "skin.json")
+    url = "emulator://8x8?seed=5&wires=30"
+    done = run("doctor", url, "--calibration", str(tmp_path / "skin.json"), "--json")
+    names = [each["id"] for each in json.loads(done.out)["findings"]]
+    assert set(names) == {"wires"}
+    assert done.code == 1
+
+
+@pytest.mark.parametrize("end", [None, KeyboardInterrupt, RuntimeError])
+def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
+    bench = Bench("emulator://3x4")
+    before = bench.configure(rate_hz=77.5, settle_us=120, adc_prescaler="clock_250khz")
+    settled_us: list[int] = []
+    configure = bench.configure
+
+    def interrupted(**wanted: object) -> ohmskin.Hello:
+        board = configure(**wanted)  # type: ignore[arg-type]
+        settled_us.append(board.settle_us)
+        if end is not None and board.settle_us > before.settle_us:
+            raise end
+        return board
+
+    bench.configure = interrupted  # type: ignore[method-assign, assignment]
+    if end is None:
+        bench.evidence()
+    else:
+        with pytest.raises(end):
+            bench.evidence()
+    assert max(settled_us) > 3 * before.settle_us
+    assert bench.info == before
+
+
+# ------------------------------------------------------------------------------- in real time
+
+
+@pytest.mark.usefixtures("hasty")
+def test_ports_that_do_not_answer_are_findings(
+    run: Run, pty_board: Callable[[str], PtyServer]
+) -> None:
+    path = pty_board("emulator://2x2").path
+    with serial.Serial(path, exclusive=True):
+        busy = json.loads(run("doctor", path, "--json").out)["findings"]
+    assert [each["id"] for each in busy] == ["port_unusable"]
+    assert "busy" in busy[0]["measured"]
+    assert "close the other program" in busy[0]["what_to_do"]
+    for url, name, word in (
+        ("emulator://2x2?silent=1", "nothing_answers", "nothing answers: "),
+        ("emulator://2x2?foreign=1", "protocol_mismatch", "layout 0x"),
+        ("emulator://2x2?vanish=0.2", "lost", "gone"),
+        ("/dev/ttyACM99", "port_unusable", "no port"),
+    ):
+        done = run("doctor", url, "--json")
+        answer = json.loads(done.out)
+        assert (done.code, done.err) == (1, "")
+        assert answer["findings"][0]["id"] == name
+        assert word in answer["findings"][0]["measured"]
+        assert answer["findings"][0]["what_to_do"]
+        assert "not sound" in answer["verdict"]
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_board_at_a_port(
+    run: Run, pty_board: Callable[[str], PtyServer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = pty_board("emulator://3x4").path
+    with ohmskin.open(path, start=False) as skin:
+        before = skin.configure(rate_hz=77.5, settle_us=120)
+    monkeypatch.setattr("sys.stderr", quiet := io.StringIO())
+    done = run("doctor", path, "--json")
+    assert {each["severity"] for each in json.loads(done.out)["findings"]} <= {"note"}
+    assert (done.code, quiet.getvalue()) == (0, "")
+    with ohmskin.open(path, start=False) as skin:
+        assert skin.info == before
+
+
+@pytest.mark.simavr
+@pytest.mark.usefixtures("hasty")
+def test_the_firmware_is_sound(run: Run) -> None:
+    done = run("doctor", "simavr://uno", "--json")
+    answer = json.loads(done.out)
+    assert answer["sound"], answer["findings"]
+    assert done.code == 0
+    assert answer["measured"]["settling_lsb"] < 1
+    assert {each["id"] for each in answer["findings"]} <= {"slow_host"}
