@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrations import GHOST, of_scene
+from calibrations import of_scene
 from command_line import Done, assert_one_line
 from ohmskin.force.calibration import load_calibration
 
+GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?seed=1"
 
 
