@@ -40,8 +40,8 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
-WAIT_S: Final = 30.0  # seconds for a person to press where they are asked to
-LONGEST: Final = 2.0  # times as long as usual, at most, where scans are slow
+WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
+LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
 
 _out = Console(soft_wrap=True)

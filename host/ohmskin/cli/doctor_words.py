@@ -13,7 +13,7 @@ from ohmskin.doctor.wires import LAYERS, CornerScans
 from ohmskin.link.protocol import ENUMS
 
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
-MOST_CELLS: Final = 6  # cells that are named one by one
+MOST_CELLS: Final = 6  # [cells] More are not named one by one.
 
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"

@@ -45,45 +45,47 @@ from ohmskin.link.messages import Hello
 
 Bool = NDArray[np.bool_]
 
-WIRE_OHM: Final = (100.0, 200.0)  # a segment, top and bottom, unless told: as of simulated skins
+WIRE_OHM: Final = (100.0, 200.0)  # [ohm] Top and bottom segments are so unless told otherwise.
 
-# No current, as it looks.
-DARK_LSB: Final = 0.7  # LSB, at most, without noise: half a code of rounding, and a little
-DARK_NOISE: Final = 0.4  # LSB more for each LSB of noise: negative noise is read as zero
-DARK_SHARE: Final = 0.08  # of the usual current: a cell at rest shows far more of it
-OFFSET_LSB: Final = 2.5  # LSB, at most: the converter's offset, which looks like a current
+# Open lines.
+DARK_LSB: Final = 0.7  # [LSB] No current is read as less than this, because of rounding.
+DARK_NOISE: Final = 0.4  # [1] Noise adds this share of itself, because no code is below zero.
+OFFSET_LSB: Final = 2.5  # [LSB] The converter's offset makes no current look like up to this.
+DARK_SHARE: Final = 0.08  # [1] No more than this share of the usual current is taken for offset.
 
-# Lines that are one electrode.
-ALIKE_LSB: Final = 0.05  # LSB between the means of two lines at a port, besides noise
-ALIKE_STDS: Final = 6.0  # and in deviations of it: many ports of many lines are compared
-DOUBLED: Final = 1.4  # least conductance over that of other lines: 2 is expected, cells differ
-ALIKE_PORTS: Final = 5  # ports that do not agree by chance
-RISE_STDS: Final = 3.0  # with fewer, the rise has to stand out of the other lines' scatter, too
+# Shorted lines.
+ALIKE_LSB: Final = 0.05  # [LSB] Mean readings of shorted lines differ by less, besides noise.
+ALIKE_STDS: Final = 6.0  # [deviations] The noise of hundreds of readings does not reach this.
+DOUBLED: Final = 1.4  # [1] `matrix` finds shorted lines more conductive by this; 2 is expected.
+ALIKE_PORTS: Final = 5  # [ports] So many do not agree by chance.
+RISE_STDS: Final = 3.0  # [deviations] With fewer, the rise must stand out of all lines' scatter.
 
 # Dead cells.
-DEAD_SHARE: Final = 0.3  # of the usual conductance, at most: cells at rest differ by less
-CLEAR_STDS: Final = 5.0  # deviations that the conductance is below it, beside touched cells
+DEAD_SHARE: Final = 0.3  # [1] A dead cell has less than this share of the usual conductance.
+CLEAR_STDS: Final = 5.0  # [deviations] Beside a touch, a dead cell is below that by this.
 
 # Touched and saturated cells.
-REST_QUANTILE: Final = 0.25  # of the cells, taken for one at rest: at least a quarter are
-MOST_AT_REST_SIEMENS: Final = 5e-6  # S: where all cells conduct more, all are touched
-TOUCHED_SHARE: Final = 2.0  # of the conductance at rest, at least
-TOUCHED_STDS: Final = 5.0  # and in deviations of the log of cells at rest, where these are known
-MANY_CELLS: Final = 8  # from which they are
-MOST_SPREAD: Final = 0.4  # log, largest deviation of cells at rest: if wider, many are touched
-SHORTED_OHM: Final = 350.0  # ohm that a saturated cell has at most: the hardest touch has 300
-WIRE_SPREAD: Final = 1.15  # of the wires to it over nominal: the segments differ by 10 %
+REST_QUANTILE: Final = 0.25  # [1] This share of the cells, at least, is taken to be at rest.
+MOST_AT_REST_SIEMENS: Final = 5e-6  # [S] No cell at rest conducts more; 1e-6 is usual.
+TOUCHED_SHARE: Final = 2.0  # [1] A touched cell conducts more than one at rest by this factor.
+TOUCHED_STDS: Final = 5.0  # [deviations] It also stands out of the scatter at rest by this.
+MANY_CELLS: Final = 8  # [cells] The scatter of fewer cells is not known.
+MOST_SPREAD: Final = 0.4  # [log] Cells at rest scatter less: a wider scatter is of touches.
+SHORTED_OHM: Final = 350.0  # [ohm] A saturated cell has less: the hardest touch has 300.
+WIRE_SPREAD: Final = 1.15  # [1] The wires to a cell are over nominal by less: segments scatter.
 
 # Reference resistors.
-RATIO_TOLERANCE: Final = 0.03  # of their ratio: resistors of 1 % differ by up to 2 %
-RATIO_STDS: Final = 3.0  # and in deviations by noise and rounding
+RATIO_TOLERANCE: Final = 0.03  # [1] The ratio of two resistors of 1 % is off by up to 2 %.
+RATIO_STDS: Final = 3.0  # [deviations] Noise and rounding change the ratio by less than this.
 
 
 @dataclass(frozen=True, eq=False)
 class Circuit:
-    """What the means show. touched, wrong: cells (R, C); wrong are those of open or shorted lines,
-    dead and saturated ones. cell_siemens: (R, C), NaN where unknown. reference_ratio: R_top /
-    R_bottom, None where nothing conducts.
+    """What the means show.
+
+    touched: cells (R, C). wrong: cells (R, C) that are dead or saturated, and those of open or
+    shorted lines. cell_siemens: (R, C), NaN where unknown. reference_ratio: R_top / R_bottom, None
+    if nothing conducts.
     """
 
     findings: list[Finding]

@@ -30,11 +30,11 @@ from ohmskin.doctor.wires import CornerScans, measure_untouched
 from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
-RATE_TOLERANCE: Final = 0.005  # of the rate that was asked for: a ceramic resonator is off by that
-SLOW_HOST: Final = 0.1  # of the scan rate: clocks are off by less, so the host has not kept up
-LEAST_SPAN_S: Final = 1.0  # seconds by the host's clock; in less, bursts of scans change the rate
-LEAST_TIMER_MS: Final = 1  # milliseconds, the least that a USB bridge's timer can be set to
-BAD_RESETS: Final = ("brown_out", "watchdog")  # causes of a reset that nobody means to bring about
+RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
+SLOW_HOST: Final = 0.1  # [1] Clocks differ by far less, so a host that is off by this is slow.
+LEAST_SPAN_S: Final = 1.0  # [s] Scans come in bursts, which hide the rate in less time.
+LEAST_TIMER_MS: Final = 1  # [ms] The timer of a USB bridge cannot be set to less.
+BAD_RESETS: Final = ("brown_out", "watchdog")  # A sound board is not reset by these.
 
 
 @dataclass

@@ -75,30 +75,31 @@ Bool = NDArray[np.bool_]
 
 LAYERS: Final = ("top", "bottom")
 
-# What is told. Shares are over the nominal wires, deviations of pressed ones those of logs.
-KNOWN: Final = 0.15  # largest deviation of a share that is told: well below a change
-CHANGED: Final = 0.25  # a change that matters: estimators expect smaller ones of every layer
-LINE_CHANGED: Final = 0.75  # a change of one line that matters: it moves fewer cells
-CLEAR_STDS: Final = 5.0  # deviations of a clear change: up to 34 shares are looked at
-PRESSED_CLEAR_STDS: Final = 3.5  # the same of presses: two or three shares are looked at
+# What is told. Shares are over nominal; deviations of pressed ones are those of their logs.
+KNOWN: Final = 0.15  # [share] A deviation above this is too close to a change to tell the share.
+CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of a layer anyway.
+LINE_CHANGED: Final = 0.75  # [share] A line matters less than a layer: it moves fewer cells.
+CLEAR_STDS: Final = 5.0  # [deviations] By chance, none of up to 34 shares differs by this.
+PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
 
-# What is expected of an untouched skin: deviations of shares and of log resistances.
-LAYER_STD: Final = 30.0  # of a layer: wide, so that the readings decide
-LINE_STD: Final = 0.05  # of a line from its layer, because lines of a layer change alike
-ODD_LINE_STD: Final = 30.0  # of the one line that is asked about
-COMMON_STD: Final = 1.0  # log, of what all cells have in common: it drifts, and tells no wires
-LEAST_STD: Final = 0.001  # log, of each cell: no two cells are more alike than this
+# Standard deviations before the readings, of an untouched skin.
+LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
+LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
+ODD_LINE_STD: Final = 30.0  # [share] The one line that is asked about may have changed by any factor.
+COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
+LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
+# Standard deviations before the readings, of a pressed skin.
+BEFORE_STD: Final = 2.0  # [log] All wires may have changed by a factor of seven.
+DRIFT_STD: Final = 0.01  # [log] An untouched cell drifts by this in the seconds since it was read.
 
-# What is expected of presses.
-PRESS_S: Final = 1.0  # seconds of scans with the same corners: 90 scans even the noise out
-PRESSED_SIEMENS: Final = 2e-5  # a firm press: 20 times a cell at rest, so that wires show
-FOURTH_SHARE: Final = 0.5  # what any other cell may conduct, over the weakest corner
-HELD_SHARE: Final = 0.5  # scans of corners that count, over those held longest: not in passing
-BEFORE_STD: Final = 2.0  # of y before anything is pressed: a factor of 7
-DRIFT_STD: Final = 0.01  # log, of an untouched cell since it was read, seconds ago
-MOST_STEPS: Final = 20  # Gauss-Newton steps: as a rule five are enough
-LONGEST_STEP: Final = 1.0  # log: further away the slopes are others
-CLOSE: Final = 1e-4  # log: a last step, far below any deviation
+# Presses.
+PRESS_S: Final = 1.0  # [s] Corners are held this long, so that scans even the noise out.
+PRESSED_SIEMENS: Final = 2e-5  # [S] A firm press conducts more: 20 times a cell at rest.
+FOURTH_SHARE: Final = 0.5  # [1] No other cell conducts more than this share of the weakest corner.
+HELD_SHARE: Final = 0.5  # [1] Corners with less than this share of the most scans were passed by.
+MOST_STEPS: Final = 20  # [steps] A fit that converges takes fewer.
+LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
+CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
 
 
 def _port_ohm(ratio: Float, noise_lsb: Float | float, board: Hello) -> tuple[Float, Float]:
