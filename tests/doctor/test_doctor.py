@@ -222,7 +222,8 @@ def test_noisy_lines_and_cells_are_named() -> None:
     ):
         codes = rest.codes.copy()
         codes[at] += np.round(3 * random.standard_normal(codes[at].shape))
-        [finding] = examine_signal(replace(rest, codes=codes)).findings
+        examine_signal(replace(rest, codes=codes), diagnosis := Diagnosis())
+        [finding] = diagnosis.findings
         assert (finding.kind, finding.place) == (Kind.NOISE, place)
         assert finding.values["noise_lsb"] == pytest.approx(3.05, abs=0.25)
         assert words_of(finding)["what_to_do"].startswith(f"check the contacts of {named(place)}")
@@ -231,8 +232,8 @@ def test_noisy_lines_and_cells_are_named() -> None:
 def test_noise_is_measured_beside_hum_and_drift() -> None:
     rest = rest_of("emulator://6x5?noise=0.5&hum=50")
     drift = np.linspace(0, 2, len(rest.codes))[:, None, None, None]
-    signal = examine_signal(replace(rest, codes=rest.codes + drift))
-    assert signal.noise_lsb == pytest.approx((0.5**2 + 1 / 12) ** 0.5, rel=0.1)
+    noise_lsb, _ = examine_signal(replace(rest, codes=rest.codes + drift), Diagnosis())
+    assert noise_lsb == pytest.approx((0.5**2 + 1 / 12) ** 0.5, rel=0.1)
     hum = find_hum(rest)
     assert hum is not None
     assert hum.lsb == pytest.approx(3.0, rel=0.05)

@@ -28,7 +28,7 @@ references included, changes none of them and cannot be known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
-from ohmskin.doctor.signal import mean_std_lsb
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
+from ohmskin.doctor.signal import RestScans, mean_std_lsb
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import ratio_from_codes
@@ -79,36 +79,22 @@ RATIO_TOLERANCE: Final = 0.03  # [1] The ratio of two resistors of 1 % is off by
 RATIO_STDS: Final = 3.0  # [deviations] Noise and rounding change the ratio by less than this.
 
 
-@dataclass(frozen=True, eq=False)
-class Circuit:
-    """What the means show.
-
-    touched: cells (R, C). wrong: cells (R, C) that are dead or saturated, and those of open or
-    shorted lines. cell_siemens: (R, C), NaN where unknown. reference_ratio: R_top / R_bottom, None
-    if nothing conducts.
-    """
-
-    findings: list[Finding]
-    touched: Bool
-    wrong: Bool
-    cell_siemens: Float
-    reference_ratio: float | None
-
-
 def examine_circuit(
-    mean_codes: Float,
+    rest: RestScans,
     noise_lsb: float,
-    scans: int,
-    board: Hello,
-    wire_ohm: tuple[float, float] = WIRE_OHM,
+    wire_ohm: tuple[float, float],
+    diagnosis: Diagnosis,
     *,
-    moved: bool = False,
-) -> Circuit:
-    """Findings from mean codes (R, C, 4) of so many scans, each reading with this noise [LSB].
+    moved: bool,
+) -> tuple[Bool, Bool]:
+    """Adds lines, cells and references to a diagnosis. Returns two masks of cells, (R, C): those
+    that are touched, and those that are dead or saturated or have an open or shorted line.
 
-    wire_ohm: a segment of the top and bottom layer. moved: something touches the skin and moves;
-    then shorted lines and dead cells are not judged, because the means are of no one skin.
+    noise_lsb: of a reading. wire_ohm: a segment of the top and bottom layer. moved: something
+    touches the skin and moves; then shorted lines and dead cells are not judged, because the means
+    are of no one skin.
     """
+    board, mean_codes, findings = rest.board, rest.mean, diagnosis.findings
     full = (1 << board.adc_bits) - 1
     shown = np.where(READING_SIGN > 0, mean_codes, full - mean_codes)
     current = shown.mean(axis=2)
@@ -118,10 +104,10 @@ def examine_circuit(
     dark = current < least
     nothing = np.zeros(current.shape, dtype=np.bool_)
     if dark.all():
-        finding = found(Kind.NOTHING_CONDUCTS, cell_count=dark.size)
-        return Circuit([finding], nothing, ~nothing, np.full(dark.shape, np.nan), None)
+        findings.append(found(Kind.NOTHING_CONDUCTS, cell_count=dark.size))
+        diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
+        return nothing, ~nothing
     no_row, no_column = dark.all(axis=1), dark.all(axis=0)
-    findings = []
     for kind, place, count, cells in (
         (Kind.OPEN_ROW, Place(rows=lines_of(no_row)), rows, columns),
         (Kind.OPEN_COLUMN, Place(columns=lines_of(no_column)), columns, rows),
@@ -132,7 +118,7 @@ def examine_circuit(
     siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
     shorted = nothing.copy()
     if not moved:
-        std = noise_lsb / (4 * scans) ** 0.5
+        std = noise_lsb / (4 * len(rest.codes)) ** 0.5
         row_groups = _shorted(current, siemens, std, out)
         column_groups = _shorted(current.T, siemens.T, std, out.T)
         for group in row_groups:
@@ -146,11 +132,13 @@ def examine_circuit(
         if shorted.any():
             # Shorted lines are one: the network without the others is right for all other cells.
             siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
-    judged = ~out & ~shorted
-    touched, bad, cell_findings = _judge_cells(siemens, siemens_std, judged, wire_ohm, moved)
-    ratio, ratio_findings = _references(shown[~dark], board, mean_std_lsb(noise_lsb, scans))
-    findings += cell_findings + ratio_findings
-    return Circuit(findings, touched, out | shorted | bad, siemens, ratio)
+    wrong = out | shorted
+    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, wire_ohm, findings, moved=moved)
+    mean_std = mean_std_lsb(noise_lsb, len(rest.codes))
+    ratio = _reference_ratio(shown[~dark], mean_std, board, findings)
+    cell_ohm = 1 / np.nanmedian(siemens)
+    diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
+    return touched, wrong | bad
 
 
 def _cells(mean_codes: Float, board: Hello, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
@@ -190,13 +178,18 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
 
 
 def _judge_cells(
-    siemens: Float, std: Float, judged: Bool, wire_ohm: tuple[float, float], moved: bool
-) -> tuple[Bool, Bool, list[Finding]]:
-    """Touched cells, cells that are dead or saturated, findings."""
+    siemens: Float,
+    std: Float,
+    judged: Bool,
+    wire_ohm: tuple[float, float],
+    findings: list[Finding],
+    *,
+    moved: bool,
+) -> tuple[Bool, Bool]:
+    """Adds dead and saturated cells to findings. Returns touched cells, and these."""
     dead: Bool = np.zeros(siemens.shape, dtype=np.bool_)
     if not judged.any():
-        return dead, dead, []
-    findings = []
+        return dead, dead
     rest = min(float(np.quantile(siemens[judged], REST_QUANTILE)), MOST_AT_REST_SIEMENS)
     high: Bool = judged & (siemens > _touched_share(siemens[judged]) * rest)
     if not moved and high.sum() < judged.sum() > 1:
@@ -215,7 +208,7 @@ def _judge_cells(
     if saturated.any():
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
         findings.append(found(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest))
-    return high & ~saturated, dead | saturated, findings
+    return high & ~saturated, dead | saturated
 
 
 def _touched_share(siemens: Float) -> float:
@@ -227,23 +220,19 @@ def _touched_share(siemens: Float) -> float:
     return max(TOUCHED_SHARE, float(np.exp(TOUCHED_STDS * spread)))
 
 
-def _references(lit: Float, board: Hello, mean_std: float) -> tuple[float, list[Finding]]:
-    """R_top / R_bottom, and whether it is far from what the board says.
+def _reference_ratio(lit: Float, mean_std: float, board: Hello, findings: list[Finding]) -> float:
+    """R_top / R_bottom. Adds to findings if it is far from what the board says.
 
     lit: what the ports (P, 4) with a current show of it, with the deviation mean_std [LSB].
     """
     ratio = float(lit[:, READING_SENSES_TOP].sum() / lit[:, ~READING_SENSES_TOP].sum())
-    nominal = board.ref_top_ohm / board.ref_bottom_ohm
     # Of A and D, one rounds as the other; the same of B and C.
     ratio_std = mean_std * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
-    off = ratio / nominal - 1
-    if abs(off) < RATIO_TOLERANCE + RATIO_STDS * ratio_std:
-        return ratio, []
-    finding = found(
-        Kind.REFERENCE_RATIO,
-        ratio=ratio,
-        off_percent=100 * off,
-        ref_top_ohm=board.ref_top_ohm,
-        ref_bottom_ohm=board.ref_bottom_ohm,
-    )
-    return ratio, [finding]
+    top, bottom = board.ref_top_ohm, board.ref_bottom_ohm
+    off = ratio * bottom / top - 1
+    if abs(off) >= RATIO_TOLERANCE + RATIO_STDS * ratio_std:
+        refs = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
+        findings.append(
+            found(Kind.REFERENCE_RATIO, WHOLE_SKIN, ratio=ratio, off_percent=100 * off, **refs)
+        )
+    return ratio

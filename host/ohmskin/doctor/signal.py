@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
 from ohmskin.link.timing import reading_offsets_s, slot_s
@@ -121,23 +121,11 @@ class Hum:
     lsb: float
 
 
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """What scans show besides their means.
-
-    noise_lsb: of a reading, without hum. hum_lsb: amplitude, 0 for none. hidden_hz: mains that the
-    scans cannot show. moved: cells that changed meanwhile, (R, C).
-    """
-
-    findings: list[Finding]
-    noise_lsb: float
-    hum_lsb: float
-    hidden_hz: tuple[float, ...]
-    moved: Bool
-
-
-def examine_signal(scans: RestScans, other: RestScans | None = None) -> Signal:
-    """Hum, the noise that is left without it, and what moved meanwhile.
+def examine_signal(
+    scans: RestScans, diagnosis: Diagnosis, other: RestScans | None = None
+) -> tuple[float, Bool]:
+    """Adds hum and noise to a diagnosis. Returns the noise of a reading without hum [LSB], and the
+    cells that changed meanwhile, (R, C).
 
     other: scans at another rate, which may show a hum that these hide.
     """
@@ -148,15 +136,22 @@ def examine_signal(scans: RestScans, other: RestScans | None = None) -> Signal:
         rest -= np.real(turn[:, None, None, None] * hum.amplitude)
     # Differences from scan to scan: what moves slowly is no noise.
     variance = np.mean(np.diff(rest, axis=0) ** 2, axis=0) / 2
+    noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
     moved = _moved(rest, variance)
     if other is not None and hidden_hz and hum is None and not moved.any():
         hum = find_hum(other)
         hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
-    findings = [] if hum is None else [_hum_finding(hum, scans.board)]
+    if hum is not None:
+        diagnosis.findings.append(_hum_finding(hum, scans.board))
     if len(scans.codes) >= LEAST_SCANS and not moved.any():
-        findings += _noise(np.sqrt(variance.mean(axis=2)))
-    noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
-    return Signal(findings, noise_lsb, 0.0 if hum is None else hum.lsb, hidden_hz, moved)
+        diagnosis.findings += _noise(np.sqrt(variance.mean(axis=2)))
+    diagnosis.measured |= {
+        "noise_lsb": round(noise_lsb, 3),
+        "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
+        "hum_lsb": 0.0 if hum is None else round(hum.lsb, 2),
+        "hum_not_visible": list(hidden_hz),
+    }
+    return noise_lsb, moved
 
 
 def mean_std_lsb(noise_lsb: float, scans: int) -> float:
@@ -340,19 +335,20 @@ def _is_longer(settle_us: int, than_us: int) -> bool:
     return settle_us > NOT_LONGER * than_us
 
 
-def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding], float]:
-    """Means at the usual settle time against a longer one; the largest clear difference [LSB]."""
+def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis) -> bool:
+    """Adds to a diagnosis how means change with a longer settle time. Returns whether they do."""
     settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
+    diagnosis.measured["settling_lsb"] = 0.0
     if not _is_longer(longer_us, settle_us):
-        return [], 0.0
+        return False
     change = np.abs(usual.mean - settled.mean)
     scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
     in_mean = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
     clear = change - CLEAR_STDS * np.maximum(scatter, SETTLED_NOISE_LSB) * in_mean
-    most_lsb = float(clear.max())
-    if most_lsb <= UNSETTLED_LSB:
-        return [], max(most_lsb, 0.0)
+    diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
     cells = (clear > UNSETTLED_LSB).any(axis=2)
+    if not cells.any():
+        return False
     # A node that is left with e of its swing S after t settles with tau = t / ln(S / e).
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(float(change.max()), 0.9 * swing)
@@ -366,4 +362,5 @@ def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding
         longer_us=longer_us,
         needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
     )
-    return [finding], most_lsb
+    diagnosis.findings.append(finding)
+    return True

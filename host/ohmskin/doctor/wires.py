@@ -85,7 +85,9 @@ PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses d
 # Standard deviations before the readings, of an untouched skin.
 LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
 LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
-ODD_LINE_STD: Final = 30.0  # [share] The one line that is asked about may have changed by any factor.
+ODD_LINE_STD: Final = (
+    30.0  # [share] The line that is asked about may have changed by any factor.
+)
 COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
 LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
 # Standard deviations before the readings, of a pressed skin.
@@ -259,7 +261,7 @@ class CornerScans:
         rest_codes: mean codes (R, C, 4) of so many scans of the untouched skin, each reading with
         this noise. wire_ohm: nominal ones of a segment, top and bottom.
         """
-        rest = self._look(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
+        rest = self._ports(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
         most = max(map(len, self._codes.values()), default=0)
         found = []
         for corners, codes in self._codes.items():
@@ -267,16 +269,16 @@ class CornerScans:
                 continue
             # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
             scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
-            pressed = self._look(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
+            pressed = self._ports(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
             free = _free(rest.log_ohm.shape, corners)
             found.append((corners[0], *_pressed_fit(rest, pressed, free, wire_ohm)))
         return shares_of(found)
 
-    def _look(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Look:
+    def _ports(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Ports:
         ratio = ratio_from_codes(mean, self._board.adc_bits)
         variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1) + noise_lsb**2 / scans
         port_ohm, std_ohm = _port_ohm(ratio, np.sqrt(variance), self._board)
-        return _Look(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
+        return _Ports(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
 
 
 def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
@@ -301,7 +303,7 @@ def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _Ports:
     """Port resistances and deviations (RC,) [ohm]; log resistances of the cells by `matrix`."""
 
     port_ohm: Float
@@ -310,7 +312,7 @@ class _Look:
 
 
 def _pressed_fit(
-    rest: _Look, pressed: _Look, free: Bool, wire_ohm: tuple[float, float]
+    rest: _Ports, pressed: _Ports, free: Bool, wire_ohm: tuple[float, float]
 ) -> tuple[float, float]:
     """y and its deviation."""
     shape = free.shape
@@ -325,12 +327,12 @@ def _pressed_fit(
             for cell in (untouched, untouched + lift)
         )
         at_rest = np.linalg.inv(before.by_cell)
-        through = now.by_cell @ at_rest
+        through = now.by_cell @ at_rest  # B1 B0^-1
         by_rest_wires = before.by_wires()
         off_rest = rest.port_ohm - before.port_ohm
-        residual = pressed.port_ohm - now.port_ohm - through @ off_rest
-        by_segment = now.by_wires() - through @ by_rest_wires
-        slopes = by_segment.sum(axis=1)
+        residual = pressed.port_ohm - now.port_ohm - through @ off_rest  # r
+        by_segment = now.by_wires() - through @ by_rest_wires  # W
+        slopes = by_segment.sum(axis=1)  # w
         spread = now.by_cell * variance
         covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
         covariance += (through * rest.std_ohm**2) @ through.T + np.diag(pressed.std_ohm**2)
