@@ -86,12 +86,9 @@ def named(place: Place) -> str:
     """Lines and cells by name."""
     cells = [f"({row}, {column})" for row, column in place.cells]
     more = f" and {len(cells) - MOST_CELLS} more" if len(cells) > MOST_CELLS else ""
+    names = {"row": place.rows, "column": place.columns, "cell": cells[:MOST_CELLS]}
     parts = []
-    for what, several in (
-        ("row", place.rows),
-        ("column", place.columns),
-        ("cell", cells[:MOST_CELLS]),
-    ):
+    for what, several in names.items():
         if several:
             listed = ", ".join(map(str, several))
             parts.append(f"{what}{'s' if len(several) > 1 else ''} {listed}")

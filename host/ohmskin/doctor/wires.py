@@ -85,9 +85,7 @@ PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses d
 # Standard deviations before the readings, of an untouched skin.
 LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
 LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
-ODD_LINE_STD: Final = (
-    30.0  # [share] The line that is asked about may have changed by any factor.
-)
+ODD_LINE_STD: Final = 30.0  # [share] The line that is asked about may have changed by any factor.
 COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
 LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
 # Standard deviations before the readings, of a pressed skin.
