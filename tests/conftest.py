@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -24,6 +25,10 @@ from ohmskin.opening import emulated
 from places import ROOT
 
 OPEN_FILES = Path("/proc/self/fd")
+
+# Commands are interrupted as by a keyboard. Where this process was started with SIGINT ignored, as
+# in the background of a shell, they would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples in every run, and no deadline: the machine may be busy.
 settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)

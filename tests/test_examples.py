@@ -100,13 +100,14 @@ def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Callable[..
 
 def test_two_boards_have_one_clock() -> None:
     urls = ("emulator://8x8?unit=1", "emulator://8x8?unit=2")
+    begin_s = time.monotonic()
     head, *lines = first_lines(40, str(EXAMPLES / "two_boards.py"), *urls)
     assert head == "units 1, 2\n"
     scans = [re.match(r"([\d.]+) s: unit (\d), scan (\d+), missed 0, 0\.\d+, ", x) for x in lines]
     times_s = [float(each[1]) for each in scans if each]
     assert len(times_s) == 39
     assert all(b - a > -0.002 for a, b in pairwise(times_s))
-    assert 0 < time.monotonic() - times_s[-1] < 60
+    assert begin_s < times_s[0] < times_s[-1] < time.monotonic()
     assert {each[2] for each in scans if each} == {"1", "2"}
 
 
@@ -161,6 +162,7 @@ def test_the_lsl_outlet_pushes_forces_at_their_times(
     samples: list[tuple[list[float], float]] = []
     infos: list[StreamInfo] = []
     monkeypatch.setitem(sys.modules, "pylsl", pylsl_module(samples, infos))
+    begin_s = time.monotonic()
     example("lsl_outlet").main(GHOST, skin_json, 0.5)
     (info,) = infos
     assert (info.name, info.type, info.channel_count) == ("ohmskin", "Force", 64)
@@ -171,7 +173,7 @@ def test_the_lsl_outlet_pushes_forces_at_their_times(
     assert len(samples) > 30
     times_s = np.array([timestamp for _, timestamp in samples])
     assert np.diff(times_s) == pytest.approx(1 / 90, abs=3e-3)
-    assert 0 < time.monotonic() + CLOCK_OFFSET_S - times_s[-1] < 1
+    assert begin_s < times_s[0] - CLOCK_OFFSET_S < times_s[-1] - CLOCK_OFFSET_S < time.monotonic()
     assert np.count_nonzero(np.array(samples[-1][0]) > 0.1) == 3
 
 

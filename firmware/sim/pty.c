@@ -68,7 +68,7 @@ int pty_run(void) {
     }
     if (!control_reply('P', path, strlen(path)))
         return 0;
-    /* Whoever opens the terminal throws away what it has sent before: the board waits for that. */
+    /* Opening the terminal throws away what it holds: the board waits until that is done. */
     enum control_result said;
     while ((said = control_serve_one(true)) != CONTROL_GO)
         if (said == CONTROL_END)

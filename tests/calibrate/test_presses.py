@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ohmskin.arrays import Float
-from ohmskin.calibrate.force_log import ForceLog
 from ohmskin.calibrate.presses import LevelHistory, find_presses
+from ohmskin.calibrate.tables import ForceLog
 
 HZ = 90.0
 OFFSET_S = 500.0

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 
 from lockstep import CPU_HZ, LockstepSim
+from ohmskin.emulate import simavr
 from ohmskin.emulate.simavr import SimulationError, default_program
 
 pytestmark = pytest.mark.skipif(
@@ -654,10 +655,12 @@ def test_bad_requests_are_refused(build: Build) -> None:
     assert [op for op, _ in exchange(request(b"Q") + good, elf)] == ["Q"]
 
 
-def test_program_errors(build: Build, tmp_path: Path) -> None:
+def test_program_errors(build: Build, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     elf = build("uno", FOREVER)
-    with pytest.raises(FileNotFoundError, match="make -C firmware/sim"):
-        LockstepSim("uno", elf, program=tmp_path / "none")
+    with monkeypatch.context() as patched:
+        patched.setattr(simavr, "default_program", lambda: tmp_path / "none")
+        with pytest.raises(FileNotFoundError, match="make -C firmware/sim"):
+            LockstepSim("uno", elf)
     with pytest.raises(FileNotFoundError, match="no firmware"):
         LockstepSim("uno", tmp_path / "none.elf")
     with pytest.raises(SimulationError, match="usage"):

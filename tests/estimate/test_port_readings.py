@@ -10,12 +10,11 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.codes import quantise, ratio_from_codes
 from studies.conditions import shorted_readings
 from studies.trials import random_trial, skin_at_rest, touch
-
-REF_OHM = (30_000.0, 30_000.0)
 
 
 def ten_bits(ratio: Float) -> Float:
@@ -23,8 +22,10 @@ def ten_bits(ratio: Float) -> Float:
 
 
 def reader_of(rest_ratio: Float | None, wires: bool = True) -> PortReader:
-    shape = (8, 8) if rest_ratio is None else rest_ratio.shape[:2]
-    return PortReader(shape, REF_OHM, 10, rest_ratio, (100.0, 200.0) if wires else None)
+    known = WireOhm(100.0, 200.0) if wires else WireOhm()
+    return PortReader(
+        SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest_ratio, nominal_wire_ohm=known)
+    )
 
 
 @pytest.fixture

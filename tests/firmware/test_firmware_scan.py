@@ -135,7 +135,7 @@ def test_stop_ends_with_a_whole_scan_and_its_ack(rig: Rig) -> None:
 
 
 def test_start_and_stop_at_random_phases_damage_nothing(rig: Rig, rng: np.random.Generator) -> None:
-    for _ in range(60):
+    for _ in range(40):
         scan: dict[str, Any] = {
             "rows": int(rng.integers(3, 9)),
             "columns": int(rng.integers(3, 9)),
@@ -192,7 +192,7 @@ def test_no_load_damages_a_frame(rig: Rig, ratio: float | None) -> None:
         rig.set_codes(np.full(TABLE_SHAPE, int(ratio * CODES), np.uint16), np.random.default_rng(0))
     for (rows, columns), rate_mhz in LOADS:
         rig.start_scan(rows=rows, columns=columns, rate_mhz=rate_mhz)
-        rig.run(0.25)
+        rig.run(0.15)
         rig.must("stop")
         assert rig.damaged == 0, (rows, columns, rate_mhz)
         assert rig.scans

@@ -29,9 +29,7 @@ class Bench(Closing):
         self.board.advance(now_s)
 
     def _take(self, faults: Faults) -> None:
-        if faults.resets(self.now_s):
-            self.board.reset()
-        octets = faults.apply(self.board.advance(self.now_s), self.now_s)
+        octets = self.board.heard(faults, self.now_s)
         self._messages += self._decoder.feed(octets, self.now_s)
 
     def ask(self, name: str, **values: protocol.Value) -> None:

@@ -16,6 +16,7 @@ from ohmskin.link.messages import BoardDecoder, Hello, Scan
 from ohmskin.record.recorder import Recorder
 
 HOST_BEGIN_S = 1000.0
+SCAN_HZ = 30.0
 SENSOR_HZ = 80
 SENSOR_NOISE_N = 0.02
 SENSOR_ZERO_N = 0.07
@@ -24,7 +25,11 @@ SENSOR_ZERO_N = 0.07
 def record_presses(path: Path, scene: Scene, seconds: float, unit_id: int = 3) -> None:
     """Record what an emulated board reads of the scene, with a jitter of 1 ms in host times."""
     board = EmulatedBoard(
-        scene.ratio, scene.rows, scene.columns, noise_lsb=0.3, seed=1, unit_id=unit_id
+        *(scene.ratio, scene.rows, scene.columns),
+        rate_hz=SCAN_HZ,
+        noise_lsb=0.3,
+        seed=1,
+        unit_id=unit_id,
     )
     decoder, random = BoardDecoder(), np.random.default_rng(2)
     start = protocol.FRAMES["start"]

@@ -6,7 +6,8 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +17,14 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from ohmskin import opening
+from ohmskin.emulate.board import CLOCK_HZ
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
-from ohmskin.link import session
+from ohmskin.link import framing, protocol, session
+from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.link.serial_port import SerialPort
+from ohmskin.opening import Boards, BoardScan
 
 Serve = Callable[[str], PtyServer]
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -93,40 +97,67 @@ def test_a_slow_reader_loses_nothing() -> None:
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
+class Past:
+    """A board whose scans have come, at made-up times: a few milliseconds late.
+
+    begins_s: when it was switched on, and each time that it was reset; it scans for 2 s from there.
+    """
+
+    def __init__(self, url: str, *begins_s: float) -> None:
+        random = np.random.default_rng(1)
+        self.begins_s = begins_s
+        self.scans: list[Scan] = []
+        for begin_s in begins_s:
+            board, _, _ = opening.emulated(url)
+            decoder = BoardDecoder()
+            board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
+            self.info, _ = decoder.feed(board.advance(0.0), begin_s)
+            while (end_s := board.next_scan_s) is not None and end_s <= 2.0:
+                arrived_s = begin_s + end_s + random.exponential(2e-3)
+                self.scans += decoder.feed(board.advance(end_s), arrived_s)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return iter(self.scans)
+
+    def close(self) -> None:
+        pass
+
+
+def past_scans(*boards: Past) -> list[BoardScan[Scan]]:
+    return list(Boards(boards, ExitStack()).scans())
+
+
 def test_times_are_of_the_middle_of_scans_on_one_clock() -> None:
-    with ohmskin.open_all([*units(1), "emulator://8x8?unit=2&rate=45"]) as skins:
-        taken = list(itertools.islice(skins.scans(), 150))
-    for unit, period_s in ((1, 1 / 90), (2, 1 / 45)):
+    taken = past_scans(Past(*units(1), 50.0), Past("emulator://8x8?unit=2&rate=45", 50.3))
+    assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(taken))
+    for unit, begin_s, period_s in ((1, 50.0, 1 / 90), (2, 50.3, 1 / 45)):
         found = [each for each in taken if each.unit_id == unit][20:]
-        ages_s = np.array([each.scan.host_time_s - each.time_s for each in found])
-        # The emulator says all of a scan at its end, half a scan after its middle.
-        assert np.median(ages_s) == pytest.approx(period_s / 2, abs=2e-3)
-        steps_s = np.diff([each.time_s for each in found])
-        assert steps_s == pytest.approx(period_s, abs=1e-3)
-        assert 0 <= found[-1].jitter_s < 0.2
+        times_s = np.array([each.time_s for each in found])
+        middles_s = [begin_s + 1e-6 * each.scan.time_us + period_s / 2 for each in found]
+        assert times_s == pytest.approx(np.array(middles_s), abs=2e-3)
+        assert np.diff(times_s) == pytest.approx(period_s, abs=1e-3)
+        assert 0 <= found[-1].jitter_s < 0.02
 
 
 def test_a_slow_board_has_the_time_of_its_readings() -> None:
     """Its scan is short, the rest of its period idle."""
-    with ohmskin.open_all(["emulator://4x4?rate=2"]) as skins:
-        found = list(itertools.islice(skins.scans(), 3))
-    # 64 slots of 60,000 cycles at most.
-    middle_s = 64 * 3.7e-3 / 2
-    for each in found:
-        assert each.scan.host_time_s - each.time_s == pytest.approx(0.5 - middle_s, abs=0.02)
+    for each in past_scans(Past("emulator://4x4?rate=2", 50.0)):
+        middle_s = 64 * 60_000 / CLOCK_HZ / 2  # 64 slots of 60,000 cycles at most
+        begun_s = 50.0 + 1e-6 * each.scan.time_us
+        assert each.time_s - begun_s == pytest.approx(middle_s, abs=5e-3)
 
 
 def test_a_board_that_is_reset_keeps_the_time() -> None:
-    """It begins anew at board time 0; the scans that were lost are counted."""
-    with ohmskin.open_all([*units(1), "emulator://8x8?unit=2&reset=1"]) as skins:
-        taken = list(itertools.islice(skins.scans(), 400))
-        assert skins[2].stats.restarts == 2
-    found = [each for each in taken if each.unit_id == 2]
-    assert sum(b.scan.time_us < a.scan.time_us for a, b in itertools.pairwise(found)) == 2
-    ages_s = [each.scan.host_time_s - each.time_s for each in found]
-    assert min(ages_s) > 0
-    assert np.median(ages_s) == pytest.approx(0.5 / 90, abs=2e-3)
-    assert all(a.time_s < b.time_s for a, b in itertools.pairwise(found))
+    """It begins anew at board time 0."""
+    begins_s = (50.0, 52.1, 54.3)
+    found = past_scans(Past(*units(1), *begins_s))
+    resets = [b.scan.time_us < a.scan.time_us for a, b in itertools.pairwise(found)]
+    assert sum(resets) == 2
+    begun_s = np.array(begins_s)[np.cumsum([0, *resets])]
+    times_s = np.array([each.time_s for each in found])
+    middles_s = begun_s + [1e-6 * each.scan.time_us + 0.5 / 90 for each in found]
+    assert times_s == pytest.approx(middles_s, abs=10e-3)
+    assert (np.diff(times_s) > 0).all()
 
 
 def test_a_board_that_vanishes_ends_the_scans_and_is_named() -> None:

@@ -25,18 +25,21 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 import ohmskin
+from command_line import Done, assert_one_line
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
 from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
-from ohmskin.record.recorder import FLUSH_EVERY_S, Recorder
+from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 URL = "emulator://3x4?scene=multi&seed=3&rate=400"
 Command = Callable[..., "subprocess.Popen[str]"]
+# Scans reach the file within half a second; on a busy machine, within this [s].
+LATE_S = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -154,8 +157,10 @@ def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello
     path = tmp_path / "a.mcap"
     with Recorder(path, hello) as recorder:
         recorder.add(scan(0))
-        time.sleep(FLUSH_EVERY_S + 0.4)
-        found = load_recording(path)
+        end_s = time.monotonic() + LATE_S
+        while not (found := load_recording(path)).scans:
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
     assert found.cut_off
     assert_same(found.scans, [scan(0)])
 
@@ -179,7 +184,7 @@ def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
     assert len(found.hellos) == 1
     numbers = [each.number for each in found.scans]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-    assert killed_s - found.scans[-1].host_time_s < 1.0
+    assert killed_s - found.scans[-1].host_time_s < LATE_S
     assert_same(replayed(path), found.scans, host_time=False)
 
 
@@ -209,7 +214,16 @@ def outcome(path: Path) -> Recording | str:
     return text
 
 
-def test_cut_off_at_every_byte(tmp_path: Path, hello: Hello) -> None:
+def ends_of_records(octets: bytes) -> list[int]:
+    """Where the records of an MCAP file end: each has an opcode, 8 bytes of length, and those."""
+    ends = [8]  # of the magic bytes
+    while ends[-1] < len(octets) - 8:
+        ends.append(ends[-1] + 9 + int.from_bytes(octets[ends[-1] + 1 : ends[-1] + 9], "little"))
+    return ends
+
+
+def test_cut_off_at_any_byte(tmp_path: Path, hello: Hello) -> None:
+    """About the ends of records and of their heads, and at a hundred places between these."""
     whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
     with Recorder(whole, hello) as recorder:
         for number in range(6):
@@ -217,7 +231,10 @@ def test_cut_off_at_every_byte(tmp_path: Path, hello: Hello) -> None:
             recorder._flush()
     octets = whole.read_bytes()
     counts = []
-    for size in range(len(octets)):
+    ends = ends_of_records(octets)
+    sizes = {end + step for end in ends for step in (-1, 0, 1, 8, 9, 10)}
+    sizes |= set(np.random.default_rng(1).integers(len(octets), size=100).tolist())
+    for size in sorted(sizes & set(range(len(octets)))):
         cut.write_bytes(octets[:size])
         found = outcome(cut)
         if isinstance(found, str):
@@ -385,8 +402,7 @@ def test_replay_takes_the_recorded_time(tmp_path: Path, hello: Hello) -> None:
     begin_s = time.monotonic()
     found = replayed(path, speed=1)
     assert time.monotonic() - begin_s >= 0.5
-    steps_s = np.diff([each.host_time_s for each in found])
-    assert np.median(steps_s) == pytest.approx(0.1, abs=0.05)
+    assert found[-1].host_time_s - found[0].host_time_s == pytest.approx(0.5, abs=0.4)
 
 
 def test_replay_shortens_long_pauses(
@@ -573,7 +589,7 @@ def test_typed_lines_become_marks(tmp_path: Path) -> None:
     assert [mark.text for mark in load_recording(path).marks] == ["left hand", "right hand"]
 
 
-def test_the_commands(tmp_path: Path, command: Command) -> None:
+def test_the_commands(tmp_path: Path, command: Command, run: Callable[..., Done]) -> None:
     path, out = tmp_path / "a.mcap", tmp_path / "a.npz"
     quiet = "emulator://3x4?scene=rest"
     process = command(
@@ -584,16 +600,10 @@ def test_the_commands(tmp_path: Path, command: Command) -> None:
     assert text.startswith(f"{path}: 60 scans, missed 0, ")
     assert [mark.text for mark in load_recording(path).marks] == ["left hand"]
     assert sum(isinstance(message, Tare) for message in messages(path)) == 1
-    process = command("export", str(path), str(out))
-    text, err = process.communicate(timeout=30)
-    assert (process.returncode, text, err) == (0, f"{out}: 60 scans\n", "")
-    process = command("stream", f"replay://{path}?speed=0", "--json", "--method", "none")
-    text, err = process.communicate(timeout=30)
-    assert (process.returncode, text.count("\n"), err) == (0, 60, "")
+    assert run("export", str(path), str(out)) == Done(0, f"{out}: 60 scans\n", "")
+    done = run("stream", f"replay://{path}?speed=0", "--json", "--method", "none")
+    assert (done.code, done.out.count("\n"), done.err) == (0, 60, "")
     path.write_bytes(path.read_bytes()[:100])
     out.unlink()
-    process = command("export", str(path), str(out))
-    text, err = process.communicate(timeout=30)
-    assert (process.returncode, text, err.count("\n")) == (2, "", 1)
-    assert "cut off" in err
+    assert_one_line(run("export", str(path), str(out)), "cut off")
     assert not out.exists()

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -174,10 +175,11 @@ def test_a_page_that_is_slow_gets_the_newest_scan_and_no_other() -> None:
             pass
         time.sleep(0.5)
         for _ in range(5):  # nothing was queued up meanwhile
+            asked_s = time.monotonic()
             page.say(do="clock", page_ms=1.5)
             answer = page.take()
             assert (answer["kind"], answer["page_ms"]) == ("clock", 1.5)
-            assert abs(answer["host_s"] - time.monotonic()) < 1
+            assert asked_s <= answer["host_s"] <= time.monotonic()
         for wrong in (first["scan"] - 1, first["scan"] + 1):
             page.say(do="ack", scan=wrong)
         page.say(do="clock", page_ms=0)
@@ -185,7 +187,7 @@ def test_a_page_that_is_slow_gets_the_newest_scan_and_no_other() -> None:
         page.say(do="ack", scan=first["scan"])
         second = page.take()
         assert second["scan"] - first["scan"] >= 30
-        assert time.monotonic() - second["host_time_s"] < 0.2
+        assert second["host_time_s"] - first["host_time_s"] > 0.3
         page.say(do="ack", scan=second["scan"])
         assert page.take()["scan"] > second["scan"]
 
@@ -587,6 +589,8 @@ def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(
     port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)/", url)[1])  # type: ignore[index]
     if Path("/proc/net/tcp").exists():
         assert listening(process.pid) == {("127.0.0.1", port)}
+    with urlopen(url) as page:
+        assert page.status == 200
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=30)
     assert (process.returncode, out, err) == (0, "", "")

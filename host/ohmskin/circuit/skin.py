@@ -32,7 +32,7 @@ Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g),
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
@@ -73,7 +73,7 @@ class Skin:
         shape = np.shape(self.cell_siemens)
         if len(shape) != 2 or 0 in shape:
             raise ValueError(f"cell_siemens must be (rows, columns), at least 1x1, not {shape}")
-        for name in [f.name for f in fields(self)][:3]:
+        for name in ("cell_siemens", "top_wire_ohm", "bottom_wire_ohm"):
             resistances = np.array(getattr(self, name), dtype=np.float64)
             if resistances.shape != shape:
                 raise ValueError(f"{name} has shape {resistances.shape}, cell_siemens {shape}")
@@ -99,14 +99,9 @@ class Skin:
             raise ValueError(f"a skin has at least 1 row and 1 column, not {rows}x{columns}")
         if not rest_ohm > 0:
             raise ValueError(f"rest_ohm must be positive, not {rest_ohm}")
-        shape = (rows, columns)
-        return cls(
-            np.full(shape, 1.0 / rest_ohm),
-            np.full(shape, top_wire_ohm),
-            np.full(shape, bottom_wire_ohm),
-            ref_top_ohm,
-            ref_bottom_ohm,
-        )
+        layers = (1.0 / rest_ohm, top_wire_ohm, bottom_wire_ohm)
+        cell, top, bottom = (np.full((rows, columns), each) for each in layers)
+        return cls(cell, top, bottom, ref_top_ohm, ref_bottom_ohm)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -153,7 +148,7 @@ def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tupl
     return factor, solve_lower(factor, driven.reshape(rows * columns, -1))
 
 
-def _admittance(half: Float) -> Float:
+def admittance_of(half: Float) -> Float:
     """Y = half^T half. No current leaves the skin: a diagonal made from its row keeps small
     conductances that rounding of the large ones would drown.
     """
@@ -166,7 +161,7 @@ def _admittance(half: Float) -> Float:
 def electrode_admittance(skin: Skin) -> Float:
     """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
     root = np.sqrt(skin.cell_siemens)
-    return _admittance(factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
+    return admittance_of(factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
 
 
 def port_resistance_ohm(skin: Skin) -> Float:
@@ -176,19 +171,35 @@ def port_resistance_ohm(skin: Skin) -> Float:
     chain of cells connects (all of them open) is inf.
     """
     rows = skin.shape[0]
-    admittance = electrode_admittance(skin)
     part = _connected_parts(skin.cell_siemens)
-    for number in np.unique(part):
-        # Grounding any one electrode of a connected part changes no resistance within it; the
-        # best connected one costs the least precision.
-        members = np.flatnonzero(part == number)
+    _, resistance = impedance_of(electrode_admittance(skin), rows, part)
+    connected = part[:rows, None] == part[None, rows:]
+    return np.where(connected, np.maximum(resistance, 0.0), np.inf)
+
+
+def impedance_of(
+    admittance: Float, rows: int, part: NDArray[np.intp] | None = None
+) -> tuple[Float, Float]:
+    """Z and rho (R, C) of Y, which is overwritten. part: each electrode's; None: all are connected.
+
+    Grounding any one electrode of a connected part changes no resistance within it. The best
+    connected one costs the least precision.
+    """
+    parts = [np.arange(len(admittance))]
+    if part is not None:
+        parts = [np.flatnonzero(part == number) for number in np.unique(part)]
+    for members in parts:
         ground = members[np.argmax(np.diagonal(admittance)[members])]
         admittance[ground, ground] = 2 * admittance[ground, ground] or 1.0
     impedance = np.linalg.inv(admittance)
     diagonal = np.diagonal(impedance)
-    resistance = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
-    connected = part[:rows, None] == part[None, rows:]
-    return np.where(connected, np.maximum(resistance, 0.0), np.inf)
+    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    return np.asarray(impedance), np.asarray(port_ohm)
+
+
+def port_potential(impedance: Float, rows: int) -> Float:
+    """Potential of every electrode per current through every port, (R+C, RC) [ohm]."""
+    return (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(len(impedance), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,27 +249,13 @@ def port_sensitivity(
     enough for all RC x 3RC derivatives. Cells must conduct (g > 0): (R, C) [S]; wires (R, C) [ohm].
     """
     rows, columns = cell_siemens.shape
-    cells = rows * columns
     root = np.sqrt(cell_siemens)
     factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
-    impedance, port_ohm = impedance_of(half, rows)
+    impedance, port_ohm = impedance_of(admittance_of(half), rows)
     per_potential = solve_lower(factor, half, transposed=True)
     per_potential *= root.reshape(-1, 1)
-    # Electrode potentials for unit current into row i and out of column j, port by port.
-    potential = (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(-1, cells)
-    current = (potential.T @ per_potential.T).reshape(cells, rows, columns)
-    return Sensitivity(cell_siemens, top_wire_ohm, bottom_wire_ohm, port_ohm, current)
-
-
-def impedance_of(half: Float, rows: int) -> tuple[Float, Float]:
-    """Z and rho (RC,) of Y = half^T half, if all cells conduct."""
-    admittance = _admittance(half)
-    ground = np.argmax(np.diagonal(admittance))
-    admittance[ground, ground] *= 2
-    impedance = np.linalg.inv(admittance)
-    diagonal = np.diagonal(impedance)
-    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
-    return np.asarray(impedance), np.asarray(port_ohm.ravel())
+    current = (port_potential(impedance, rows).T @ per_potential.T).reshape(-1, rows, columns)
+    return Sensitivity(cell_siemens, top_wire_ohm, bottom_wire_ohm, port_ohm.ravel(), current)
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

@@ -15,7 +15,7 @@ import struct
 import subprocess
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
@@ -52,36 +52,23 @@ def default_program() -> Path:
 class SkinSim(Closing):
     """A board with a skin, simulated cycle by cycle.
 
-    board: one of `BOARDS`. elf: the firmware. program: path of `skinsim`, by default the one built
-    in this repository. pty: run in real time, from `power_on` on, with the UART on the
-    pseudo-terminal `pty_path`; otherwise simulated time passes only in requests that run the board.
+    board: one of `BOARDS`. elf: the firmware. pty: run in real time, from `power_on` on, with the
+    UART on the pseudo-terminal `pty_path`; else time passes only in requests that run the board.
 
-    Raises FileNotFoundError if the program or the ELF is missing, SimulationError if the
+    Raises FileNotFoundError if the simulator or the firmware is not built, SimulationError if the
     simulator does not start. Not thread-safe.
     """
 
-    def __init__(
-        self,
-        board: str,
-        elf: str | os.PathLike[str],
-        *,
-        program: str | os.PathLike[str] | None = None,
-        pty: bool = False,
-    ) -> None:
-        executable = default_program() if program is None else Path(program)
-        if not executable.exists():
-            raise FileNotFoundError(f"{executable} is missing: run 'make -C firmware/sim'")
-        if not Path(elf).exists():
-            raise FileNotFoundError(f"no firmware {os.fspath(elf)}: build it first")
-        command = [str(executable), "--board", board, *(["--pty"] if pty else []), os.fspath(elf)]
+    def __init__(self, board: str, elf: str | os.PathLike[str], *, pty: bool = False) -> None:
+        program = default_program()
+        if not program.exists():
+            raise FileNotFoundError(f"{program} is missing: run 'make -C firmware/sim'")
+        if not Path(elf).is_file():
+            raise FileNotFoundError(f"no firmware at {elf}: run 'make firmware' in a checkout")
+        command = [str(program), "--board", board, *(["--pty"] if pty else []), os.fspath(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._stderr,
-            bufsize=0,
-        )
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._stderr)
         try:
             # Either answer shows that the simulator has started.
             self.pty_path = self._receive("P").decode() if pty else ""
@@ -95,7 +82,8 @@ class SkinSim(Closing):
         """End the simulator. Further calls raise SimulationError. May be called again."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
-                pipe.close()
+                with suppress(BrokenPipeError):
+                    pipe.close()
         try:
             self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -144,10 +132,9 @@ class SkinSim(Closing):
         pipe = self._process.stdin
         if pipe is None or pipe.closed:
             raise SimulationError("the simulator is closed")
-        unsent = memoryview(_HEADER.pack(ord(op), len(payload)) + payload)
         try:
-            while unsent:
-                unsent = unsent[pipe.write(unsent) or 0 :]
+            pipe.write(_HEADER.pack(ord(op), len(payload)) + payload)
+            pipe.flush()
         except BrokenPipeError:
             raise self._death() from None
         return self._receive(op)
@@ -164,13 +151,10 @@ class SkinSim(Closing):
     def _read(self, count: int) -> bytes:
         pipe = self._process.stdout
         assert pipe is not None
-        received = bytearray()
-        while len(received) < count:
-            chunk = pipe.read(count - len(received))
-            if not chunk:
-                raise self._death()
-            received += chunk
-        return bytes(received)
+        octets = pipe.read(count)
+        if len(octets) < count:
+            raise self._death()
+        return octets
 
     def _death(self) -> SimulationError:
         try:
@@ -197,8 +181,6 @@ class SimavrLink(SerialLink):
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
         elf = elf or _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
-        if not elf.is_file():
-            raise PortError(f"no firmware at {elf}: run 'make firmware' in a checkout")
         with ExitStack() as opened:
             try:
                 self.sim = opened.enter_context(SkinSim(board, elf, pty=True))

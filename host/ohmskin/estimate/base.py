@@ -91,21 +91,11 @@ class SkinKnowledge:
 
     @classmethod
     def of(
-        cls,
-        board: Hello,
-        rest_ratio: Float | None = None,
-        nominal_wire_ohm: WireOhm = NO_WIRES,
+        cls, board: Hello, rest_ratio: Float | None = None, nominal_wire_ohm: WireOhm = NO_WIRES
     ) -> Self:
         """What is known of the skin at this board."""
-        return cls(
-            board.rows,
-            board.columns,
-            board.ref_top_ohm,
-            board.ref_bottom_ohm,
-            board.adc_bits,
-            rest_ratio,
-            nominal_wire_ohm,
-        )
+        size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
+        return cls(*size, *references, board.adc_bits, rest_ratio, nominal_wire_ohm)
 
     @property
     def ratio_std(self) -> float:
@@ -175,12 +165,6 @@ class Solution:
     bottom_wire_ohm: Float | None = None
     cell_siemens_std_down: Float | None = None
 
-    @property
-    def std_down(self) -> Float:
-        """Downwards, where that differs."""
-        down = self.cell_siemens_std_down
-        return self.cell_siemens_std if down is None else down
-
 
 class Estimator(ABC):
     """One method for one skin, fed frame after frame."""
@@ -189,13 +173,7 @@ class Estimator(ABC):
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         self.knowledge = knowledge
-        self._reader = PortReader(
-            (knowledge.rows, knowledge.columns),
-            (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm),
-            knowledge.adc_bits,
-            knowledge.rest_ratio,
-            knowledge.nominal_wire_ohm.both,
-        )
+        self._reader = PortReader(knowledge)
         self._rest: Solution | None = None
 
     @abstractmethod
@@ -265,12 +243,13 @@ class Estimator(ABC):
         return found.cell_siemens, found.cell_siemens_std
 
     def _touched(self, found: Solution) -> NDArray[np.bool_]:
+        down = found.cell_siemens_std_down
+        rise_std = found.cell_siemens_std if down is None else down
         if self._rest is None:
             rise = found.cell_siemens - np.median(found.cell_siemens)
-            rise_std = found.std_down
         else:
             rise = found.cell_siemens - self._rest.cell_siemens
-            rise_std = np.hypot(found.std_down, self._rest.cell_siemens_std)
+            rise_std = np.hypot(rise_std, self._rest.cell_siemens_std)
         return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
 
     def _chi2(self, ratio: Float, current_siemens: Float) -> float:

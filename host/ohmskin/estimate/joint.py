@@ -4,14 +4,19 @@
 RC readings do not determine 3RC resistances, so a prior does the rest, and the answer carries a
 standard deviation that says how much of it is prior:
 
-- a cell is near its rest resistance, or touched (`prior`). This is what removes ghosts that the
-  readings do not exclude.
-- a wire segment is near what is believed of it (`wires`): at first the nominal value of its layer,
-  later what the frames before have revealed.
+- a cell is near its rest resistance, or touched. This is what removes ghosts that the readings do
+  not exclude.
+- a wire segment is near what is believed of it: at first the nominal value of its layer, later what
+  the frames before have revealed.
 
-The maximum of the posterior is found from the simplest model that explains the frame (`touched`),
-in one or two steps (`joint_fit`). Where the answer leaves a doubt, other explanations are tried:
-other wires than believed, a touch that hides.
+The maximum of the posterior is found from the simplest model that explains the frame
+(`sparse_fit`), in one or two steps (`full_fit`). Where the answer leaves a doubt, other
+explanations are tried: other wires than believed, a touch that hides.
+
+`touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is that
+simplest model, where it is enough. It is not where the touches contradict the readings, where a
+fifth of the skin is touched, where wires hide how hard, or where a touch may hide: such frames are
+for `joint`. Without rest readings no cell is known to be untouched, so every frame is.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import MIN_CELL_SIEMENS, Estimator, SkinKnowledge, Solution
-from ohmskin.estimate.joint_fit import JointFit
+from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.ohm import conductance_from_current
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
@@ -34,21 +39,24 @@ from ohmskin.estimate.prior import (
     UNTOUCHED_OHM,
     UNTOUCHED_STD,
     CellPrior,
+    Lesson,
+    WireBelief,
     rest_level,
     siemens_std,
 )
-from ohmskin.estimate.touched import Touched, TouchedFit
-from ohmskin.estimate.wires import Lesson, WireBelief
+from ohmskin.estimate.sparse_fit import SparseFit, Touched
 
-LOWER_LEVEL: Final = 0.8  # a frame of so much less conductance shows rest better than those before
-MAX_DOUBTS: Final = 4
-MISFIT: Final = 1.5  # chi-square per port; at the truth, rounding alone has 1
-BENT_MESSAGE: Final = "the wires changed since they were learned: they are learned anew"
-LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault, not touched
-LOSS_STDS: Final = 6.0  # of the prior
+LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
+MAX_DOUBTS: Final = 4  # other touches that are tried for a frame
+MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
+LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
+LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
-CLEAR: Final = 12.0  # deviations of the prior: a cell is at rest, or touched beyond doubt
-HIGHEST_START_SIEMENS: Final = 1e-2
+CLEAR: Final = 12.0  # deviations of the prior: a cell beyond them is touched beyond doubt
+HIGHEST_START_SIEMENS: Final = 1e-2  # the hardest touch that a fit starts from
+MOST_TOUCHED: Final = 0.2  # share of the cells up to which `touch` is enough
+WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
+BENT_MESSAGE: Final = "the wires changed since they were learned: they are learned anew"
 
 
 class JointEstimator(Estimator):
@@ -61,7 +69,7 @@ class JointEstimator(Estimator):
         self._shape = (knowledge.rows, knowledge.columns)
         self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
-        self._finder: TouchedFit | None = None
+        self._finder: SparseFit | None = None
         self._before: Float | None = None
         self._learned_from: Float | None = None
         self._bent = False
@@ -78,95 +86,101 @@ class JointEstimator(Estimator):
         self._bent = False
         prior = self._prior_of(current)
         found = self._finder.find(current, current_std) if self._finder is not None else None
-        known_rest = self.knowledge.rest_ratio is not None
-        if found is not None and known_rest and self._is_enough(found):
-            return self._simple_solution(found, ports)
+        if found is not None and self.knowledge.rest_ratio is not None and self._is_enough(found):
+            return self._simple_solution(prior, found, ports)
         fit = self._best_fit(prior, current, current_std, self._starts(prior, current, found))
         usual = not (ports.fault or fit.message)
         self._before = fit.cell if usual else None
         if usual and not fit.is_crowded:
-            self._learn(fit.cell, fit.lesson)
-        return self._solution(fit, ports)
+            self._learn(prior, fit.cell, fit.lesson)
+        return self._solution(
+            ports,
+            (fit.cell, fit.cell_std),
+            fit.wires,
+            fit.modelled,
+            fit.iterations,
+            fit.message,
+            max(1.0, fit.misfit) ** 0.5,
+        )
 
     def _is_enough(self, found: Touched) -> bool:
         """Whether the touched cells alone are the answer."""
         return False
 
-    def _simple_solution(self, found: Touched, ports: PortReadings) -> Solution:
-        assert self._prior is not None
-        log_siemens, log_std = -self._prior.expected, self._prior.std.copy()
-        log_siemens[found.cells], log_std[found.cells] = found.log_siemens, found.log_std
+    def _simple_solution(self, prior: CellPrior, found: Touched, ports: PortReadings) -> Solution:
+        cell, std = prior.expected.copy(), prior.std.copy()
+        cell[found.cells], std[found.cells] = -found.log_siemens, found.log_std
         if found.cells.size > 1 and not ports.fault:
-            self._learn(-log_siemens, lambda: found.lesson)
-        siemens = np.exp(log_siemens).reshape(self._shape)
-        top, bottom = np.exp(self._belief.mean).reshape(2, *self._shape)
-        paths = self._belief.paths(self._belief.mean, self._shape)
-        std, std_down = siemens_std(log_siemens, log_std, *paths, self.knowledge.ref_ohm)
+            self._learn(prior, cell, lambda: found.lesson)
+        return self._solution(ports, (cell, std), self._belief.mean, found.current, found.steps)
+
+    def _solution(
+        self,
+        ports: PortReadings,
+        cells: tuple[Float, Float],
+        wires: Float,
+        current: Float,
+        iterations: int,
+        message: str = "",
+        wider: float = 1.0,
+    ) -> Solution:
+        """From log resistances of cells, with their deviations, and of wires.
+
+        current: what they predict (RC,) [S]. wider: what the deviations are multiplied with.
+        """
+        cell, cell_std = cells
+        path_ohm = self._belief.path_ohm(wires)
+        path_std = self._belief.std().reshape(2, -1).mean(axis=0)
+        std, std_down = siemens_std(-cell, cell_std, path_ohm, path_std, self.knowledge.ref_ohm)
+        top, bottom = self._belief.layers(wires)
         return Solution(
-            cell_siemens=siemens,
-            cell_siemens_std=std.reshape(self._shape),
-            cell_siemens_std_down=std_down.reshape(self._shape),
-            chi2=self._chi2(ports.ratio, found.current.reshape(self._shape)),
-            iterations=found.steps,
-            message=BENT_MESSAGE if self._bent else "",
+            cell_siemens=np.exp(-cell).reshape(self._shape),
+            cell_siemens_std=wider * std.reshape(self._shape),
+            cell_siemens_std_down=wider * std_down.reshape(self._shape),
+            chi2=self._chi2(ports.ratio, current.reshape(self._shape)),
+            iterations=iterations,
+            message=message or (BENT_MESSAGE if self._bent else ""),
             top_wire_ohm=top,
             bottom_wire_ohm=bottom,
         )
 
+    def _fit(
+        self, prior: CellPrior, current: Float, current_std: Float, starts: list[Float]
+    ) -> FullFit:
+        ref_ohm = self.knowledge.ref_ohm
+        return FullFit(prior, self._belief, ref_ohm, current, current_std, starts)
+
     def _best_fit(
         self, prior: CellPrior, current: Float, current_std: Float, starts: list[Float]
-    ) -> JointFit:
+    ) -> FullFit:
         """The best fit that can be found: other wires and other touched cells are tried if the
         first leaves a doubt.
         """
-
-        def run(starts: list[Float]) -> JointFit:
-            fit = JointFit(
-                self._shape, self.knowledge.ref_ohm, prior, self._belief, current, current_std
-            )
-            fit.run(starts)
-            return fit
-
-        best = run(starts)
+        best = self._fit(prior, current, current_std, starts)
         if best.wires_contradict and not self._belief.is_fresh:
             self._belief.forget()
             self._bent = True
-            best = run([best.cell])
+            best = self._fit(prior, current, current_std, [best.cell])
         iterations = best.iterations
         for _ in range(MAX_DOUBTS):
             if best.elsewhere is None:
                 break
-            other = run([best.elsewhere])
+            other = self._fit(prior, current, current_std, [best.elsewhere])
             iterations += other.iterations
             if other.cost >= best.cost:
                 break
             best = other
         best.iterations = iterations
-        if not best.message and best.misfit > MISFIT:
-            best.message = f"no resistances explain the readings: chi-square {best.misfit:.1f}"
         loss = best.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
         worst = int(loss.argmax())
-        known_rest = self.knowledge.rest_ratio is not None
-        if known_rest and not best.message and loss[worst] > 0:
+        if best.message:
+            return best
+        if best.misfit > MISFIT:
+            best.message = f"no resistances explain the readings: chi-square {best.misfit:.1f}"
+        elif self.knowledge.rest_ratio is not None and loss[worst] > 0:
             row, column = divmod(worst, self._shape[1])
             best.message = f"cell ({row}, {column}): conducts less than at rest, is a line open?"
         return best
-
-    def _solution(self, fit: JointFit, ports: PortReadings) -> Solution:
-        cells = fit.cell.size
-        siemens = np.exp(-fit.cell)
-        std, std_down = fit.siemens_std()
-        misfit = max(1.0, fit.misfit) ** 0.5
-        return Solution(
-            cell_siemens=siemens.reshape(self._shape),
-            cell_siemens_std=misfit * std.reshape(self._shape),
-            cell_siemens_std_down=misfit * std_down.reshape(self._shape),
-            chi2=self._chi2(ports.ratio, fit.modelled.reshape(self._shape)),
-            iterations=fit.iterations,
-            message=fit.message or (BENT_MESSAGE if self._bent else ""),
-            top_wire_ohm=np.exp(fit.wires[:cells]).reshape(self._shape),
-            bottom_wire_ohm=np.exp(fit.wires[cells:]).reshape(self._shape),
-        )
 
     def _starts(self, prior: CellPrior, current: Float, found: Touched | None) -> list[Float]:
         """Log resistances of the cells to start from: one, or two if it takes trying."""
@@ -183,12 +197,11 @@ class JointEstimator(Estimator):
         afresh = np.minimum(log_ohm, prior.expected)
         return [afresh] if self._before is None else [self._before, afresh]
 
-    def _learn(self, cell: Float, lesson: Callable[[], Lesson]) -> None:
+    def _learn(self, prior: CellPrior, cell: Float, lesson: Callable[[], Lesson]) -> None:
         """Let the wires learn from a plain frame that is not like the last one learned from."""
-        assert self._prior is not None
-        if not self._is_plain(self._prior.rise(cell).reshape(self._shape)):
-            return
         before = self._learned_from
+        if not self._is_plain(prior.rise(cell).reshape(self._shape)):
+            return
         if before is not None and np.abs(cell - before).max() < NEWS:
             return
         self._learned_from = cell
@@ -212,29 +225,37 @@ class JointEstimator(Estimator):
         A level is one number for all cells: what has always been pressed is not taken for rest, as
         it would be cell by cell.
         """
-        if self._prior is not None and self.knowledge.rest_ratio is not None:
-            return self._prior
-        if self.knowledge.rest_ratio is not None:
-            expected, std = self._at_rest(self._reader.read(self.knowledge.rest_ratio))
-        else:
-            level = rest_level(current.reshape(self._shape), self.knowledge.ref_ohm)
-            if self._prior is not None and level > LOWER_LEVEL * np.exp(-self._prior.expected[0]):
-                return self._prior
+        known = self.knowledge
+        if known.rest_ratio is None:
+            level = rest_level(current.reshape(self._shape), known.ref_ohm)
+            before = self._prior
+            if before is not None and level > LOWER_LEVEL * np.exp(-before.expected[0]):
+                return before
             expected = np.full(current.size, -np.log(level))
             std = np.full(current.size, UNKNOWN_REST_STD)
+        elif self._prior is not None:
+            return self._prior
+        else:
+            expected, std = self._at_rest(self._reader.read(known.rest_ratio))
         self._prior = CellPrior(expected, std, TAIL)
-        self._finder = TouchedFit(self._shape, self._prior, self._belief, self.knowledge.ref_ohm)
+        self._finder = SparseFit(self._prior, self._belief, known.ref_ohm)
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
         """Log resistances of the untouched cells, and how well they are known: the same fit."""
-        cells = ports.current.size
-        wide = CellPrior(
-            np.full(cells, np.log(UNTOUCHED_OHM)), np.full(cells, UNTOUCHED_STD), np.inf
-        )
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
-        fit = JointFit(
-            self._shape, self.knowledge.ref_ohm, wide, self._belief, current, current_std
-        )
-        fit.run(self._starts(wide, current, None))
+        expected = np.full(current.size, np.log(UNTOUCHED_OHM))
+        wide = CellPrior(expected, np.full(current.size, UNTOUCHED_STD), np.inf)
+        fit = self._fit(wide, current, current_std, self._starts(wide, current, None))
         return fit.cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
+
+
+class TouchEstimator(JointEstimator):
+    """The simplest model that explains a frame. Cells at rest are reported as at rest."""
+
+    name: ClassVar[str] = "touch"
+
+    def _is_enough(self, found: Touched) -> bool:
+        few = found.cells.size <= MOST_TOUCHED * found.current.size
+        known = found.log_std.max(initial=0.0) <= WIDEST_LOG_STD
+        return few and known and not (found.doubtful or found.contradicted)

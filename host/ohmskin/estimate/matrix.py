@@ -36,13 +36,13 @@ Journal 15(1), 2015; the weights, bounds and standard deviations are ours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import impedance_of, port_potential
 from ohmskin.estimate.base import (
     MAX_CELL_SIEMENS,
     MIN_CELL_SIEMENS,
@@ -68,41 +68,27 @@ _LARGEST_DAMPING: Final = 1e12
 _BOUND_ROUNDS: Final = 5
 
 
-@dataclass(frozen=True, eq=False)
-class Ports:
-    """Port resistance rho (R, C) [ohm] of a wire-free network, and its inverse Laplacian Z."""
-
-    resistance_ohm: Float
-    impedance_ohm: Float
-
-    def voltage_squared(self) -> Float:
-        """v^2, shape (RC, RC): row p = (i, j), column e = (k, l), -d rho_p / d g_e [ohm^2].
-
-        v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]) with j, l the nodes of the columns.
-        """
-        rows, columns = self.resistance_ohm.shape
-        over_cell = self.impedance_ohm[:, :rows, None] - self.impedance_ohm[:, None, rows:]
-        lines = over_cell.reshape(rows + columns, rows * columns)
-        voltage = lines[:rows, None, :] - lines[None, rows:, :]
-        voltage *= voltage
-        return voltage.reshape(rows * columns, rows * columns)
-
-
-def solve_ports(cell_siemens: Float) -> Ports:
-    """All port resistances of cells (R, C), all > 0 [S], whose stripes have no resistance."""
+def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
+    """rho (R, C) [ohm] and Z of cells (R, C), all > 0 [S], whose stripes have no resistance."""
     rows, columns = cell_siemens.shape
     laplacian = np.zeros((rows + columns, rows + columns))
     laplacian[:rows, rows:] = -cell_siemens
     laplacian[rows:, :rows] = -cell_siemens.T
     degree = np.concatenate([cell_siemens.sum(axis=1), cell_siemens.sum(axis=0)])
-    # No port current flows to ground, so any stripe may be grounded through any conductance;
-    # the best connected one keeps Z, and the differences taken of it, small.
-    degree[np.argmax(degree)] *= 2.0
     laplacian.ravel()[:: rows + columns + 1] = degree
-    impedance = np.linalg.inv(laplacian)
-    diagonal = np.diagonal(impedance)
-    resistance = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
-    return Ports(np.maximum(resistance, 0.0), impedance)
+    impedance, port_ohm = impedance_of(laplacian, rows)
+    return np.maximum(port_ohm, 0.0), impedance
+
+
+def voltage_squared(impedance: Float, rows: int) -> Float:
+    """v^2, shape (RC, RC): row p = (i, j), column e = (k, l), -d rho_p / d g_e [ohm^2].
+
+    v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]) with j, l the nodes of the columns.
+    """
+    lines = port_potential(impedance, rows)
+    voltage = lines[:rows, None, :] - lines[None, rows:, :]
+    voltage *= voltage
+    return np.asarray(voltage.reshape(-1, lines.shape[1]))
 
 
 class MatrixEstimator(Estimator):
@@ -165,18 +151,19 @@ class _Fit:
     def _is_far(self, cost: float) -> bool:
         return cost > _FAR_CHI2 * self._target.size
 
-    def _evaluate(self, cell: Float) -> tuple[Ports, Float, Float, float]:
-        ports = solve_ports(cell)
-        current = 1.0 / (ports.resistance_ohm.ravel() + self._ref_ohm)
+    def _evaluate(self, cell: Float) -> tuple[Float, Float, Float, float]:
+        """Z, currents and residuals of these cells, and the chi-square."""
+        port_ohm, impedance = solve_ports(cell)
+        current = 1.0 / (port_ohm.ravel() + self._ref_ohm)
         residual = (self._target - current) / self._current_std
-        return ports, current, residual, float(residual @ residual)
+        return impedance, current, residual, float(residual @ residual)
 
     def _move_to(
-        self, cell: Float, ports: Ports, current: Float, residual: Float, cost: float
+        self, cell: Float, impedance: Float, current: Float, residual: Float, cost: float
     ) -> None:
         self.cell, self.current, self.cost = cell, current, cost
         self.scale = np.maximum(cell.ravel(), SCALE_FLOOR_SIEMENS)
-        jacobian = ports.voltage_squared()
+        jacobian = voltage_squared(impedance, len(cell))
         jacobian *= (current**2 / self._current_std)[:, None]
         jacobian *= self.scale[None, :]
         self.gradient: Float = residual @ jacobian

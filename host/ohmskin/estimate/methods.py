@@ -14,7 +14,7 @@ _WHERE: Final = {
     "lsq": ("paper", "LsqEstimator"),
     "regularized": ("paper", "RegularizedEstimator"),
     "joint": ("joint", "JointEstimator"),
-    "touch": ("touch", "TouchEstimator"),
+    "touch": ("joint", "TouchEstimator"),
     "voltage": ("ohm", "VoltageEstimator"),
 }
 # Its levels are no conductances.

@@ -67,39 +67,36 @@ OHM_PER_MEGOHM: Final = 1e6
 # The top pin is high where the sensed electrode is the top one and on the source side, or neither.
 TOP_IS_HIGH: Final = (READING_OFFSET > 0) == READING_SENSES_TOP
 
-# 20 N^2 variables: 64 cells take 1.9 GB and 25 s a step.
-MAX_CELLS: Final = 64
-# Resistances are believed to lie within these bounds [megohm].
-MIN_MEGOHM: Final = 1e-6
+MAX_CELLS: Final = 64  # 20 N^2 variables: 64 cells take 1.9 GB and 25 s a step
+MIN_MEGOHM: Final = 1e-6  # of any resistance, and the highest: what is believed
 MAX_MEGOHM: Final = 20.0
 MAX_ITERATIONS: Final = 300
-# Of the optimality error.
-TOLERANCE: Final = 1e-6
-# Of Kirchhoff's and Ohm's laws, as a ratio to Vdd.
-CIRCUIT_TOLERANCE: Final = 1e-9
-# Step 2's cells lie within these bounds [megohm].
-_START_CELL_MEGOHM: Final = (2e-6, 15.0)
-# A port of less resistance [megohm] has no solution within the bounds, or none but on them.
+TOLERANCE: Final = 1e-6  # of the optimality error
+CIRCUIT_TOLERANCE: Final = 1e-9  # of Kirchhoff's and Ohm's laws, as a ratio to Vdd
+_START_CELL_MEGOHM: Final = (2e-6, 15.0)  # the least and the highest cell of step 2
+# Ports of less resistance, or of cells with more, have no solution within the bounds, or on them.
 _LEAST_PORT_MEGOHM: Final = 1e-5
-# Nor has a skin whose cells all have more than this [megohm].
 _MOST_CELL_MEGOHM: Final = 18.0
-# A reading is at fault if it is beyond such a port by this many standard deviations.
-_FAULT_STDS: Final = 5.0
+_FAULT_STDS: Final = 5.0  # a reading that is further from such ports is at fault
 # The states' mean must give back the readings to this (root mean square, of Vdd): if not, the
 # states are different circuits, and their mean is none of them.
 MISFIT_RATIO: Final = 1e-3
-# A solution with a resistance this near its bound is a poor start for the next frame [megohm].
-_POOR_START_MEGOHM: Final = 10.0
-# A frame starts afresh if any of its readings changed by more than this since the last [Vdd].
-_JUMP_RATIO: Final = 0.02
+_POOR_START_MEGOHM: Final = 10.0  # nearer to its bound, a solution is a poor start for the next
+_JUMP_RATIO: Final = (
+    0.02  # of a reading since the last frame, of Vdd: above it a frame starts afresh
+)
 
 
 class Start(Enum):
-    """Where a solution starts from, which decides how Ipopt's barrier starts."""
+    """Where a solution starts from, with Ipopt's options for it: they decide how barriers start."""
 
-    CIRCUIT = "a simulated circuit: a weak barrier, so that the answer stays near it"
-    STEP_3 = "another program's solution: the usual barrier"
-    PREVIOUS = "this program's solution of the frame before, with its multipliers"
+    # A simulated circuit: the barrier is weak, so that the answer stays near it.
+    CIRCUIT = (("bound_mult_init_val", 1e-6),)
+    # Another program's solution.
+    STEP_3 = ()
+    # This program's solution of the frame before, with its multipliers. Those of bounds that do not
+    # hold stay as weak as they were, or the states drift.
+    PREVIOUS = (("warm_start_init_point", "yes"), ("warm_start_mult_bound_push", 1e-6))
 
 
 _IPOPT: Final[dict[str, Any]] = {
@@ -112,12 +109,6 @@ _IPOPT: Final[dict[str, Any]] = {
     "mu_oracle": "probing",
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
-}
-_IPOPT_START: Final[dict[Start, dict[str, Any]]] = {
-    Start.CIRCUIT: {"bound_mult_init_val": 1e-6},
-    Start.STEP_3: {},
-    # The multipliers of bounds that do not hold stay as weak as they were, or the states drift.
-    Start.PREVIOUS: {"warm_start_init_point": "yes", "warm_start_mult_bound_push": 1e-6},
 }
 # What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
 # without callbacks: numbers that are none end as Invalid_Number_Detected.
@@ -367,7 +358,16 @@ class Program:
         states = [
             _State(rows, columns, number, y[number], references) for number in range(y.shape[0])
         ]
-        cost_f, cost_c = _discrepancies(states)
+        # States that should agree: of one cell, and of consecutive cells.
+        cost_f = sum(
+            casadi.sumsqr(getattr(first, values) - getattr(second, values))
+            for first, second in zip(states[::2], states[1::2], strict=True)
+            for values in ("resistances", "potentials")
+        )
+        cost_c = sum(
+            casadi.sumsqr(before.resistances - after.resistances)
+            for before, after in zip(states, states[READINGS_PER_CELL:], strict=False)
+        )
         cost_r = sum(casadi.sumsqr(state.wires) for state in states)
         problem = {
             "x": casadi.vertcat(*(state.variables for state in states)),
@@ -430,10 +430,10 @@ def program_for(rows: int, columns: int) -> Program:
 
 
 def _make_solver(problem: dict[str, Any], start: Start) -> Any:
-    options = {f"ipopt.{name}": value for name, value in (_IPOPT | _IPOPT_START[start]).items()}
-    quiet = {"print_time": False, "show_eval_warnings": False, "error_on_fail": False}
-    # Sensitivities to the parameters are not needed, and warn where Ipopt gave up.
-    quiet["calc_lam_p"] = False
+    options = {f"ipopt.{name}": value for name, value in (_IPOPT | dict(start.value)).items()}
+    # Sensitivities to the parameters (lam_p) are not needed, and warn where Ipopt gave up.
+    silent = ("print_time", "show_eval_warnings", "error_on_fail", "calc_lam_p")
+    quiet = dict.fromkeys(silent, False)
     return casadi.nlpsol(f"paper_{start.name.lower()}", "ipopt", problem, options | quiet)
 
 
@@ -477,15 +477,3 @@ class _State:
         into_bottom[:-1, :] += by_bottom[1:, :] * (bottom[1:, :] - bottom[:-1, :])
         nodes = casadi.horzcat(casadi.vec(into_top.T), casadi.vec(into_bottom.T))
         self.laws = references[0] * casadi.vertcat(casadi.vec(nodes.T), measured)
-
-
-def _discrepancies(states: list[_State]) -> tuple[Any, Any]:
-    """Cost_f and Cost_c: states that should agree, of one cell and of consecutive cells."""
-    cost_f: Any = 0.0
-    cost_c: Any = 0.0
-    for first, second in zip(states[::2], states[1::2], strict=True):
-        cost_f += casadi.sumsqr(first.resistances - second.resistances)
-        cost_f += casadi.sumsqr(first.potentials - second.potentials)
-    for before, after in zip(states, states[READINGS_PER_CELL:], strict=False):
-        cost_c += casadi.sumsqr(before.resistances - after.resistances)
-    return cost_f, cost_c

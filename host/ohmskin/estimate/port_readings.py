@@ -23,7 +23,7 @@ A frame is at fault, and its answer not to be relied on, where
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,13 +35,14 @@ from ohmskin.circuit.skin import (
     READINGS_PER_CELL,
     Skin,
     current_from_ratio,
-    current_std,
     port_resistance_ohm,
     ratio_from_current,
     reference_ohm,
 )
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
-from ohmskin.link.codes import ratio_std
+
+if TYPE_CHECKING:
+    from ohmskin.estimate.base import SkinKnowledge
 
 _DEGREES: Final = READINGS_PER_CELL - 1
 _MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
@@ -51,13 +52,12 @@ DISAGREE_ONE: Final = 0.03
 DISAGREE_OVER_NOISE: Final = 6.0
 AGREE: Final = 4.0  # deviations of a reading: three that disagree by less agree
 DROP_SHARE: Final = 0.85  # of the current at rest, below which drift is no explanation
-CLEAR_STDS: Final = 5.0
+CLEAR_STDS: Final = 5.0  # deviations that are more than noise
 # Joined electrodes give the same code, or differ by what the readings disagree within a cell; one
 # code is 3.5 deviations of rounding.
 SAME_STDS: Final = 2.5
-# Shorted lines draw so much more than at rest, or than other lines.
-RISE_SHARE: Final = 1.15
-PAIR_SHARE: Final = 1.15
+RISE_SHARE: Final = 1.15  # of the current at rest: shorted lines draw more, all of them
+PAIR_SHARE: Final = 1.15  # of the median line's current: lines that were shorted at rest draw more
 WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of it is pressed
 
 
@@ -72,33 +72,21 @@ class PortReadings:
 
 
 class PortReader:
-    """Reads frames of a skin whose references and, perhaps, rest readings and wires are known.
+    """Reads the frames of a skin, and compares them with its rest readings and its wires."""
 
-    wire_ohm: nominal ones of a segment, top and bottom, or None. rest_ratio: (R, C, 4) or None.
-    """
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        ref_ohm: tuple[float, float],
-        adc_bits: int | None,
-        rest_ratio: Float | None,
-        wire_ohm: tuple[float, float] | None,
-    ) -> None:
-        self._ref_ohm = ref_ohm
-        self._loop_ohm = sum(ref_ohm)
-        self._slope = READING_SIGN * reference_ohm(*ref_ohm)
-        self._ratio_std = ratio_std(adc_bits)
-        self._current_std = current_std(self._ratio_std, *ref_ohm)
+    def __init__(self, known: SkinKnowledge) -> None:
+        shape = (known.rows, known.columns)
+        self._ref_ohm = (known.ref_top_ohm, known.ref_bottom_ohm)
+        self._ratio_std, self._current_std = known.ratio_std, known.current_std
         self._highest_current: Float = np.full(shape, np.inf)
-        if wire_ohm is not None:
-            top, bottom = (np.full(shape, WIRE_SHARE * ohm) for ohm in wire_ohm)
+        if known.nominal_wire_ohm.both is not None:
+            top, bottom = (np.full(shape, WIRE_SHARE * ohm) for ohm in known.nominal_wire_ohm.both)
             pressed = Skin(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
-            self._highest_current = 1.0 / (port_resistance_ohm(pressed) + self._loop_ohm)
+            self._highest_current = 1.0 / (port_resistance_ohm(pressed) + known.ref_ohm)
         self._rest: PortReadings | None = None
         self._rest_fault = ""
-        if rest_ratio is not None:
-            self._rest = rest = self.read(rest_ratio)
+        if known.rest_ratio is not None:
+            self._rest = rest = self.read(known.rest_ratio)
             self._rest_apart = [_apart(rest, axis) for axis in (0, 1)]
             self._rest_fault = self._fault_at_rest(rest)
 
@@ -132,32 +120,32 @@ class PortReader:
             return ""
         fault = ""
         for index in np.flatnonzero(square > _DEGREES * limit**2):
-            row, column = divmod(int(index), square.shape[1])
-            without, off = self._without_one(ratio[row, column])
+            cell = np.unravel_index(index, square.shape)
+            off, without = self._without_one(ratio[cell])
             if off < max(AGREE * self._ratio_std, DISAGREE_OVER_NOISE * most):
-                current[row, column] = without
-                std[row, column] = 2.0 * std.min()
+                current[cell] = without
+                std[cell] = 2.0 * std.min()
             else:
-                by = 100 * float(square[row, column] / _DEGREES) ** 0.5
-                fault = f"cell ({row}, {column}): its readings disagree by {by:.0f} % of Vdd"
+                by = 100 * float(square[cell] / _DEGREES) ** 0.5
+                fault = f"{_cell(index, square)}: its readings disagree by {by:.0f} % of Vdd"
         return fault
 
     def _without_one(self, ratio: Float) -> tuple[float, float]:
-        """The current of the three of four readings that agree best, and how they disagree."""
+        """How the three of four readings disagree that agree best, and their current."""
         found = []
         for left_out in range(READINGS_PER_CELL):
             kept = np.arange(READINGS_PER_CELL) != left_out
-            slope = self._slope[kept]
-            current = float(slope @ (ratio - READING_OFFSET)[kept] / (slope @ slope))
-            off = (ratio - READING_OFFSET)[kept] - slope * current
+            slope = (READING_SIGN * reference_ohm(*self._ref_ohm))[kept]
+            level = (ratio - READING_OFFSET)[kept]
+            current = float(slope @ level / (slope @ slope))
+            off = level - slope * current
             found.append((float(off @ off / (kept.sum() - 1)) ** 0.5, current))
-        off, current = min(found)
-        return current, off
+        return min(found)
 
     def _short(self, found: PortReadings) -> str:
         """A port with less resistance than a skin can have."""
         excess = found.current - self._highest_current - CLEAR_STDS * found.current_std
-        worst = int(excess.argmax())
+        worst = excess.argmax()
         if excess.flat[worst] <= 0:
             return ""
         return f"{_cell(worst, excess)}: less resistance than wires have: row and column shorted?"
@@ -168,23 +156,19 @@ class PortReader:
         assert rest is not None
         std = np.hypot(found.current_std, rest.current_std)
         drop = DROP_SHARE * rest.current - found.current - CLEAR_STDS * std
-        worst = int(drop.argmax())
+        worst = drop.argmax()
         if np.mean(drop > 0) > 0.5:
             return "the whole skin conducts less than at rest: take the rest readings anew"
         if drop.flat[worst] > 0:
             return f"{_cell(worst, drop)}: conducts less than at rest, is a line open?"
         risen = found.current > RISE_SHARE * rest.current
-        for axis, line in enumerate(("rows", "columns")):
-            if found.current.shape[1 - axis] < 3:
-                continue
+        for axis, line in enumerate(("row", "column")):
             up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
-            if np.count_nonzero(up) < 2:
+            if found.current.shape[1 - axis] < 3 or np.count_nonzero(up) < 2:
                 continue
-            same = (_apart(found, axis) < SAME_STDS) & up & up[:, None]
-            same &= self._rest_apart[axis] > 2 * SAME_STDS
-            if same.any():
-                one, other = (int(index) for index in np.argwhere(same)[0])
-                return f"{line} {one} and {other} read alike as they did not at rest: shorted?"
+            differed = self._rest_apart[axis] > 2 * SAME_STDS
+            if pair := _alike(np.where(differed, _apart(found, axis), np.inf), up, line):
+                return f"{pair} read alike as they did not at rest: shorted?"
         return ""
 
     def _fault_at_rest(self, rest: PortReadings) -> str:
@@ -196,13 +180,11 @@ class PortReader:
                 return f"{line} {int(dark.argmax())} conducted nothing at rest: is it open?"
             current = rest.current if axis == 0 else rest.current.T
             lines, ports = current.shape
-            if ports < 3 or lines < 4:
-                continue
             up = np.all(current > PAIR_SHARE * np.median(current, axis=0), axis=1)
-            same = np.triu((self._rest_apart[axis] < SAME_STDS) & up & up[:, None], 1)
-            if same.any():
-                one, other = (int(index) for index in np.argwhere(same)[0])
-                return f"{line}s {one} and {other} conducted alike at rest, and more than others"
+            if lines < 4 or ports < 3:
+                continue
+            if pair := _alike(self._rest_apart[axis], up, line):
+                return f"{pair} conducted alike at rest, and more than others"
         return ""
 
 
@@ -219,6 +201,12 @@ def _apart(ports: PortReadings, axis: int) -> Float:
     return np.asarray(difference.max(axis=2))
 
 
-def _cell(index: int, of: Float) -> str:
+def _alike(apart: Float, up: NDArray[np.bool_], line: str) -> str:
+    """The first two of the lines `up` that read alike, in words; empty if there are none."""
+    pairs = np.argwhere(np.triu((apart < SAME_STDS) & up & up[:, None], 1))
+    return f"{line}s {pairs[0][0]} and {pairs[0][1]}" if len(pairs) else ""
+
+
+def _cell(index: np.intp, of: Float) -> str:
     row, column = np.unravel_index(index, of.shape)
-    return f"cell ({int(row)}, {int(column)})"
+    return f"cell ({row}, {column})"

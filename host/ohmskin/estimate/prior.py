@@ -1,7 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is expected of a skin's resistances before a frame is read: cells here, wires in `wires`.
+"""What is expected of a skin's resistances before a frame is read: its cells, and its wires.
 
-RC readings do not determine 3RC resistances; these numbers are what decides the rest.
+RC readings do not determine 3RC resistances; these numbers are what decides the rest. Touches
+correct what is believed of the wires:
+
+====== =========== ============================================================== ==========
+symbol shape       meaning                                                        unit
+====== =========== ============================================================== ==========
+w      (2RC,)      log resistances of the segments, top layer, then bottom layer  log ohm
+P0     (2RC, 2RC)  prior covariance: own part of each segment, common part of each layer
+U      (2RC, n)    what was learned: P = P0 - U U^T
+J      (m, 2RC)    slope of m readings by w, over their noise                      1
+N      (m, m)      covariance of these readings' noise, cells of unknown force in it
+====== =========== ============================================================== ==========
+
+A frame is one step of a Kalman filter: with z the residual at the mean and S = N + J P J^T,
+
+    mean += P J^T S^-1 z ,     P -= P J^T S^-1 J P .
+
+The common part of a layer is most of P0, so it is what the first touches settle; segments follow.
+A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
+cells as noise without limit. Between frames knowledge fades, U shrinks: a skin bends.
 """
 
 from __future__ import annotations
@@ -10,31 +29,42 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
 
-# Deviations are of the log. Untouched cells are around 1 MOhm, before they are read.
-UNTOUCHED_OHM: Final = 1e6
+# Deviations (..._STD) are of the log of a resistance.
+UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
 UNTOUCHED_STD: Final = 1.0
 UNKNOWN_REST_STD: Final = 0.3  # of a cell whose rest readings are not known, about all cells' level
 REST_QUANTILE: Final = 0.2  # of the ports, taken for untouched ones where rest is not known
-REST_STD: Final = 0.05  # drift since the rest readings
+REST_STD: Final = 0.05  # drift of a cell since the rest readings
 TAIL: Final = 1.0  # exponent of the density of touched cells
-
-UNKNOWN_WIRE_OHM: Final = 150.0
-UNKNOWN_LAYER_STD: Final = 1.5
-LAYER_STD: Final = 0.25  # what all segments of a layer share: stretch, temperature
-SEGMENT_STD: Final = 0.1  # what each has of its own
-
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 HARDEST_LOG_OHM: Final = float(np.log(300.0))
-WALL_STD: Final = 0.3  # log: how far beyond it a cell may be
+WALL_STD: Final = 0.3  # how far beyond the hardest touch a cell may be
 # A cell that the prior holds at rest may be touched all the same, where readings say little of it.
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
-UNLIMITED_STD: Final = 3.0  # what is not known of it
-HIDDEN: Final = 0.3  # log: a rise that must not go unnoticed
+UNLIMITED_STD: Final = 3.0  # what is not known of such a cell
+HIDDEN: Final = 0.3  # a rise that must not go unnoticed
 DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
+
+UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
+UNKNOWN_LAYER_STD: Final = 1.5  # what all segments of such a layer share
+LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
+SEGMENT_STD: Final = 0.1  # what each segment has of its own
+FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
+# Lessons, the last few together, that ask for a change of a layer by ALARM standard deviations say
+# that the skin has been bent. Each lesson counts by the share MEMORY of the next one.
+MEMORY: Final = 0.8
+ALARM: Final = 1.6  # three times what they scatter by: lessons state their noise on the safe side
+MAX_DIRECTIONS: Final = 32  # columns of U; the least informative are forgotten
+_LEAST_DIRECTION: Final = 1e-3  # of SEGMENT_STD^2: not worth a column
+LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
+
+Lesson = tuple[Float, Float, Float]  # what wires learn from: J, z and N
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +109,112 @@ class CellPrior:
             variance = 1.0 / (precision + wall)
             expected = (precision * expected + wall * HARDEST_LOG_OHM) * variance
         return expected, variance
+
+
+class WireBelief:
+    """Mean and covariance of the log wire resistances of a skin of rows x columns."""
+
+    def __init__(
+        self, rows: int, columns: int, nominal_top: float | None, nominal_bottom: float | None
+    ) -> None:
+        self.shape = (rows, columns)
+        self._cells = rows * columns
+        told = nominal_top is not None and nominal_bottom is not None
+        self._layer_std = LAYER_STD if told else UNKNOWN_LAYER_STD
+        nominal = [
+            np.log(max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3))
+            for ohm in (nominal_top, nominal_bottom)
+        ]
+        self._nominal = np.repeat(nominal, self._cells)
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the nominal wires."""
+        self.mean = self._nominal
+        self.forget()
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether nothing has been learned."""
+        return self._learned.shape[1] == 0
+
+    def forget(self) -> None:
+        """Back to the prior's covariance; the mean stays as the best guess there is."""
+        self._learned = np.zeros((2 * self._cells, 0))
+        self._slope, self._curvature = np.zeros(2), np.full(2, 1e-9)
+
+    def times(self, slopes: Float) -> Float:
+        """P J^T, shape (2RC, m), or P a for a vector (2RC,)."""
+        rows = slopes.reshape(*slopes.shape[:-1], 2, self._cells)
+        product = SEGMENT_STD**2 * rows
+        product += self._layer_std**2 * rows.sum(axis=-1, keepdims=True)
+        product = product.reshape(slopes.shape)
+        if self._learned.shape[1]:
+            product -= (slopes @ self._learned) @ self._learned.T
+        return np.asarray(product.T)
+
+    def seen(self, slopes: Float, onto: Float | None = None) -> Float:
+        """J P J^T, what the wires' uncertainty does to m readings: lower triangle (m, m).
+
+        Added onto a matrix that is overwritten, if there is one.
+        """
+        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
+        seen = gram(slopes, SEGMENT_STD**2, onto)
+        seen = gram(layers, self._layer_std**2, seen)
+        return gram(slopes @ self._learned, -1.0, seen) if self._learned.shape[1] else seen
+
+    def variance(self, slopes: Float) -> Float:
+        """Diagonal of J P J^T, (m,)."""
+        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
+        learned = slopes @ self._learned
+        variance = SEGMENT_STD**2 * np.einsum("ij,ij->i", slopes, slopes)
+        variance += self._layer_std**2 * np.einsum("ij,ij->i", layers, layers)
+        return np.asarray(variance - np.einsum("ij,ij->i", learned, learned))
+
+    def std(self) -> Float:
+        """Standard deviation of each log resistance, (2RC,)."""
+        variance = SEGMENT_STD**2 + self._layer_std**2 - np.sum(self._learned**2, axis=1)
+        return np.asarray(np.sqrt(np.maximum(variance, 1e-12)))
+
+    def layers(self, log_wires: Float) -> tuple[Float, Float]:
+        """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
+        top, bottom = np.exp(log_wires).reshape(2, *self.shape)
+        return top, bottom
+
+    def path_ohm(self, log_wires: Float) -> Float:
+        """Wire between each cell and its electrodes [ohm], (RC,)."""
+        top, bottom = self.layers(log_wires)
+        return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
+
+    def learn(self, slopes: Float, residual: Float, noise: Float) -> bool:
+        """One Kalman step; True if lessons say that the skin was bent: what was learned is dropped.
+
+        slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m).
+        """
+        if len(residual) < 2:
+            return False
+        self._learned *= np.sqrt(1 - FADE)
+        spread = self.times(slopes)
+        factor = cholesky(noise + slopes @ spread)
+        # Slope and curvature of the likelihood along a change of a whole layer.
+        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
+        pulls = solve(factor, np.column_stack([residual, layers]))
+        self._slope = MEMORY * self._slope + layers.T @ pulls[:, 0]
+        self._curvature = MEMORY * self._curvature + np.sum(layers * pulls[:, 1:], axis=0)
+        bent = False
+        if np.any(self._slope**2 > ALARM**2 * self._curvature):
+            self.forget()
+            bent = True
+            spread = self.times(slopes)
+            factor = cholesky(noise + slopes @ spread)
+            pulls = solve(factor, residual[:, None])
+        self.mean = np.clip(self.mean + spread @ pulls[:, 0], *LOG_LIMITS)
+        gain = solve_lower(factor, spread.T)
+        learned = np.concatenate([self._learned, gain.T], axis=1)
+        size, turn = scipy.linalg.eigh(learned.T @ learned, check_finite=False)
+        kept = np.flatnonzero(size > _LEAST_DIRECTION * SEGMENT_STD**2)[-MAX_DIRECTIONS:]
+        self._learned = learned @ turn[:, kept]
+        return bent
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

@@ -130,8 +130,8 @@ class SkinReader:
 
     @property
     def method(self) -> str:
-        """The method in use."""
-        return self._wanted
+        """The method of the scan that was read last, and of the next one before the first."""
+        return self._made[0]
 
     @property
     def has_forces(self) -> bool:

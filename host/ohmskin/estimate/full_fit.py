@@ -34,35 +34,39 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
 from ohmskin.circuit.skin import port_sensitivity
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
-from ohmskin.estimate.prior import DOUBT, HIDDEN, TOUCHED, UNLIMITED_STD, CellPrior, siemens_std
-from ohmskin.estimate.wires import LOG_LIMITS, Lesson, WireBelief
+from ohmskin.estimate.prior import (
+    DOUBT,
+    HIDDEN,
+    LOG_LIMITS,
+    TOUCHED,
+    UNLIMITED_STD,
+    CellPrior,
+    Lesson,
+    WireBelief,
+)
 
 MAX_ITERATIONS: Final = 40
+MAX_HALVINGS: Final = 8  # of a step that goes too far
 MAX_STEP: Final = 1.5  # of a log resistance
-# A step that moves no reading and no cell by more than this share of its deviation is the last; so
-# is one up to `NEARLY` if the next can be foreseen to be.
+# A step that moves no reading and no cell by more than this share of its deviation is the last. So
+# is one of up to NEARLY deviations if it can be foreseen that the next will be such a step.
 CLOSE: Final = 0.3
 NEARLY: Final = 3.0
-# Wires are in the model for the readings that they can move by this share of the noise.
-HEAVY: Final = 0.01
-# Chi-square of the wires, per touched cell, above which they are not what they were believed.
-BENT: Final = 9.0
-CROWDED: Final = 0.3  # share of touched cells, beyond which no other is known to be at rest,
-LIGHT_TOUCH: Final = 10.0  # but may have risen by so much, over its conductance there
-# Wires learn from readings that their uncertainty may move by half the noise, and from the best.
-LESSON: Final = 0.25
-MAX_LESSON: Final = 32
-MAX_HALVINGS: Final = 8
+HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
+BENT: Final = 9.0  # chi-square of the wires for each touched cell: above it they have changed
+CROWDED: Final = 0.3  # share of touched cells: above it no other cell is known to be at rest
+LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
+LESSON: Final = 0.25  # share of the noise's variance: wires learn from what they move by more
+MAX_LESSON: Final = 32  # readings that wires learn from, the best
 _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Slopes:
     """h and J at one state, over the noise. by_cell: (RC, RC), times the cells' deviations.
 
-    centre, cell_std: the normal that stands for the prior of the cells there.
-
-    heavy: (m,), the ports that wires matter to; by_wires: (m, 2RC).
+    centre, cell_std: the normal that stands for the prior of the cells there. heavy: (m,), the
+    ports that wires matter to; by_wires: (m, 2RC).
     """
 
     modelled: Float
@@ -73,18 +77,23 @@ class _Slopes:
     heavy: NDArray[np.intp]
     by_wires: Float
 
-    def seen(self, belief: WireBelief) -> Float:
-        """J P J^T + 1, lower triangle (RC, RC)."""
+    def factor(self, belief: WireBelief) -> Float:
+        """Cholesky factor of J P J^T + 1, (RC, RC)."""
         seen = gram(self.by_cell)
         if self.heavy.size == len(seen):
             seen = belief.seen(self.by_wires, seen)
         elif self.heavy.size:
             seen[np.ix_(self.heavy, self.heavy)] += belief.seen(self.by_wires)
         np.einsum("ii->i", seen)[:] += 1.0
-        return seen
+        return cholesky(seen)
+
+    def learned(self, factor: Float) -> Float:
+        """Share of each cell's prior variance that the readings take away, (RC,)."""
+        own = solve_lower(factor, self.by_cell)
+        return np.asarray(np.einsum("ij,ij->j", own, own))
 
 
-class JointFit:
+class FullFit:
     """One frame's fit. cell (RC,), wires (2RC,): log resistances.
 
     cell_std: standard deviation of the cells' log resistances. elsewhere: another start that may
@@ -93,60 +102,25 @@ class JointFit:
 
     def __init__(
         self,
-        shape: tuple[int, int],
-        ref_ohm: float,
         prior: CellPrior,
         belief: WireBelief,
+        ref_ohm: float,
         current: Float,
         current_std: Float,
+        starts: list[Float],
     ) -> None:
-        self._shape = shape
-        self._ref_ohm = ref_ohm
-        self._prior = prior
-        self._belief = belief
-        self._current = current
-        self._weight = 1.0 / current_std
+        """Minimise from the best of some starts; `message` says if that did not converge."""
+        self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
+        self._current, self._weight = current, 1.0 / current_std
         self.iterations = 0
         self.message = ""
-
-    def run(self, starts: list[Float]) -> None:
-        """Minimise from the best of some starts; `message` says if that did not converge."""
         self._minimise(starts)
         self._conclude()
 
-    def _minimise(self, starts: list[Float]) -> None:
-        self.wires = self._belief.mean
-        # a of wires - mean = P a, which saves an inverse of P in the cost
-        self._wire_pull = np.zeros_like(self.wires)
-        self._moved = 0.0
-        tried = []
-        for self.cell in starts:
-            self._here = self._slopes()
-            tried.append((self._cost(), self.cell, self._here))
-        self.cost, self.cell, self._here = min(tried, key=lambda each: each[0])
-        for _ in range(MAX_ITERATIONS):
-            self.iterations += 1
-            before = self.cell, self.wires, self._wire_pull
-            if self._step():
-                return
-            self._here = self._slopes()
-            cost_before, self.cost = self.cost, self._cost()
-            for _ in range(MAX_HALVINGS):
-                if self.cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
-                    break
-                # Too far: back half the way. What is lost is one factorisation.
-                self.cell = 0.5 * (self.cell + before[0])
-                self.wires = 0.5 * (self.wires + before[1])
-                self._wire_pull = 0.5 * (self._wire_pull + before[2])
-                self.iterations += 1
-                self._here = self._slopes()
-                self.cost = self._cost()
-        self.message = f"not converged in {MAX_ITERATIONS} iterations"
-
-    def _slopes(self) -> _Slopes:
-        """At the present state."""
-        top, bottom = np.exp(self.wires).reshape(2, *self._shape)
-        circuit = port_sensitivity(np.exp(-self.cell).reshape(self._shape), top, bottom)
+    def _evaluate(self) -> None:
+        """Slopes and cost at the present state."""
+        cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
+        circuit = port_sensitivity(cell_siemens, *self._belief.layers(self.wires))
         modelled = 1.0 / (circuit.port_ohm + self._ref_ohm)
         slope = -self._weight * modelled**2
         centre, variance = self._prior.normal(self.cell)
@@ -155,16 +129,40 @@ class JointFit:
         by_cell *= slope[:, None]
         by_cell *= cell_std
         # All wires in series with a port bound what they can do to it.
-        path = np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)
-        heavy = np.flatnonzero(path.ravel() * slope < -HEAVY)
+        heavy = np.flatnonzero(self._belief.path_ohm(self.wires) * slope < -HEAVY)
         by_wires = circuit.by_wires(heavy)
         by_wires *= slope[heavy, None]
         residual = (self._current - modelled) * self._weight
-        return _Slopes(modelled, residual, centre, cell_std, by_cell, heavy, by_wires)
+        self._here = _Slopes(modelled, residual, centre, cell_std, by_cell, heavy, by_wires)
+        self.cost = float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
 
-    def _cost(self) -> float:
-        residual = self._here.residual
-        return float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
+    def _minimise(self, starts: list[Float]) -> None:
+        self.wires = self._belief.mean
+        # a of wires - mean = P a, which saves an inverse of P in the cost
+        self._wire_pull = np.zeros_like(self.wires)
+        self._moved = 0.0
+        tried = []
+        for start in starts:
+            self.cell: Float = start
+            self._evaluate()
+            tried.append((self.cost, start, self._here))
+        self.cost, self.cell, self._here = min(tried, key=lambda each: each[0])
+        for _ in range(MAX_ITERATIONS):
+            self.iterations += 1
+            before, cost_before = (self.cell, self.wires, self._wire_pull), self.cost
+            if self._step():
+                return
+            self._evaluate()
+            for _ in range(MAX_HALVINGS):
+                if self.cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
+                    break
+                # Too far: back half the way. What is lost is one factorisation.
+                self.cell = 0.5 * (self.cell + before[0])
+                self.wires = 0.5 * (self.wires + before[1])
+                self._wire_pull = 0.5 * (self._wire_pull + before[2])
+                self.iterations += 1
+                self._evaluate()
+        self.message = f"not converged in {MAX_ITERATIONS} iterations"
 
     @property
     def modelled(self) -> Float:
@@ -187,6 +185,11 @@ class JointFit:
         touches = int(np.sum(self._prior.rise(self.cell) > TOUCHED))
         return self.wire_chi2 > BENT * (1 + touches)
 
+    @property
+    def is_crowded(self) -> bool:
+        """Whether so many cells are touched that rest is no more likely than a touch."""
+        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > CROWDED)
+
     def _step(self) -> bool:
         """One step; True when the next would not matter."""
         here, heavy = self._here, self._here.heavy
@@ -194,7 +197,7 @@ class JointFit:
         off = self.wires - self._belief.mean
         wanted = here.residual + here.by_cell @ (away / here.cell_std)
         wanted[heavy] += here.by_wires @ off
-        self._factored, self._factor = here, cholesky(here.seen(self._belief))
+        self._factored, self._factor = here, here.factor(self._belief)
         left = solve(self._factor, wanted)
         cell_step = here.cell_std * (left @ here.by_cell) - away
         pull = left[heavy] @ here.by_wires
@@ -225,40 +228,36 @@ class JointFit:
         Where that may be a touch all the same, small for the readings but not for the cell, it is
         counted as uncertain by so much, and so is what depends on it.
         """
-        at = self._factored
-        learned = _learned(self._factor, at.by_cell)
-        distance = self._prior.expected - self.cell
-        at_rest = distance**2 < self._prior.tail * self._prior.std**2
+        at, prior = self._factored, self._prior
+        learned = at.learned(self._factor)
+        distance = prior.expected - self.cell
+        at_rest = distance**2 < prior.tail * prior.std**2
         # What the readings alone say of a cell: rise of its conductance over rest, and deviation.
         share = np.maximum(learned, 1e-9)
         rise = distance / share
-        rise_std = self._prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
-        self._hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
-        self.elsewhere: Float | None = None
-        if self._hidden.any() or self.is_crowded:
-            evidence = np.where(self._hidden, rise / rise_std, 0.0)
-            likeliest = int(np.argmax(evidence))
-            if evidence[likeliest] > DOUBT:
-                self.elsewhere = self.cell.copy()
-                self.elsewhere[likeliest] = self._prior.expected[likeliest] - np.log1p(
-                    rise[likeliest]
-                )
-            if self.is_crowded:
-                self._hidden, rise = at_rest, np.maximum(rise, LIGHT_TOUCH)
-            wider = np.where(self._hidden, rise + rise_std, at.cell_std)
+        rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
+        hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
+        self.elsewhere = self._with_the_likeliest(hidden, rise, rise_std)
+        if self.is_crowded:
+            hidden, rise = at_rest, np.maximum(rise, LIGHT_TOUCH)
+        self._hidden = hidden
+        if hidden.any() or self.is_crowded:
+            wider = np.where(hidden, rise + rise_std, at.cell_std)
             at = replace(at, cell_std=wider, by_cell=at.by_cell * (wider / at.cell_std))
-            learned = _learned(cholesky(at.seen(self._belief)), at.by_cell)
+            learned = at.learned(at.factor(self._belief))
         self.cell_std: Float = at.cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
-    def siemens_std(self) -> tuple[Float, Float]:
-        """Standard deviations of each cell's conductance, up and down, (RC,) [S]."""
-        path_ohm, wire_std = self._belief.paths(self.wires, self._shape)
-        return siemens_std(-self.cell, self.cell_std, path_ohm, wire_std, self._ref_ohm)
-
-    @property
-    def is_crowded(self) -> bool:
-        """Whether so many cells are touched that rest is no more likely than a touch."""
-        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > CROWDED)
+    def _with_the_likeliest(
+        self, hidden: NDArray[np.bool_], rise: Float, rise_std: Float
+    ) -> Float | None:
+        """The cells, the likeliest of the hidden touches among them, if any is worth a try."""
+        evidence = np.where(hidden, rise / rise_std, 0.0)
+        likeliest = int(np.argmax(evidence))
+        if evidence[likeliest] <= DOUBT:
+            return None
+        elsewhere: Float = self.cell.copy()
+        elsewhere[likeliest] = self._prior.expected[likeliest] - np.log1p(rise[likeliest])
+        return elsewhere
 
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings that wires matter to, for the belief."""
@@ -275,9 +274,3 @@ class JointFit:
         noise = by_cell @ by_cell.T
         noise.ravel()[:: ports.size + 1] += 1.0
         return slopes, residual, noise
-
-
-def _learned(factor: Float, by_cell: Float) -> Float:
-    """Share of each cell's prior variance that the readings take away, (RC,)."""
-    own = solve_lower(factor, by_cell)
-    return np.asarray(np.einsum("ij,ij->j", own, own))

@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells a frame shows to be touched, and how hard: what `touch` answers, and where `joint`
+starts.
+
+Symbols
+
+====== ======== ================================================================== ==========
+symbol shape    meaning                                                            unit
+====== ======== ================================================================== ==========
+rho0   (RC,)    port resistance of the untouched skin                              ohm
+H      (RC, RC) voltage over cell e per current through port p                     ohm
+M      (RC, RC) voltage over cell e per current forced through cell f from outside ohm
+d      (k,)     what the touches add to the conductance of k cells                 S
+q      (k, RC)  current that the added conductance draws, per port current         1
+v      (RC, RC) voltage over cell e per current through port p, cells touched      ohm
+x      (k,)     log conductances of the k cells in the model, others are at rest   log S
+I      (RC,)    port currents per Vdd                                              S
+s      (RC,)    their noise: of the readings, of cells at rest and wires           S
+r      (RC,)    residual (I_read - I) / s                                          1
+J      (k, RC)  dI / dx / s                                                        1
+Jw     (m, 2RC) dI / dw / s, w the log wire resistances, at the m ports they matter
+N      (m, m)   1 + Jw P Jw^T, P the covariance of w                               1
+====== ======== ================================================================== ==========
+
+The untouched skin is solved once. Added conductances are a change of rank k (Woodbury):
+
+    q = (diag(1/d) + M_kk)^-1 H_k ,   rho = rho0 - sum_k H_k q ,   v = H - M_k^T q ,
+
+over the touched cells v_k = q / d. All derivatives follow: d rho / d g_e = -v_e^2 (Tellegen).
+
+A frame starts from no touched cells. Gauss-Newton steps on x minimise |r|^2 and the prior of the
+cells. Where a reading then shows more current than the model explains, the cells that would explain
+most in their row and column are added, until no reading asks for one; a cell that falls back to
+rest is taken out. The last steps know that wires are known to P only, and weigh the readings by
+N^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.cholesky import cholesky, solve, solve_lower
+from ohmskin.circuit.skin import admittance_of, by_wires, factorised, impedance_of, port_potential
+from ohmskin.estimate.base import MAX_CELL_SIEMENS
+from ohmskin.estimate.prior import (
+    DOUBT,
+    HIDDEN,
+    HIGHEST_TOUCH_SIEMENS,
+    UNLIMITED_STD,
+    CellPrior,
+    Lesson,
+    WireBelief,
+)
+
+Cells = NDArray[np.intp]
+
+MOST_PER_LINE: Final = 2  # touches a row and column; with more, the skin is not at rest any more
+DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
+SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
+LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
+MAX_ROUNDS: Final = 8  # of adding cells
+MAX_STEPS: Final = 8  # in a round
+MAX_STEP: Final = 1.5  # of a log conductance
+CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
+# Wires matter to a reading that they may move by the share HEAVY of its noise. The next ones, down
+# to the share LIGHT and up to MAX_HEAVY in all, tell a bend together that none tells alone.
+HEAVY: Final = 0.5
+LIGHT: Final = 0.03
+MAX_HEAVY: Final = 24
+HIDING: Final = (
+    0.1  # deviation of the wires to a cell at rest, over the cell: above it they hide it
+)
+REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
+CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
+_HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
+
+
+class RestNetwork:
+    """rho0, H and M of cells (R, C) [S] that all conduct, and wires (R, C) [ohm]."""
+
+    def __init__(self, cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> None:
+        self.shape = cell_siemens.shape
+        rows = self.shape[0]
+        self.cell_siemens = cell_siemens.ravel()
+        self.top_wire_ohm, self.bottom_wire_ohm = top_wire_ohm, bottom_wire_ohm
+        root = np.sqrt(cell_siemens)
+        factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
+        impedance, port_ohm = impedance_of(admittance_of(half), rows)
+        self.port_ohm = port_ohm.ravel()
+        # With L of the factor, L' = L^-1 sqrt(g): cell currents x are L'^T half V of the electrode
+        # potentials V, and L'^T (1 - half Z half^T) L' of voltages inserted in series with cells.
+        inverse = solve_lower(factor, np.diag(root.ravel()))
+        cell_ohm = 1.0 / self.cell_siemens
+        by_port = half @ port_potential(impedance, rows)
+        self.port_volt = (inverse.T @ by_port) * cell_ohm[:, None]
+        between = half @ impedance @ half.T
+        between *= -1.0
+        between.ravel()[:: len(cell_ohm) + 1] += 1.0
+        in_series = inverse.T @ between @ inverse
+        self.cell_volt = -cell_ohm[:, None] * in_series * cell_ohm
+        self.cell_volt.ravel()[:: len(cell_ohm) + 1] += cell_ohm
+        self.own_port_volt = np.diagonal(self.port_volt).copy()
+        self.own_cell_volt = np.diagonal(self.cell_volt).copy()
+
+    def by_wires(self, cell_current: Float) -> Float:
+        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents (m, RC)."""
+        current = cell_current.reshape(-1, *self.shape)
+        return by_wires(current, self.top_wire_ohm, self.bottom_wire_ohm)
+
+
+class TouchedNetwork:
+    """A `RestNetwork` with conductances `added` (k,) > 0 [S] at `cells` (k,).
+
+    port_ohm: rho (RC,). volt: v of the touched cells (k, RC).
+    """
+
+    def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
+        self._rest = rest
+        self._cells = cells
+        self._added = added
+        self._coupling = rest.cell_volt[cells]
+        port_volt = rest.port_volt[cells]
+        system = rest.cell_volt[cells[:, None], cells]
+        system.ravel()[:: len(cells) + 1] += 1.0 / added
+        self._system = system
+        _, self._current, _ = lapack.dposv(system, port_volt, lower=1)
+        self.volt = self._current / added[:, None]
+        self.port_ohm = rest.port_ohm - np.einsum("ij,ij->j", port_volt, self._current)
+
+    def own_volt(self) -> tuple[Float, Float]:
+        """Diagonals of v and of the touched M, (RC,): each cell at its own port, and alone."""
+        _, drawn, _ = lapack.dposv(self._system, self._coupling, lower=1)
+        port = self._rest.own_port_volt - np.einsum("ij,ij->j", self._coupling, self._current)
+        cell = self._rest.own_cell_volt - np.einsum("ij,ij->j", self._coupling, drawn)
+        return port, cell
+
+    def cell_current(self, ports: Cells) -> Float:
+        """Current through all cells per current through some ports, (m, RC)."""
+        rest = self._rest
+        volt: Float = rest.port_volt[:, ports] - self._coupling.T @ self._current[:, ports]
+        siemens = rest.cell_siemens.copy()
+        siemens[self._cells] += self._added
+        volt *= siemens[:, None]
+        return volt.T
+
+
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """What was found: cells (k,), their log conductance and its standard deviation (k,).
+
+    current: what the model predicts, wires corrected (RC,) [S]. doubtful: a touch may hide at
+    another cell. contradicted: no touches explain the readings. lesson: what the wires can learn
+    from: Jw, r and N of the m ports, the touched cells in N as noise without limit.
+    """
+
+    cells: Cells
+    log_siemens: Float
+    log_std: Float
+    current: Float
+    doubtful: bool
+    contradicted: bool
+    steps: int
+    lesson: Lesson
+
+
+class SparseFit:
+    """Fits the frames of a skin (R, C), each by itself."""
+
+    def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
+        self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
+        self.least_log = -prior.expected + LEAST_RISE * prior.std
+        self._solve_rest()
+
+    def _solve_rest(self) -> None:
+        """The untouched skin, with wires as they are believed now."""
+        prior, belief = self.prior, self.belief
+        self.log_wires = belief.mean
+        rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
+        self.net = net = RestNetwork(rest_siemens, *belief.layers(belief.mean))
+        self.current = 1.0 / (net.port_ohm + self.ref_ohm)
+        by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
+        wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
+        # Cells drift and skins bend after their rest readings [S^2].
+        self.slack = prior.std**2 @ (by_cell * by_cell)
+        self.slack += belief.variance(wires * (self.current**2)[:, None])
+        self.path_ohm = belief.path_ohm(belief.mean)
+        self.wire_std = float(belief.std().max())
+        # Wires this uncertain are no small noise beside a cell at rest.
+        self.hides = bool(np.any(self.path_ohm * self.wire_std * net.cell_siemens > HIDING))
+
+    def find(self, current: Float, current_std: Float) -> Touched | None:
+        """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
+        path_change = np.abs(self.belief.path_ohm(self.belief.mean) / self.path_ohm - 1.0)
+        if path_change.max() > REBUILD:
+            self._solve_rest()
+        frame = _Frame(self, current, current_std)
+        # Never from the frame before: that keeps cells in the model that no reading asks for.
+        frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
+        for _ in range(MAX_ROUNDS):
+            asked, rise = frame.asked_for()
+            if not asked.size:
+                return frame.finish()
+            cells = np.concatenate([frame.cells, asked])
+            if cells.size > MOST_PER_LINE * sum(self.net.shape):
+                return None
+            added = np.log(self.net.cell_siemens[asked] + rise)
+            frame.settle(cells, np.concatenate([frame.log_siemens, added]))
+        return None
+
+
+class _Frame:
+    """One frame: the cells in the model, and all that follows from them."""
+
+    def __init__(self, skin: SparseFit, current: Float, current_std: Float) -> None:
+        self._skin = skin
+        self._measured = current
+        self._reading_std = current_std
+        self._loose_std = np.sqrt(current_std**2 + skin.slack)
+        self._target_ohm = 1.0 / np.maximum(current, 1e-12) - skin.ref_ohm
+        self.steps = 0
+
+    def _place(self, cells: Cells, log_siemens: Float) -> None:
+        """Take these cells for the touched ones: network, currents, residual."""
+        skin = self._skin
+        self.cells, self.log_siemens = cells, log_siemens
+        self._siemens = np.exp(log_siemens)
+        self._std = self._loose_std
+        self._touched: TouchedNetwork | None = None
+        self._current = skin.current
+        if cells.size:
+            added = self._siemens - skin.net.cell_siemens[cells]
+            self._touched = TouchedNetwork(skin.net, cells, added)
+            self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
+            self._std = self._loose_std.copy()
+            self._std[cells] = self._reading_std[cells]
+        self._residual = (self._measured - self._current) / self._std
+
+    def settle(self, cells: Cells, log_siemens: Float) -> None:
+        """Steps from here until none matters; cells that fall back to rest leave."""
+        self._place(cells, np.maximum(log_siemens, self._skin.least_log[cells]))
+        for _ in range(MAX_STEPS):
+            if not self.cells.size:
+                return
+            slopes = self._slopes()
+            moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
+            moved = np.minimum(moved, _HIGHEST_LOG)
+            stays = moved > self._skin.least_log[self.cells]
+            self._place(self.cells[stays], moved[stays])
+            if is_last and stays.all():
+                return
+
+    def _slopes(self) -> Float:
+        """J, (k, RC)."""
+        assert self._touched is not None
+        volt = self._touched.volt
+        weight = self._current**2 / self._std
+        return np.asarray(volt * volt * self._siemens[:, None] * weight)
+
+    def _stepped(self, normal: Float, pull: Float) -> tuple[Float, bool]:
+        """x after the step of J J^T and J r (k,), and whether that is the last that matters.
+
+        The prior about rest is added onto the normal matrix J J^T.
+        """
+        centre, variance = self._skin.prior.normal(-self.log_siemens, self.cells)
+        away, precision = self.log_siemens + centre, 1.0 / variance
+        normal.ravel()[:: self.cells.size + 1] += precision
+        _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
+        self.steps += 1
+        is_last = (step * step * np.diagonal(normal)).max() < CLOSE**2
+        return self.log_siemens + np.clip(step, -MAX_STEP, MAX_STEP), bool(is_last)
+
+    def asked_for(self) -> tuple[Cells, Float]:
+        """Cells that readings ask for, and the conductance that each, alone, would need [S].
+
+        A current above the model's by `DEMAND` asks for its cell. Of these only such count that
+        need at least `SHARE` of the largest rise in their row and column: a ghost needs less, as
+        its current passes three touches in series.
+        """
+        skin, net = self._skin, self._skin.net
+        asks = self._residual > DEMAND
+        asks[self.cells] = False
+        if not asks.any():
+            return np.flatnonzero(asks), np.zeros(0)
+        port_volt, cell_volt, port_ohm = net.own_port_volt, net.own_cell_volt, net.port_ohm
+        if self._touched is not None:
+            port_volt, cell_volt = self._touched.own_volt()
+            port_ohm = self._touched.port_ohm
+        # From rho = target for one cell more.
+        target = np.maximum(self._target_ohm, 0.5 * skin.path_ohm)
+        need = port_volt**2 / np.maximum(port_ohm - target, 1e-9) - cell_volt
+        rise = np.where(asks, 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS), 0.0)
+        map_ = rise.reshape(net.shape)
+        rival = np.maximum(map_.max(axis=1, keepdims=True), map_.max(axis=0, keepdims=True))
+        asked = np.flatnonzero((map_ > 0) & (map_ >= SHARE * rival))
+        return asked, rise[asked]
+
+    def finish(self) -> Touched:
+        """The last steps, with wires known to their covariance only, and what they leave."""
+        skin, cells = self._skin, self.cells
+        if not cells.size:
+            none = np.zeros(0)
+            lesson = np.zeros((0, 2 * skin.current.size)), none, np.zeros((0, 0))
+            less = bool(self._residual.min() < -DEMAND)
+            return Touched(cells, none, none, self._current, False, less, 0, lesson)
+        heavy = self._moved_by_wires()
+        ports, light = np.flatnonzero(heavy), ~heavy
+        wires = self._sharpened(ports)
+        covariance = skin.belief.seen(wires)
+        np.einsum("ii->i", covariance)[:] += 1.0
+        factor = cholesky(covariance)
+        offset = wires @ (skin.belief.mean - skin.log_wires)
+        for _ in range(2):
+            slopes = self._slopes()
+            residual = self._residual[ports] - offset
+            whitened = solve_lower(factor, np.vstack([slopes[:, ports], residual]).T)
+            own, rest = whitened[:, :-1], whitened[:, -1]
+            free = slopes[:, light]
+            normal = free @ free.T + own.T @ own
+            pull = free @ self._residual[light] + rest @ own
+            moved, is_last = self._stepped(normal, pull)
+            self._place(cells, np.clip(moved, skin.least_log[cells], _HIGHEST_LOG))
+            if is_last:
+                break
+        residual = self._residual[ports] - offset
+        left = solve(factor, residual)
+        spare = ports.size - cells.size  # degrees of freedom
+        current = self._current.copy()
+        current[ports] += (residual - left + offset) * self._std[ports]
+        of_touches = slopes[:, ports]
+        noise = UNLIMITED_STD**2 * (of_touches.T @ of_touches)
+        noise.ravel()[:: ports.size + 1] += 1.0
+        unit = np.sqrt(np.diagonal(covariance))
+        return Touched(
+            cells=cells,
+            log_siemens=self.log_siemens,
+            log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
+            current=current,
+            doubtful=skin.hides or self._doubtful(ports, residual, unit),
+            contradicted=bool(
+                residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1)
+                or self._residual[light].min(initial=0.0) < -DEMAND
+            ),
+            steps=self.steps,
+            lesson=(wires, residual, noise),
+        )
+
+    def _moved_by_wires(self) -> NDArray[np.bool_]:
+        """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
+        skin = self._skin
+        move = (self._current**2 - skin.current**2) * skin.path_ohm * skin.wire_std
+        weight = move / self._std
+        least = np.partition(weight, -MAX_HEAVY)[-MAX_HEAVY] if weight.size > MAX_HEAVY else 0.0
+        heavy: NDArray[np.bool_] = weight > np.clip(least, LIGHT, HEAVY)
+        heavy[self.cells] = True
+        return heavy
+
+    def _sharpened(self, ports: Cells) -> Float:
+        """Jw (m, 2RC); takes the drift of cells at rest from the touched network at these ports."""
+        assert self._touched is not None
+        skin, net = self._skin, self._skin.net
+        currents = self._touched.cell_current(ports)
+        square = self._current[ports] ** 2
+        by_cell = currents * currents / net.cell_siemens
+        by_cell[:, self.cells] = 0.0
+        by_cell *= skin.prior.std
+        slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
+        self._loose_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
+        self._place(self.cells, self.log_siemens)
+        wires = net.by_wires(currents)
+        wires *= -(square / self._std[ports])[:, None]
+        return wires
+
+    def _doubtful(self, ports: Cells, residual: Float, deviation: Float) -> bool:
+        """Whether a touch may hide at a cell that this model holds for untouched.
+
+        What its own reading says of it: rise of its conductance over rest, and deviation.
+        """
+        assert self._touched is not None
+        net = self._skin.net
+        volt, _ = self._touched.own_volt()
+        slope = (self._current * volt) ** 2 * net.cell_siemens / self._std
+        left, unit = self._residual.copy(), np.ones(volt.size)
+        left[ports], unit[ports] = residual, deviation
+        rise, rise_std = left / slope, unit / slope
+        hidden = (rise > DOUBT * rise_std) & (rise + 2 * rise_std > HIDDEN)
+        hidden[self.cells] = False
+        return bool(hidden.any())

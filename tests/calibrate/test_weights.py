@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``calibrate weights``: a scripted person puts weights on a simulated skin."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ohmskin
+from command_line import Done, assert_one_line
+from ohmskin.arrays import Float
+from ohmskin.calibrate.tables import load_press_table
+from ohmskin.force.calibration import load_calibration
+from scripted_skin import REST, ScriptedSkin
+
+Run = Callable[..., Done]
+Cell = tuple[int, int]
+# From when on [s], the cells, and the force on each [N].
+Script = Sequence[tuple[float, Sequence[Cell], float]]
+
+TOLD = ("--indenter-mm2", "100")
+CELLS = ((0, 0), (0, 1))
+ASKED = [(cell, mass_g) for cell in CELLS for mass_g in (50, 200, 1000)]
+OPTIONS = ("--grams", "50,200,1000", "--repeats", "1")
+PUT_S, OFF_S = 2.2, 0.8
+
+
+def newtons(mass_g: float) -> float:
+    return 9.80665e-3 * mass_g
+
+
+def rise(force_n: float | Float) -> Float:
+    """Conductance above rest of every cell that has crept [S]."""
+    return np.asarray(30e-6 * force_n**1.7)
+
+
+def on_skin(script: Script, time_s: float) -> Float:
+    """Conductances above rest (1, 2) [S]; what is put on creeps for a while."""
+    siemens = np.zeros((1, 2))
+    now = [step for step in script if step[0] <= time_s]
+    if now:
+        put_s, cells, force_n = now[-1]
+        for cell in cells:
+            siemens[cell] = rise(force_n) * (1 - 0.15 * np.exp((put_s - time_s) / 0.4))
+    return siemens
+
+
+def putting(presses: Sequence[tuple[Cell, float]], begin_s: float = 0.5) -> list:
+    """A script: each cell and mass [g] for a while, one after another."""
+    steps: list[tuple[float, Sequence[Cell], float]] = []
+    for cell, mass_g in presses:
+        steps.append((begin_s, [cell], newtons(mass_g)))
+        steps.append((begin_s + PUT_S, [], 0.0))
+        begin_s += PUT_S + OFF_S
+    return steps
+
+
+@pytest.fixture
+def weigh(monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path) -> Callable[..., Done]:
+    """A function that runs the command for skin.json while somebody acts by a script."""
+
+    def call(script: Script, *options: str, interrupt_s: float = float("inf")) -> Done:
+        def ctrl_c() -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+
+        def too_long() -> None:
+            pytest.fail("the script is over, and more presses are wanted")
+
+        happens = [(interrupt_s, ctrl_c), (script[-1][0] + 5 if script else 0.0, too_long)]
+        skin = ScriptedSkin(lambda time_s: on_skin(script, time_s), 10.0, happens)
+
+        def rest_measured(seconds: float) -> Float:
+            ratio = ScriptedSkin.mean_ratio(skin, seconds)
+            skin.begin()
+            return ratio
+
+        monkeypatch.setattr(skin, "mean_ratio", rest_measured)
+        monkeypatch.setattr(ohmskin, "open", lambda url: skin)
+        return run("calibrate", "weights", "fast", str(tmp_path / "skin.json"), *TOLD, *options)
+
+    return call
+
+
+def pairs_of(path: Path) -> list[tuple[Cell, int]]:
+    return [
+        ((row, column), round(force_n / 9.80665e-3))
+        for row, column, force_n, *_ in load_press_table(path).tolist()
+    ]
+
+
+def test_weights_are_asked_for_read_and_learned(weigh: Callable[..., Done], tmp_path: Path) -> None:
+    out, table = tmp_path / "skin.json", tmp_path / "skin.presses.csv"
+    # The fourth weight is first put on the wrong cell, then beside a hand.
+    script = putting(ASKED[:3])
+    begin_s = script[-1][0] + OFF_S
+    script += [(begin_s, [(0, 0)], newtons(50)), (begin_s + 2, list(CELLS), newtons(50))]
+    script += putting(ASKED[3:], begin_s + 4)
+
+    done = weigh(script, *OPTIONS, interrupt_s=begin_s + 4 + 1.2 * PUT_S)
+    assert (done.code, done.err) == (130, "")
+    lines = done.out.splitlines()
+    assert lines[0] == "take everything off the skin: its rest is measured, 1 s"
+    assert re.fullmatch(r"rest: \d\.\d\d to \d\.\d\d microsiemens", lines[1])
+    assert lines[2] == "put 50 g (0.490 N) on cell (0, 0), row 0, column 0"
+    assert re.fullmatch(r"1 of 6: .*microsiemens above rest: take it off", lines[3])
+    wrong = lines.index("cell (0, 0) is pressed: put the weight on (0, 1) alone")
+    assert lines[wrong - 1] == "put 50 g (0.490 N) on cell (0, 1), row 0, column 1"
+    assert "cells (0, 0), (0, 1) are pressed: put the weight on (0, 1) alone" in lines[wrong:]
+    assert lines[-1] == f"4 of 6 presses are in {table}: the same command goes on"
+    assert pairs_of(table) == ASKED[:4]
+    assert not out.exists()
+
+    done = weigh(putting(ASKED[4:]), *OPTIONS)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.splitlines()[2] == "put 200 g (1.961 N) on cell (0, 1), row 0, column 1"
+    assert "held-out error" in done.out
+    assert f"{out}: calibration of unit 7" in done.out
+    assert pairs_of(table) == ASKED
+
+    rest = REST.cell_siemens
+    kept = load_press_table(table)
+    truth = rest[kept["row"], kept["column"]] + rise(kept["force_n"])
+    # Creep has not quite ended, and wires of 300 ohm are not told apart from a cell of 700.
+    np.testing.assert_allclose(kept["conductance"], truth, rtol=0.12)
+    assert (kept["conductance_std"] > 0).all()
+    assert (kept["conductance_std"] < 0.02 * kept["conductance"]).all()
+    calibration = load_calibration(out)
+    assert (calibration.unit_id, calibration.method) == (7, "joint")
+    assert calibration.indenter_area_m2 == pytest.approx(1e-4)
+    for mass_g in (100, 500):
+        force_n, _ = calibration.predict(rest + rise(newtons(mass_g)), np.zeros((1, 2)))
+        np.testing.assert_allclose(force_n, newtons(mass_g), rtol=0.1)
+
+    # Cells that are redone: asked again, the others kept.
+    before = kept
+    done = weigh(putting(ASKED[:3]), *OPTIONS, "--redo", "0,0", interrupt_s=0.5 + PUT_S)
+    assert done.code == 130
+    assert f"4 of 6 presses are in {table}: the same command without --redo goes on" in done.out
+    assert pairs_of(table) == [*ASKED[3:], ASKED[0]]
+    done = weigh(putting(ASKED[1:3]), *OPTIONS)
+    assert done.code == 0
+    after = load_press_table(table)
+    assert sorted(pairs_of(table)) == sorted(ASKED)
+    assert after["conductance"][:3].tolist() == before["conductance"][3:].tolist()
+
+
+def test_a_full_table_is_fitted_at_once(weigh: Callable[..., Done], tmp_path: Path) -> None:
+    table, out = tmp_path / "mine.csv", tmp_path / "skin.json"
+    lines = ["row,column,force_n,conductance"]
+    for cell, mass_g in ASKED:
+        siemens = REST.cell_siemens[cell] + rise(newtons(mass_g))
+        lines.append(f"{cell[0]},{cell[1]},{newtons(mass_g)},{siemens}")
+    table.write_text("\n".join(lines) + "\n")
+    of_table = table.read_text()
+    done = weigh([], *OPTIONS, "--table", str(table))
+    assert (done.code, done.err) == (0, "")
+    assert "put" not in done.out
+    assert load_calibration(out).columns == 2
+    assert table.read_text() == of_table
+    # What cannot be fitted leaves the calibration as it was, and the table.
+    was = out.read_bytes()
+    table.write_text(of_table.replace(f"{newtons(1000)},", f"{newtons(1000)},-"))
+    done = weigh([], *OPTIONS, "--table", str(table))
+    assert_one_line(done, "mine.csv: row 4: conductance is -")
+    assert out.read_bytes() == was
+
+
+def test_all_presses_can_be_redone(weigh: Callable[..., Done], tmp_path: Path) -> None:
+    table = tmp_path / "skin.presses.csv"
+    table.write_text("row,column,force_n,conductance\n0,0,1,1e-5\n0,1,1,1e-5\n")
+    redo = ("--redo", "0,0", "--redo", "0,1")
+    done = weigh(putting(ASKED), *OPTIONS, *redo, interrupt_s=0.1)
+    assert "0 of 6 presses are in" in done.out
+    assert not table.exists()
+
+
+def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
+    out, port = str(tmp_path / "skin.json"), "emulator://1x2"
+    table = tmp_path / "skin.presses.csv"
+    good = {"--grams": "50,100,200", "--indenter-mm2": "100"}
+    for options, words in (
+        ({"--method": "voltage"}, ["presses are kept as conductances, which 'voltage'"]),
+        ({"--method": "magic"}, ["no method 'magic'", "joint"]),
+        ({"--grams": "50,no"}, ["--grams '50,no': give weights above 0"]),
+        ({"--grams": "50,-1"}, ["give weights above 0"]),
+        ({"--grams": "50,50"}, ["stands twice: say --repeats"]),
+        ({"--grams": "50", "--repeats": "9"}, ["give two or more in --grams"]),
+        ({"--repeats": "0"}, ["--repeats is 0"]),
+        ({"--indenter-mm2": "0"}, ["--indenter-mm2 is 0"]),
+        ({"--top-wire": "-1"}, ["top_wire_ohm is -1"]),
+        ({"--cells": "0;1"}, ["'0;1' is no cell: write row,column"]),
+        ({"--cells": "0,0 1,0"}, ["cell (1, 0) is not on this 1x2 skin"]),
+        ({"--cells": "0,0"}, ["one cell does not tell how much cells differ"]),
+        ({"--cells": "0,0", "--repeats": "1"}, ["3 presses are too few: 5 are needed"]),
+        ({"--redo": "0,2"}, ["cell (0, 2) is not on this 1x2 skin"]),
+    ):
+        arguments = [word for pair in (good | options).items() for word in pair]
+        assert_one_line(run("calibrate", "weights", port, out, *arguments), *words)
+    arguments = [word for pair in good.items() for word in pair]
+    nowhere = str(tmp_path / "none" / "skin.json")
+    done = run("calibrate", "weights", port, nowhere, *arguments)
+    assert_one_line(done, "skin.json: cannot be written: say a file in a directory there is")
+    table.write_text("row,column,force_n,conductance\n0,0,1,1e-5\n1,1,1,1e-5\n")
+    was = table.read_bytes()
+    done = run("calibrate", "weights", port, out, *arguments, "--redo", "0,0")
+    assert_one_line(replace(done, out=""), "skin.presses.csv: row 3: cell (1, 1) is not on this")
+    assert table.read_bytes() == was
+    assert not Path(out).exists()

@@ -1,0 +1,478 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A force sensor: its lines, its port, and ``record --force-port``, which is then calibrated."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+import ohmskin
+from command_line import Done, assert_one_line
+from ohmskin.arrays import Float
+from ohmskin.cli.record import PressDisplay
+from ohmskin.errors import DeviceLost, PortError
+from ohmskin.files import Closing
+from ohmskin.force.calibration import load_calibration
+from ohmskin.link.messages import Scan
+from ohmskin.record.force_sensor import QUEUE_SAMPLES, ForceLineDecoder, ForceSensor
+from ohmskin.record.recorder import Recorder, record
+from ohmskin.record.recording import ForceSample, load_recording
+from scripted_skin import REST, ScriptedSkin
+
+tty = pytest.importorskip("tty")
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+Run = Callable[..., Done]
+# Longest time that a test waits for another thread [s].
+PATIENCE_S = 20.0
+
+
+# --------------------------------------------------------------------------------------- lines
+
+
+@pytest.mark.parametrize(
+    ("line", "forces"),
+    [
+        (b"12.34\r\n", [12.34]),
+        (b"-0.5\n", [-0.5]),
+        (b" +3 N\r", [3.0]),
+        (b".5N\n", [0.5]),
+        (b"1.5e1\n", [15.0]),
+        (b"\r\n\r\n", []),
+    ],
+)
+def test_a_line_with_one_number_is_a_force(line: bytes, forces: list[float]) -> None:
+    decoder = ForceLineDecoder()
+    assert decoder.feed(b"4.2\r\n" + line) == forces
+    assert decoder.damaged == 0
+    doubled = ForceLineDecoder(newtons_per_unit=2.0)
+    assert doubled.feed(b"\n" + line) == [2 * force_n for force_n in forces]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(b"Reading: 12.3 g", b"12.3 g", b"1,5", b"1 2", b"nan", b"1e999", b"--1", b"\xff", b"1_0"),
+        *(b".", b"1" * 65, b"x" * 100_000),
+    ],
+)
+def test_another_line_is_counted_and_the_next_is_read(line: bytes) -> None:
+    decoder = ForceLineDecoder()
+    assert decoder.feed(b"\n" + line + b"\r\n7\r\n") == [7.0]
+    assert decoder.damaged == 1
+
+
+def test_the_first_line_may_be_a_part_and_counts_for_nothing() -> None:
+    decoder = ForceLineDecoder()
+    assert decoder.feed(b"x" * 1000) == []
+    assert decoder.feed(b"4.1\r\n5.1\r\n6") == [5.1]
+    assert decoder.feed(b".1\r") == [6.1]
+    assert decoder.damaged == 0
+
+
+@given(
+    st.lists(
+        st.sampled_from([b"1.5", b"-2 N", b"x", b"\r\n", b"\n", b"9" * 70, b" "]), max_size=30
+    ),
+    st.integers(1, 80),
+)
+def test_lines_do_not_depend_on_how_they_come(pieces: list[bytes], size: int) -> None:
+    octets = b"".join([*pieces, b"\n"])
+    decoder = ForceLineDecoder()
+    found = [
+        force_n
+        for start in range(0, len(octets), size)
+        for force_n in decoder.feed(octets[start : start + size])
+    ]
+    lines = [line.strip() for line in re.split(rb"[\r\n]", octets)[1:] if line.strip()]
+    forces = {b"1.5": 1.5, b"-2 N": -2.0}
+    assert found == [forces[line] for line in lines if line in forces]
+    assert decoder.damaged == len([line for line in lines if line not in forces])
+
+
+def test_a_line_without_end_is_damaged_once() -> None:
+    decoder = ForceLineDecoder()
+    decoder.feed(b"\n")
+    for _ in range(1000):
+        assert decoder.feed(b"1" * 1000) == []
+    assert decoder.damaged == 1
+    assert decoder.feed(b"\n3\n") == [3.0]
+
+
+# ---------------------------------------------------------------------------------------- port
+
+
+class PtySensor:
+    """What a sketch prints at a pseudo-terminal."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()  # a closed file's number may soon be another file's
+        self._files = list(os.openpty())
+        tty.setraw(self._files[1])
+        self.path = os.ttyname(self._files[1])
+
+    def print(self, octets: bytes) -> None:
+        with self._lock:
+            os.write(self._files[0], octets)
+
+    def vanish(self) -> None:
+        with self._lock:
+            while self._files:
+                os.close(self._files.pop())
+
+
+@pytest.fixture
+def sketch() -> Iterator[PtySensor]:
+    sensor = PtySensor()
+    yield sensor
+    sensor.vanish()
+
+
+def taken(sensor: ForceSensor, count: int) -> list[ForceSample]:
+    samples: list[ForceSample] = []
+    end_s = time.monotonic() + PATIENCE_S
+    while len(samples) < count and time.monotonic() < end_s:
+        samples += sensor.take()
+        time.sleep(0.01)
+    assert len(samples) == count
+    return samples
+
+
+def until_lost(sensor: ForceSensor) -> list[ForceSample]:
+    """What can be taken before it raises that the sensor is lost."""
+    samples: list[ForceSample] = []
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        try:
+            samples += sensor.take()
+        except DeviceLost:
+            return samples
+        time.sleep(0.01)
+    pytest.fail("the sensor is never lost")
+
+
+def test_numbers_are_forces_at_their_time(sketch: PtySensor) -> None:
+    with ForceSensor(sketch.path, newtons_per_unit=0.00980665) as sensor:
+        begin_s = time.monotonic()
+        sketch.print(b"7.5\r\n100\r\n")  # the first is perhaps the end of a number
+        sensor.wait()
+        middle_s = time.monotonic()
+        sketch.print(b"-2")
+        (first,) = taken(sensor, 1)
+        time.sleep(0.02)
+        assert sensor.take() == []
+        sketch.print(b"50.0\r\n")
+        (second,) = taken(sensor, 1)
+        end_s = time.monotonic()
+    assert first.force_n == pytest.approx(0.980665)
+    assert second.force_n == pytest.approx(-2.4516625)
+    assert begin_s < first.host_time_s < middle_s < second.host_time_s - 0.02 < end_s
+    assert (first.row, first.column, first.source) == (-1, -1, sketch.path)
+    assert sensor.damaged == 0
+
+
+def test_lines_that_arrive_together_have_times_that_rise(sketch: PtySensor) -> None:
+    with ForceSensor(sketch.path) as sensor:
+        sketch.print(b"\n1\n")
+        sensor.wait()
+        time.sleep(0.08)
+        sketch.print(b"2\n3\n4\n5\n")
+        times_s = [sample.host_time_s for sample in taken(sensor, 5)]
+        now_s = time.monotonic()
+    assert min(after - before for before, after in itertools.pairwise(times_s)) > 0.01
+    assert times_s[-1] < now_s
+
+
+def test_lines_that_are_no_numbers_are_counted(sketch: PtySensor) -> None:
+    with ForceSensor(sketch.path, newtons_per_unit=1e300) as sensor:
+        sketch.print(b"\nHX711 ready\n1.0\nnan\n1e200\n\n-2e-3\n")
+        assert [sample.force_n for sample in taken(sensor, 2)] == [1e300, -2e297]
+        assert sensor.damaged == 3  # the text, nan, and what is no number once it is a force
+
+
+def test_a_silent_sensor(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.2)
+    with ForceSensor(sketch.path) as sensor:
+        with pytest.raises(DeviceLost, match=r"has said nothing for 0.2 s: is it the force"):
+            sensor.wait()
+        sketch.print(b"\n1\n")
+        end_s = time.monotonic() + PATIENCE_S
+        samples: list[ForceSample] = []
+        while not samples and time.monotonic() < end_s:
+            with suppress(DeviceLost):
+                samples = sensor.take()
+        assert len(samples) == 1
+        assert until_lost(sensor) == []
+
+
+def test_a_sensor_that_prints_no_numbers(
+    sketch: PtySensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.2)
+    with ForceSensor(sketch.path, 9600) as sensor:
+        sketch.print(b"\n" + b"weight: 12 g\n" * 7)
+        end_s = time.monotonic() + PATIENCE_S
+        while sensor.damaged < 7 and time.monotonic() < end_s:
+            time.sleep(0.01)
+        with pytest.raises(DeviceLost, match=r"no numbers \(7 damaged lines\).*at 9600 baud"):
+            sensor.wait()
+
+
+def test_a_sensor_that_vanishes(sketch: PtySensor) -> None:
+    with ForceSensor(sketch.path) as sensor:
+        sketch.print(b"\n1\n2\n")
+        sensor.wait()
+        sketch.vanish()
+        # What came before is not.
+        assert [sample.force_n for sample in until_lost(sensor)] == [1.0, 2.0]
+        with pytest.raises(DeviceLost, match="gone: is the force sensor still plugged in"):
+            sensor.take()
+        with pytest.raises(DeviceLost, match="gone"):
+            sensor.wait()
+
+
+def test_what_nobody_takes_is_bounded_and_counted(sketch: PtySensor) -> None:
+    with ForceSensor(sketch.path) as sensor:
+        sketch.print(b"\n")
+        for block in range(0, QUEUE_SAMPLES + 500, 100):
+            sketch.print(b"".join(b"%d\n" % number for number in range(block, block + 100)))
+            time.sleep(0.002)
+        end_s = time.monotonic() + PATIENCE_S
+        while sensor.dropped < 500 and time.monotonic() < end_s:
+            time.sleep(0.01)
+        samples = sensor.take()
+    assert [sample.force_n for sample in samples] == list(range(500, QUEUE_SAMPLES + 500))
+    assert sensor.dropped == 500
+
+
+def test_ports_that_cannot_be_opened(sketch: PtySensor) -> None:
+    with pytest.raises(PortError, match="no port /dev/ttyNONE"):
+        ForceSensor("/dev/ttyNONE")
+    with pytest.raises(PortError, match="cannot open /dev/null"):
+        ForceSensor("/dev/null")
+    with (
+        ForceSensor(sketch.path),
+        pytest.raises(PortError, match="is busy: close the other program"),
+    ):
+        ForceSensor(sketch.path)
+    for scale in (0.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="scale is"):
+            ForceSensor(sketch.path, newtons_per_unit=scale)
+
+
+# -------------------------------------------------------------------------------- ohmskin record
+
+# When a press begins [s], the cell, the force [N]: at irregular intervals.
+PRESSES = (
+    (1.6, 0, 1.0),
+    (3.0, 1, 4.0),
+    (4.1, 0, 7.0),
+    (5.8, 1, 1.5),
+    (6.9, 0, 2.5),
+    (8.6, 1, 6.0),
+    (9.8, 0, 4.5),
+    (11.4, 1, 3.0),
+    (12.5, 0, 1.8),
+    (14.6, 1, 5.2),
+)
+PRESS_S = 0.8
+
+
+def pressed(time_s: float) -> tuple[int, float]:
+    """Which column is pressed, and its force [N]: up, hold, down, each a third."""
+    for begin_s, column, force_n in PRESSES:
+        share = (time_s - begin_s) / PRESS_S
+        if 0 <= share < 1:
+            return column, force_n * min(3 * share, 1.0, 3 - 3 * share)
+    return 0, 0.0
+
+
+def rise(force_n: float) -> float:
+    """Conductance above rest [S]."""
+    return 30e-6 * force_n**1.7
+
+
+def finger(time_s: float) -> Float:
+    """Conductances above rest (1, 2) [S]."""
+    column, force_n = pressed(time_s)
+    return rise(force_n) * (np.arange(2) == column)[None]
+
+
+class ScriptedSensor(Closing):
+    """In place of a `ForceSensor`: what `PRESSES` make by the clock of a scripted skin."""
+
+    STEP_S = 0.025
+    damaged = 2
+
+    def __init__(self, skin: ScriptedSkin) -> None:
+        self._skin = skin
+        self._taken = 0
+
+    def opened(self, path: str, baud: int, newtons_per_unit: float) -> Self:
+        assert (path, baud, newtons_per_unit) == ("scale", 57_600, 2.0)
+        return self
+
+    def wait(self) -> None:
+        pass
+
+    def take(self) -> list[ForceSample]:
+        """Samples until now; the sensor is not quite zeroed."""
+        before, self._taken = self._taken, int(self._skin.now_s / self.STEP_S)
+        times_s = [self.STEP_S * step for step in range(before + 1, self._taken + 1)]
+        return [ForceSample(pressed(at_s)[1] + 0.029, at_s, source="scale") for at_s in times_s]
+
+    def close(self) -> None:
+        pass
+
+
+def scripted() -> ScriptedSkin:
+    skin = ScriptedSkin(finger, 40.0)
+    skin.begin()
+    return skin
+
+
+def test_a_recorded_force_sensor_calibrates(
+    monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path
+) -> None:
+    out, file = tmp_path / "skin.json", tmp_path / "presses.mcap"
+    skin = scripted()
+    monkeypatch.setattr(ohmskin, "open", lambda url, start: skin)
+    monkeypatch.setattr("ohmskin.cli.record.ForceSensor", ScriptedSensor(skin).opened)
+    force = ("--force-port", "scale", "--force-baud", "57600", "--force-scale", "2")
+    done = run("record", "fast", str(file), *force, "--tare", "1.5", "--seconds", "16.5")
+    assert (done.code, done.err) == (0, "")
+    assert "touch nothing for 1.5 s" in done.out
+    counts = r"presses\.mcap: 66\d scans, missed 0, \d+ bytes, 66\d forces, 2 lines that are no num"
+    assert re.search(counts, done.out)
+    recording = load_recording(file)
+    assert not recording.cut_off
+    assert len(recording.tares) == 1
+    times_s = [sample.host_time_s for sample in recording.forces]
+    assert times_s == sorted(set(times_s))
+    assert max(sample.force_n for sample in recording.forces) == pytest.approx(7.03, abs=0.1)
+    assert {sample.source for sample in recording.forces} == {"scale"}
+
+    done = run("calibrate", "recording", str(file), str(out), "--indenter-mm2", "100")
+    assert (done.code, done.err) == (0, "")
+    assert "zero of the force sensor +0.029 N" in done.out
+    calibration = load_calibration(out)
+    for force_n in (2.0, 5.0):
+        seen, _ = calibration.predict(REST.cell_siemens + rise(force_n), np.zeros((1, 2)))
+        np.testing.assert_allclose(seen, force_n, rtol=0.15)
+
+
+def test_a_display_counts_what_is_pressed(tmp_path: Path) -> None:
+    skin, heads = scripted(), []
+    console = Console(width=100)
+
+    def picture() -> list[str]:
+        with console.capture() as captured:
+            console.print(display.picture())
+        return captured.get().splitlines()
+
+    def look(scan: Scan) -> None:
+        if display.see(scan):
+            heads.append(picture()[0])
+
+    with Recorder(tmp_path / "a.mcap", skin.info) as recorder:
+        display = PressDisplay(recorder)
+        display.force_n = 0.5
+        record(skin, recorder, skin, seconds=8.4, tare_s=1.5, beside=look)
+    assert 50 < len(heads) < 90
+    assert heads[0] == "1 scans   force 0.50 N   touch nothing yet"
+    assert any(head.endswith("N   pressed: (0, 1)") for head in heads)
+    assert heads[-1].endswith("N   pressed: none")
+    assert picture()[-1].split() == ["0", "3", "2"]  # of `PRESSES`, until then
+
+
+@contextmanager
+def speaking(sketch: PtySensor, line: Callable[[], bytes]) -> Iterator[None]:
+    """A sensor prints lines meanwhile, until it vanishes."""
+    done = threading.Event()
+
+    def speak() -> None:
+        with suppress(IndexError, OSError):
+            while not done.wait(0.01):
+                sketch.print(line())
+
+    thread = threading.Thread(target=speak)
+    thread.start()
+    yield
+    done.set()
+    thread.join()
+
+
+@contextmanager
+def once_scans_are_in(recording: Path, act: Callable[[], None]) -> Iterator[None]:
+    """Act when scans are in a recording: its file has grown beyond the board's hello."""
+
+    def work() -> None:
+        sizes: set[int] = set()
+        end_s = time.monotonic() + PATIENCE_S
+        while len(sizes) < 2 and time.monotonic() < end_s:
+            time.sleep(0.02)
+            if recording.exists() and recording.stat().st_size:
+                sizes.add(recording.stat().st_size)
+        act()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield
+    thread.join()
+
+
+@pytest.mark.parametrize("end", ["sensor", "SIGTERM"])
+def test_whatever_ends_a_recording_with_forces_it_is_whole(
+    run: Run, sketch: PtySensor, tmp_path: Path, end: str
+) -> None:
+    file = tmp_path / "own.mcap"
+    arguments = ("record", "emulator://2x2", str(file), "--force-port", sketch.path)
+    stop = {
+        "sensor": sketch.vanish,
+        "SIGTERM": lambda: os.kill(os.getpid(), signal.SIGTERM),
+    }
+    with once_scans_are_in(file, stop[end]), speaking(sketch, lambda: b"0.1\n"):
+        done = run(*arguments)
+    if end == "sensor":
+        gone = f"{sketch.path} is gone: is the force sensor still plugged in? (what came before is"
+        assert_one_line(replace(done, out=""), gone, "own.mcap")
+    else:
+        assert (done.code, done.err) == (0, "")
+    given = load_recording(file)
+    assert not given.cut_off
+    assert given.scans
+    assert given.forces
+    assert len(given.tares) == 1
+
+
+def test_sensors_that_say_nothing(
+    run: Run, sketch: PtySensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.5)
+
+    def recorded(force_port: str, *options: str) -> Done:
+        file = str(tmp_path / "a.mcap")
+        return run("record", "emulator://2x2", file, "--force-port", force_port, *options)
+
+    assert_one_line(recorded(sketch.path), "has said nothing for 0.5 s", "does its sketch print?")
+    with speaking(sketch, lambda: b"12 g\n"):
+        done = recorded(sketch.path, "--force-baud", "9600")
+    assert_one_line(done, "prints no numbers (", "damaged lines)", "at 9600 baud")
+    assert_one_line(recorded("/dev/ttyNONE"), "no port /dev/ttyNONE")
+    assert_one_line(recorded(sketch.path, "--force-scale", "0"), "scale is 0")
+    assert list(tmp_path.iterdir()) == []
