@@ -8,9 +8,9 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import readings
-from ohmskin.estimate.base import Estimator, SkinKnowledge, WireOhm
+from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.link.codes import quantise, ratio_from_codes
+from skins import told
 from studies.trials import skin_at_rest
 
 FRAMES = 400
@@ -45,28 +45,22 @@ def check(estimator: Estimator, ratio: Float) -> None:
         assert np.isfinite(found.bottom_wire_ohm).all()
 
 
-def knowledge_of(shape: tuple[int, int], told: str) -> SkinKnowledge:
+def knowledge_of(shape: tuple[int, int], what: str) -> SkinKnowledge:
     random = np.random.default_rng(1)
-    if told == "nothing":
+    if what == "nothing":
         return SkinKnowledge(*shape, adc_bits=10)
-    rest = (
-        random.random((*shape, 4)) if told == "nonsense" else readings(skin_at_rest(*shape, random))
-    )
-    return SkinKnowledge(
-        *shape,
-        adc_bits=10,
-        rest_ratio=ratio_from_codes(quantise(rest)),
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
+    return told(
+        random.random((*shape, 4)) if what == "nonsense" else readings(skin_at_rest(*shape, random))
     )
 
 
-@pytest.mark.parametrize("told", ["all", "nothing", "nonsense"])
+@pytest.mark.parametrize("what", ["all", "nothing", "nonsense"])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("method", ["joint", "touch"])
-def test_nonsense_is_answered(method: str, shape: tuple[int, int], told: str) -> None:
+def test_nonsense_is_answered(method: str, shape: tuple[int, int], what: str) -> None:
     """2 methods, 5 shapes, 400 frames each of three kinds of knowledge: 12,000."""
-    random = np.random.default_rng([*shape, len(told)])
-    estimator = make_estimator(method, knowledge_of(shape, told))
+    random = np.random.default_rng([*shape, len(what)])
+    estimator = make_estimator(method, knowledge_of(shape, what))
     for number in range(FRAMES):
         check(estimator, frame(KINDS[number % len(KINDS)], shape, random))
 
