@@ -41,8 +41,7 @@ from typing import Any
 
 import numpy as np
 
-from lockstep import BOARDS, Rig, elf_of
-from ohmskin.emulate.simavr import CPU_HZ
+from lockstep import BOARDS, CPU_HZ, Rig, elf_of
 from ohmskin.link import protocol
 
 READINGS_WANTED = 1_000_000

@@ -38,11 +38,12 @@ from bars import at_least, at_most, report  # beside this file
 
 import ohmskin
 from ohmskin.arrays import Float
-from ohmskin.calibrate.bench import Bench
+from ohmskin.calibrate.calibrator import Calibrator
 from ohmskin.calibrate.presses import Presses
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.force_reader import ForceReader, ForceScan
+from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.readings import load_readings
@@ -58,7 +59,8 @@ SIEMENS_PER_NEWTON = 20e-6
 
 def calibration(board: Hello, rest_ratio: Float, method: str) -> Calibration:
     """Of a skin of which every cell answers alike: what a force costs does not depend on it."""
-    bench = Bench(board, rest_ratio, method, 1e-4, "2025-01-01", TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    knowledge = SkinKnowledge.of(board, rest_ratio, WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM))
+    calibrator = Calibrator(knowledge, method, 1e-4, board.unit_id, "2025-01-01")
     cells = np.repeat(np.arange(64), 6)
     force_n = np.tile(np.arange(1.0, 7.0), 64)
     presses = Presses(
@@ -69,7 +71,7 @@ def calibration(board: Hello, rest_ratio: Float, method: str) -> Calibration:
         press=np.arange(cells.size),
         shape=(8, 8),
     )
-    return bench.calibration(presses)[0]
+    return calibrator.calibration(presses)[0]
 
 
 def board_8x8() -> Hello:
@@ -77,7 +79,7 @@ def board_8x8() -> Hello:
         return skin.info
 
 
-def times_ms(reader: ForceReader, ratios: Float) -> Float:
+def times_ms(reader: SkinReader, ratios: Float) -> Float:
     """Of every frame of readings (F, 8, 8, 4) after the first few."""
     taken_ms = []
     for number, codes in enumerate(quantise(ratios)):
@@ -103,7 +105,7 @@ def scan_times() -> dict[str, float]:
         ("finger", "touch", scene.rest_ratio, finger),
         ("finger_joint", "joint", scene.rest_ratio, finger),
     ):
-        taken_ms = times_ms(ForceReader(board, calibration(board, rest, method)), ratios)
+        taken_ms = times_ms(SkinReader(board, calibration(board, rest, method)), ratios)
         figures[f"force_ms_{name}"] = round(float(np.median(taken_ms)), 3)
         figures[f"force_ms_{name}_p99"] = round(float(np.percentile(taken_ms, 99)), 3)
     return figures

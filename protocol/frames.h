@@ -6,7 +6,7 @@
 namespace ohmskin {
 namespace frames {
 
-constexpr uint16_t LAYOUT_CRC = 0xE371;
+constexpr uint16_t LAYOUT_CRC = 0x75C9;
 constexpr uint8_t DELIMITER = 0x00;
 constexpr uint16_t CRC_POLYNOMIAL = 0x1021;
 constexpr uint16_t CRC_INITIAL = 0xFFFF;
@@ -129,6 +129,7 @@ struct __attribute__((packed)) Hello {
     uint32_t ref_bottom_ohm;  // [ohm] reference resistor of the column side
     uint32_t rate_asked_mhz;  // [mHz] rate asked for; 0: as fast as the converter runs
     uint32_t scan_cycles;  // [clock] clock cycles from one scan's start to the next: the rate that is kept
+    uint16_t slot_cycles;  // [clock] clock cycles from one reading of a scan to the next; what is left of the scan after its last reading is idle
     uint32_t clock_hz;  // [Hz] clock of the board
     uint16_t settle_asked_us;  // [us] settle time asked for; 0: as long as the rate allows
     uint16_t settle_us;  // [us] time from a multiplexer change to the hold, at least
@@ -138,7 +139,7 @@ struct __attribute__((packed)) Hello {
     uint8_t reset_cause;  // why the board last started
     uint8_t scanning;  // 1 while scanning
 };
-static_assert(sizeof(Hello) == 46, "wire size");
+static_assert(sizeof(Hello) == 48, "wire size");
 
 // board to host: all readings of one scan. The codes follow the header: readings of a cell in the order of the enum `reading`, cells in column-major order (rows run fastest), adc_bits each, packed least significant bit first; 4 codes of 10 bits fill 5 bytes. The last byte is padded with zero bits.
 struct __attribute__((packed)) Scan {

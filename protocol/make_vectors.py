@@ -64,9 +64,9 @@ def scan(name: str, sequence: int, rows: int, columns: int, codes: list[int]) ->
 
 def all_valid() -> list[dict[str, Any]]:
     hello = struct.pack(
-        "<HBBBBIBBBBIIIIIHHBIBBB",
+        "<HBBBBIBBBBIIIIHIHHBIBBB",
         *(0x3C72, 0, 1, 0, 1, 0xC0FFEE, 8, 8, 4, 10, 30000, 30000),
-        *(90000, 177762, 16000000, 0, 36, 32, 500000, 1, 2, 0),
+        *(90000, 177762, 689, 16000000, 0, 36, 32, 500000, 1, 2, 0),
     )
     hello_fields = {
         "layout_crc": 0x3C72,
@@ -83,6 +83,7 @@ def all_valid() -> list[dict[str, Any]]:
         "ref_bottom_ohm": 30000,
         "rate_asked_mhz": 90000,
         "scan_cycles": 177762,
+        "slot_cycles": 689,
         "clock_hz": 16000000,
         "settle_asked_us": 0,
         "settle_us": 36,

@@ -30,8 +30,7 @@ from ohmskin.arrays import Float
 from ohmskin.emulate.press import PressModel
 from ohmskin.estimate.methods import METHODS, PAPER_METHODS, VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
-from ohmskin.force.curve_fit import Scatter, fit_power
-from ohmskin.force.regression import ForceRegression
+from ohmskin.force.regression import ForceRegression, fit_power
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 
 Progress = Callable[[int, int], None]
@@ -169,7 +168,7 @@ def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], 
         # In units of each cell's largest rise: a siemens to the power of 50 is no number.
         unit = np.array([x[cell == k].max() for k in range(rows * columns)])
         curves = [
-            fit_power(x[cell == k] / unit[k], force_n[cell == k], Scatter(), _EXPONENTS)
+            fit_power(x[cell == k] / unit[k], force_n[cell == k], exponents=_EXPONENTS)
             for k in range(rows * columns)
         ]
         if None not in curves:

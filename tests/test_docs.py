@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import importlib.util
+import pkgutil
 import re
 import shlex
-import subprocess
-import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -21,41 +21,52 @@ from ohmskin.cli.main import app
 from places import ROOT
 
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("examples/*.md"))]
-NAMES = [page.name for page in PAGES]
-
 COMMAND = re.compile(r"^(?:\.venv/bin/)?ohmskin (.*)")
 CODE = re.compile(r"`([^`\n]+)`")
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)\s:#]+)(?:#[^)\s]*)?\)")
 FILE = re.compile(r"[\w.-]+(?:/[\w.-]+)+\.\w+")
 TARGET = re.compile(r"\bmake ([a-z-]+)")
+NAME = re.compile(r"(?<![/\w])(?:ohmskin|studies)(?:\.[A-Za-z_]\w*)+")
 
 
-def code_lines(page: Path) -> list[str]:
-    """Lines of code blocks: fenced and indented ones."""
-    text = page.read_text()
-    fenced = [line for block in FENCE.finditer(text) for line in block[2].splitlines()]
-    outside = FENCE.sub("", text).splitlines()
-    return fenced + [line.strip() for line in outside if line.startswith("    ")]
+class Page:
+    """A page of the documentation, and what it quotes.
+
+    code: the lines of code blocks, fenced and indented ones. quoted: code in the text.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.text = path.read_text()
+        self.fences = FENCE.findall(self.text)
+        plain = FENCE.sub("", self.text)
+        fenced = [line for _, block in self.fences for line in block.splitlines()]
+        indented = [line.strip() for line in plain.splitlines() if line.startswith("    ")]
+        self.code = fenced + indented
+        self.quoted = CODE.findall(plain)
+
+    def commands(self, lines: list[str]) -> list[list[str]]:
+        """The words of command lines, without the description that follows in a list of them."""
+        found = [match[1] for line in lines if (match := COMMAND.match(line))]
+        return [shlex.split(re.split(r"\s{3,}", line)[0], comments=True) for line in found]
 
 
-def commands(page: Path) -> tuple[list[str], list[str]]:
-    """Command lines in code blocks, and those quoted in the text, which may be cut short."""
-    blocks = [match[1] for line in code_lines(page) if (match := COMMAND.match(line))]
-    quoted = CODE.findall(FENCE.sub("", page.read_text()))
-    return blocks, [match[1] for code in quoted if (match := COMMAND.match(code))]
-
-
-def words(line: str) -> list[str]:
-    """Without comments, and without the description that follows in a list of commands."""
-    return shlex.split(re.split(r"\s{3,}", line)[0], comments=True)
+PAGES = [
+    Page(path)
+    for path in (
+        *(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md")),
+        *sorted(DOCS.glob("*.md")),
+        *sorted(ROOT.glob("examples/*.md")),
+    )
+]
+every_page = pytest.mark.parametrize("page", PAGES, ids=[page.path.name for page in PAGES])
+COMMANDS: Any = app
 
 
 def found(arguments: list[str]) -> tuple[Any, list[str]]:
-    """The command that the line names, and what is left of the line."""
-    command: Any = app
-    left = list(arguments)
+    """The command that the words name, and the words that are left."""
+    command, left = COMMANDS, list(arguments)
     while hasattr(command, "commands") and left and not left[0].startswith("-"):
         assert left[0] in command.commands, f"no command {left[0]!r}"
         command = command.commands[left.pop(0)]
@@ -71,17 +82,13 @@ def check_options(arguments: list[str]) -> None:
             assert word.partition("=")[0] in known, f"no option {word!r}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_quoted_commands_exist(page: Path) -> None:
-    blocks, quoted = commands(page)
-    for line in (*blocks, *quoted):
-        check_options(words(line))
-
-
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_command_lines_parse(page: Path) -> None:
-    for line in commands(page)[0]:
-        command, left = found(words(line))
+@every_page
+def test_commands_exist_and_parse(page: Page) -> None:
+    for words in page.commands(page.quoted):  # these may be cut short
+        check_options(words)
+    for words in page.commands(page.code):
+        check_options(words)
+        command, left = found(words)
         if left:  # a bare name stands in a list of commands
             command.make_context("ohmskin", left)
 
@@ -89,46 +96,57 @@ def test_command_lines_parse(page: Path) -> None:
 def test_a_wrong_command_line_would_be_noticed() -> None:
     for line in ("strean PORT", "calibrate weight PORT"):
         with pytest.raises(AssertionError, match="no command"):
-            check_options(words(line))
+            check_options(line.split())
     with pytest.raises(AssertionError, match="no option"):
-        check_options(words("stream PORT --tara 1"))
-    command, left = found(words("tare /dev/ttyACM0"))
+        check_options(["stream", "PORT", "--tara", "1"])
+    command, left = found(["tare", "/dev/ttyACM0"])
     with pytest.raises(Exception, match=r"(?i)missing"):
         command.make_context("ohmskin", left)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_python_compiles(page: Path) -> None:
-    for language, text in FENCE.findall(page.read_text()):
-        assert language == "python", f"{page.name}: a fence of {language!r}"
-        compile(text, page.name, "exec")
-
-
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_files_and_links_exist(page: Path) -> None:
-    text = page.read_text()
-    for path in LINK.findall(text):
-        assert (page.parent / path).exists(), path
-    for code in CODE.findall(text):
-        for path in FILE.findall(code) if "://" not in code else ():
+@every_page
+def test_code_files_links_and_names_exist(page: Page) -> None:
+    for language, text in page.fences:
+        assert language == "python", f"a fence of {language!r}"
+        compile(text, page.path.name, "exec")
+    for path in LINK.findall(page.text):
+        assert (page.path.parent / path).exists(), path
+    code = CODE.findall(page.text)
+    for span in code:
+        for path in FILE.findall(span) if "://" not in span else ():
             places = (ROOT, DOCS, ROOT / "host/ohmskin")
-            assert code.startswith("/") or any((place / path).exists() for place in places), path
-
-
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_make_targets_exist(page: Path) -> None:
+            assert span.startswith("/") or any((place / path).exists() for place in places), path
+        for name in NAME.findall(span):
+            pkgutil.resolve_name(name)
+    assert not re.search(r"pip install \S*ohmskin", page.text)  # it is not published
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    code = [*code_lines(page), *CODE.findall(page.read_text())]
-    named = {target for line in code for target in TARGET.findall(line.partition("#")[0])}
-    assert named <= targets
+    named = [line.partition("#")[0] for line in (*page.code, *code)]
+    assert {target for line in named for target in TARGET.findall(line)} <= targets
 
 
 def test_every_public_name_has_a_place() -> None:
-    pages = "\n".join(page.read_text() for page in DOCS.glob("api*.md"))
+    pages = "\n".join(page.text for page in PAGES if page.path.name.startswith("api"))
     shown = set(re.findall(r"^::: ohmskin\.(\w+)$", pages, re.MULTILINE))
     errors = {name for name in ohmskin.__all__ if hasattr(ohmskin.errors, name)}
     assert "::: ohmskin.errors" in pages
     assert set(ohmskin.__all__) == shown & set(ohmskin.__all__) | errors
+
+
+def test_figures_stand_beside_their_commands() -> None:
+    headings = re.findall(r"^(.*)\n\|[-|]+\|$", (DOCS / "figures.md").read_text(), re.MULTILINE)
+    assert len(headings) >= 6
+    for heading in headings:
+        assert re.match(r"\| `(make|benchmarks/)[^`]+` prints? ", heading), heading
+
+
+def test_every_room_has_a_row_and_the_layers_are_those_that_are_checked() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    rows = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
+    assert {path.parent.name for path in ROOT.glob("host/ohmskin/*/__init__.py")} <= rows
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    (layers,) = (each["layers"] for each in contracts["contracts"] if each["type"] == "layers")
+    block = [layer for layer in layers if layer != "__main__"]
+    assert "\n".join(f"    {layer}" for layer in block) + "\n" in text
 
 
 def test_both_pages_have_the_same_wiring() -> None:
@@ -202,11 +220,11 @@ def draw() -> ModuleType:
     return loaded("draw")
 
 
-def test_pictures_are_current() -> None:
-    done = subprocess.run(
-        [sys.executable, str(DOCS / "draw.py"), "--check"], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+def test_pictures_are_current(
+    draw: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["draw.py", "--check"])
+    assert (draw.main(), capsys.readouterr().err) == (0, "")
 
 
 def test_changed_numbers_make_a_picture_stale(draw: ModuleType) -> None:
@@ -219,7 +237,7 @@ def test_printed_numbers_are_those_of_the_pages(
     draw: ModuleType, capsys: pytest.CaptureFixture[str]
 ) -> None:
     draw.report(draw.numbers())
-    pages = [line for page in ("build.md", "timing.md") for line in code_lines(DOCS / page)]
+    pages = [line for page in ("build.md", "timing.md") for line in Page(DOCS / page).code]
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) > 10
     assert [line for line in printed if line.strip() not in pages] == []

@@ -19,9 +19,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from test_calibrated_device import of_scene
 
 import ohmskin
+from calibrations import of_scene
 from command_line import Done
 from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
 from ohmskin.record.recorder import Recorder

@@ -229,5 +229,7 @@ enum control_result control_serve_one(bool real_time) {
         control_reply('Q', NULL, 0);
         return CONTROL_END;
     }
+    if (header[0] == 'G' && real_time && length == 0)
+        return control_reply('G', NULL, 0) ? CONTROL_GO : CONTROL_END;
     return serve(header[0], length, real_time) ? CONTROL_OK : CONTROL_END;
 }

@@ -68,6 +68,11 @@ int pty_run(void) {
     }
     if (!control_reply('P', path, strlen(path)))
         return 0;
+    /* Whoever opens the terminal throws away what it has sent before: the board waits for that. */
+    enum control_result said;
+    while ((said = control_serve_one(true)) != CONTROL_GO)
+        if (said == CONTROL_END)
+            return 0;
     int64_t due = now_ns();
     for (;;) {
         const int64_t wait = due - now_ns();

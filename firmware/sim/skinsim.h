@@ -168,7 +168,7 @@ void hold_log_clear(void);
 
 /* ---- control.c and pty.c: the outside world */
 
-enum control_result { CONTROL_OK, CONTROL_END };
+enum control_result { CONTROL_OK, CONTROL_GO, CONTROL_END };
 void control_start(int in_fd, int out_fd);
 enum control_result control_serve_one(bool real_time);
 bool control_reply(uint8_t op, const void *payload, size_t length);

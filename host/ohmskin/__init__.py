@@ -24,17 +24,15 @@ from ohmskin.errors import (
 )
 
 if TYPE_CHECKING:
-    from ohmskin.boards import Boards, BoardScan, open_all
     from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
     from ohmskin.estimate.methods import METHODS, make_estimator
-    from ohmskin.force.calibrated_device import CalibratedDevice
     from ohmskin.force.calibration import Calibration, load_calibration
     from ohmskin.force.contacts import Contact
-    from ohmskin.force.force_reader import ForceScan
+    from ohmskin.force.reader import CalibratedSkin, ForceScan
     from ohmskin.link.clock import BoardClock
     from ohmskin.link.device import Device
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-    from ohmskin.opening import open
+    from ohmskin.opening import Boards, BoardScan, open, open_all
 
 __all__ = [
     "METHODS",
@@ -42,7 +40,7 @@ __all__ = [
     "BoardScan",
     "BoardStats",
     "Boards",
-    "CalibratedDevice",
+    "CalibratedSkin",
     "Calibration",
     "CommandRefused",
     "Contact",
@@ -72,17 +70,15 @@ __version__ = "0.1.0"
 
 # Where a name is from. Its module is imported when the name is first asked for.
 _MODULES = {
-    "boards": ("Boards", "BoardScan", "open_all"),
     "estimate.base": ("Estimate", "Estimator", "SkinKnowledge", "WireOhm"),
     "estimate.methods": ("METHODS", "make_estimator"),
-    "force.calibrated_device": ("CalibratedDevice",),
     "force.calibration": ("Calibration", "load_calibration"),
     "force.contacts": ("Contact",),
-    "force.force_reader": ("ForceScan",),
+    "force.reader": ("CalibratedSkin", "ForceScan"),
     "link.clock": ("BoardClock",),
     "link.device": ("Device",),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
-    "opening": ("open",),
+    "opening": ("BoardScan", "Boards", "open", "open_all"),
 }
 
 

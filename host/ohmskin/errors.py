@@ -5,7 +5,16 @@ from __future__ import annotations
 
 
 class OhmskinError(Exception):
-    """Any of the errors below. Bad arguments are `ValueError` instead."""
+    """Any of the errors below. Bad arguments are `ValueError` instead.
+
+    `problem`: what happened. `remedy`: what to do about it, where that is told apart. The text is
+    both.
+    """
+
+    def __init__(self, problem: str, remedy: str = "") -> None:
+        super().__init__(f"{problem}: {remedy}" if remedy else problem)
+        self.problem = problem
+        self.remedy = remedy
 
 
 class PortError(OhmskinError):

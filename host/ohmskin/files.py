@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written whole or not at all, and what a ``with`` closes."""
+"""Files that are read within bounds and written whole or not at all; what a ``with`` closes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,28 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO, Self
+
+
+@contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the file's name before the text of a ValueError from inside, and keep it one line."""
+    try:
+        yield
+    except ValueError as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{os.fspath(path)}: {reason}") from error
+
+
+def read_bounded(path: str | os.PathLike[str], most_bytes: int) -> bytes:
+    """All bytes of a file. Raises ValueError if it cannot be read, or is larger than that."""
+    try:
+        with open(path, "rb") as file:
+            octets = file.read(most_bytes + 1)
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror or error}") from error
+    if len(octets) > most_bytes:
+        raise ValueError(f"more than {most_bytes} bytes")
+    return octets
 
 
 @contextmanager

@@ -1,43 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a port's URL to a `Link`: the one place that knows the kinds of ports.
+"""From a port's URL to a device, or to several: the one place that knows the kinds of ports.
 
 ==================================  ==========================================================
 ``/dev/ttyACM0``, ``COM3``          a serial port; ``?baud=1000000`` for the faster line
-``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulate.board`)
+``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulate`)
 ``simavr://uno?scene=ghost``        the built firmware, run by an AVR simulator in real time
 ``replay://FILE.mcap?speed=1``      a recording (`ohmskin.record.replay`); 0: as fast as it is taken
 ==================================  ==========================================================
+
+What only one kind needs is imported when that kind is opened.
 """
 
 from __future__ import annotations
 
+import heapq
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
-from typing import overload
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
 from urllib.parse import parse_qsl
 
 from ohmskin.arrays import Float
-from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard, EmulatorLink
-from ohmskin.emulate.line_faults import FAULTS, Faults
-from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.simavr_link import SimavrLink
-from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
-from ohmskin.errors import PortError
-from ohmskin.force.calibrated_device import CalibratedDevice
+from ohmskin.errors import DeviceSilent, PortError
+from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import protocol
+from ohmskin.link.clock import BoardClock
 from ohmskin.link.device import Device
-from ohmskin.link.serial_port import Link, SerialLink
-from ohmskin.record.readings import load_readings
-from ohmskin.record.replay import ReplayLink
+from ohmskin.link.messages import Scan
+from ohmskin.link.serial_port import Link, SerialLink, serial_ports
+from ohmskin.link.session import Session
+from ohmskin.link.timing import line_delay_s, scan_s
+
+if TYPE_CHECKING:
+    from ohmskin.emulate.board import EmulatedBoard
+    from ohmskin.emulate.line_faults import Faults
+    from ohmskin.emulate.scenes import Scene
+    from ohmskin.emulate.skin_faults import SkinFaults
 
 CalibrationLike = Calibration | str | os.PathLike[str]
+SkinT = TypeVar("SkinT", bound=Device | CalibratedSkin)
+ScanT = TypeVar("ScanT", bound=Scan)
 
 _SCENE_KEYS = ("scene", "seed")
 _BOARD_KEYS = ("readings", "rate", "noise", "unit", "foreign")
-_EMULATOR_KEYS = (*_SCENE_KEYS, *_BOARD_KEYS, *SKIN_FAULTS, *FAULTS)
+# Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
 
 
@@ -48,7 +59,7 @@ def open(url: str, *, start: bool = True) -> Device: ...
 @overload
 def open(
     url: str, *, start: bool = True, calibration: CalibrationLike, force: bool = False
-) -> CalibratedDevice: ...
+) -> CalibratedSkin: ...
 
 
 def open(
@@ -57,7 +68,7 @@ def open(
     start: bool = True,
     calibration: CalibrationLike | None = None,
     force: bool = False,
-) -> Device:
+) -> Device | CalibratedSkin:
     """Connect to a board, and start scanning unless told otherwise.
 
     calibration: a `Calibration` or the path of its file; scans then carry forces. force: take it
@@ -74,19 +85,45 @@ def open(
     :raises ValueError: the calibration cannot be read, or is of another unit or geometry.
     """
     if calibration is None:
-        link, baud = open_link(url)
-        return Device(link, start=start, baud=baud)
+        return open_device(url, start=start)
     if not isinstance(calibration, Calibration):
         calibration = load_calibration(calibration)
-    link, baud = open_link(url)
-    recorded = link if isinstance(link, ReplayLink) else None
-    return CalibratedDevice(
-        link, calibration, start=start, baud=baud, force=force, recorded=recorded
-    )
+    return _calibrated(open_device(url, start=False), calibration, start=start, force=force)
+
+
+def _calibrated(
+    device: Device, calibration: Calibration, *, start: bool, force: bool = False
+) -> CalibratedSkin:
+    try:
+        skin = CalibratedSkin(device, calibration, force=force)
+        if start:
+            device.start()
+    except BaseException:
+        device.close()
+        raise
+    return skin
+
+
+def open_device(url: str, *, start: bool = True) -> Device:
+    """The device of a URL.
+
+    :raises PortError: as `open`, and so are the other errors.
+    """
+    scheme, separator, rest = url.partition("://")
+    place, _, query = rest.partition("?")
+    if scheme == "replay" and separator:
+        from ohmskin.record.replay import Replay
+
+        options = _options(url, query, ("speed",))
+        try:
+            return Device(Replay(place, float(options.get("speed", "1")), url), start=start)
+        except ValueError as exc:
+            raise PortError(f"{url}: {exc}") from exc
+    return Device(Session(*open_link(url)), start=start)
 
 
 def open_link(url: str) -> tuple[Link, int | None]:
-    """The link of a URL, and the line speed it asks for, if any.
+    """The link of the board at a URL, and the line speed that the URL asks for, if any.
 
     :raises PortError: as `open`.
     """
@@ -97,19 +134,18 @@ def open_link(url: str) -> tuple[Link, int | None]:
         return SerialLink(path), baud
     place, _, query = rest.partition("?")
     if scheme == "emulator":
+        from ohmskin.emulate.board import EmulatorLink
+
         return EmulatorLink(*emulated(url)), None
     if scheme == "simavr":
         return _simavr(url, place, query)
-    if scheme == "replay":
-        options = _options(url, query, ("speed",))
-        try:
-            return ReplayLink(place, float(options.get("speed", "1")), url), None
-        except ValueError as exc:
-            raise PortError(f"{url}: {exc}") from exc
     raise PortError(
         f"no kind of port '{scheme}://': there are serial ports by name, emulator://, simavr:// "
         "and replay://"
     )
+
+
+# ----------------------------------------------------------------------------- without a board
 
 
 def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
@@ -117,11 +153,15 @@ def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
 
     :raises PortError: the URL is wrong.
     """
+    from ohmskin.emulate.board import EmulatedBoard
+    from ohmskin.emulate.line_faults import FAULTS, Faults
+    from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
+
     scheme, _, rest = url.partition("://")
     place, _, query = rest.partition("?")
     if scheme != "emulator":
         raise PortError(f"{url} is not emulated: write emulator://8x8")
-    options = _options(url, query, _EMULATOR_KEYS)
+    options = _options(url, query, (*_SCENE_KEYS, *_BOARD_KEYS, *SKIN_FAULTS, *FAULTS))
     try:
         seed = int(options.pop("seed", "0"))
         skin_faults = SkinFaults.from_texts(options)
@@ -156,6 +196,9 @@ def _skin(
         raise ValueError("say either scene or readings")
     if faults.of_resistances:
         raise ValueError("readings of a file have no resistances that could be at fault")
+    from ohmskin.emulate.board import DEFAULT_RATE_HZ
+    from ohmskin.record.readings import load_readings
+
     ratio = load_readings(path).ratio
     rate_hz = float(options.setdefault("rate", str(DEFAULT_RATE_HZ)))
     # Half a scan on, because a scan begins a rounding error before its frame's time.
@@ -165,6 +208,8 @@ def _skin(
 def _scene(
     place: str, options: dict[str, str], seed: int, faults: SkinFaults | None = None
 ) -> Scene:
+    from ohmskin.emulate.scenes import Scene
+
     size = re.fullmatch(r"(\d{1,2})x(\d{1,2})", place)
     if size is None:
         raise ValueError(f"the size '{place}' is not of the form 8x8")
@@ -176,6 +221,8 @@ def _scene(
 
 
 def _simavr(url: str, place: str, query: str) -> tuple[Link, int | None]:
+    from ohmskin.emulate.simavr import SimavrLink
+
     options = _options(url, query, (*_SCENE_KEYS, "rows", "columns", "elf", "baud", "tau_us"))
     try:
         seed = int(options.pop("seed", "0"))
@@ -206,3 +253,186 @@ def _options(url: str, query: str, known: Iterable[str]) -> dict[str, str]:
         if key not in known:
             raise PortError(f"{url}: no option '{key}': there are {', '.join(known)}")
     return options
+
+
+# ------------------------------------------------------------------------------ several boards
+
+
+class BoardScan(NamedTuple, Generic[ScanT]):
+    """A scan of one of several boards.
+
+    time_s: when its middle was, on `time.monotonic()` [s]; late by what USB delays all scans alike.
+    jitter_s: `BoardClock.jitter_s`.
+    """
+
+    unit_id: int
+    scan: ScanT
+    time_s: float
+    jitter_s: float
+
+
+class Boards(Closing, Mapping[int, SkinT]):
+    """Open boards by unit id. Made by `open_all`; closes all with ``with`` or `close`."""
+
+    def __init__(self, devices: Iterable[SkinT], closing: ExitStack) -> None:
+        self._devices = {device.info.unit_id: device for device in devices}
+        self._closing = closing
+
+    def __getitem__(self, unit_id: int) -> SkinT:
+        return self._devices[unit_id]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._devices)
+
+    def __len__(self) -> int:
+        return len(self._devices)
+
+    @overload
+    def scans(self: Boards[CalibratedSkin]) -> Iterator[BoardScan[ForceScan]]: ...
+
+    @overload
+    def scans(self: Boards[Device]) -> Iterator[BoardScan[Scan]]: ...
+
+    def scans(self: Boards[SkinT]) -> Iterator[BoardScan[Scan]]:  # type: ignore[misc]
+        """Every scan of every board from now on, in order of their times.
+
+        A scan comes when every other board has sent a later one: about a period of the slowest
+        board late. A program for which that is too late reads each device's `latest`.
+
+        :raises DeviceLost: one of the boards went away; its text names the port.
+        """
+        # All boards begin now: the merge below takes from one after the other.
+        begun = [(unit_id, device, iter(device)) for unit_id, device in self.items()]
+        each = [_timed(unit_id, device, scans) for unit_id, device, scans in begun]
+        return heapq.merge(*each, key=lambda board_scan: board_scan.time_s)
+
+    def close(self) -> None:
+        """Stop all boards and give their ports back. May be called again."""
+        self._closing.close()
+
+
+def _timed(
+    unit_id: int, device: Device | CalibratedSkin, scans: Iterator[Scan]
+) -> Iterator[BoardScan[Scan]]:
+    clock = BoardClock()
+    for scan in scans:
+        board = device.info
+        took_us = 1e6 * scan_s(board)
+        clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
+        time_s = clock.host_s(scan.time_us + took_us / 2)
+        yield BoardScan(unit_id, scan, time_s, clock.jitter_s)
+
+
+@overload
+def open_all(
+    urls: Iterable[str] | None = None, *, calibrations: None = None, start: bool = True
+) -> Boards[Device]: ...
+
+
+@overload
+def open_all(
+    urls: Iterable[str] | None = None,
+    *,
+    calibrations: Sequence[CalibrationLike],
+    start: bool = True,
+) -> Boards[CalibratedSkin]: ...
+
+
+def open_all(
+    urls: Iterable[str] | None = None,
+    *,
+    calibrations: Sequence[CalibrationLike] | None = None,
+    start: bool = True,
+) -> Boards[Any]:
+    """Connect to several boards, all of these or none, and start scanning unless told otherwise.
+
+    urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a
+    Mega 2560. Of these, what does not answer as a skin is skipped: it is another device. A skin
+    that cannot be used, for its port is busy or its firmware of another version, is an error.
+    calibrations: `Calibration` or files, for each board the one of its unit id; there may be more.
+
+    >>> with open_all(["emulator://8x8?unit=1", "emulator://8x8?unit=2"]) as skins:
+    ...     sorted(skins)
+    [1, 2]
+
+    :raises PortError: as `ohmskin.open`; no board is found; two have the same unit id.
+    :raises DeviceSilent: as `ohmskin.open`, for a port that was named.
+    :raises ProtocolMismatch: as `ohmskin.open`.
+    :raises ValueError: as `ohmskin.open`; a board has no calibration, or two are of one unit.
+    """
+    searched = urls is None
+    named = [port.path for port in serial_ports() if port.board] if urls is None else list(urls)
+    if not named:
+        raise PortError(
+            "no skin board found: 'ohmskin ports' lists the ports there are; name those of boards "
+            "that it does not know"
+        )
+    by_unit = None if calibrations is None else _by_unit(calibrations)
+    with ExitStack() as opened:
+
+        def connect(url: str) -> Device | CalibratedSkin | None:
+            try:
+                device = _open(url, by_unit)
+            except DeviceSilent:
+                if searched:
+                    return None
+                raise
+            opened.callback(device.close)
+            return device
+
+        # At once, because each takes as long as its board to boot.
+        with ThreadPoolExecutor(len(named)) as pool:
+            found = [device for device in pool.map(connect, named) if device is not None]
+        if not found:
+            raise PortError(f"no skin board answers at {', '.join(named)}: are they flashed?")
+        _check_units(found)
+        if start:
+            for device in found:
+                device.start()
+        return Boards(found, opened.pop_all())
+
+
+def _open(url: str, by_unit: Mapping[int, Calibration] | None) -> Device | CalibratedSkin:
+    device = open_device(url, start=False)
+    if by_unit is None:
+        return device
+    unit_id = device.info.unit_id
+    if unit_id not in by_unit:
+        device.close()
+        known = ", ".join(map(str, sorted(by_unit))) or "none"
+        raise ValueError(
+            f"{url} is unit {unit_id}, of which there is no calibration (there are of units: "
+            f"{known}): calibrate this skin"
+        )
+    try:
+        return _calibrated(device, by_unit[unit_id], start=False)
+    except ValueError as exc:
+        raise ValueError(f"{url}: {exc}") from exc
+
+
+def _by_unit(calibrations: Sequence[CalibrationLike]) -> dict[int, Calibration]:
+    by_unit: dict[int, Calibration] = {}
+    names: dict[int, str] = {}
+    for index, given in enumerate(calibrations):
+        if isinstance(given, Calibration):
+            calibration, name = given, f"calibration {index}"
+        else:
+            calibration, name = load_calibration(given), os.fspath(given)
+        unit_id = calibration.unit_id
+        if unit_id in by_unit:
+            raise ValueError(f"{names[unit_id]} and {name} are both of unit {unit_id}: give one")
+        by_unit[unit_id], names[unit_id] = calibration, name
+    return by_unit
+
+
+def _check_units(devices: Sequence[Device | CalibratedSkin]) -> None:
+    by_unit: dict[int, Device | CalibratedSkin] = {}
+    taken = {device.info.unit_id for device in devices}
+    for device in devices:
+        first = by_unit.setdefault(device.info.unit_id, device)
+        if first is not device:
+            free = next(number for number in range(1, len(taken) + 2) if number not in taken)
+            raise PortError(
+                f"{first.name} and {device.name} are both unit {device.info.unit_id}: rename one: "
+                f"ohmskin configure {device.name} --unit-id {free} --save"
+            )

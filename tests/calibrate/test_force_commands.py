@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_calibrated_device import GHOST, of_scene
 
+from calibrations import GHOST, of_scene
 from command_line import Done, assert_one_line
 from ohmskin.force.calibration import load_calibration
 

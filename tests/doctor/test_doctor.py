@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
-from test_calibrated_device import calibration
 
 import ohmskin
 from bench_board import Bench, examined
+from calibrations import calibration
 from command_line import Done, assert_one_line
 from ohmskin.cli import doctor as doctor_command
 from ohmskin.doctor.examine import Examined, examine
@@ -30,8 +30,7 @@ from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link import protocol, session
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
-from ohmskin.link.scan_times import reading_offsets_s, slot_s
-from ohmskin.link.usb_latency import latency_ms, latency_timer_file
+from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
 
@@ -277,21 +276,6 @@ def test_second_look_is_what_a_board_takes() -> None:
         bench.ask("configure", adc_prescaler=board.adc_prescaler, **size, **wanted)
         assert bench.hello().settle_asked_us == other[0]
         assert bench.hello().rate_hz >= min(1.0, 0.7 * board.rate_hz)
-
-
-def test_readings_are_timed_as_the_board_takes_them() -> None:
-    for url in ("8x8", "16x16", "8x8?rate=20", "3x5?rate=0", "1x1"):
-        bench = Bench(f"emulator://{url}")
-        board = bench.hello()
-        slot_cycles = bench.board._plan["slot_cycles"]
-        readings = board.rows * board.columns * 4
-        # A degree of 60 Hz at the scan's end.
-        assert abs(slot_s(board) - slot_cycles / 16e6) * readings < 1.2e-4
-        offsets = reading_offsets_s(board)
-        assert offsets[0, 0].tolist() == pytest.approx([k * slot_s(board) for k in range(4)])
-        assert offsets.max() < board.scan_cycles / board.clock_hz
-        if board.rows > 1:
-            assert offsets[1, 0, 0] == pytest.approx(4 * slot_s(board))
 
 
 # ------------------------------------------------------------------------------------- wires

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from lockstep import LockstepSim, elf_of
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.simavr import SkinSim
 from ohmskin.errors import PortError
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
@@ -49,7 +49,7 @@ class Firmware:
     """The built firmware in lock-step: simulated time passes only in `exchange`."""
 
     def __init__(self, board: str) -> None:
-        self.sim = SkinSim(board, ROOT / ".pio" / "build" / board / "firmware.elf")
+        self.sim = LockstepSim(board, elf_of(board))
         self.sim.set_table(Scene().ratio(0.0))
 
     def exchange(self, octets: bytes, seconds: float) -> bytes:
@@ -340,6 +340,7 @@ def test_emulator_and_firmware_answer_alike(board: str) -> None:
             assert asked_for(kept) == asked_for(modelled)
             assert (asked_for(kept) == wanted) >= (result == "ok"), change
             assert modelled.rate_hz == pytest.approx(kept.rate_hz, rel=0.002), change
+            assert modelled.slot_cycles == pytest.approx(kept.slot_cycles, rel=0.05), change
             assert modelled.settle_us == pytest.approx(kept.settle_us, rel=0.05, abs=1), change
         print(f"{board}: {len(CONFIGURATIONS)} configurations: {results}")
         assert len(CONFIGURATIONS) >= 60

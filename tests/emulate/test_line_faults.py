@@ -15,16 +15,18 @@ import numpy as np
 import pytest
 
 import ohmskin
+from lockstep import LockstepSim
+from ohmskin.emulate import simavr
 from ohmskin.emulate.board import EmulatorLink
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.simavr_link import SimavrLink
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import device, framing, protocol, session
 from ohmskin.link.codes import quantise
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import SerialLink
+from ohmskin.link.session import Session
 from ohmskin.opening import emulated, open_link
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -126,16 +128,16 @@ def test_a_reset_board_goes_on_as_it_was_configured() -> None:
 
 @pytest.mark.simavr
 @pytest.mark.parametrize("baud", [500_000, 1_000_000])
-def test_a_reset_of_the_firmware(baud: int) -> None:
+def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its line speed is that of the start again, too; the simulated line follows the board's."""
+    monkeypatch.setattr(simavr, "SkinSim", LockstepSim)
     link, _ = open_link("simavr://uno")
-    assert isinstance(link, SimavrLink)
-    with ohmskin.Device(link, baud=baud) as skin:
+    with ohmskin.Device(Session(link, baud)) as skin:
         kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
         scans = iter(skin)
         for _ in range(20):
             assert next(scans).codes.shape == (3, 7, 4)
-        link._sim.reset()
+        link.sim.reset()
         until = next(scan for scan in scans if skin.stats.restarts)
         for scan in itertools.islice(scans, 20):
             assert scan.codes.shape == (3, 7, 4)
@@ -178,7 +180,7 @@ class ResetAfterConfigure(EmulatorLink):
 
 def test_a_reset_right_after_configure_does_not_undo_it() -> None:
     link = ResetAfterConfigure(*emulated("emulator://4x4"))
-    with ohmskin.Device(link) as skin:
+    with ohmskin.Device(Session(link)) as skin:
         assert skin.configure(rows=2, rate_hz=77).rows == 2
         assert link.resets_due == 0
         assert skin.info.rate_asked_mhz == 77_000
@@ -187,7 +189,7 @@ def test_a_reset_right_after_configure_does_not_undo_it() -> None:
 
 def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
     board, name, _ = emulated("emulator://4x4")
-    with Device(EmulatorLink(board, name), start=False) as skin:
+    with Device(Session(EmulatorLink(board, name)), start=False) as skin:
         skin.configure(rows=2, columns=3, rate_hz=77)
         board.reset()
         skin.start()
@@ -320,7 +322,7 @@ def test_a_board_that_is_reset_by_the_opening_of_its_port() -> None:
         def close(self) -> None:
             pass
 
-    with ohmskin.Device(Bootloader()) as skin:
+    with ohmskin.Device(Session(Bootloader())) as skin:
         assert skin.latest().codes.shape == (3, 3, 4)
         assert skin.stats.restarts == 0
 

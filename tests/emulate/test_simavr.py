@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator bridge itself, against small firmwares and numbers from the datasheet.
+"""The simulator and its bridge, against small programs and numbers from the data sheet.
 
 Assembler programs start at the reset vector, so that the cycle of each of their instructions is
-known: comments give the cycle at which an instruction's effect is there.
+known: comments give the cycle at which an instruction takes effect.
 """
 
 from __future__ import annotations
@@ -13,14 +13,19 @@ import select
 import shutil
 import struct
 import subprocess
+import termios
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ohmskin.emulate.simavr import CPU_HZ, SimulationError, SkinSim, default_program
+from lockstep import CPU_HZ, LockstepSim
+from ohmskin.emulate import simavr
+from ohmskin.emulate.simavr import SimulationError, default_program
 
 pytestmark = pytest.mark.skipif(
     shutil.which("avr-gcc") is None or not default_program().exists(),
@@ -36,28 +41,38 @@ PORF, EXTRF, WDRF = 0x01, 0x02, 0x08
 DOR0, FE0, RXC0 = 0x08, 0x10, 0x80
 ENTRY_AND_RETI_CYCLES = {"uno": 8, "megaatmega2560": 10}
 
-Build = Callable[..., Path]
+Build = Callable[[str, str], Path]
+Simulate = Callable[..., LockstepSim]
 
 
 @pytest.fixture(scope="session")
 def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """Compile C (or assembler without start-up code) once per program and board."""
+    """Compile C, or assembler without start-up code, once per program and board."""
     folder = tmp_path_factory.mktemp("firmware")
-    built: dict[tuple[str, str, bool], Path] = {}
 
-    def compile_for(board: str, source: str, *, assembler: bool = False) -> Path:
-        key = (board, source, assembler)
-        if key not in built:
-            stem = folder / f"f{len(built)}"
-            path = stem.with_suffix(".S" if assembler else ".c")
-            path.write_text(source)
-            options = ["-nostartfiles", "-nostdlib"] if assembler else ["-std=gnu99"]
-            command = ["avr-gcc", f"-mmcu={MCU[board]}", "-DF_CPU=16000000UL", "-Os", *options]
-            subprocess.run([*command, "-o", stem.with_suffix(".elf"), path], check=True)
-            built[key] = stem.with_suffix(".elf")
-        return built[key]
+    @cache
+    def compile_for(board: str, source: str) -> Path:
+        stem = folder / f"f{len(list(folder.iterdir()))}"
+        assembler = "#include" not in source
+        path = stem.with_suffix(".S" if assembler else ".c")
+        path.write_text(source)
+        options = ["-nostartfiles", "-nostdlib"] if assembler else ["-std=gnu99"]
+        command = ["avr-gcc", f"-mmcu={MCU[board]}", "-DF_CPU=16000000UL", "-Os", *options]
+        subprocess.run([*command, "-o", stem.with_suffix(".elf"), path], check=True)
+        return stem.with_suffix(".elf")
 
     return compile_for
+
+
+@pytest.fixture
+def simulate(build: Build) -> Iterator[Simulate]:
+    """A function that simulates a board with a program."""
+    with ExitStack() as stack:
+
+        def start(source: str, board: str = "uno", *, pty: bool = False) -> LockstepSim:
+            return stack.enter_context(LockstepSim(board, build(board, source), pty=pty))
+
+        yield start
 
 
 def sts(address: int, value: int) -> str:
@@ -72,12 +87,34 @@ def sts_word(address: int, value: int) -> str:
 
 FOREVER = "1: rjmp 1b\n"
 CLEAR_OCF1B_FOREVER = "1: sbi 0x16, 2\n rjmp 1b\n"
+# The ADC runs freely and holds at 470, 886, ...; at 9.
+FREE_RUNNING = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA5) + sts(ADCSRA, 0xE5)
+# The transmitter at 500 kbaud; at 6.
+TRANSMITTER = sts(0xC0, 2) + sts(0xC1, 8)
+
+# Begin of C programs that send.
+C = """
+#include <avr/io.h>
+#include <util/delay.h>
+static void send(uint8_t b) { while (!(UCSR0A & 0x20)) {} UDR0 = b; }
+static void transmitter(void) { UCSR0A = 2; UBRR0L = 3; UCSR0B = 8; }
+"""
 
 
-def hold_cycles(sim: SkinSim, cycles: int) -> list[int]:
+def triggered(top: int, compare: int, adps: int = 5) -> str:
+    """Timer 1 counts to `top` and triggers the ADC at `compare`; it runs from 24 on."""
+    adc = sts(ADMUX, 0x40) + sts(ADCSRB, 5) + sts(ADCSRA, 0xA0 | adps)
+    return adc + sts_word(ICR1, top) + sts_word(OCR1B, compare) + sts(TCCR1B, 0x19)
+
+
+def hold_log(sim: LockstepSim, cycles: int) -> np.ndarray:
     sim.hold_log(True)
     sim.run_cycles(cycles)
-    return [int(cycle) for cycle in sim.drain_hold_log()["cycle"]]
+    return sim.drain_hold_log()
+
+
+def hold_cycles(sim: LockstepSim, cycles: int) -> list[int]:
+    return [int(cycle) for cycle in hold_log(sim, cycles)["cycle"]]
 
 
 # ---- ADC ---------------------------------------------------------------------------------------
@@ -85,26 +122,23 @@ def hold_cycles(sim: SkinSim, cycles: int) -> list[int]:
 
 @BOARDS
 @pytest.mark.parametrize("adps", [1, 2, 3, 4, 5, 6, 7])
-def test_free_running_holds_and_period(build: Build, board: str, adps: int) -> None:
+def test_free_running_holds_and_period(simulate: Simulate, board: str, adps: int) -> None:
     program = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA0 | adps) + sts(ADCSRA, 0xE0 | adps) + FOREVER
     clock = 1 << adps
     start = 6 + clock * (3 // clock + 1)  # ADEN at 6, ADSC at 9: the next ADC clock edge
     end_of_first = start + 25 * clock
     expected = [start + int(13.5 * clock)]
     expected += [end_of_first + int(1.5 * clock) + 13 * clock * i for i in range(9)]
-    with SkinSim(board, build(board, program, assembler=True)) as sim:
-        assert hold_cycles(sim, 200 * clock)[:10] == expected
-        assert sim.stats()["trigger_gap_cycles_max"] == 25 * clock
+    sim = simulate(program, board)
+    assert hold_cycles(sim, 200 * clock)[:10] == expected
+    assert sim.stats()["trigger_gap_cycles_max"] == 25 * clock
 
 
-def test_single_conversion_takes_13_clocks_from_the_next_edge(build: Build) -> None:
+def test_single_conversion_takes_13_clocks_from_the_next_edge(simulate: Simulate) -> None:
     program = sts(ADMUX, 0x40) + sts(ADCSRA, 0x85) + sts(ADCSRA, 0xC5)
     # ADEN at 6; the first conversion starts at 38 and ends at 838
-    program += "1: lds r17, 0x7A\n sbrc r17, 6\n rjmp 1b\n"
-    program += sts(ADCSRA, 0xC5)
-    program += "out 0x1E, r16\n" + FOREVER
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        holds = hold_cycles(sim, 3000)
+    program += "1: lds r17, 0x7A\n sbrc r17, 6\n rjmp 1b\n" + sts(ADCSRA, 0xC5) + FOREVER
+    holds = hold_cycles(simulate(program), 3000)
     # The loop reads the cleared ADSC within 6 cycles of 838 and restarts before the edge at 870.
     assert holds == [38 + 432, 870 + 48]
 
@@ -112,76 +146,61 @@ def test_single_conversion_takes_13_clocks_from_the_next_edge(build: Build) -> N
 @BOARDS
 @pytest.mark.parametrize("compare", [0, 10, 693])
 def test_timer_triggered_hold_is_67_cycles_after_the_match(
-    build: Build, board: str, compare: int
+    simulate: Simulate, board: str, compare: int
 ) -> None:
-    program = sts(ADMUX, 0x40) + sts(ADCSRB, 5) + sts(ADCSRA, 0xA5)
-    program += sts_word(ICR1, 693) + sts_word(OCR1B, compare) + sts(TCCR1A, 0) + sts(TCCR1B, 0x19)
-    started = 9 + 12 + 6
-    matches = [started + compare + 1 + 694 * i for i in range(12)]
+    matches = [24 + compare + 1 + 694 * i for i in range(12)]
     # The first conversion takes 3 + 800 cycles: it swallows the second match.
     expected = [matches[0] + 3 + 432] + [match + 3 + 64 for match in matches[2:]]
-    with SkinSim(board, build(board, program + CLEAR_OCF1B_FOREVER, assembler=True)) as sim:
-        assert hold_cycles(sim, 694 * 14)[:11] == expected
+    sim = simulate(triggered(693, compare) + CLEAR_OCF1B_FOREVER, board)
+    assert hold_cycles(sim, 694 * 14)[:11] == expected
 
 
-def test_triggers_during_a_conversion_are_ignored(build: Build) -> None:
-    program = sts(ADMUX, 0x40) + sts(ADCSRB, 5) + sts(ADCSRA, 0xA5)
-    program += sts_word(ICR1, 399) + sts_word(OCR1B, 399) + sts(TCCR1B, 0x19)
-    with SkinSim("uno", build("uno", program + CLEAR_OCF1B_FOREVER, assembler=True)) as sim:
-        holds = hold_cycles(sim, 40_000)
+def test_what_does_not_trigger(simulate: Simulate) -> None:
+    """A trigger during a conversion, and one for which OCF1B has not been cleared."""
+    holds = hold_cycles(simulate(triggered(399, 399) + CLEAR_OCF1B_FOREVER), 40_000)
     assert set(np.diff(holds[1:])) == {800}  # 3 + 432 cycles do not fit into 400
+    assert len(hold_cycles(simulate(triggered(693, 10) + FOREVER), 100_000)) == 1
 
 
-def test_no_trigger_while_ocf1b_stays_set(build: Build) -> None:
-    program = sts(ADMUX, 0x40) + sts(ADCSRB, 5) + sts(ADCSRA, 0xA5)
-    program += sts_word(ICR1, 693) + sts_word(OCR1B, 10) + sts(TCCR1B, 0x19)
-    with SkinSim("uno", build("uno", program + FOREVER, assembler=True)) as sim:
-        assert len(hold_cycles(sim, 100_000)) == 1
-
-
-def test_a_million_timer_periods_are_exact(build: Build) -> None:
-    program = sts(ADMUX, 0x40) + sts(ADCSRB, 5) + sts(ADCSRA, 0xA1)
-    program += sts_word(ICR1, 99) + sts_word(OCR1B, 10) + sts(TCCR1B, 0x19)
-    with SkinSim("uno", build("uno", program + CLEAR_OCF1B_FOREVER, assembler=True)) as sim:
-        sim.run_cycles(1000)
-        sim.reset_stats()
-        sim.run_cycles(100_000_000)
-        stats = sim.stats()
+def test_a_million_timer_periods_are_exact(simulate: Simulate) -> None:
+    sim = simulate(triggered(99, 10, adps=1) + CLEAR_OCF1B_FOREVER)
+    sim.run_cycles(1000)
+    sim.reset_stats()
+    sim.run_cycles(100_000_000)
+    stats = sim.stats()
     assert (stats["trigger_gap_cycles_min"], stats["trigger_gap_cycles_max"]) == (100, 100)
     assert stats["conversions"] == 1_000_000
 
 
-def test_data_register_is_locked_between_adcl_and_adch(build: Build) -> None:
+def test_data_register_is_locked_between_adcl_and_adch(simulate: Simulate) -> None:
     program = """
-    #include <avr/io.h>
-    #include <util/delay.h>
     int main(void) {
         DDRB = 15; DDRD = 0xFC; PORTD = 4;
-        UCSR0A = 2; UBRR0L = 3; UCSR0B = 8;
+        transmitter();
         ADMUX = 0x40; ADCSRA = 0xE3;
         _delay_us(50);
         uint8_t low = ADCL;
         PORTD = 4 | 16;
         _delay_us(100);
-        uint8_t high = ADCH;
-        UDR0 = low; UDR0 = high;
+        send(low); send(ADCH);
         _delay_us(50);
         ADMUX |= 0x20;
-        low = ADCL; high = ADCH;
-        UDR0 = low; UDR0 = high;
+        low = ADCL;
+        send(low); send(ADCH);
         for (;;) {}
     }"""
     table = np.zeros((2, 1, 4))
     table[0, 0, 0], table[1, 0, 0] = 0x155 / 1024, 0x2AA / 1024
-    with SkinSim("uno", build("uno", program)) as sim:
-        sim.set_table(table)
-        sent = sim.run(0.01)
-        assert sim.stats()["lost_results"] > 10
+    sim = simulate(C + program)
+    sim.set_table(table)
+    sent = sim.run(0.01)
+    assert sim.stats()["lost_results"] > 10
     assert struct.unpack("<2H", sent) == (0x155, 0x2AA << 6)
 
 
-SCAN = """
-#include <avr/io.h>
+SCAN = (
+    C
+    + """
 #ifdef __AVR_ATmega2560__
 #define SELECT(r, c, top) (PORTA = (r), PORTC = (c), PORTL = (top) ? 1 : 2)
 #define OUTPUTS() (DDRA = 15, DDRC = 15, DDRL = 3)
@@ -189,10 +208,9 @@ SCAN = """
 #define SELECT(r, c, top) (PORTB = (c), PORTD = (r) << 4 | ((top) ? 4 : 8))
 #define OUTPUTS() (DDRB = 15, DDRD = 0xFC)
 #endif
-static void send(uint8_t b) { while (!(UCSR0A & 0x20)) {} UDR0 = b; }
 int main(void) {
     OUTPUTS();
-    UCSR0A = 2; UBRR0L = 3; UCSR0B = 8;
+    transmitter();
     ADCSRA = 0x82;
     for (uint8_t c = 0; c < 16; c++)
         for (uint8_t r = 0; r < 16; r++)
@@ -207,63 +225,49 @@ int main(void) {
     for (;;) {}
 }
 """
+)
 
 
 @BOARDS
-def test_codes_of_every_cell_and_configuration(build: Build, board: str) -> None:
+def test_codes_of_every_cell_and_configuration(simulate: Simulate, board: str) -> None:
     rng = np.random.default_rng(7)
     ratio = rng.random((16, 16, 4))
     codes = np.minimum(np.floor(ratio * 1024), 1023)
-    edges = {
-        0.0: 0,
-        1.0: 1023,
-        1023.999 / 1024: 1023,
-        1 / 1024: 1,
-        0.999 / 1024: 0,
-        0.5: 512,
-        -0.1: 0,
-        1.5: 1023,
-    }
-    for row, (value, code) in enumerate(edges.items()):
-        ratio[row, 3, 1], codes[row, 3, 1] = value, code
-    with SkinSim(board, build(board, SCAN)) as sim:
-        sim.set_table(ratio)
-        sim.hold_log(True)
-        sent = sim.run(0.1)
-        holds = sim.drain_hold_log()
-        assert sim.stats()["undriven"] == 0
+    ratio[:8, 3, 1] = [0.0, 1.0, 1023.999 / 1024, 1 / 1024, 0.999 / 1024, 0.5, -0.1, 1.5]
+    codes[:8, 3, 1] = [0, 1023, 1023, 1, 0, 512, 0, 1023]
+    sim = simulate(SCAN, board)
+    sim.set_table(ratio)
+    sim.hold_log(True)
+    sent = sim.run(0.1)
+    holds = sim.drain_hold_log()
+    assert sim.stats()["undriven"] == 0
     received = np.frombuffer(sent, "<u2").reshape(16, 16, 4).transpose(1, 0, 2)  # rows run fastest
     np.testing.assert_array_equal(received, codes)
     np.testing.assert_array_equal(holds["code"], received.transpose(1, 0, 2).ravel())
     assert list(holds["configuration"][:8]) == [0, 1, 2, 3, 0, 1, 2, 3]
     assert list(holds["row"][::4][:3]) == [0, 1, 2]
     assert holds["column"][-1] == 15
-
-
-def test_unset_cells_carry_no_current(build: Build) -> None:
-    with SkinSim("uno", build("uno", SCAN)) as sim:
-        sim.set_table(np.full((2, 2, 4), 0.5))
-        codes = np.frombuffer(sim.run(0.1), "<u2").reshape(16, 16, 4)
+    sim.set_table(np.full((2, 2, 4), 0.5))  # cells beyond it carry no current
+    sim.reset()
+    codes = np.frombuffer(sim.run(0.1), "<u2").reshape(16, 16, 4)
     assert list(codes[1, 1]) == [512] * 4
     assert list(codes[2, 0]) == [1023, 0, 1023, 0]
 
 
-def test_undriven_pins_and_equal_drive(build: Build) -> None:
+def test_undriven_pins_and_equal_drive(simulate: Simulate) -> None:
     program = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA2) + sts(ADCSRA, 0xE2)
     delay = "ldi r24, 0\n 2: dec r24\n brne 2b\n"
     program += delay + "ldi r16, 15\n out 0x04, r16\n ldi r16, 0xFC\n out 0x0A, r16\n"
     program += delay + "ldi r16, 12\n out 0x0B, r16\n" + FOREVER
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        sim.hold_log(True)
-        sim.run_cycles(3000)
-        holds = sim.drain_hold_log()
-        undriven = sim.stats()["undriven"]
+    sim = simulate(program)
+    holds = hold_log(sim, 3000)
+    undriven = sim.stats()["undriven"]
     states = [(int(h["configuration"]), int(h["code"])) for h in holds]
     assert sorted(set(states)) == [(4, 0), (4, 1023), (5, 0)]
     assert undriven == states.count((5, 0)) > 5
 
 
-def test_settling_is_exponential_and_continues_from_an_unsettled_value(build: Build) -> None:
+def test_settling_is_exponential_and_continues_from_an_unsettled_value(simulate: Simulate) -> None:
     # Pins: outputs first, drive top high at row 0, then row 1 a little later.
     program = sts(ADMUX, 0x40) + sts(ADCSRA, 0x83)  # ADEN at 6, ADC clock 8 cycles
     program += "ldi r16, 15\n out 0x04, r16\n ldi r16, 0xFC\n out 0x0A, r16\n"  # driven low: 0.0
@@ -275,13 +279,11 @@ def test_settling_is_exponential_and_continues_from_an_unsettled_value(build: Bu
     table = np.zeros((2, 1, 4))
     table[0, 0, 0], table[1, 0, 0] = 0.9, 0.3
     tau_us = 4.0
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        sim.set_table(table)
-        sim.set_tau_us(tau_us)
-        sim.hold_log(True)
-        sim.run_cycles(1000)
-        record = sim.drain_hold_log()[0]
-        stats = sim.stats()
+    sim = simulate(program)
+    sim.set_table(table)
+    sim.set_tau_us(tau_us)
+    record = hold_log(sim, 1000)[0]
+    stats = sim.stats()
     decay = [math.exp(-d / 16 / tau_us) for d in (changed_again - changed, held - changed_again)]
     unsettled = 0.9 * (1 - decay[0])
     expected = 0.3 + (unsettled - 0.3) * decay[1]
@@ -290,27 +292,19 @@ def test_settling_is_exponential_and_continues_from_an_unsettled_value(build: Bu
     assert stats["settle_cycles_min"] == held - changed_again
 
 
-def test_settle_and_change_after_hold_gaps(build: Build) -> None:
-    program = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA5) + sts(ADCSRA, 0xE5)  # holds at 470, 886, ...
-    program += "ldi r24, 160\n 2: dec r24\n brne 2b\n"  # to 9 + 480 = 489
-    program += "ldi r16, 0x10\n out 0x0B, r16\n" + FOREVER  # at 491
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        sim.run_cycles(1000)
-        stats = sim.stats()
-    assert stats["change_after_hold_cycles_min"] == 491 - 470
-    assert stats["settle_cycles_min"] == 886 - 491
-
-
-def test_settling_of_pins_and_of_the_channel_are_told_apart(build: Build) -> None:
-    program = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA5) + sts(ADCSRA, 0xE5)  # holds at 470, 886, ...
-    program += "ldi r16, 0x10\n out 0x0B, r16\n"  # row 1 at 11
-    program += "ldi r24, 160\n 2: dec r24\n brne 2b\n"  # to 491
-    program += sts(ADMUX, 0x41) + FOREVER  # at 494; in effect 1 ADC clock before the end, at 806
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        sim.run_cycles(1000)
-        stats = sim.stats()
+def test_gaps_between_changes_and_holds(simulate: Simulate) -> None:
+    """Those of row, column and drive pins are told apart from those of the ADC's channel."""
+    program = FREE_RUNNING + "ldi r16, 0x10\n out 0x0B, r16\n"  # row 1 at 11
+    program += "ldi r24, 159\n 2: dec r24\n brne 2b\n"  # to 11 + 477 = 488
+    program += "ldi r16, 0x20\n out 0x0B, r16\n"  # row 2 at 490
+    program += sts(ADMUX, 0x41) + FOREVER  # at 493; in effect 1 ADC clock before the end, at 806
+    sim = simulate(program)
+    sim.run_cycles(1000)
+    stats = sim.stats()
+    assert stats["settle_cycles_max"] == 470 - 11
+    assert stats["settle_cycles_min"] == 886 - 490
+    assert stats["change_after_hold_cycles_min"] == 490 - 470
     assert stats["channel_settle_cycles_min"] == 886 - 806
-    assert stats["settle_cycles_min"] == 470 - 11
 
 
 # ---- timers ------------------------------------------------------------------------------------
@@ -329,14 +323,14 @@ def with_vectors(board: str, main: str, handler: str = "reti") -> str:
 
 @BOARDS
 @pytest.mark.parametrize("wait", [FOREVER, "1: sleep\n rjmp 1b\n"])
-def test_compare_a_interrupts_come_every_period(build: Build, board: str, wait: str) -> None:
+def test_compare_a_interrupts_come_every_period(simulate: Simulate, board: str, wait: str) -> None:
     main = sts_word(ICR1, 693) + sts_word(OCR1A, 5) + sts(TIMSK1, 2) + sts(TCCR1B, 0x19)
     program = with_vectors(board, main + "ldi r16, 1\n out 0x33, r16\n sei\n" + wait)
-    with SkinSim(board, build(board, program, assembler=True)) as sim:
-        sim.run_cycles(10_000)
-        sim.reset_stats()
-        sim.run_cycles(694 * 20_000)
-        stats = sim.stats()
+    sim = simulate(program, board)
+    sim.run_cycles(10_000)
+    sim.reset_stats()
+    sim.run_cycles(694 * 20_000)
+    stats = sim.stats()
     vector = str(VECTOR_TIMER1_A[board])
     cycles = ENTRY_AND_RETI_CYCLES[board]
     assert stats["vectors"] == {
@@ -348,45 +342,42 @@ def test_compare_a_interrupts_come_every_period(build: Build, board: str, wait: 
 @BOARDS
 @pytest.mark.parametrize("enable", ["sei\n", "rcall 5f\n"])
 def test_one_instruction_runs_between_enabling_interrupts_and_the_interrupt(
-    build: Build, board: str, enable: str
+    simulate: Simulate, board: str, enable: str
 ) -> None:
-    main = sts(0xC0, 2) + sts(0xC1, 8) + "clr r20\n"
+    main = TRANSMITTER + "clr r20\n"
     main += sts_word(OCR1A, 5) + sts(TIMSK1, 2) + sts(TCCR1B, 1) + "nop\n" * 20
     main += enable + "inc r20\n" * 5 + FOREVER + "5: reti\n"
     program = with_vectors(board, main, "rjmp 4f") + "4: sts 0xC6, r20\n cli\n" + FOREVER
-    with SkinSim(board, build(board, program, assembler=True)) as sim:
-        assert sim.run(0.001) == b"\x01"
+    sim = simulate(program, board)
+    assert sim.run(0.001) == b"\x01"
 
 
 @BOARDS
-def test_sleep_ends_at_once_if_an_interrupt_waits(build: Build, board: str) -> None:
+def test_sleep_ends_at_once_if_an_interrupt_waits(simulate: Simulate, board: str) -> None:
     main = sts_word(OCR1A, 5) + sts(TIMSK1, 2) + sts(TCCR1B, 1) + "nop\n" * 20
-    main += sts(0xC0, 2) + sts(0xC1, 8)
+    main += TRANSMITTER
     main += "ldi r16, 1\n out 0x33, r16\n sei\n sleep\n" + sts(0xC6, 7) + FOREVER
-    with SkinSim(board, build(board, with_vectors(board, main), assembler=True)) as sim:
-        assert sim.run_cycles(500) == b"\x07"
+    sim = simulate(with_vectors(board, main), board)
+    assert sim.run_cycles(500) == b"\x07"
 
 
-TIMER0 = """
-#include <avr/io.h>
+TIMER0 = (
+    C
+    + """
 int main(void) {
-    UCSR0A = 2; UBRR0L = 3; UCSR0B = 8;
+    transmitter();
     TCCR0A = 0; TCCR0B = 3;
-    for (;;) {
-        while (!(TIFR0 & 1)) {}
-        UDR0 = TCNT0;
-        TCNT0 = PRELOAD;
-        TIFR0 = 1;
-    }
+    for (;;) { while (!(TIFR0 & 1)) {} UDR0 = TCNT0; TCNT0 = PRELOAD; TIFR0 = 1; }
 }
 """
+)
 
 
 @pytest.mark.parametrize(("preload", "ticks"), [("TCNT0", 256), ("6", 250), ("128", 128)])
-def test_timer0_polled_overflows(build: Build, preload: str, ticks: int) -> None:
-    with SkinSim("uno", build("uno", TIMER0.replace("PRELOAD", preload))) as sim:
-        sim.run(0.01)
-        sent = sim.run_cycles(64 * ticks * 100)
+def test_timer0_polled_overflows(simulate: Simulate, preload: str, ticks: int) -> None:
+    sim = simulate(TIMER0.replace("PRELOAD", preload))
+    sim.run(0.01)
+    sent = sim.run_cycles(64 * ticks * 100)
     assert len(sent) == 100
     assert set(sent) == {0}
 
@@ -404,29 +395,28 @@ int main(void) {
 
 @BOARDS
 @pytest.mark.parametrize(("frame", "cycles"), [("0x06", 320), ("0x0E", 352), ("0x26", 352)])
-def test_back_to_back_bytes(build: Build, board: str, frame: str, cycles: int) -> None:
-    with SkinSim(board, build(board, SENDER.replace("FORMAT", frame))) as sim:
-        first = sim.run_cycles(10_000)
-        sent = sim.run_cycles(cycles * 5000)
-        assert sim.stats()["tx_ignored"] == 0
+def test_back_to_back_bytes(simulate: Simulate, board: str, frame: str, cycles: int) -> None:
+    sim = simulate(SENDER.replace("FORMAT", frame), board)
+    first = sim.run_cycles(10_000)
+    sent = sim.run_cycles(cycles * 5000)
+    assert sim.stats()["tx_ignored"] == 0
     assert len(sent) == 5000
     assert all(b == a + 1 & 0xFF for a, b in zip(first + sent, (first + sent)[1:], strict=False))
 
 
-def test_transmitter_holds_two_bytes_and_ignores_a_third(build: Build) -> None:
+def test_transmitter_holds_two_bytes_and_ignores_a_third(simulate: Simulate) -> None:
     program = sts(0xC0, 2) + sts(0xC4, 3) + sts(0xC1, 8)
     program += "".join(sts(0xC6, byte) for byte in b"abc") + FOREVER
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        assert sim.run_cycles(12 + 320 - 2) == b""  # UDR written at 12
-        assert sim.run_cycles(2) == b"a"
-        assert sim.run_cycles(1000) == b"b"
-        assert sim.stats()["tx_ignored"] == 1
+    sim = simulate(program)
+    assert sim.run_cycles(12 + 320 - 2) == b""  # UDR written at 12
+    assert sim.run_cycles(2) == b"a"
+    assert sim.run_cycles(1000) == b"b"
+    assert sim.stats()["tx_ignored"] == 1
 
 
-RECEIVER = """
-#include <avr/io.h>
-#include <util/delay.h>
-static void send(uint8_t b) { while (!(UCSR0A & 0x20)) {} UDR0 = b; }
+RECEIVER = (
+    C
+    + """
 int main(void) {
     UCSR0A = 2; UBRR0L = 3; UCSR0B = 0x18;
     for (;;) {
@@ -437,6 +427,7 @@ int main(void) {
     }
 }
 """
+)
 
 
 @pytest.mark.parametrize(
@@ -448,13 +439,13 @@ int main(void) {
     ],
 )
 def test_receiver_overruns_after_three_bytes(
-    build: Build, sent: bytes, received: list[tuple[int, str]]
+    simulate: Simulate, sent: bytes, received: list[tuple[int, str]]
 ) -> None:
-    with SkinSim("uno", build("uno", RECEIVER)) as sim:
-        sim.run_cycles(1000)
-        sim.write(sent)
-        answer = sim.run(0.003)
-        assert sim.stats()["rx_overruns"] == len(sent) - 3
+    sim = simulate(RECEIVER)
+    sim.run_cycles(1000)
+    sim.write(sent)
+    answer = sim.run(0.003)
+    assert sim.stats()["rx_overruns"] == len(sent) - 3
     assert [(answer[i], chr(answer[i + 1])) for i in range(0, len(answer), 2)] == received
 
 
@@ -475,79 +466,79 @@ int main(void) {
 
 
 @BOARDS
-def test_bytes_arrive_one_after_the_other_at_line_speed(build: Build, board: str) -> None:
+def test_bytes_arrive_one_after_the_other_at_line_speed(simulate: Simulate, board: str) -> None:
     text = bytes(range(200))
-    with SkinSim(board, build(board, ECHO)) as sim:
-        sim.run_cycles(1000)
-        sim.write(text)
-        echoed = sim.run_cycles(100 * 320)
-        assert sim.stats()["rx_bytes"] == 100
-        echoed += sim.run_cycles(110 * 320)
-        assert sim.stats()["rx_overruns"] == 0
+    sim = simulate(ECHO, board)
+    sim.run_cycles(1000)
+    sim.write(text)
+    echoed = sim.run_cycles(100 * 320)
+    assert sim.stats()["rx_bytes"] == 100
+    echoed += sim.run_cycles(110 * 320)
+    assert sim.stats()["rx_overruns"] == 0
     assert echoed == text
 
 
-def test_baud_mismatch_garbles_both_ways(build: Build) -> None:
-    with SkinSim("uno", build("uno", RECEIVER)) as sim:
-        sim.set_baud(510_000)  # 2 % off
-        sim.run_cycles(1000)
-        sim.write(b"x")
-        assert sim.run(0.003) == bytes([RXC0]) + b"x"
-        sim.set_baud(115_200)
-        sim.write(b"x")
-        sim.run(0.0001)
-        garbled = sim.run(0.003)
-        assert len(garbled) == 2
-        assert garbled[0] != RXC0 | FE0  # garbled on the way back as well
-        sim.write(b"x")
-        sim.run_cycles(1500)
-        sim.set_baud(0)
-        status, byte = sim.run(0.003)
-        assert status == RXC0 | FE0
-        assert byte != ord("x")
+def test_baud_mismatch_garbles_both_ways(simulate: Simulate) -> None:
+    sim = simulate(RECEIVER)
+    sim.set_baud(510_000)  # 2 % off
+    sim.run_cycles(1000)
+    sim.write(b"x")
+    assert sim.run(0.003) == bytes([RXC0]) + b"x"
+    sim.set_baud(115_200)
+    sim.write(b"x")
+    sim.run(0.0001)
+    garbled = sim.run(0.003)
+    assert len(garbled) == 2
+    assert garbled[0] != RXC0 | FE0  # garbled on the way back as well
+    sim.write(b"x")
+    sim.run_cycles(1500)
+    sim.set_baud(0)
+    status, byte = sim.run(0.003)
+    assert status == RXC0 | FE0
+    assert byte != ord("x")
 
 
 # ---- resets, EEPROM, idle time -----------------------------------------------------------------
 
-RESETS = """
-#include <avr/io.h>
+RESETS = (
+    C
+    + """
 #include <avr/wdt.h>
-#include <util/delay.h>
 uint8_t kept __attribute__((section(".noinit")));
-static void send(uint8_t b) { while (!(UCSR0A & 0x20)) {} UDR0 = b; }
 int main(void) {
     uint8_t flags = MCUSR, ddr = DDRB;
     MCUSR = 0;
     wdt_disable();
     DDRB = 15;
     if (flags & 1) kept = 40;
-    UCSR0A = 2; UBRR0L = 3; UCSR0B = 8;
+    transmitter();
     send(flags); send(kept++); send(ddr);
     _delay_ms(1);
     if (flags & 1) wdt_enable(WDTO_15MS);
     for (;;) {}
 }
 """
+)
 
 
 @BOARDS
-def test_power_on_watchdog_and_external_reset(build: Build, board: str) -> None:
-    with SkinSim(board, build(board, RESETS)) as sim:
-        assert sim.run(0.015) == bytes([PORF, 40, 0])
-        assert sim.run(0.010) == bytes([WDRF, 41, 0])
-        sim.reset()
-        assert sim.run(0.050) == bytes([EXTRF, 42, 0])
-        stats = sim.stats()
+def test_power_on_watchdog_and_external_reset(simulate: Simulate, board: str) -> None:
+    sim = simulate(RESETS, board)
+    assert sim.run(0.015) == bytes([PORF, 40, 0])
+    assert sim.run(0.010) == bytes([WDRF, 41, 0])
+    sim.reset()
+    assert sim.run(0.050) == bytes([EXTRF, 42, 0])
+    stats = sim.stats()
     assert stats["resets"] == 2
     assert stats["cycles"] >= 0.075 * CPU_HZ
 
 
-EEPROM = """
-#include <avr/io.h>
+EEPROM = (
+    C
+    + """
 #include <avr/eeprom.h>
-static void send(uint8_t b) { while (!(UCSR0A & 0x20)) {} UDR0 = b; }
 int main(void) {
-    UCSR0A = 2; UBRR0L = 3; UCSR0B = 8;
+    transmitter();
     send(eeprom_read_byte((uint8_t *)9));
     TCCR1B = 3;
     EEAR = 5; EEDR = 0x5A; EECR = 4; EECR = 2;
@@ -558,84 +549,70 @@ int main(void) {
     for (;;) {}
 }
 """
+)
 
 
 @BOARDS
-def test_eeprom_takes_its_time_and_survives_resets(build: Build, board: str) -> None:
+def test_eeprom_takes_its_time_and_survives_resets(simulate: Simulate, board: str) -> None:
     size = {"uno": 1024, "megaatmega2560": 4096}[board]
-    with SkinSim(board, build(board, EEPROM)) as sim:
-        assert sim.eeprom() == b"\xff" * size
-        sim.write_eeprom(b"\x77", 9)
-        assert sim.run(0.003) == b"\x77"
-        (ticks,) = struct.unpack("<H", sim.run(0.002))
-        assert abs(ticks - 850) <= 1  # 3.4 ms in units of 4 us
-        sim.reset()
-        assert sim.run(0.001) == b"\x77"
-        assert sim.eeprom() == b"\xff" * 5 + b"\x5a" + b"\xff" * 3 + b"\x77" + b"\xff" * (size - 10)
-        with pytest.raises(SimulationError, match="EEPROM"):
-            sim.write_eeprom(b"ab", size - 1)
+    sim = simulate(EEPROM, board)
+    assert sim.eeprom() == b"\xff" * size
+    sim.write_eeprom(b"\x77", 9)
+    assert sim.run(0.003) == b"\x77"
+    (ticks,) = struct.unpack("<H", sim.run(0.002))
+    assert abs(ticks - 850) <= 1  # 3.4 ms in units of 4 us
+    sim.reset()
+    assert sim.run(0.001) == b"\x77"
+    assert sim.eeprom() == b"\xff" * 5 + b"\x5a" + b"\xff" * 3 + b"\x77" + b"\xff" * (size - 10)
+    with pytest.raises(SimulationError, match="EEPROM"):
+        sim.write_eeprom(b"ab", size - 1)
 
 
-def test_idle_time_between_markers(build: Build) -> None:
+def test_idle_time_between_markers(simulate: Simulate) -> None:
     # A pass of 300 cycles that worked, then one of 100 that did not.
-    program = """
-    clr r0
-    ldi r16, 1
-    3: ldi r24, 99
-    1: dec r24
-    brne 1b
-    rjmp 4f
-    4: out 0x1E, r16
-    ldi r24, 33
-    2: dec r24
-    brne 2b
-    out 0x1E, r0
-    rjmp 3b
-    """
+    program = "clr r0\n ldi r16, 1\n"
+    program += "3: ldi r24, 99\n 1: dec r24\n brne 1b\n rjmp 4f\n 4: out 0x1E, r16\n"
+    program += "ldi r24, 33\n 2: dec r24\n brne 2b\n out 0x1E, r0\n rjmp 3b\n"
     # worked: rjmp 2, ldi 1, loop 296, rjmp 2, out 1 = 302; idle: ldi 1, loop 98, out 1 = 100
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        sim.run_cycles(302)
-        sim.reset_stats()
-        sim.run_cycles(402 * 1000)
-        stats = sim.stats()
+    sim = simulate(program)
+    sim.run_cycles(302)
+    sim.reset_stats()
+    sim.run_cycles(402 * 1000)
+    stats = sim.stats()
     assert abs(stats["idle_cycles"] - 100 * 1000) <= 100
     assert stats["cpu_percent"] == pytest.approx(100 * 302 / 402, abs=0.05)
 
 
-def test_jump_goes_on_at_the_address(build: Build) -> None:
-    program = sts(0xC0, 2) + sts(0xC1, 8) + FOREVER + sts(0xC6, 65) + FOREVER
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        assert sim.run(0.001) == b""
-        sim.jump(2 * (3 + 3 + 1))
-        assert sim.run(0.001) == b"A"
-        with pytest.raises(ValueError, match="even"):
-            sim.jump(3)
+def test_jump_goes_on_at_the_address(simulate: Simulate) -> None:
+    sim = simulate(TRANSMITTER + FOREVER + sts(0xC6, 65) + FOREVER)
+    assert sim.run(0.001) == b""
+    sim.jump(2 * (3 + 3 + 1))
+    assert sim.run(0.001) == b"A"
+    for address in (3, 1 << 15):
         with pytest.raises(SimulationError, match="no such instruction"):
-            sim.jump(1 << 15)
+            sim.jump(address)
 
 
 # ---- the bridge --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fatal", ["jmp 0x7FF0\n", "sts 0xFFFF, r16\n", "lds r16, 0xF000\n"])
-def test_crash_is_reported_and_stats_still_work(build: Build, fatal: str) -> None:
-    program = sts(0xC0, 2) + sts(0xC1, 8) + sts(0xC6, 65) + fatal + FOREVER
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        with pytest.raises(SimulationError, match="crashed"):
-            sim.run(0.1)
-        assert sim.stats()["state"] == "crashed"
-        assert sim.run_cycles(0) in (b"", b"A")
-        with pytest.raises(SimulationError, match="crashed"):
-            sim.run_cycles(1)
+def test_crash_is_reported_and_stats_still_work(simulate: Simulate, fatal: str) -> None:
+    sim = simulate(TRANSMITTER + sts(0xC6, 65) + fatal + FOREVER)
+    with pytest.raises(SimulationError, match="crashed"):
+        sim.run(0.1)
+    assert sim.stats()["state"] == "crashed"
+    assert sim.run_cycles(0) in (b"", b"A")
+    with pytest.raises(SimulationError, match="crashed"):
+        sim.run_cycles(1)
 
 
-def test_sleep_without_interrupts_is_done(build: Build) -> None:
-    program = "cli\n ldi r16, 1\n out 0x33, r16\n sleep\n" + FOREVER
-    with SkinSim("uno", build("uno", program, assembler=True)) as sim:
-        with pytest.raises(SimulationError, match="done"):
-            sim.run(0.1)
-        sim.reset()
-        assert sim.stats()["state"] == "running"
+def test_sleep_without_interrupts_is_done(simulate: Simulate) -> None:
+    sim = simulate("cli\n ldi r16, 1\n out 0x33, r16\n sleep\n" + FOREVER)
+    with pytest.raises(SimulationError, match="done"):
+        sim.run(0.1)
+    sim.reset()
+    assert sim.stats()["state"] == "running"
 
 
 def exchange(requests: bytes, elf: Path) -> list[tuple[str, bytes]]:
@@ -650,7 +627,7 @@ def exchange(requests: bytes, elf: Path) -> list[tuple[str, bytes]]:
 
 
 def test_bad_requests_are_refused(build: Build) -> None:
-    elf = build("uno", FOREVER, assembler=True)
+    elf = build("uno", FOREVER)
 
     def request(op: bytes, payload: bytes = b"") -> bytes:
         return op + struct.pack("<I", len(payload)) + payload
@@ -678,67 +655,72 @@ def test_bad_requests_are_refused(build: Build) -> None:
     assert [op for op, _ in exchange(request(b"Q") + good, elf)] == ["Q"]
 
 
-def test_program_errors(build: Build, tmp_path: Path) -> None:
-    elf = build("uno", FOREVER, assembler=True)
-    with pytest.raises(FileNotFoundError, match="make -C firmware/sim"):
-        SkinSim("uno", elf, program=tmp_path / "none")
+def test_program_errors(build: Build, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    elf = build("uno", FOREVER)
+    with monkeypatch.context() as patched:
+        patched.setattr(simavr, "default_program", lambda: tmp_path / "none")
+        with pytest.raises(FileNotFoundError, match="make -C firmware/sim"):
+            LockstepSim("uno", elf)
     with pytest.raises(FileNotFoundError, match="no firmware"):
-        SkinSim("uno", tmp_path / "none.elf")
+        LockstepSim("uno", tmp_path / "none.elf")
     with pytest.raises(SimulationError, match="usage"):
-        SkinSim("due", elf)
+        LockstepSim("due", elf)
     (tmp_path / "not.elf").write_bytes(b"no ELF")
     with pytest.raises(SimulationError, match="cannot load"):
-        SkinSim("uno", tmp_path / "not.elf")
-    sim = SkinSim("uno", elf)
+        LockstepSim("uno", tmp_path / "not.elf")
+    sim = LockstepSim("uno", elf)
     sim.close()
     sim.close()
     with pytest.raises(SimulationError, match="closed"):
         sim.run_cycles(1)
 
 
-def test_bad_arguments(build: Build) -> None:
-    with SkinSim("uno", build("uno", FOREVER, assembler=True)) as sim:
-        for shape in [(17, 1, 4), (1, 17, 4), (2, 2, 3), (4,)]:
-            with pytest.raises(ValueError, match="shape"):
-                sim.set_table(np.zeros(shape))
-        with pytest.raises(ValueError, match="finite"):
-            sim.set_table(np.full((1, 1, 4), np.nan))
-        with pytest.raises(ValueError, match="cycles"):
-            sim.run_cycles(-1)
-        with pytest.raises(ValueError, match="tau_us"):
-            sim.set_tau_us(math.nan)
-        with pytest.raises(ValueError, match="baud"):
-            sim.set_baud(7)
+def test_bad_arguments(simulate: Simulate) -> None:
+    sim = simulate(FOREVER)
+    for shape in [(17, 1, 4), (1, 17, 4), (2, 2, 3), (4,)]:
+        with pytest.raises(ValueError, match="shape"):
+            sim.set_table(np.zeros(shape))
+    with pytest.raises(ValueError, match="finite"):
+        sim.set_table(np.full((1, 1, 4), np.nan))
+    with pytest.raises(ValueError, match="tau_us"):
+        sim.set_tau_us(math.nan)
 
 
-@pytest.fixture
-def echo_pty(build: Build) -> Iterator[tuple[SkinSim, int]]:
-    with SkinSim("uno", build("uno", ECHO), pty=True) as sim:
-        assert sim.pty_path is not None
-        port = os.open(sim.pty_path, os.O_RDWR | os.O_NOCTTY)
-        yield sim, port
+def test_pty_echoes_in_real_time_from_power_on(simulate: Simulate) -> None:
+    sim = simulate(ECHO.replace("sei();", "sei(); UDR0 = '!';"), pty=True)
+    time.sleep(0.05)  # nothing is sent before the port is open
+    port = os.open(sim.pty_path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        termios.tcflush(port, termios.TCIFLUSH)
+        sim.power_on()
+        assert received(port, 1) == b"!"
+        os.write(port, b"hello")
+        assert received(port, 5) == b"hello"
+        asked_s, before, told_s = time.monotonic(), sim.stats(), time.monotonic()
+        time.sleep(0.3)
+        least_s, after = time.monotonic() - told_s, sim.stats()
+        passed_s = after["simulated_s"] - before["simulated_s"]
+        dropped_s = 1e-3 * (after["late_slices"] - before["late_slices"])
+        # The simulator may lag by 0.1 s; what it is later than that, it drops and counts.
+        assert least_s - 0.12 < passed_s + dropped_s < time.monotonic() - asked_s + 0.12
+        with pytest.raises(SimulationError, match="lock-step"):
+            sim.run(1)
+    finally:
         os.close(port)
 
 
-def test_pty_echoes_in_real_time(echo_pty: tuple[SkinSim, int]) -> None:
-    sim, port = echo_pty
-    time.sleep(0.05)
-    os.write(port, b"hello")
+def received(port: int, count: int) -> bytes:
     answer = b""
-    while len(answer) < 5 and select.select([port], [], [], 2)[0]:
+    while len(answer) < count and select.select([port], [], [], 2)[0]:
         answer += os.read(port, 100)
-    assert answer == b"hello"
-    before, start = sim.stats()["simulated_s"], time.monotonic()
-    time.sleep(0.3)
-    assert sim.stats()["simulated_s"] - before == pytest.approx(time.monotonic() - start, abs=0.1)
-    with pytest.raises(SimulationError, match="lock-step"):
-        sim.run(1)
+    return answer
 
 
-def test_pty_without_a_reader_drops_bytes_and_goes_on(build: Build) -> None:
+def test_pty_without_a_reader_drops_bytes_and_goes_on(simulate: Simulate) -> None:
     fastest = SENDER.replace("FORMAT", "6").replace("UBRR0 = 3", "UBRR0 = 0")  # 200 kB/s
-    with SkinSim("uno", build("uno", fastest), pty=True) as sim:
-        time.sleep(1)  # the kernel buffers about 64 kB
-        stats = sim.stats()
-    assert stats["tx_bytes"] > 120_000
-    assert stats["pty_dropped"] > 20_000
+    sim = simulate(fastest, pty=True)
+    sim.power_on()
+    until_s = time.monotonic() + 20
+    while (stats := sim.stats())["pty_dropped"] < 20_000 and time.monotonic() < until_s:
+        time.sleep(0.1)  # the kernel buffers about 64 kB
+    assert 20_000 <= stats["pty_dropped"] < stats["tx_bytes"]

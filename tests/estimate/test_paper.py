@@ -183,8 +183,7 @@ def test_a_press_is_followed_and_a_jump_starts_afresh(method: type[PaperEstimato
 
 
 @both_methods
-@pytest.mark.parametrize("shape", [(1, 2), (2, 2)])
-@pytest.mark.parametrize("adc_bits", [None, 10])
+@pytest.mark.parametrize(("shape", "adc_bits"), [((1, 2), None), ((1, 2), 10), ((2, 2), 10)])
 @pytest.mark.parametrize("kind", ["zeros", "ones", "open", "short", "noise"])
 def test_nonsense_readings_are_answered_with_finite_cells_and_a_message(
     method: type[PaperEstimator], shape: tuple[int, int], adc_bits: int | None, kind: str

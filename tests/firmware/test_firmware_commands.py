@@ -13,8 +13,7 @@ from firmware_helpers import (
     VECTORS,
     reset,
 )
-from lockstep import DEFAULT_SCAN, Rig
-from ohmskin.emulate.simavr import CPU_HZ
+from lockstep import CPU_HZ, DEFAULT_SCAN, Rig
 from ohmskin.link import framing, protocol
 
 pytestmark = pytest.mark.simavr

@@ -17,8 +17,7 @@ from firmware_helpers import (
     numbers,
     reset,
 )
-from lockstep import CODES, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of
-from ohmskin.emulate.simavr import CPU_HZ
+from lockstep import CODES, CPU_HZ, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of, first_holds
 from ohmskin.link import protocol
 
 pytestmark = pytest.mark.simavr
@@ -64,6 +63,9 @@ def test_codes_order_time_and_settling_are_exact(
 
     starts = rig.check().start_cycles[: len(rig.scans)]
     np.testing.assert_array_equal(np.diff(starts), hello["scan_cycles"])
+    holds = rig.holds()
+    of_scan = holds["cycle"][first_holds(holds)[1] :][: np.prod(shape)].astype(np.int64)
+    np.testing.assert_array_equal(np.diff(of_scan), hello["slot_cycles"])
     if hello["rate_asked_mhz"]:
         asked = CPU_HZ * 1000 / hello["rate_asked_mhz"]
         assert hello["scan_cycles"] == pytest.approx(asked, rel=1e-3)
@@ -133,7 +135,7 @@ def test_stop_ends_with_a_whole_scan_and_its_ack(rig: Rig) -> None:
 
 
 def test_start_and_stop_at_random_phases_damage_nothing(rig: Rig, rng: np.random.Generator) -> None:
-    for _ in range(60):
+    for _ in range(40):
         scan: dict[str, Any] = {
             "rows": int(rng.integers(3, 9)),
             "columns": int(rng.integers(3, 9)),
@@ -190,7 +192,7 @@ def test_no_load_damages_a_frame(rig: Rig, ratio: float | None) -> None:
         rig.set_codes(np.full(TABLE_SHAPE, int(ratio * CODES), np.uint16), np.random.default_rng(0))
     for (rows, columns), rate_mhz in LOADS:
         rig.start_scan(rows=rows, columns=columns, rate_mhz=rate_mhz)
-        rig.run(0.25)
+        rig.run(0.15)
         rig.must("stop")
         assert rig.damaged == 0, (rows, columns, rate_mhz)
         assert rig.scans

@@ -1,86 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An emulated board examined in simulated time, as the doctor would do it, for tests."""
+"""An emulated board in simulated time, with as much of a `Device` as the doctor needs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
-from ohmskin.cli.doctor import LONGEST
-from ohmskin.doctor.examine import Examined
-from ohmskin.doctor.press import CornerScans
-from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
+from ohmskin.cli.doctor import gather
+from ohmskin.doctor.examine import Evidence
 from ohmskin.emulate.line_faults import Faults
+from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
-from ohmskin.link.messages import BoardDecoder, Hello, Message, Scan, SelfTestReport
+from ohmskin.link.messages import BoardDecoder, BoardStats, Hello, Message, Scan, SelfTestReport
+from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 
 
-@dataclass
-class Bench:
-    """An `emulator://` URL's board, and the host's half of the line. `now_s`: simulated time."""
+class Bench(Closing):
+    """An `emulator://` URL's board. Time passes only while its scans are taken: `now_s`."""
 
-    url: str
-    now_s: float = 0.0
-    messages: list[Message] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.board, _, self.faults = emulated(self.url)
+    def __init__(self, url: str, now_s: float = 0.0) -> None:
+        self.board, self.name, self.faults = emulated(url)
+        self.now_s = 0.0
         self._decoder = BoardDecoder()
+        self._messages: list[Message] = []
         self._take(self.faults)
+        self.now_s = now_s
+        self.board.advance(now_s)
 
     def _take(self, faults: Faults) -> None:
-        if faults.resets(self.now_s):
-            self.board.reset()
-        octets = faults.apply(self.board.advance(self.now_s), self.now_s)
-        self.messages += self._decoder.feed(octets, self.now_s)
+        octets = self.board.heard(faults, self.now_s)
+        self._messages += self._decoder.feed(octets, self.now_s)
 
     def ask(self, name: str, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
         self.board.receive(framing.encode(frame.id, 1, frame.pack(**values)))
         self._take(Faults())  # commands are repeated until they are answered
 
-    def hello(self) -> Hello:
-        self.ask("get_hello")
-        return [each for each in self.messages if isinstance(each, Hello)][-1]
-
-    def scan(self, seconds: float) -> list[Scan]:
-        self.messages.clear()
+    def __iter__(self) -> Iterator[Scan]:
+        self._messages = [self.info]
         self.ask("start")
-        fast = self.hello().rate_hz * seconds >= LEAST_SCANS
-        end_s = self.now_s + seconds * (1 if fast else LONGEST)
-        while (due_s := self.board.next_scan_s) is not None and due_s <= end_s:
+        while True:
+            scans = [each for each in self._messages if isinstance(each, Scan)]
+            self._messages = [each for each in self._messages if not isinstance(each, Scan)]
+            yield from scans
+            due_s = self.board.next_scan_s
+            assert due_s is not None
             self.now_s = due_s
             self._take(self.faults)
-        self.ask("stop")
-        return [each for each in self.messages if isinstance(each, Scan)]
 
-    def examined(self) -> Examined:
-        """All that the doctor reads."""
+    @property
+    def info(self) -> Hello:
+        self.ask("get_hello")
+        return [each for each in self._messages if isinstance(each, Hello)][-1]
+
+    @property
+    def stats(self) -> BoardStats:
+        return self._decoder.snapshot()
+
+    def self_test(self) -> SelfTestReport:
         self.ask("self_test")
-        report = next(each for each in self.messages if isinstance(each, SelfTestReport))
-        scans = self.scan(REST_S)
-        board = self.hello()
-        settled = None
-        stats = self._decoder.snapshot()
-        other = comparison(board)
-        if other is not None:
-            wanted = {"rate_mhz": protocol.rate_mhz(other[1]), "settle_us": other[0]}
-            wanted |= {"rows": board.rows, "columns": board.columns}
-            self.ask("configure", adc_prescaler=board.adc_prescaler, **wanted)
-            now = self.hello()
-            assert now.settle_us >= other[0]
-            settled = (now, self.scan(SETTLED_S))
-        return Examined(board, scans, stats, settled, report)
+        return next(each for each in self._messages if isinstance(each, SelfTestReport))
 
-    def pressed(self) -> Examined:
-        """All that the doctor reads of a skin in the scene "corners", until they have moved."""
-        read = self.examined()
-        presses = CornerScans(read.board)
-        for scan in self.scan(9.0 - self.now_s):
-            presses.take(scan)
-        return replace(read, presses=presses)
+    def configure(self, *, rate_hz: float, settle_us: int, **others: protocol.Value) -> Hello:
+        wanted = configuration(self.info) | {"rate_mhz": protocol.rate_mhz(rate_hz), **others}
+        self.ask("configure", **{**wanted, "settle_us": settle_us})
+        assert self.info.settle_asked_us == settle_us
+        return self.info
+
+    def stop(self) -> None:
+        self.ask("stop")
+
+    def close(self) -> None:
+        pass
 
 
-def examined(url: str, **changes: object) -> Examined:
-    """What the doctor reads of the board at an `emulator://` URL, and what is told besides."""
-    return replace(Bench(url).examined(), **changes)
+def evidence(url: str, **told: object) -> Evidence:
+    """What the doctor reads of the board at an `emulator://` URL, and what it is told besides."""
+    bench = Bench(url)
+    read = Evidence(bench.info)
+    gather(bench, read)
+    return replace(read, **told)

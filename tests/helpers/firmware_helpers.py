@@ -6,8 +6,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from lockstep import Rig
-from ohmskin.emulate.simavr import CPU_HZ
+from lockstep import CPU_HZ, Rig
 from ohmskin.link import protocol
 from places import ROOT
 

@@ -2,11 +2,13 @@
 """The built firmware in lock-step with a host that knows what every reading must be.
 
 For tests and benchmarks of the firmware: simulated time passes only in `Rig.run`, so that every
-figure is exact and repeatable. In real time there is ``simavr://`` (`ohmskin.emulate.simavr_link`).
+figure is exact and repeatable. In real time there is ``simavr://`` (`ohmskin.emulate.simavr`).
 """
 
 from __future__ import annotations
 
+import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -14,10 +16,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.emulate.simavr import CPU_HZ, HOLD_DTYPE, SkinSim
+from ohmskin.emulate.simavr import SkinSim
 from ohmskin.link import framing, protocol
 from places import ROOT
 
+CPU_HZ = 16_000_000
 BOARDS = ("uno", "megaatmega2560")
 CODES = 1 << protocol.ADC_BITS
 TABLE_SHAPE = (16, 16, protocol.READINGS_PER_CELL)
@@ -29,10 +32,100 @@ DEFAULT_SCAN: dict[str, Any] = {
     "adc_prescaler": "clock_500khz",
 }
 
+# One record of the hold log. cycle: CPU cycles since power-on at the instant of the hold.
+# configuration: 0 to 3 are A to D; 4: no current, 5: undriven, 6: of another channel.
+# settle_cycles: since row, column or drive pins last changed; 2**32 - 1: never, or longer ago.
+HOLD_DTYPE = np.dtype(
+    [
+        ("cycle", "<u8"),
+        ("row", "u1"),
+        ("column", "u1"),
+        ("configuration", "u1"),
+        ("channel", "u1"),
+        ("code", "<u2"),
+        ("settle_cycles", "<u4"),
+    ]
+)
+
+
+class LockstepSim(SkinSim):
+    """All that the simulator can be asked for; operations are those of firmware/sim/README.md."""
+
+    def run_cycles(self, cycles: int) -> bytes:
+        """Run for `cycles` CPU cycles (16 MHz), to the end of the instruction that reaches them.
+
+        Returns what the device has sent since the last call. 0 only collects that, even after a
+        crash. Raises SimulationError if the processor crashes or sleeps for ever, or for more than
+        an hour.
+        """
+        return self.request("R", struct.pack("<Q", cycles))
+
+    def run(self, seconds: float) -> bytes:
+        """Run for `seconds` of simulated time; else as `run_cycles`."""
+        return self.run_cycles(round(seconds * CPU_HZ))
+
+    def write(self, uart_bytes: bytes) -> None:
+        """Queue bytes on the line to the device; they arrive one after the other at line speed."""
+        self.request("W", uart_bytes)
+
+    def set_baud(self, baud: int) -> None:
+        """Baud of the host's end of the line; 0 (at the start) follows the device.
+
+        Bytes between ends that differ by more than 4 % arrive as other bytes, at the device with
+        FE0 set.
+        """
+        self.request("B", struct.pack("<I", baud))
+
+    def stats(self) -> dict[str, Any]:
+        """Counters since the start or `reset_stats`, even after a crash.
+
+        `state` is "running", "crashed" or "done" (asleep for ever).
+        """
+        counters: dict[str, Any] = json.loads(self.request("S"))
+        return counters
+
+    def reset_stats(self) -> None:
+        """Restart all counters but `cycles`, `simulated_s` and `resets`."""
+        self.request("Z")
+
+    def hold_log(self, enable: bool) -> None:
+        """Log every hold of the ADC from now on, or stop. Records kept so far stay."""
+        self.request("L", bytes([enable]))
+
+    def drain_hold_log(self) -> NDArray[np.void]:
+        """Take the logged holds, at most 2**20: array of `HOLD_DTYPE`, oldest first."""
+        return np.frombuffer(self.request("L", b"\x02"), dtype=HOLD_DTYPE)
+
+    def eeprom(self) -> bytes:
+        """The whole EEPROM, 1024 bytes (uno) or 4096 (megaatmega2560)."""
+        return self.request("E")
+
+    def write_eeprom(self, content: bytes, offset: int = 0) -> None:
+        """Put `content` into the EEPROM at `offset` [bytes], at once."""
+        self.request("e", struct.pack("<H", offset) + content)
+
+    def reset(self) -> None:
+        """Pull the reset pin, as a USB bridge does when a port opens: sets EXTRF in MCUSR."""
+        self.request("X")
+
+    def jump(self, address: int) -> None:
+        """Go on at this byte address of the flash, as a fault in the program counter would."""
+        self.request("J", struct.pack("<I", address))
+
 
 def elf_of(board: str) -> Path:
     """Where PlatformIO leaves the firmware; it need not exist."""
     return ROOT / ".pio" / "build" / board / "firmware.elf"
+
+
+def first_holds(holds: NDArray[np.void]) -> NDArray[np.intp]:
+    """Where in a log of holds each scan begins.
+
+    Reading b of the first cell comes once a scan, right after the scan's first hold; idle slots lie
+    before that.
+    """
+    second = (holds["row"] == 0) & (holds["column"] == 0) & (holds["configuration"] == 1)
+    return np.flatnonzero(second) - 1
 
 
 @dataclass(frozen=True)
@@ -60,7 +153,7 @@ class Rig:
 
     def __init__(self, board: str) -> None:
         self.board = board
-        self.sim = SkinSim(board, elf_of(board))
+        self.sim = LockstepSim(board, elf_of(board))
         self.decoder = framing.Decoder()
         self.scans: list[ReceivedScan] = []
         self.log: list[tuple[str, dict[str, Any]]] = []
@@ -199,12 +292,10 @@ class Rig:
     def check(self) -> Check:
         """Compare every received scan since `start_scan`; the scan's size must not have changed.
 
-        Which hold belongs to which reading follows from the order of a scan: reading b of the first
-        cell comes once a scan, right after the scan's first hold; idle slots lie before that.
+        Which hold belongs to which reading follows from the order of a scan.
         """
         holds = self.holds()
-        second = (holds["row"] == 0) & (holds["column"] == 0) & (holds["configuration"] == 1)
-        first = np.flatnonzero(second) - 1
+        first = first_holds(holds)
         starts = holds["cycle"][first].astype(np.int64)
         if not self.scans:
             return Check(0, 0, starts)

@@ -20,7 +20,7 @@ import ohmskin
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
-from ohmskin.link import device, framing, protocol, session
+from ohmskin.link import device, feed, framing, protocol
 from ohmskin.link.messages import Scan
 
 SCENE = "scene=multi&seed=3"
@@ -350,7 +350,7 @@ def test_a_moving_scene_moves_in_the_simulator_too() -> None:
 
 @pytest.mark.parametrize("fault", ["", "&drop=0.2"])
 def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(feed, "QUEUE_SCANS", 16)
     with ohmskin.open(f"emulator://1x1?rate=1000{fault}") as skin:
         slow, quick = iter(skin), iter(skin)
         before = next(slow)
@@ -370,7 +370,7 @@ def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.Mo
 def test_an_iterator_never_used_costs_nothing(
     fast: ohmskin.Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(feed, "QUEUE_SCANS", 16)
     unused = iter(fast)
     until(lambda: fast.stats.overflowed > 0)  # while somebody may still use it
     del unused

@@ -166,7 +166,7 @@ def test_the_first_whole_frame_after_anything_is_found(before: bytes, frame: Raw
     assert Decoder().feed(before + wire(frame))[-1] == frame
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(frames, frames, frames, st.data())
 def test_damage_to_one_frame_takes_no_other_along(
     first: RawFrame, middle: RawFrame, last: RawFrame, data: st.DataObject
@@ -249,7 +249,7 @@ def test_a_million_random_bytes_make_no_scan() -> None:
 
 
 def test_bit_errors_never_deliver_a_damaged_scan() -> None:
-    count, error_rate = 10_000, 1e-4
+    count, error_rate = 3_000, 1e-4
     random = np.random.default_rng(3)
     kind = protocol.FRAMES["scan"]
     sent = random.integers(0, 1024, (count, 8, 8, 4), dtype=np.uint16)
@@ -273,7 +273,7 @@ def test_bit_errors_never_deliver_a_damaged_scan() -> None:
     for scan in delivered:
         np.testing.assert_array_equal(scan.codes, sent[scan.number])
         assert scan.time_us == scan.number * 11_111
-    assert hit > 2000
+    assert hit > 600
     # An error in a delimiter costs a frame nothing where the next one's stands right behind it.
     assert count - hit <= len(delivered) < count - 0.97 * hit
     assert delivered[0].number + len(delivered) + stats.missed == delivered[-1].number + 1

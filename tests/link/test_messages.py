@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ohmskin.link import framing, protocol
-from ohmskin.link.messages import Ack, BoardDecoder, ForeignHello, Hello, Scan
+from ohmskin.link.messages import Ack, BoardDecoder, ForeignHello, Hello, Scan, SelfTestReport
 
 SCAN = protocol.FRAMES["scan"]
 MINUTE_US = 60_000_000
@@ -197,6 +198,13 @@ def test_a_scan_of_no_cells_does_no_harm() -> None:
         payload = SCAN.pack(**header, rows=rows, columns=columns)
         decoder.feed(framing.encode(SCAN.id, 0, payload), 0.0)
     assert scans(decoder, scan_wire(0))[0].codes.shape == (1, 2, 4)
+
+
+@pytest.mark.parametrize(
+    ("message", "name"), [(Hello, "hello"), (Ack, "ack"), (SelfTestReport, "self_test_report")]
+)
+def test_a_message_has_the_fields_of_its_frame(message: type[Any], name: str) -> None:
+    assert [f.name for f in fields(message)] == [f.name for f in protocol.FRAMES[name].fields]
 
 
 def test_values_of_a_newer_definition_have_a_name() -> None:

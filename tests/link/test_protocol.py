@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import importlib.util
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ohmskin.link import framing, protocol
@@ -189,6 +188,7 @@ def test_vectors_are_those_of_the_cobs_package(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------- codes
 
 
+@settings(max_examples=40)
 @given(st.integers(1, 16), st.integers(1, 16), st.randoms(use_true_random=False))
 def test_codes_are_packed_like_one_long_integer(rows: int, columns: int, random: Any) -> None:
     in_order = [random.getrandbits(10) for _ in range(rows * columns * 4)]
@@ -244,26 +244,54 @@ def test_crc_check_value() -> None:
 # --------------------------------------------------------------------------------- definition
 
 
-@pytest.fixture
-def layout_crc(tmp_path: Path) -> Callable[[str], int]:
-    """A function from the text of a frames.toml to the layout CRC that the host computes of it."""
-    source = ROOT / "host" / "ohmskin" / "link" / "protocol.py"
+# What protocol/generate.py reads and writes.
+TREE = (
+    *("protocol/generate.py", "protocol/frames.toml", "protocol/vectors.json"),
+    *("protocol/frames.h", "protocol/FRAMES.md", "firmware/test/vectors.h"),
+    "host/ohmskin/link/protocol.py",
+)
 
-    def crc_of(definition: str) -> int:
-        (tmp_path / "frames.toml").write_text(definition, encoding="utf-8")
-        copy = tmp_path / "link" / "protocol.py"
-        copy.parent.mkdir(exist_ok=True)
-        shutil.copy(source, copy)
-        spec = importlib.util.spec_from_file_location("protocol_copy", copy)
+
+class Tree:
+    """A copy of these files. Its modules take the place of this checkout's."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.path, self._monkeypatch = path, monkeypatch
+        monkeypatch.setattr(sys, "path", list(sys.path))  # generate.py adds its own tree
+        for name in TREE:
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, path / name)
+
+    def module(self, name: str, path: str) -> Any:
+        spec = importlib.util.spec_from_file_location(name, self.path / path)
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
-        sys.modules["protocol_copy"] = module  # dataclasses look it up
-        try:
-            spec.loader.exec_module(module)
-        finally:
-            del sys.modules["protocol_copy"]
-        return int(module.LAYOUT_CRC)
+        self._monkeypatch.setitem(sys.modules, name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    def protocol(self) -> Any:
+        return self.module("ohmskin.link.protocol", "host/ohmskin/link/protocol.py")
+
+    def generate(self, *arguments: str) -> int:
+        """What protocol/generate.py exits with."""
+        self.protocol()
+        return int(self.module("generate", "protocol/generate.py").main(list(arguments)))
+
+
+@pytest.fixture
+def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tree:
+    return Tree(tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def layout_crc(tree: Tree) -> Callable[[str], int]:
+    """A function from the text of a frames.toml to the layout CRC that the host computes of it."""
+
+    def crc_of(definition: str) -> int:
+        (tree.path / "protocol" / "frames.toml").write_text(definition, encoding="utf-8")
+        return int(tree.protocol().LAYOUT_CRC)
 
     return crc_of
 
@@ -324,32 +352,8 @@ def test_layout_crc_changes_with_the_order_of_fields(layout_crc: Callable[[str],
     assert layout_crc("".join(lines)) != protocol.LAYOUT_CRC
 
 
-@pytest.fixture
-def tree(tmp_path: Path) -> Path:
-    """A copy of what protocol/generate.py reads and writes."""
-    no_caches = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(ROOT / "protocol", tmp_path / "protocol", ignore=no_caches)
-    shutil.copytree(ROOT / "host" / "ohmskin", tmp_path / "host" / "ohmskin", ignore=no_caches)
-    (tmp_path / "firmware" / "test").mkdir(parents=True)
-    shutil.copy(ROOT / "firmware" / "test" / "vectors.h", tmp_path / "firmware" / "test")
-    return tmp_path
-
-
-def generate(tree: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    return subprocess.run(
-        [sys.executable, tree / "protocol" / "generate.py", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        env=environment,
-    )
-
-
-def test_generated_files_are_up_to_date() -> None:
-    done = generate(ROOT, "--check")
-    assert (done.returncode, done.stderr) == (0, "")
+def test_generated_files_are_up_to_date(tree: Tree) -> None:
+    assert tree.generate("--check") == 0
 
 
 @pytest.mark.parametrize(
@@ -362,8 +366,10 @@ def test_generated_files_are_up_to_date() -> None:
         ("protocol/vectors.json", ["firmware/test/vectors.h"]),
     ],
 )
-def test_a_stale_generated_file_is_named(tree: Path, changed_file: str, stale: list[str]) -> None:
-    path = tree / changed_file
+def test_a_stale_generated_file_is_named(
+    tree: Tree, changed_file: str, stale: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tree.path / changed_file
     before = path.read_text(encoding="utf-8")
     after = {
         ".toml": lambda: before.replace('name = "busy", value = 12', 'name = "busy", value = 14'),
@@ -371,15 +377,14 @@ def test_a_stale_generated_file_is_named(tree: Path, changed_file: str, stale: l
     }.get(path.suffix, lambda: before + "\n")()
     assert after != before
     path.write_text(after, encoding="utf-8")
-    files = sorted(p for p in tree.rglob("*") if p.is_file() and p.suffix != ".pyc")
-    contents = [p.read_bytes() for p in files]
-    done = generate(tree, "--check")
-    assert done.returncode == 1
+    contents = [(tree.path / name).read_bytes() for name in TREE]
+    assert tree.generate("--check") == 1
+    named = capsys.readouterr().err
     for name in ("protocol/frames.h", "protocol/FRAMES.md", "firmware/test/vectors.h"):
-        assert (name in done.stderr) == (name in stale)
-    assert [p.read_bytes() for p in files] == contents, "--check has changed a file"
-    assert generate(tree).returncode == 0
-    assert generate(tree, "--check").returncode == 0
+        assert (name in named) == (name in stale)
+    assert contents == [(tree.path / name).read_bytes() for name in TREE]
+    assert tree.generate() == 0
+    assert tree.generate("--check") == 0
 
 
 def test_no_protocol_number_is_repeated_in_the_host() -> None:

@@ -12,14 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_calibrated_device import of_scene
 
 import ohmskin
-from ohmskin import boards
+from calibrations import of_scene
+from ohmskin import opening
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
-from ohmskin.force.calibrated_device import CalibratedDevice
-from ohmskin.force.force_reader import ForceScan
+from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import session
 from ohmskin.link.serial_port import SerialPort
 
@@ -37,7 +36,7 @@ def attach(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def say(*ports: tuple[str, str]) -> None:
         found = [SerialPort(path, "", board) for path, board in ports]
-        monkeypatch.setattr(boards, "serial_ports", lambda: found)
+        monkeypatch.setattr(opening, "serial_ports", lambda: found)
 
     return say
 
@@ -217,7 +216,7 @@ def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:
         largest = {}
         for each in itertools.islice(skins.scans(), 20):
             assert isinstance(each.scan, ForceScan)
-            assert isinstance(skins[each.unit_id], CalibratedDevice)
+            assert isinstance(skins[each.unit_id], CalibratedSkin)
             largest[each.unit_id] = np.max(each.scan.force_n)
     assert largest[2] == pytest.approx(2 * largest[1], rel=0.1)
 

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,17 @@ def foreign(path: Path, topic: str, content: object) -> None:
         writer.finish()
 
 
+def test_an_old_recording_does_not_say_how_long_a_slot_is(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "old.mcap"
+    content = {**asdict(hello), "host_time_s": 1.0}
+    del content["slot_cycles"]
+    readings = hello.rows * hello.columns * 4
+    for scan_cycles, slot_cycles in ((177_762, 177_762 // readings), (10**7, 60_000)):
+        foreign(path, "/skin/hello", {**content, "scan_cycles": scan_cycles})
+        (found,) = load_recording(path).hellos
+        assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
+
+
 def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"")
@@ -441,9 +453,31 @@ def test_wrong_replays(tmp_path: Path, hello: Hello) -> None:
     with pytest.raises(RecordingError, match="No such file"):
         ohmskin.open(f"replay://{tmp_path}/none.mcap")
     path.unlink()
-    write(path, hello, [scan(0), scan(1, rows=20)])
-    with pytest.raises(RecordingError, match="20x4 cells"):
+    beyond = scan(1)
+    beyond.codes[0, 0, 0] = 1024
+    write(path, hello, [scan(0), beyond])
+    with pytest.raises(RecordingError, match="scan 1 has a code beyond the converter"):
         replayed(path)
+
+
+def test_a_skin_larger_than_any_board_is_replayed(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, hello, [scan(0, rows=20)])
+    assert replayed(path)[0].codes.shape == (20, 4, 4)
+
+
+def test_scans_carry_the_tare_in_force(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    tares = [Tare(np.full((3, 4, 4), ratio), 1.0) for ratio in (0.25, 0.75)]
+    with Recorder(path, hello) as recorder:
+        for message in (scan(0), tares[0], scan(1), scan(2), tares[1], scan(3)):
+            recorder.add(message)
+    rests = [each.rest_ratio for each in replayed(path)]
+    assert rests[0] is None
+    assert rests[1] is rests[2]
+    for found, tare in ((rests[2], tares[0]), (rests[3], tares[1])):
+        assert found is not None
+        np.testing.assert_array_equal(found, tare.rest_ratio)
 
 
 # -------------------------------------------------------------------------------------- export

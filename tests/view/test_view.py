@@ -20,18 +20,18 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
-from test_calibrated_device import NEWTON_SIEMENS, of_scene
 
 import ohmskin
+from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Done, assert_one_line
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
-from ohmskin.view import server, viewed_board
+from ohmskin.view import boards, server
+from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
 from ohmskin.view.server import make_app
-from ohmskin.view.viewed_boards import MOST_BOARDS, ViewedBoards
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?scene=rest&seed=1"
@@ -46,7 +46,7 @@ Message = dict[str, Any]
 
 @pytest.fixture(autouse=True)
 def _short_tare(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewed_board, "TARE_S", TARE_S)
+    monkeypatch.setattr(boards, "TARE_S", TARE_S)
 
 
 class Page:
@@ -334,7 +334,7 @@ def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 def test_a_board_that_is_pulled_out_comes_back_by_itself(
     pty_board: Callable[[str], PtyServer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewed_board, "AGAIN_S", 0.1)
+    monkeypatch.setattr(boards, "AGAIN_S", 0.1)
     port = tmp_path / "skin"
     first = pty_board(REST)
     port.symlink_to(first.path)

@@ -18,13 +18,13 @@ from typing import Any
 
 import pytest
 import uvicorn
-from test_calibrated_device import of_scene
 
 import ohmskin
+from calibrations import of_scene
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.record.recording import load_recording
+from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.server import make_app
-from ohmskin.view.viewed_boards import ViewedBoards
 
 pytestmark = pytest.mark.browser
 

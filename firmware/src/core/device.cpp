@@ -295,6 +295,7 @@ void Device::send_hello() {
         board::REF_BOTTOM_OHM,
         settings_.request.rate_mhz,
         plan_.scan_cycles(),
+        plan_.slot_cycles,
         board::CLOCK_HZ,
         settings_.request.settle_us,
         settle_us(plan_, board::CLOCK_HZ),

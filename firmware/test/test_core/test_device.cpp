@@ -176,6 +176,8 @@ TEST(boot_sends_hello_with_defaults_from_a_blank_eeprom) {
     CHECK_EQ(frames::Settings::DefaultsBlank, static_cast<frames::Settings>(hello.settings));
     CHECK_EQ(8, hello.rows);
     CHECK_EQ(90000, hello.rate_asked_mhz);
+    CHECK_EQ(689, hello.slot_cycles);
+    CHECK_EQ(258 * 689UL, hello.scan_cycles);
     CHECK_EQ(4, hello.readings_per_cell);
     CHECK_EQ(29000, hello.ref_bottom_ohm);
     CHECK(!host.next(&frame));

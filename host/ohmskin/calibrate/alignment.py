@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The offset between a force sensor's clock and the scans', from what both saw of the presses.
+"""The offset between a force sensor's clock and that of the scans, from the presses both saw.
 
 Symbols
 
@@ -15,19 +15,19 @@ r      (K,)    Pearson's correlation of x and y over those points               
 G      (K,)    score, -n/2 log(1 - r^2) where r > 0, else 0                               1
 ====== ======= ========================================================================= ==========
 
-Edges: conductance grows with force, but by another power and gain in each cell, and creeps on
-while the force rests. Hence both are compressed, log(1 + z / (0.2 z_99)) with their own 99th
-percentile z_99, so that strong and weak presses count alike, and then differentiated: creep, drift
-and the zero are slow, and presses begin and end in both at once. The derivative is that of a
-Gaussian of 50 ms: a shorter one sees more noise, a longer one more creep.
+Edges: conductance grows with force, but with another power and gain in each cell, and it creeps on
+while the force rests. Both are therefore compressed, log(1 + z / (0.2 z_99)) with their own 99th
+percentile z_99, so that strong and weak presses count alike. Then both are differentiated: creep,
+drift and the zero are slow, while a press begins and ends in both at once. The derivative is that
+of a Gaussian of 50 ms: a shorter one sees more noise, a longer one sees more creep.
 
-r is normalised at each lag by what is shared there, gaps left out: no lag wins by a large press.
-G is the log-likelihood ratio of "x is a multiple of y and noise" to "x is noise": by r alone the
-chance likeness of two short stretches would win. A parabola through G about its maximum gives the
-offset between grid points.
+At each lag r is normalised by what both share there, without gaps, so a large press wins at no lag
+by its size. G is the log-likelihood ratio of "x is a multiple of y and noise" to "x is noise". By r
+alone two short stretches that are alike by chance would win. A parabola through G about its maximum
+gives the offset between grid points.
 
-`tests/calibrate/test_alignment.py` prints the error for simulated skins that creep.
-What lags in the force sensor, such as its filter, is part of the offset.
+`tests/calibrate/test_alignment.py` prints the error for simulated skins that creep. A delay inside
+the force sensor, such as that of its filter, is part of the offset.
 """
 
 from __future__ import annotations
@@ -37,21 +37,25 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import correlate
 
 from ohmskin.arrays import Float
-from ohmskin.calibrate.force_log import MIN_SAMPLES, ForceLog, between_gaps
+from ohmskin.calibrate.tables import ForceLog, between_gaps
 
+# Both are compared on a grid of this step [s]: as fine as the scans of most boards.
 STEP_S: Final = 0.01
+# Standard deviation of the Gaussian that differentiates [s]: see the module.
 SMOOTHING_S: Final = 0.05
+# A rise of this share of the 99th percentile is where the logarithm begins to compress.
 COMPRESSION: Final = 0.2
+# A longer recording or log [s] takes more memory than a session of presses needs.
 MAX_SPAN_S: Final = 6 * 3600.0
-# Shorter stretches are alike by chance.
+# Both must have measured together for so long [s]: shorter stretches are alike by chance.
 MIN_OVERLAP_S: Final = 15.0
+# They must have measured together for this share of the shorter one.
 MIN_OVERLAP_SHARE: Final = 0.5
+# A smaller r is that of two sessions which have nothing in common (test_alignment.py).
 MIN_CORRELATION: Final = 0.6
-# The next best offset's G, as a share of the best's, from which on neither can be trusted.
+# Where another offset has more than this share of the best G, neither can be trusted.
 MAX_SECOND: Final = 0.7
 
 
@@ -59,7 +63,7 @@ MAX_SECOND: Final = 0.7
 class Alignment:
     """log time + offset_s = scan time.
 
-    correlation: r there, of edges. overlap_s: for how long both measured at that offset [s].
+    correlation: r at that offset, of edges. overlap_s: for how long both measured there [s].
     """
 
     offset_s: float
@@ -70,34 +74,37 @@ class Alignment:
 def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     """The offset at which the skin's edges are most like the force's.
 
-    scan_time_s (n,): of the middles of scans [s], increasing; their host's clock or any other. rise
-    (n,): of the whole skin above rest, summed over cells [S]. Both must run for at least 15 s
-    together, and for half of the shorter one. Two clocks whose rates differ are aligned on average.
+    scan_time_s (n,): the middle of each scan by any clock [s], increasing. rise (n,): of the whole
+    skin above rest, summed over cells [S]. Two clocks whose rates differ are aligned on average.
 
-    Raises ValueError for bad arrays; where nothing was pressed; where nothing fits (r < 0.6); and
-    where another offset fits nearly as well, as with presses that repeat evenly.
+    Raises ValueError for bad arrays; if nothing was pressed; if both did not run together for 15 s
+    and for half of the shorter one; if nothing fits (r < 0.6); and if another offset fits nearly as
+    well, as with presses that repeat evenly.
     """
     time_s, rises = (np.asarray(each, dtype=np.float64) for each in (scan_time_s, rise))
-    _check(time_s, rises)
+    good = np.isfinite(rises) & (np.diff(time_s, prepend=-np.inf) > 0)
+    if not good.all():
+        raise ValueError(
+            f"scan {int(np.argmin(good))}: its rise is not finite, or its time is not later than "
+            "that of the scan before it"
+        )
     x, in_x = _edges(time_s, rises, "the skin's rise")
     y, in_y = _edges(log.time_s, log.force_n, "the force")
-    shorter = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * STEP_S
-    if shorter < MIN_OVERLAP_S:
-        raise ValueError(
-            f"{shorter:.1f} s without gaps are too short: scans and force log need "
-            f"{MIN_OVERLAP_S:g} s each"
-        )
     r, shared = _correlations(x, in_x, y, in_y)
-    enough = shared * STEP_S >= max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter)
+    shorter_s = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * STEP_S
+    enough = shared * STEP_S >= max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s)
     if not enough.any():
-        raise ValueError("at no offset do scans and force log overlap enough: their gaps are long")
+        raise ValueError(
+            f"scans and force log overlap at no offset for {MIN_OVERLAP_S:g} s, and for half of "
+            "the shorter one, gaps left out"
+        )
     likeness = np.where(enough, r, 0.0).clip(0.0, 1 - 1e-12)
     score = -0.5 * shared * np.log1p(-(likeness**2))
     best = int(np.argmax(score))
     if likeness[best] < MIN_CORRELATION:
         raise ValueError(
-            f"fit at no offset: the best correlation is {likeness[best]:.2f}, less than "
-            f"{MIN_CORRELATION:g}: are scans and force log of the same session?"
+            "scans and force log fit at no offset: their best correlation is "
+            f"{likeness[best]:.2f}, less than {MIN_CORRELATION:g}: are they of the same session?"
         )
     _check_unique(r, score, best)
     lag = best + _vertex(score, best) - (y.size - 1)
@@ -108,24 +115,10 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     )
 
 
-def _check(time_s: Float, rises: Float) -> None:
-    if time_s.ndim != 1 or time_s.shape != rises.shape:
-        raise ValueError(
-            f"scan_time_s has shape {time_s.shape}, rise {rises.shape}: they must be (n,) both"
-        )
-    if time_s.size < MIN_SAMPLES:
-        raise ValueError(f"{time_s.size} scans are too few: {MIN_SAMPLES} are needed")
-    for name, values in (("scan_time_s", time_s), ("rise", rises)):
-        bad = ~np.isfinite(values)
-        if bad.any():
-            raise ValueError(f"{name} of scan {int(np.argmax(bad))} is not finite: leave it out")
-    back = np.diff(time_s) <= 0
-    if back.any():
-        raise ValueError(f"scan_time_s does not increase at scan {int(np.argmax(back)) + 1}")
-
-
 def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, NDArray[np.bool_]]:
     """Edges on a grid that begins with `time_s`, 0 in gaps; and where there is no gap."""
+    from scipy.ndimage import gaussian_filter1d
+
     span_s = float(time_s[-1] - time_s[0])
     if span_s < MIN_OVERLAP_S:
         raise ValueError(f"{name} lasts {span_s:.3g} s, {MIN_OVERLAP_S:g} s are needed")
@@ -156,8 +149,10 @@ def _correlations(
     x: Float, in_x: NDArray[np.bool_], y: Float, in_y: NDArray[np.bool_]
 ) -> tuple[Float, Float]:
     """r and n of all lags, the first being 1 - Y; r is 0 where either does not vary."""
+    from scipy.signal import correlate
+
     mask_x, mask_y = in_x.astype(np.float64), in_y.astype(np.float64)
-    # Without their means first, the differences below would lose digits.
+    # The differences below would lose digits if the means were not taken off first.
     x = (x - x[in_x].mean()) * mask_x
     y = (y - y[in_y].mean()) * mask_y
 
@@ -170,14 +165,14 @@ def _correlations(
     square_x = sums(x * x, mask_y) - sum_x**2 / count
     square_y = sums(mask_x, y * y) - sum_y**2 / count
     product = sums(x, y) - sum_x * sum_y / count
-    # Below this share of all its edges a stretch holds none, only the rounding of the FFT.
+    # A stretch with less than this share of all edges holds none, only the rounding of the FFT.
     varies = (square_x > 1e-9 * np.sum(x * x)) & (square_y > 1e-9 * np.sum(y * y))
     squares = np.where(varies, square_x * square_y, 1.0)
     return np.where(varies, product / np.sqrt(squares), 0.0).clip(-1.0, 1.0), shared
 
 
 def _check_unique(r: Float, score: Float, best: int) -> None:
-    """Raise ValueError where a peak beside the best one, which ends at half its r, is as good."""
+    """Raise ValueError if there is a peak as good beside the best one, which ends at half its r."""
     low = np.flatnonzero(r < 0.5 * r[best])
     end = int(np.searchsorted(low, best))
     first = int(low[end - 1]) if end else 0
@@ -188,14 +183,14 @@ def _check_unique(r: Float, score: Float, best: int) -> None:
     if others[second] > MAX_SECOND * score[best]:
         raise ValueError(
             f"an offset {abs(second - best) * STEP_S:.2f} s away fits nearly as well, with "
-            f"correlation {r[second]:.2f} for {r[best]:.2f}: the presses repeat so evenly, or are "
-            "so few, that none tells the time: press at irregular intervals, and begin and end "
-            "both recordings with the skin untouched"
+            f"correlation {r[second]:.2f} for {r[best]:.2f}: the presses are too even or too few: "
+            "press at irregular intervals, and begin and end both recordings with the skin "
+            "untouched"
         )
 
 
 def _vertex(score: Float, best: int) -> float:
-    """Where the parabola through the maximum and its neighbours is highest, -0.5 to 0.5."""
+    """Where the parabola through the maximum and its neighbours is highest, in -0.5..0.5."""
     if not 0 < best < score.size - 1:
         return 0.0
     before, peak, after = score[best - 1 : best + 2]

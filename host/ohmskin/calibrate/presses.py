@@ -1,36 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Presses of single cells, found in what a skin showed while a force sensor measured.
 
-A scan belongs to the cell that rises most above rest, if that one is touched. Scans in a row of one
-cell are a press, flickers of at most `FLICKER_SCANS` bridged, or several where the rise falls to a
-fifth in between; fewer scans than `MIN_SCANS` are left out, and so is every scan in which another
-cell rises by more than `SECOND_SHARE` of the first: two share the force, and nothing tells how.
+A scan belongs to the cell that rises most above rest, if that cell is touched. Consecutive scans of
+one cell are a press. Where its rise falls to a fifth in between, they are several presses.
+
+Two kinds of scans are left out: those of a run of less than `MIN_SCANS`, and those in which another
+cell rises by more than `SECOND_SHARE` of the first, for nothing tells how two cells share a force.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing
-from scipy.signal import find_peaks
 
 from ohmskin.arrays import Float
-from ohmskin.calibrate.force_log import ForceLog
-from ohmskin.link.clock import scan_times_s
-from ohmskin.link.messages import Scan
+from ohmskin.calibrate.tables import ForceLog
 
+# So many scans without touch may interrupt a press: a light touch flickers about its threshold.
 FLICKER_SCANS: Final = 3
+# Fewer scans in a row are a bounce, not a press.
 MIN_SCANS: Final = 5
+# A cell that rises by more than this share of the strongest one is pressed, too; a neighbour of
+# one pressed cell rises by less.
 SECOND_SHARE: Final = 0.25
-# Fewer scans of a time without touch do not tell the zero of a force sensor.
+# Fewer scans without touch do not tell the zero of a force sensor.
 MIN_ZERO_SCANS: Final = 10
-# Creep keeps a cell touched for a while: presses in quick succession meet in a valley.
+# Creep keeps a cell touched for a while, so that quick presses meet in a valley: two presses are
+# told apart if the logarithm of the rise falls by so much between them.
 VALLEY_LOG: Final = np.log(5.0)
+# What rises by less than this share of the strongest rise is noise to that logarithm.
 _NOISE_FLOOR: Final = 1e-3
+# Stands for a cell, or a press, where a scan has none.
 _NOTHING: Final = -1
 
 
@@ -38,9 +42,10 @@ _NOTHING: Final = -1
 class Presses:
     """What `ForceRegression.fit` learns from, n rows: arrays (n,).
 
-    cells: flat indices. rise, rise_std: of that cell [S, or 1 for `voltage`]. force_n [N]. press:
-    number of the press that a row is of. shape: (R, C). shared: scans left out because two cells
-    were pressed. zero_n: what the force sensor showed without touch, already taken off [N].
+    cells: flat indices, row * columns + column. rise, rise_std: of that cell [S, or 1 for
+    `voltage`]. force_n [N]. press: number of the press that a row is of. shape: (R, C). shared:
+    scans left out because two cells were pressed. zero_n: what the force sensor showed without
+    touch, already taken off [N].
     """
 
     cells: NDArray[np.intp]
@@ -56,27 +61,20 @@ class Presses:
     def counts(self) -> NDArray[np.intp]:
         """Number of presses of each cell, (R, C)."""
         _, first = np.unique(self.press, return_index=True)
-        return np.bincount(self.cells[first], minlength=self.shape[0] * self.shape[1]).reshape(
-            self.shape
-        )
+        rows, columns = self.shape
+        return np.bincount(self.cells[first], minlength=rows * columns).reshape(self.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class LevelHistory:
-    """Levels above rest of n scans. time_s (n,) [s]; rise, rise_std, touched (n, R, C)."""
+    """What n scans showed. time_s (n,): of their middles [s]; levels above rest, their standard
+    deviations [S, or 1 for `voltage`] and touched cells: rise, rise_std, touched (n, R, C).
+    """
 
     time_s: Float
     rise: Float
     rise_std: Float
     touched: NDArray[np.bool_]
-
-    @classmethod
-    def empty(cls, scans: list[Scan]) -> Self:
-        """Room for what an estimator will say of these scans."""
-        shape = (len(scans), *scans[0].codes.shape[:2])
-        return cls(
-            scan_times_s(scans), np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
-        )
 
 
 def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Presses:
@@ -90,25 +88,25 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     if not known.any():
         raise ValueError("scans and force log never overlap: are they of the same session?")
     untouched = known & ~history.touched.any(axis=(1, 2))
-    # Of many scans, for the force begins before a touch is certain.
+    # The median of many scans, because the force begins before a touch is certain.
     enough = np.count_nonzero(untouched) >= MIN_ZERO_SCANS
     zero_n = float(np.median(force_n[untouched])) if enough else 0.0
 
-    flat = history.rise.reshape(scans, -1)
-    pressed = _pressed(flat, history.touched.reshape(scans, -1))
-    index = np.arange(scans)
-    top = flat[index, pressed]
+    rise = history.rise.reshape(scans, -1)
+    pressed = _pressed(rise, history.touched.reshape(scans, -1))
+    every = np.arange(scans)
+    top = rise[every, pressed]
     press = _numbered(pressed, top)
-    others = flat.copy()
-    others[index, pressed] = -np.inf
-    shared = (press >= 0) & (others.max(axis=1) > SECOND_SHARE * top)
-    good = (press >= 0) & ~shared & known
+    others = rise.copy()
+    others[every, pressed] = -np.inf
+    shared = (press != _NOTHING) & (others.max(axis=1) > SECOND_SHARE * top)
+    good = (press != _NOTHING) & ~shared & known
     if not good.any():
         raise ValueError("no cell is pressed alone while the force is known")
     return Presses(
         cells=pressed[good],
         rise=top[good],
-        rise_std=history.rise_std.reshape(scans, -1)[index, pressed][good],
+        rise_std=history.rise_std.reshape(scans, -1)[every, pressed][good],
         # Below zero is the sensor's noise: `ForceLog` refuses more than that.
         force_n=np.maximum(force_n[good] - zero_n, 0.0),
         press=press[good],
@@ -119,36 +117,38 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
 
 
 def _pressed(rise: Float, touched: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Index of the cell that each scan belongs to, or `_NOTHING`."""
+    """Index of the cell that each scan belongs to, or `_NOTHING`. Arrays (n, R * C)."""
+    from scipy.ndimage import binary_closing
+
     top = rise.argmax(axis=1)
-    bridge = np.ones(FLICKER_SCANS + 1, dtype=np.bool_)
     pressed = np.full(top.size, _NOTHING, dtype=np.intp)
     for cell in np.unique(top):
         of_cell = (top == cell) & touched[:, cell]
         padded = np.pad(of_cell, FLICKER_SCANS + 1)
-        closed = binary_closing(padded, bridge)[FLICKER_SCANS + 1 : -FLICKER_SCANS - 1]
-        pressed[closed & (pressed == _NOTHING)] = cell
+        closed = binary_closing(padded, np.ones(FLICKER_SCANS + 1))
+        pressed[closed[FLICKER_SCANS + 1 : -FLICKER_SCANS - 1] & (pressed == _NOTHING)] = cell
         pressed[of_cell] = cell
     return pressed
 
 
 def _numbered(pressed: NDArray[np.intp], top: Float) -> NDArray[np.intp]:
     """Number of the press that each scan is of, or `_NOTHING`."""
-    starts = np.flatnonzero(np.diff(pressed, prepend=_NOTHING - 1))
     press = np.full(pressed.size, _NOTHING, dtype=np.intp)
     number = 0
-    for start, end in zip(starts, [*starts[1:], pressed.size], strict=True):
-        if pressed[start] == _NOTHING or end - start < MIN_SCANS:
+    changes = np.flatnonzero(np.diff(pressed)) + 1
+    for run in np.split(np.arange(pressed.size), changes):
+        if pressed[run[0]] == _NOTHING or run.size < MIN_SCANS:
             continue
-        valleys = _valleys(top[start:end])
-        for begin, stop in zip([0, *valleys], [*valleys, end - start], strict=True):
-            press[start + begin : start + stop] = number
+        for part in np.split(run, _valleys(top[run])):
+            press[part] = number
             number += 1
     return press
 
 
 def _valleys(rise: Float) -> list[int]:
-    """Where the presses of a run (n,) meet: the least between peaks that stand out of it."""
+    """Where the presses of a run (n,) meet: the least rise between peaks that stand out of it."""
+    from scipy.signal import find_peaks
+
     floor = _NOISE_FLOOR * float(rise.max())
     height = np.log(np.maximum(rise, floor))
     peaks, _ = find_peaks(np.pad(height, 1, constant_values=np.log(floor)), prominence=VALLEY_LOG)

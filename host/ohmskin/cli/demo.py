@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -17,7 +18,7 @@ from rich.table import Table
 
 import ohmskin
 from ohmskin.arrays import Float
-from ohmskin.cli.show import cells_table, save_picture
+from ohmskin.cli.stream import FULL_SCALE_US, cells_table
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import OhmskinError, PortError
 from ohmskin.estimate.base import SkinKnowledge
@@ -137,3 +138,43 @@ def report(demo: Demo, console: Console) -> None:
         f"{demo.stats.scans} scans at {demo.rate_hz:.2f} Hz, {demo.stats.missed} missed, "
         f"{demo.stats.line.damaged} damaged"
     )
+
+
+def save_picture(
+    path: Path, panels: Sequence[tuple[str, Float, NDArray[np.bool_]]], title: str
+) -> None:
+    """A PNG of skins side by side: title, conductances [S] and touched cells of each.
+
+    :raises OhmskinError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as exc:
+        raise OhmskinError("pictures need matplotlib: pip install 'ohmskin[plot]'") from exc
+    figure = Figure(figsize=(3.4 * len(panels) + 0.8, 3.9), layout="constrained")
+    figure.suptitle(title)
+    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    image = None
+    for axes, (name, cell_siemens, touched) in zip(all_axes, panels, strict=True):
+        image = axes.imshow(
+            np.maximum(1e6 * cell_siemens, 0.1), norm="log", vmin=0.5, vmax=FULL_SCALE_US
+        )
+        image.set_cmap("viridis")
+        for row, column in np.argwhere(touched):
+            axes.text(
+                column,
+                row,
+                f"{1e6 * cell_siemens[row, column]:.0f}",
+                ha="center",
+                va="center",
+                color="white" if cell_siemens[row, column] < 5e-5 else "black",
+                fontsize=8,
+            )
+        axes.set_title(name, fontsize=10)
+        axes.set_xlabel("column")
+        axes.set_ylabel("row")
+        axes.set_xticks(range(cell_siemens.shape[1]))
+        axes.set_yticks(range(cell_siemens.shape[0]))
+    assert image is not None
+    figure.colorbar(image, ax=all_axes, label="cell conductance [µS]", shrink=0.9)
+    figure.savefig(path, dpi=120)

@@ -4,20 +4,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
 
 import ohmskin
-from ohmskin.doctor.examine import Examined, examine
-from ohmskin.doctor.findings import Diagnosis, Finding
-from ohmskin.doctor.press import Cell, Corners, CornerScans, moved_across, suggested_corners
+from ohmskin.cli.doctor_words import (
+    FIELDS,
+    answer,
+    measured_in_words,
+    request,
+    verdict,
+    words_of,
+)
+from ohmskin.doctor.examine import Evidence, examine
+from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Severity, found
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
+from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import (
     CommandRefused,
     DeviceLost,
@@ -28,16 +37,16 @@ from ohmskin.errors import (
 )
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
-from ohmskin.link.messages import Hello, Scan, SelfTestReport
-from ohmskin.link.usb_latency import latency_ms, latency_timer_file
+from ohmskin.link.messages import Scan
+from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
-PRESS_S: Final = 1.0  # of scans with the same cells pressed
-WAIT_S: Final = 30.0  # for a person
-LONGEST: Final = 2.0  # times the usual, where scans are slow
-_COLOURS: Final = {"fault": "red", "warning": "yellow", "note": "cyan"}
+WAIT_S: Final = 30.0  # seconds for a person to press where they are asked to
+LONGEST: Final = 2.0  # times as long as usual, at most, where scans are slow
+_COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
 
 _out = Console(soft_wrap=True)
 Progress = Callable[[str], None]
+Ask = Callable[[CornerScans], None]
 
 
 def doctor(
@@ -62,13 +71,14 @@ def doctor(
     """
     told = None if calibration is None else load_calibration(calibration)
     wire_ohm = _wires(wires) if wires else _wires_of(told)
-    with _progress() as progress:
-        diagnosis = diagnose(port, told, wire_ohm, progress, _asking(progress) if press else None)
+    with _terminal() as (progress, ask):
+        diagnosis = diagnose(port, told, wire_ohm, progress, ask if press else None)
+    page = as_object(port, diagnosis)
     if as_json:
-        print(json.dumps(as_object(port, diagnosis)))  # noqa: T201
+        print(json.dumps(page, default=asdict))  # noqa: T201
     else:
-        _print(port, diagnosis)
-    if diagnosis.wrong:
+        _print(page)
+    if diagnosis.worse:
         raise SystemExit(1)
 
 
@@ -90,30 +100,27 @@ def _wires_of(calibration: Calibration | None) -> tuple[float, float] | None:
 
 
 @contextmanager
-def _progress() -> Iterator[Progress]:
-    """A line that says what is done, where somebody looks."""
-    errors = Console(stderr=True)
-    if not errors.is_terminal:
-        yield lambda text: None
-        return
-    with errors.status("connecting") as status:
-        yield lambda text: status.update(text)
+def _terminal() -> Iterator[tuple[Progress, Ask]]:
+    """Ways to say what is done, and what to press.
 
-
-def _asking(progress: Progress) -> Progress:
-    """Where nobody sees a line that changes, what to press is said once."""
+    On a terminal, one line changes. Elsewhere the progress is not told, and each request once.
+    """
     errors = Console(stderr=True)
     if errors.is_terminal:
-        return progress
-    said: set[str] = set()
+        with errors.status("connecting") as status:
+            yield (
+                status.update,
+                lambda presses: status.update(f"{request(presses)}; {answer(presses)}"),
+            )
+        return
+    said: list[str] = []
 
-    def ask(text: str) -> None:
-        request = text.partition(";")[0]
-        if request not in said:
-            said.add(request)
-            errors.print(request, markup=False, highlight=False)
+    def ask(presses: CornerScans) -> None:
+        if request(presses) not in said:
+            said.append(request(presses))
+            errors.print(said[-1], markup=False, highlight=False)
 
-    return ask
+    yield lambda text: None, ask
 
 
 # ------------------------------------------------------------------------------- the examination
@@ -124,124 +131,61 @@ def diagnose(
     calibration: Calibration | None = None,
     wire_ohm: tuple[float, float] | None = None,
     progress: Progress = lambda text: None,
-    ask: Progress | None = None,
+    ask: Ask | None = None,
 ) -> Diagnosis:
-    """Examine the board at `port`. What keeps it from being examined is a finding.
+    """Examine the board at `port`. A port at which there is nothing to examine is a finding, too.
 
     ask: tells a person where to press; without, nobody is asked.
 
     :raises PortError: the URL is wrong.
-    :raises ValueError: the calibration is of another unit or geometry.
+    :raises ValueError: the calibration is of another unit or geometry; a skin of one row or column
+        cannot be pressed as it would be asked for.
     """
-    progress("connecting")
     try:
         device = ohmskin.open(port, start=False)
     except (DeviceSilent, DeviceLost, ProtocolMismatch, PortError) as exc:
-        return Diagnosis((_unanswered(port, exc),), {})
+        return Diagnosis([_unanswered(port, exc)])
     with device:
         board = device.info
+        evidence = Evidence(board, wire_ohm=wire_ohm, host_version=ohmskin.__version__)
         if calibration is not None:
             calibration.check(board.unit_id, board.rows, board.columns)
-        if ask is not None:
-            suggested_corners(board.rows, board.columns)  # before the scans, if there are none
-        timer_ms = None if "://" in port else latency_ms(_path(port))
-        latency = (timer_ms, str(latency_timer_file(_path(port)))) if timer_ms is not None else None
-        gathered = _Gathered()
-        lost = None
-        try:
-            gathered.take(device, progress)
-            if ask is not None:
-                gathered.ask_for_presses(device, ask)
-        except DeviceLost as exc:
-            lost = exc
-        examined = Examined(
-            board=device.info if lost else gathered.board or board,
-            scans=gathered.scans,
-            stats=device.stats,
-            settled=gathered.settled,
-            report=gathered.report,
-            rest_ratio=None if calibration is None else calibration.rest.ratio,
-            wire_ohm=wire_ohm,
-            presses=gathered.presses,
-            latency=latency,
-            host_version=ohmskin.__version__,
-        )
-    diagnosis = examine(examined)
-    if lost is None:
-        return diagnosis
-    finding = Finding(
-        *("lost", "fault", "board", str(lost), "a board that goes on scanning"),
-        "check the USB cable and plug, and that the supply is strong enough",
-    )
-    return Diagnosis((finding, *diagnosis.findings), diagnosis.measured)
+            evidence.rest_ratio = calibration.rest.ratio
+        path = port.partition("?")[0]
+        timer_ms = None if "://" in port else latency_ms(path)
+        if timer_ms is not None:
+            evidence.latency = timer_ms, str(latency_timer_file(path))
+        gather(device, evidence, progress, ask)
+    return examine(evidence)
 
 
-class _Gathered:
-    """What was read, as far as it came."""
+def gather(
+    device: Device,
+    evidence: Evidence,
+    progress: Progress = lambda text: None,
+    ask: Ask | None = None,
+) -> None:
+    """Read what `examine` goes by into `evidence`, as far as the board lets; leave it as it was.
 
-    def __init__(self) -> None:
-        self.board: Hello | None = None
-        self.report: SelfTestReport | None = None
-        self.scans: list[Scan] = []
-        self.settled: tuple[Hello, list[Scan]] | None = None
-        self.presses: CornerScans | None = None
-
-    def take(self, device: Device, progress: Progress) -> None:
+    :raises ValueError: a skin of one row or column cannot be pressed as it would be asked for.
+    """
+    presses = None if ask is None else CornerScans(device.info)
+    try:
         progress("self-test")
         with suppress(CommandRefused):  # a recording has none
-            self.report = device.self_test()
+            evidence.report = device.self_test()
         progress(f"scanning the untouched skin for {REST_S} s")
-        _scan(device, self.scans, REST_S)
-        self.board = device.info
+        _scan(device, evidence.scans, REST_S)
+        evidence.board = device.info
         progress("scanning with a longer settle time")
         with suppress(CommandRefused):
-            self._scan_settled(device, self.board)
-
-    def _scan_settled(self, device: Device, board: Hello) -> None:
-        other = comparison(board)
-        if other is None:
-            return
-        settle_us, rate_hz = other
-        device.stop()
-        try:
-            settled = device.configure(rate_hz=rate_hz, settle_us=settle_us)
-            self.settled = (settled, [])
-            _scan(device, self.settled[1], SETTLED_S)
-        finally:
-            device.stop()
-            device.configure(rate_hz=board.rate_asked_mhz / 1000, settle_us=board.settle_asked_us)
-
-    def ask_for_presses(self, device: Device, ask: Progress) -> None:
-        """Until three corners were pressed, and three others, for `PRESS_S` each, or it is late."""
-        board = self.board or device.info
-        self.presses = presses = CornerScans(board)
-        wanted = suggested_corners(board.rows, board.columns)
-        held: Corners | None = None
-        begin_s = None
-        for scan in device:
-            begin_s = scan.host_time_s if begin_s is None else begin_s
-            corners = presses.take(scan)
-            if corners not in (None, held) and presses.scans(corners) >= PRESS_S * board.rate_hz:
-                if held is not None:
-                    return
-                held, wanted = corners, moved_across(corners)
-            if scan.host_time_s - begin_s >= WAIT_S:
-                return
-            still = corners not in (None, held)
-            request = _request(wanted, again=held is not None)
-            ask(f"{request}; {'hold still' if still else _pressed(presses.pressed)}")
-
-
-def _request(wanted: Corners, *, again: bool) -> str:
-    return f"{'now' if again else 'press firmly, at once:'} {_cells(sorted(wanted))}"
-
-
-def _pressed(cells: tuple[Cell, ...]) -> str:
-    return f"pressed: {_cells(cells) if cells else 'nothing'}"
-
-
-def _cells(cells: Iterable[Cell]) -> str:
-    return " ".join(f"({row}, {column})" for row, column in cells)
+            _scan_settled(device, evidence)
+        if ask is not None and presses is not None:
+            evidence.presses = presses
+            _scan_presses(device, presses, ask)
+    except DeviceLost as exc:
+        evidence.board, evidence.lost = device.info, str(exc)
+    evidence.stats = device.stats
 
 
 def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
@@ -252,58 +196,75 @@ def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
             return
 
 
-def _path(port: str) -> str:
-    return port.partition("?")[0]
+def _scan_settled(device: Device, evidence: Evidence) -> None:
+    board, other = evidence.board, comparison(evidence.board)
+    if other is None:
+        return
+    device.stop()
+    try:
+        evidence.settled = (device.configure(settle_us=other[0], rate_hz=other[1]), [])
+        _scan(device, evidence.settled[1], SETTLED_S)
+    finally:
+        device.stop()
+        device.configure(rate_hz=board.rate_asked_mhz / 1000, settle_us=board.settle_asked_us)
+
+
+def _scan_presses(device: Device, presses: CornerScans, ask: Ask) -> None:
+    """Until three corners and then three others were pressed, or it has taken too long."""
+    begin_s = None
+    for scan in device:
+        begin_s = scan.host_time_s if begin_s is None else begin_s
+        presses.take(scan)
+        if presses.done or scan.host_time_s - begin_s >= WAIT_S:
+            return
+        ask(presses)
 
 
 def _unanswered(port: str, error: OhmskinError) -> Finding:
     """Why there is nothing to examine. Raises what is a wrong use instead."""
-    text = str(error)
-    what, _, to_do = text.rpartition(": ")
-    expected = "a skin board that answers"
     match error:
         case ProtocolMismatch():
-            return Finding("protocol_mismatch", "fault", port, what, "one protocol layout", to_do)
+            kind = Kind.PROTOCOL_MISMATCH
+            return found(kind, port=port, problem=error.problem, remedy=error.remedy)
         case DeviceSilent():
-            measured = f"nothing answers: {text}"
-            to_do = "check the cable and the port; flash the board with 'ohmskin flash'"
-            return Finding("nothing_answers", "fault", port, measured, expected, to_do)
+            return found(Kind.NOTHING_ANSWERS, port=port, problem=str(error))
         case DeviceLost():
-            return Finding("lost", "fault", port, what, expected, to_do)
+            return found(Kind.LOST, problem=error.problem)
     if "://" in port or error.__cause__ is None:
-        raise error
-    return Finding("port_unusable", "fault", port, what or text, expected, to_do)
+        raise error  # no port has refused: the URL is wrong
+    return found(Kind.PORT_UNUSABLE, port=port, problem=error.problem, remedy=error.remedy)
 
 
 # ----------------------------------------------------------------------------------- the page
 
 
-def as_object(port: str, diagnosis: Diagnosis) -> dict[str, object]:
+def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
     """What ``--json`` prints."""
+    findings = []
+    for finding in diagnosis.findings:
+        kind, data = finding.kind, {"place": asdict(finding.place), "values": finding.values}
+        findings.append({"id": kind.id, "severity": kind.severity, **words_of(finding), **data})
     return {
         "port": port,
-        "sound": not diagnosis.wrong,
-        "verdict": diagnosis.verdict,
-        "findings": [asdict(finding) for finding in diagnosis.findings],
-        "measured": diagnosis.measured,
+        "sound": not diagnosis.worse,
+        "verdict": verdict(diagnosis),
+        "findings": findings,
+        "measured": measured_in_words(diagnosis),
     }
 
 
-def _print(port: str, diagnosis: Diagnosis) -> None:
-    _out.print(f"{port}: {diagnosis.verdict}", markup=False, highlight=False)
-    for number, finding in enumerate(diagnosis.findings, start=1):
-        colour = _COLOURS[finding.severity]
-        title = f"{finding.id.replace('_', ' ')}: {finding.where}"
-        _out.print(f"\n{number}. ", end="", highlight=False)
-        _out.print(f"{finding.severity}, {title}", style=colour, markup=False, highlight=False)
-        for label, text in (
-            ("measured", finding.measured),
-            ("expected", finding.expected),
-            ("what to do", finding.what_to_do),
-        ):
-            _out.print(f"   {label:<10}  {text}", markup=False, highlight=False)
-    if diagnosis.measured:
-        _out.print("")
-    for name, value in diagnosis.measured.items():
+def _print(page: dict[str, Any]) -> None:
+    """What `as_object` has, for people."""
+    show = partial(_out.print, markup=False, highlight=False)
+    show(f"{page['port']}: {page['verdict']}")
+    for number, finding in enumerate(page["findings"], start=1):
+        severity, name = finding["severity"], finding["id"].replace("_", " ")
+        show(f"\n{number}. ", end="")
+        show(f"{severity}, {name}: {finding['where']}", style=_COLOURS[severity])
+        for field in FIELDS[1:]:
+            show(f"   {field.replace('_', ' '):<10}  {finding[field]}")
+    if page["measured"]:
+        show("")
+    for name, value in page["measured"].items():
         shown = ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
-        _out.print(f"{name:<18}  {shown}", markup=False, highlight=False)
+        show(f"{name:<18}  {shown}")

@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 
 import ohmskin
-from ohmskin.emulate.simavr_link import BOARDS
+from ohmskin.emulate.simavr import BOARDS
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.link.messages import Hello
 from ohmskin.link.serial_port import SerialPort, serial_ports

@@ -9,29 +9,41 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Final, TypeVar
 
 import numpy as np
 import typer
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 import ohmskin
-from ohmskin.arrays import Float
-from ohmskin.errors import OhmskinError, RecordingError
-from ohmskin.link.device import Device
+from ohmskin.calibrate.guide import OnSkin, pressed_cells
+from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
+from ohmskin.force.reader import SkinReader
 from ohmskin.link.messages import Scan
+from ohmskin.record import recorder as recording
 from ohmskin.record.export import FORMATS
 from ohmskin.record.export import export as export_recording
+from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import Mark, Tare, load_recording
+from ohmskin.record.recording import Mark, load_recording
+
+# With a force sensor the first scans are a tare of so many seconds, unless told.
+FORCE_TARE_S: Final = 2.0
+# A terminal shows ten pictures a second [s].
+_SHOW_EVERY_S: Final = 0.1
+# How long the end of a recording may wait for the thread that reads typed lines [s].
+_TYPED_EVERY_S: Final = 0.2
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 _out = Console(soft_wrap=True)
-_TYPED_EVERY_S = 0.2
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_T = TypeVar("_T")
 
 
 def record(
@@ -40,113 +52,174 @@ def record(
     scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
     seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
     tare_s: Annotated[
-        float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its tare")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            "--tare",
+            help="so long nothing touches the skin at first, in seconds: its tare "
+            "[default: 0; with a force sensor 2]",
+        ),
+    ] = None,
     mark: Annotated[list[str] | None, typer.Option(help="a mark at the beginning")] = None,
+    force_port: Annotated[
+        str, typer.Option(help="also record a force sensor at this serial port: a number a line")
+    ] = "",
+    force_baud: Annotated[int, typer.Option(help="speed of that port")] = DEFAULT_BAUD,
+    force_scale: Annotated[
+        float, typer.Option(help="newtons for one unit of its numbers; of grams: 0.00980665")
+    ] = 1.0,
 ) -> None:
-    """Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a mark."""
-    with ohmskin.open(port, start=False) as skin, Recorder(file, skin.info) as recorder:
-        for text in mark or ():
-            recorder.add(Mark(text, time.monotonic()))
-        with _marks_typed(recorder):
-            record_scans(skin, recorder, scans, seconds, tare_s)
-    size = file.stat().st_size
-    _out.print(
-        f"{file}: {recorder.scans} scans, missed {recorder.missed}, {size} bytes", markup=False
-    )
+    """Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a mark.
 
-
-def record_scans(
-    skin: Device,
-    recorder: Recorder,
-    count: int,
-    seconds: float,
-    tare_s: float,
-    beside: Callable[[Scan], None] = lambda scan: None,
-) -> None:
-    """Record every scan until Ctrl-C or SIGTERM, so many scans, or so many seconds (0: never).
-
-    tare_s: of so many seconds at first a tare is recorded. beside: is called after each scan.
+    With a force sensor: press cell after cell, and 'ohmskin calibrate recording' learns from that.
     """
-    with stop_signals() as (may_interrupt, is_stopped):
-        _record(skin, recorder, count, seconds, tare_s, beside, may_interrupt, is_stopped)
-
-
-def _record(
-    skin: Device,
-    recorder: Recorder,
-    count: int,
-    seconds: float,
-    tare_s: float,
-    beside: Callable[[Scan], None],
-    may_interrupt: Callable[[bool], None],
-    is_stopped: Callable[[], bool],
-) -> None:
-    board, first_s = skin.info, float("nan")
-    untouched: list[Float] = []
-    may_interrupt(True)
-    try:
-        for scan in skin:
-            may_interrupt(False)
-            if not recorder.scans:
-                first_s = scan.host_time_s
-            elapsed_s = scan.host_time_s - first_s
-            if skin.info is not board:
-                board = skin.info
-                recorder.add(board)
-            recorder.add(scan)
-            if tare_s and elapsed_s <= tare_s:
-                untouched.append(scan.ratio)
-            elif untouched:
-                recorder.add(_tare(untouched))
-            beside(scan)
-            if is_stopped() or recorder.scans == count or (seconds and elapsed_s >= seconds):
-                return
-            may_interrupt(True)
-    finally:
-        may_interrupt(False)
-        if untouched:
-            recorder.add(_tare(untouched))
-
-
-def _tare(untouched: list[Float]) -> Tare:
-    newest = untouched[-1].shape  # somebody may have configured the board meanwhile
-    tare = Tare(
-        np.mean([ratio for ratio in untouched if ratio.shape == newest], axis=0), time.monotonic()
-    )
-    untouched.clear()
-    return tare
+    if tare_s is None:
+        tare_s = FORCE_TARE_S if force_port else 0.0
+    with (
+        ohmskin.open(port, start=False) as skin,
+        ForceSensor(force_port, force_baud, force_scale) if force_port else nullcontext() as sensor,
+    ):
+        if sensor is not None:
+            sensor.wait()
+        with (
+            Recorder(file, skin.info) as recorder,
+            until_stopped() as watched,
+            _marks_typed(recorder),
+            _forces_kept(recorder, sensor, tare_s) as keep_forces,
+        ):
+            for text in mark or ():
+                recorder.add(Mark(text, time.monotonic()))
+            try:
+                recording.record(
+                    skin,
+                    recorder,
+                    watched(skin),
+                    count=scans,
+                    seconds=seconds,
+                    tare_s=tare_s,
+                    beside=keep_forces,
+                )
+            except DeviceLost as exc:
+                raise DeviceLost(f"{exc} (what came before is in {file})") from exc
+    done = f"{recorder.scans} scans, missed {recorder.missed}, {file.stat().st_size} bytes"
+    if sensor is not None:
+        done += f", {recorder.forces} forces, {sensor.damaged} lines that are no numbers"
+    _out.print(f"{file}: {done}", markup=False)
 
 
 @contextmanager
-def stop_signals() -> Iterator[tuple[Callable[[bool], None], Callable[[], bool]]]:
-    """Ctrl-C and SIGTERM end the ``with`` between two scans, never amid a write.
+def until_stopped() -> Iterator[Callable[[Iterable[_T]], Iterator[_T]]]:
+    """Ctrl-C and SIGTERM end what is inside between two scans, never amid a write.
 
-    Gives two functions: one says whether they may interrupt from now on, as while a scan is waited
-    for; the other whether one has come.
+    Gives a function that passes scans on until such a signal has come. The signal interrupts the
+    wait for the next scan, and nothing else.
     """
-    stopped = interruptible = False
+    is_stopped = waits = False
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal stopped
-        stopped = True
-        if interruptible:
+        nonlocal is_stopped
+        is_stopped = True
+        if waits:
             raise KeyboardInterrupt
 
-    def may_interrupt(may: bool) -> None:
-        nonlocal interruptible
-        interruptible = may
-        if may and stopped:
-            raise KeyboardInterrupt
+    def watched(scans: Iterable[_T]) -> Iterator[_T]:
+        nonlocal waits
+        source = iter(scans)
+        while True:
+            try:
+                waits = True
+                if is_stopped:
+                    return
+                scan = next(source)
+            except (KeyboardInterrupt, StopIteration):
+                return
+            finally:
+                waits = False
+            yield scan
 
     before = [signal.signal(number, handle) for number in _SIGNALS]
     try:
         with suppress(KeyboardInterrupt):
-            yield may_interrupt, lambda: stopped
+            yield watched
     finally:
-        interruptible = False
         for number, handler in zip(_SIGNALS, before, strict=True):
             signal.signal(number, handler)
+
+
+@contextmanager
+def _forces_kept(
+    recorder: Recorder, sensor: ForceSensor | None, tare_s: float
+) -> Iterator[Callable[[Scan], None]]:
+    """Gives what is called after each scan: it records the forces, and shows them in a terminal."""
+    if sensor is None:
+        yield lambda scan: None
+        return
+    _out.print(f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it")
+    display = PressDisplay(recorder)
+    with Live(console=_out, transient=True, auto_refresh=False) as live:
+
+        def keep(scan: Scan) -> None:
+            for sample in sensor.take():
+                recorder.add(sample)
+                display.force_n = sample.force_n
+            if _out.is_terminal and display.see(scan):
+                live.update(display.picture(), refresh=True)
+
+        yield keep
+
+
+class PressDisplay:
+    """What a person sees who presses cells while they are recorded, and so which are missing.
+
+    counts: presses of each cell (R, C), of one cell alone, for `CERTAIN_S`. force_n: the newest.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.counts = np.zeros((recorder.board.rows, recorder.board.columns), dtype=np.intp)
+        self.force_n = float("nan")
+        self._recorder = recorder
+        self._reader: SkinReader | None = None
+        self._on = OnSkin()
+        self._shown_s = float("-inf")
+
+    def see(self, scan: Scan) -> bool:
+        """A scan that was recorded. Returns whether it is time for a new picture."""
+        if scan.host_time_s - self._shown_s < _SHOW_EVERY_S:
+            return False
+        self._shown_s = scan.host_time_s
+        tare = self._recorder.tare
+        if tare is not None and tare.rest_ratio.shape == scan.codes.shape:
+            if self._reader is None:
+                self._reader = SkinReader(self._recorder.board, rest_ratio=tare.rest_ratio)
+            found = self._reader.estimate(scan.ratio)
+            pressed = pressed_cells(self._reader.rise(found), found.touched)
+            if self._on.see(scan.host_time_s, pressed) and len(self._on.cells) == 1:
+                self.counts[self._on.cells[0]] += 1
+        return True
+
+    def picture(self) -> Group:
+        """All of it, for a terminal."""
+        pressed = f"pressed: {', '.join(map(str, self._on.cells)) or 'none'}"
+        now = "touch nothing yet" if self._reader is None else pressed
+        head = f"{self._recorder.scans} scans   force {self.force_n:.2f} N   {now}"
+        counts = [
+            [
+                Text(str(count), style="reverse" if (row, column) in self._on.cells else "")
+                for column, count in enumerate(counts)
+            ]
+            for row, counts in enumerate(self.counts)
+        ]
+        return Group(Text(head), cell_table(counts, "presses of each cell"))
+
+
+def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
+    """A text for each cell, row by row, beside the numbers of rows and columns."""
+    table = Table("", *map(str, range(len(cells[0]))), box=None, title=title)
+    for row, texts in enumerate(cells):
+        table.add_row(str(row), *texts)
+    for column in table.columns:
+        column.justify = "right"
+    table.columns[0].style = "dim"
+    return table
 
 
 @contextmanager

@@ -9,27 +9,33 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
 from numpy.typing import ArrayLike
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
 import ohmskin
-from ohmskin.cli import show
-from ohmskin.estimate.base import Estimator, SkinKnowledge
-from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.force.calibrated_device import CalibratedDevice
-from ohmskin.force.force_reader import ForceScan
+from ohmskin.arrays import Float
+from ohmskin.estimate.methods import METHODS
+from ohmskin.force.calibration import load_calibration
+from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
 _out = Console()
-_DISPLAY_EVERY_S = 0.1
-_DEFAULT_METHOD = "joint"
+# Conductance at which a table's colours end: a cell of 5 kOhm [microsiemens].
+FULL_SCALE_US: Final = 200.0
+# Force at which a table's colours end [N].
+FULL_SCALE_N: Final = 10.0
+_COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
+# Time between two pictures in a terminal [s]; every scan is counted all the same.
+_DISPLAY_EVERY_S: Final = 0.1
 
 
 def stream(
@@ -61,31 +67,24 @@ def stream(
         raise ValueError(
             "say either --method or --calibration: forces are by the calibration's method"
         )
-    with _opened(port, calibration, force) as skin:
-        estimator = None
-        if isinstance(skin, CalibratedDevice):
-            if tare_s:
-                skin.tare(tare_s)
-        elif method != "none":
-            rest_ratio = skin.mean_ratio(tare_s) if tare_s else None
-            knowledge = SkinKnowledge.of(skin.info, rest_ratio)
-            estimator = make_estimator(method or _DEFAULT_METHOD, knowledge)
+    told = None if calibration is None else load_calibration(calibration)
+    with ohmskin.open(port) as skin:
+        board = skin.info
+        if told is not None:
+            told.check(board.unit_id, board.rows, board.columns, force=force)
+        reader = None if method == "none" else SkinReader(board, told, method=method)
+        if tare_s and reader is not None:
+            reader.tare(skin.mean_ratio(tare_s), force=told is None)
         with suppress(KeyboardInterrupt):
             if as_json:
-                _print_scans(skin, estimator, scans, seconds)
+                _print_scans(skin, reader, scans, seconds)
             else:
-                _show_scans(skin, estimator, scans, seconds)
-        lost = skin.stats
+                _show_scans(skin, reader, scans, seconds)
+    lost = skin.stats
     if lost.missed or lost.line.damaged or lost.restarts:
         text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
         text += f"{lost.line.damaged} damaged frames, {lost.restarts} restarts"
         print(text, file=sys.stderr)  # noqa: T201
-
-
-def _opened(port: str, calibration: Path | None, force: bool) -> Device:
-    if calibration is None:
-        return ohmskin.open(port)
-    return ohmskin.open(port, calibration=calibration, force=force)
 
 
 def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
@@ -96,7 +95,7 @@ def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan
             return
 
 
-def _print_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
+def _print_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
     for scan in _limited(iter(skin), count, seconds):
         line: dict[str, Any] = {
             "scan": scan.number,
@@ -105,17 +104,15 @@ def _print_scans(skin: Device, estimator: Estimator | None, count: int, seconds:
             "missed": scan.missed,
             "ratio": scan.ratio.tolist(),
         }
-        estimate = scan.estimate if isinstance(scan, ForceScan) else None
-        if estimator is not None:
-            estimate = estimator.estimate(scan.ratio)
-        if estimate is not None:
-            line["method"] = _method(skin, estimator)
-            line["cell_siemens"] = _numbers(estimate.cell_siemens)
-            line["cell_siemens_std"] = _numbers(estimate.cell_siemens_std)
-            line["converged"] = estimate.converged
-            line["message"] = estimate.message
-        if isinstance(scan, ForceScan):
-            line |= forces_as_json(scan)
+        if reader is not None:
+            found = reader.read(scan)
+            line["method"] = reader.method
+            line["cell_siemens"] = _numbers(found.estimate.cell_siemens)
+            line["cell_siemens_std"] = _numbers(found.estimate.cell_siemens_std)
+            line["converged"] = found.estimate.converged
+            line["message"] = found.estimate.message
+            if reader.has_forces:
+                line |= forces_as_json(found)
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
         except BrokenPipeError:
@@ -146,13 +143,7 @@ def _numbers(values: ArrayLike) -> Any:
     return objects.tolist()
 
 
-def _method(skin: Device, estimator: Estimator | None) -> str:
-    if estimator is not None:
-        return estimator.name
-    return skin.calibration.method if isinstance(skin, CalibratedDevice) else "none"
-
-
-def _show_scans(skin: Device, estimator: Estimator | None, count: int, seconds: float) -> None:
+def _show_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
     rate_hz, shown_s = 0.0, 0.0
     first: Scan | None = None
     with Live(console=_out, auto_refresh=False) as live:
@@ -161,33 +152,30 @@ def _show_scans(skin: Device, estimator: Estimator | None, count: int, seconds: 
                 first = scan  # or the board has restarted
             elif scan.time_us > first.time_us:
                 rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
-            # A terminal shows ten pictures a second; every scan is counted all the same.
             if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
                 shown_s = scan.host_time_s
-                live.update(_picture(skin, estimator, scan, rate_hz), refresh=True)
+                live.update(_picture(skin, reader, scan, rate_hz), refresh=True)
 
 
-def _picture(skin: Device, estimator: Estimator | None, scan: Scan, rate_hz: float) -> Group:
+def _picture(skin: Device, reader: SkinReader | None, scan: Scan, rate_hz: float) -> Group:
     stats = skin.stats
     caption = (
         f"scan {scan.number}  {rate_hz:.1f} Hz  missed {stats.missed}  "
         f"damaged {stats.line.damaged}  restarts {stats.restarts}"
     )
-    method = _method(skin, estimator)
-    if isinstance(scan, ForceScan):
-        title = f"{skin.name}: force by '{method}' [N]"
-        table, estimate = show.forces_table(scan.force_n, ""), scan.estimate
-    elif estimator is None:
+    if reader is None:
         title = f"{skin.name}: reading B in thousandths of Vdd"
-        return Group(Text(title), show.cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
+        return Group(Text(title), cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
+    found = reader.read(scan)
+    if not found.estimate.converged:
+        caption += f"  not converged: {found.estimate.message}"
+    if reader.has_forces:
+        title = f"{skin.name}: force by '{reader.method}' [N]"
+        table = forces_table(found.force_n, "")
+        caption = f"{_contact_line(found)}\n{caption}"
     else:
-        estimate = estimator.estimate(scan.ratio)
-        title = f"{skin.name}: cell conductance by '{method}' [microsiemens]"
-        table = show.cells_table(estimate.cell_siemens, "")
-    if not estimate.converged:
-        caption += f"  not converged: {estimate.message}"
-    if isinstance(scan, ForceScan):
-        caption = f"{_contact_line(scan)}\n{caption}"
+        title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
+        table = cells_table(found.estimate.cell_siemens, "")
     return Group(Text(title), table, Text(caption))
 
 
@@ -199,3 +187,38 @@ def _contact_line(scan: ForceScan) -> str:
         f"at ({each.row:.1f}, {each.column:.1f})"
         for each in scan.contacts
     )
+
+
+def cells_table(cell_siemens: Float, title: str) -> Table:
+    """Conductances [S], shape (rows, columns), as a table in microsiemens, coloured by value."""
+    return _table(1e6 * cell_siemens, title, 1.0, FULL_SCALE_US)
+
+
+def forces_table(force_n: Float, title: str) -> Table:
+    """Forces [N], shape (rows, columns), as a table, coloured by value."""
+    return _table(force_n, title, FULL_SCALE_N / 100, FULL_SCALE_N)
+
+
+def _table(values: Float, title: str, low: float, high: float) -> Table:
+    """Colours on a logarithmic scale from `low` to `high`."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
+    table.add_column("", justify="right", style="dim")
+    for column in range(values.shape[1]):
+        table.add_column(str(column), justify="right", min_width=3, header_style="dim")
+    for row, cells in enumerate(values):
+        styled = (Text(_short(value), style=_colour(value, low, high)) for value in cells)
+        table.add_row(str(row), *styled)
+    return table
+
+
+def _short(value: float) -> str:
+    if not np.isfinite(value):
+        return "?"
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
+
+
+def _colour(value: float, low: float, high: float) -> str:
+    if not value > low:
+        return _COLOURS[0]
+    share = np.log(value / low) / np.log(high / low)
+    return _COLOURS[int(np.clip(share * len(_COLOURS), 0, len(_COLOURS) - 1))]

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 import ohmskin
-from ohmskin.force.calibrated_device import TARE_S
+from ohmskin.force.reader import TARE_S
 
 _out = Console(soft_wrap=True)
 

@@ -52,7 +52,7 @@ def view(
         raise OhmskinError(
             f"the page needs more ({exc.name}): pip install 'ohmskin[view]'"
         ) from exc
-    from ohmskin.view.viewed_boards import ViewedBoards
+    from ohmskin.view.boards import ViewedBoards
 
     calibrations = [load_calibration(path) for path in calibration or ()]
 

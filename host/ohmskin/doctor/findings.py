@@ -1,86 +1,153 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the doctor says: findings, and the order in which they matter."""
+"""What the doctor finds, as data: kinds, lines and cells, and figures whose names carry units.
+
+Words are made of it elsewhere: `ohmskin.cli.doctor_words`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, StrEnum
+from typing import Any, Final, Self
 
-SEVERITIES: Final = {
-    "fault": "readings are wrong",
-    "warning": "readings are worse than they could be",
-    "note": "good to know; nothing is wrong with the skin",
-}
-# Within a severity, what hides or explains others comes first.
-ORDER: Final = (
-    *("port_unusable", "nothing_answers", "protocol_mismatch", "lost"),
-    *("self_test", "nothing_conducts", "open_row", "open_column", "short_rows", "short_columns"),
-    *("dead_cell", "saturated_cell", "reference_ratio", "settling"),
-    *("reset_cause", "restarted", "loss", "damaged", "receive_errors", "rate"),
-    *("hum", "noise", "wires"),
-    *("touched", "unsettled_unknown", "version", "usb_latency", "slow_host"),
-)
-NOT_KNOWN: Final = "not known"  # how a figure begins that could not be had
+import numpy as np
+from numpy.typing import NDArray
+
+Cell = tuple[int, int]  # row, column
+
+
+class Severity(StrEnum):
+    """How bad a finding is, the worst first."""
+
+    FAULT = "fault"  # readings are wrong
+    WARNING = "warning"  # readings are worse than they could be
+    NOTE = "note"  # good to know; nothing is wrong with the skin
+
+
+_FAULT, _WARNING, _NOTE = Severity
+
+
+class Kind(Enum):
+    """What can be found: its id, its severity, and the names of the values that describe it.
+
+    The order is the order in which findings are told: what hides or explains others comes first.
+    """
+
+    PORT_UNUSABLE = "port_unusable", _FAULT, "port problem remedy"
+    NOTHING_ANSWERS = "nothing_answers", _FAULT, "port problem"
+    PROTOCOL_MISMATCH = "protocol_mismatch", _FAULT, "port problem remedy"
+    LOST = "lost", _FAULT, "problem"
+    SELF_TEST = "self_test", _FAULT, "name code_min code_max"
+    NOTHING_CONDUCTS = "nothing_conducts", _FAULT, "cell_count"
+    OPEN_ROW = "open_row", _FAULT, "line_count cells_per_line"
+    OPEN_COLUMN = "open_column", _FAULT, "line_count cells_per_line"
+    SHORT_ROWS = "short_rows", _FAULT, ""
+    SHORT_COLUMNS = "short_columns", _FAULT, ""
+    DEAD_CELL = "dead_cell", _FAULT, "percent_of_usual"
+    SATURATED_CELL = "saturated_cell", _FAULT, "cell_ohm rest_megohm"
+    REFERENCE_RATIO = "reference_ratio", _FAULT, "ratio off_percent ref_top_ohm ref_bottom_ohm"
+    SETTLING = "settling", _FAULT, "change_lsb most_lsb settle_us longer_us needed_us"
+    RESET_CAUSE = "reset_cause", _WARNING, "cause"
+    RESTARTED = "restarted", _WARNING, "restarts causes"
+    LOSS = "loss", _WARNING, "received missed made dropped_by_board rate_hz"
+    DAMAGED = "damaged", _WARNING, "damaged crc_errors"
+    RECEIVE_ERRORS = "receive_errors", _WARNING, "commands"
+    RATE = "rate", _WARNING, "rate_hz asked_hz"
+    HUM = "hum", _WARNING, "mains_hz amplitude_lsb most_lsb rate_hz seen_hz"
+    NOISE = "noise", _WARNING, "noise_lsb sound_lsb adc_lsb"
+    WIRES = "wires", _WARNING, "share nominal_ohm"
+    TOUCHED = "touched", _NOTE, "moves"
+    VERSION = "version", _NOTE, "firmware host"
+    USB_LATENCY = "usb_latency", _NOTE, "timer_ms file"
+    SLOW_HOST = "slow_host", _NOTE, "host_rate_hz rate_hz"
+
+    def __init__(self, id: str, severity: Severity, names: str) -> None:
+        self.id = id
+        self.severity = severity
+        self.names = frozenset(names.split())
+
+
+@dataclass(frozen=True)
+class Place:
+    """Lines and cells of a skin by number; all of them empty: the whole skin."""
+
+    rows: tuple[int, ...] = ()
+    columns: tuple[int, ...] = ()
+    cells: tuple[Cell, ...] = ()
+
+    @classmethod
+    def of_cells(cls, where: NDArray[np.bool_]) -> Self:
+        """Each cell that is true in `where` (R, C)."""
+        return cls(cells=tuple((int(row), int(column)) for row, column in np.argwhere(where)))
+
+
+WHOLE_SKIN: Final = Place()
+
+
+def lines_of(where: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Number of each line that is true in `where` (R,) or (C,)."""
+    return tuple(map(int, np.flatnonzero(where)))
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found. id: one of `ORDER`; severity: one of `SEVERITIES`."""
+    """One thing found. values: what describes it, by the names that `kind` lists, and no others."""
 
-    id: str
-    severity: str
-    where: str
-    measured: str
-    expected: str
-    what_to_do: str
+    kind: Kind
+    place: Place
+    values: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self.id not in ORDER or self.severity not in SEVERITIES:
-            raise ValueError(f"no finding '{self.id}' of severity '{self.severity}'")
+        if self.values.keys() != self.kind.names:
+            raise ValueError(f"{self.kind.id} has {set(self.kind.names)}, not {set(self.values)}")
+
+
+def found(kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> Finding:
+    """A finding with these values."""
+    return Finding(kind, place, values)
 
 
 @dataclass(frozen=True)
+class WireShare:
+    """Wire resistance over the nominal one, and its deviation.
+
+    layers: "top", "bottom", or both. place: lines, or the whole layers. known: the deviation is
+    small enough to tell the share. differs: the wires are clearly not nominal, and no other share
+    tells it already.
+    """
+
+    layers: tuple[str, ...]
+    place: Place
+    share: float
+    std: float
+    known: bool
+    differs: bool
+
+
+@dataclass
 class Diagnosis:
-    """Findings in the order in which they matter, and the figures behind them, by name."""
+    """All that was found. Findings stand in the order of their kinds.
 
-    findings: tuple[Finding, ...]
-    measured: dict[str, Any]
+    measured: figures by name, None for one that could not be had. nominal_ohm: wires of a segment,
+    top and bottom. untouched: shares of both layers, then of each line if an earlier rest was told;
+    empty if touches or faults hide the wires. pressed: the share of all wires that presses show,
+    then of each row and column; None if nobody was asked to press.
+    """
+
+    findings: list[Finding] = field(default_factory=list)
+    measured: dict[str, Any] = field(default_factory=dict)
+    nominal_ohm: tuple[float, float] = (0.0, 0.0)
+    untouched: list[WireShare] = field(default_factory=list)
+    pressed: list[WireShare] | None = None
 
     @property
-    def wrong(self) -> bool:
-        """Whether there is more than notes."""
-        return any(finding.severity != "note" for finding in self.findings)
+    def worse(self) -> list[Finding]:
+        """The findings that are more than notes: with any, the skin is not sound."""
+        return [each for each in self.findings if each.kind.severity is not Severity.NOTE]
 
     @property
-    def verdict(self) -> str:
-        """One line: whether the skin is sound."""
-        worse = [finding for finding in self.findings if finding.severity != "note"]
-        touched = any(finding.id == "touched" for finding in self.findings)
-        if worse:
-            text = f"not sound: {len(worse)} finding{'s' if len(worse) > 1 else ''}, "
-            return text + f"first {_spoken(worse[0])}"
-        if touched:
-            return "no fault found, but something touches the skin: let go, and run this again"
-        if str(self.measured.get("wires", "")).startswith(NOT_KNOWN):
-            return "sound: nothing is wrong that an untouched skin shows; --press shows its wires"
-        return "sound: nothing is wrong"
-
-
-def _spoken(finding: Finding) -> str:
-    return f"{finding.id.replace('_', ' ')} ({finding.where})"
-
-
-def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Faults first, then warnings, then notes; each as in `ORDER`."""
-    severity = list(SEVERITIES)
-    return tuple(
-        sorted(findings, key=lambda each: (severity.index(each.severity), ORDER.index(each.id)))
-    )
-
-
-def named(cells: Iterable[tuple[int, int]], most: int = 6) -> str:
-    """Cells by name, so many of them at the most."""
-    names = [f"({int(row)}, {int(column)})" for row, column in cells]
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"cell{'s' if len(names) > 1 else ''} {', '.join(names[:most])}{more}"
+    def wires_hidden(self) -> bool:
+        """Whether the wires were judged, but are not known of any layer."""
+        layers = self.untouched[:2] if self.pressed is None else self.pressed[:1]
+        return bool(self.untouched) and not any(each.known for each in layers)

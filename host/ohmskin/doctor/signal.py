@@ -10,58 +10,72 @@ N, M   ()              scans, readings of one
 y      (N, R, C, 4)    codes [LSB]
 t      (N,)            board time of the scans' starts [s]
 d      (R, C, 4)       time of each reading since its scan's start [s]
-w      (N,)            Hann window: what is slow does not leak to the mains
-c(f)   (R, C, 4)       (2 / sum w) sum_n w_n (y_n - mean) exp(-2 pi i f (t_n + d)) [LSB]
+w      (N,)            Hann window over its sum: what is slow does not leak to the mains
+c(f)   (R, C, 4)       2 sum_n w_n (y_n - mean) exp(-2 pi i f t_n) [LSB]
+P(f)   ()              power: mean of |c(f)|^2 over all M readings [LSB^2]
 ====== =============== =====================================================================
 
-Hum of amplitude a at every reading has |c(f)| = a. Noise of deviation s alone has a mean |c|^2 of
-4 s^2 sum w^2 / (sum w)^2; hum is found where the mean over all readings is far above it, above that
-of frequencies beside it, and large enough to matter. One reading at rate r sees f as |f - k r|, so
-two mains may look alike; but readings of one scan are taken at different times, and with the right
-f their c agree in phase. What comes to a stand still at the scan rate cannot be seen.
+Hum of amplitude a has |c(f)| = a at every reading. Noise of deviation s alone has the power
+4 s^2 sum w^2. Hum is found where P is far above that of the noise and above that of frequencies
+beside it, and where the amplitude is large enough to matter.
+
+One reading at scan rate r sees the frequency f as |f - k r|, with k the nearest whole number, so
+that two mains may look alike. But the readings of one scan are taken at different times, and with
+the right f their c(f) exp(-2 pi i f d) have one phase. Mains that are seen at almost 0 Hz look like
+drift.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.doctor.findings import Finding, named
-from ohmskin.link.messages import Hello
-from ohmskin.link.protocol import CONSTANTS, ENUMS
-from ohmskin.link.scan_times import SELECT_S, reading_offsets_s
+from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import CONSTANTS
+from ohmskin.link.timing import reading_offsets_s, slot_s
 
 Bool = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
 
-MAINS_HZ: Final = (50.0, 60.0)
-MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)  # resonator and grid are off by up to 0.5 %
-HUM_LSB: Final = 0.5  # amplitude that matters
-HUM_OVER_NOISE: Final = 10.0  # over the root of the number of readings
-HUM_OVER_BESIDE: Final = 3.0
-IN_PHASE: Final = 1.5  # of two mains that look alike, the one whose readings agree so much better
-_OVERLAP: Final = 0.5
-ADC_NOISE_LSB: Final = 0.3
-SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5
-NOISY_LSB: Final = 0.8
-NOISY_SHARE: Final = 1.7  # of one line or cell over the others
-NOISY_CELL_LSB: Final = 1.0
-BLOCKS: Final = 8
-MOVED_LSB: Final = 3.0
-CLEAR_STDS: Final = 6.0
-UNSETTLED_LSB: Final = 1.0
-_LONGER: Final = 4  # settle time to compare with, over the board's
-_LEAST_LONGER_US: Final = 100
-_NOT_LONGER: Final = 1.2
-_LEAST_HZ: Final = 4.0  # of the second look, unless the board is slower
-LEAST_SCANS: Final = 16  # from which noise and hum are judged
-SETTLED_NOISE_LSB: Final = 0.5
-REST_S: Final = 2.5  # of scans as the board is configured
-SETTLED_S: Final = 1.6  # of the second look
+REST_S: Final = 2.5  # seconds of scans as the board is configured: tells 50 from 52.5 Hz
+SETTLED_S: Final = 1.6  # seconds of the second look: with all else, the doctor takes under 10 s
+LEAST_SCANS: Final = 16  # from which noise and hum are judged: in fewer they are not known well
+
+MAINS_HZ: Final = (50.0, 60.0)  # Hz, the mains of the world
+MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)  # Hz: resonator and grid are off by 0.5 %
+HUM_LSB: Final = 0.5  # LSB, amplitude that matters: less changes a code by one at most
+# P over that of noise, in its deviation for M independent readings. The four readings of a cell
+# round alike, so that these are five true deviations.
+HUM_OVER_NOISE: Final = 10.0
+HUM_OVER_BESIDE: Final = 3.0  # P over that beside it: drift and other tones are as strong there
+BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)  # in 1 / duration: a Hann window's main lobe ends at 2
+ALIKE_POWER: Final = 2.0  # two mains whose P differ by less may be one that is seen twice
+IN_PHASE: Final = 1.5  # of those, the one is right whose phases agree so many times better
+OVERLAP: Final = 0.5  # of |c|^2, from which a sine and its mirror image cannot be told apart
+STILL_HZ: Final = 0.5  # Hz besides 4 / duration: mains that are seen slower look like drift
+
+ADC_NOISE_LSB: Final = 0.3  # LSB, of a sound board's converter, as the emulated one has it
+SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5  # LSB, the same with rounding
+NOISY_LSB: Final = 0.8  # LSB, of most cells: twice that of a sound board
+NOISY_CELL_LSB: Final = 1.0  # LSB, of a line or cell: more, because the worst of many is taken
+NOISY_SHARE: Final = 1.7  # of a line or cell over the others: three times the power
+
+BLOCKS: Final = 8  # parts of the scans whose means are compared: 0.3 s, shorter than a touch
+MOVED_LSB: Final = 3.0  # LSB from one mean to another: the lightest touch changes some 15
+CLEAR_STDS: Final = 6.0  # deviations of a clear difference: up to 1024 readings are looked at
+
+UNSETTLED_LSB: Final = 1.0  # LSB, change with a longer settle time that matters: one code
+SETTLED_NOISE_LSB: Final = 0.5  # LSB, least scatter: codes that do not scatter hide so much
+LONGER: Final = 4  # settle time of the second look: of what was left, its fourth power is left
+LEAST_LONGER_US: Final = 100  # microseconds, at least: ten time constants of 10 us
+NOT_LONGER: Final = 1.2  # a settle time that is longer by less shows nothing new
+LEAST_LOOK_HZ: Final = 4.0  # Hz of the second look, unless the board is slower: six scans
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,55 +86,77 @@ class RestScans:
     codes: Float
     time_s: Float
 
+    @classmethod
+    def of(cls, board: Hello, scans: Sequence[Scan]) -> Self | None:
+        """The scans that have a board's size; None if there are fewer than two."""
+        fit = [scan for scan in scans if scan.codes.shape[:2] == (board.rows, board.columns)]
+        if len(fit) < 2:
+            return None
+        codes = np.stack([scan.codes for scan in fit]).astype(np.float64)
+        return cls(board, codes, np.array([1e-6 * scan.time_us for scan in fit]))
+
     @property
     def mean(self) -> Float:
         """Mean codes (R, C, 4)."""
         return np.asarray(self.codes.mean(axis=0))
 
-    def deviation(self) -> Float:
-        """Standard deviation of each reading, whatever moves it, (R, C, 4) [LSB]."""
-        return np.asarray(self.codes.std(axis=0))
+    @property
+    def hidden_hz(self) -> tuple[float, ...]:
+        """Mains that these scans cannot show [Hz]."""
+        if len(self.codes) < LEAST_SCANS:
+            return MAINS_HZ
+        return _hidden_hz(self.board.rate_hz, float(np.ptp(self.time_s)))
 
 
 @dataclass(frozen=True, eq=False)
 class Hum:
-    """Mains hum: frequency as found, its name, amplitude c (R, C, 4) as of the scans' starts."""
+    """Mains hum. mains_hz: which mains, or both where they cannot be told apart [Hz].
 
+    frequency_hz: where it was found. amplitude: c (R, C, 4). lsb: mean amplitude of a reading.
+    """
+
+    mains_hz: tuple[float, ...]
     frequency_hz: float
-    name: str
     amplitude: Complex
     lsb: float
 
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """What the scans show besides their means. moved: cells that changed, (R, C)."""
+    """What scans show besides their means.
 
-    findings: tuple[Finding, ...]
+    noise_lsb: of a reading, without hum. hum_lsb: amplitude, 0 for none. hidden_hz: mains that the
+    scans cannot show. moved: cells that changed meanwhile, (R, C).
+    """
+
+    findings: list[Finding]
     noise_lsb: float
     hum_lsb: float
-    hum_hidden: tuple[float, ...]
+    hidden_hz: tuple[float, ...]
     moved: Bool
 
 
-def examine_signal(scans: RestScans) -> Signal:
-    """Hum, then the noise that is left without it, and what moved meanwhile."""
-    enough = len(scans.codes) >= LEAST_SCANS
-    hum = find_hum(scans)
-    seconds = float(np.ptp(scans.time_s))
-    hidden = _hidden(scans.board.rate_hz, seconds) if enough else MAINS_HZ
+def examine_signal(scans: RestScans, other: RestScans | None = None) -> Signal:
+    """Hum, the noise that is left without it, and what moved meanwhile.
+
+    other: scans at another rate, which may show a hum that these hide.
+    """
+    hum, hidden_hz = find_hum(scans), scans.hidden_hz
     rest = scans.codes - scans.mean
     if hum is not None:
         turn = np.exp(2j * np.pi * hum.frequency_hz * scans.time_s)
         rest -= np.real(turn[:, None, None, None] * hum.amplitude)
-    # Of differences from scan to scan, because what moves slowly is no noise.
+    # Differences from scan to scan: what moves slowly is no noise.
     variance = np.mean(np.diff(rest, axis=0) ** 2, axis=0) / 2
     moved = _moved(rest, variance)
-    findings = [] if hum is None else [hum_finding(hum, scans.board)]
-    if enough and not moved.any():
+    if other is not None and hidden_hz and hum is None and not moved.any():
+        hum = find_hum(other)
+        hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
+    findings = [] if hum is None else [_hum_finding(hum, scans.board)]
+    if len(scans.codes) >= LEAST_SCANS and not moved.any():
         findings += _noise(np.sqrt(variance.mean(axis=2)))
     noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
-    return Signal(tuple(findings), noise_lsb, hum.lsb if hum else 0.0, hidden, moved)
+    return Signal(findings, noise_lsb, 0.0 if hum is None else hum.lsb, hidden_hz, moved)
 
 
 def mean_std_lsb(noise_lsb: float, scans: int) -> float:
@@ -141,71 +177,86 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 # ----------------------------------------------------------------------------------------- hum
 
 
+class _Spectrum:
+    """c(f) and P(f) of scans, and the power that noise alone would have."""
+
+    def __init__(self, scans: RestScans) -> None:
+        rest = scans.codes - scans.mean
+        window = np.hanning(len(rest) + 2)[1:-1]
+        self._window = window / window.sum()
+        self._weighted = self._window[:, None] * rest.reshape(len(rest), -1)
+        self._time_s = scans.time_s
+        self.seconds = float(np.ptp(scans.time_s))
+        self._shape = rest.shape[1:]
+        self.noise = 4 * float((rest**2).mean()) * float(np.sum(self._window**2))
+
+    def amplitude(self, frequency_hz: float) -> Complex:
+        """c (R, C, 4)."""
+        turn = np.exp(-2j * np.pi * frequency_hz * self._time_s)
+        return np.asarray(2 * (turn @ self._weighted).reshape(self._shape))
+
+    def power(self, frequency_hz: float) -> float:
+        """P."""
+        return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
+
+    def sine(self, frequency_hz: float) -> tuple[float, Complex]:
+        """What share of P a sine at f has, and its complex amplitude (R, C, 4).
+
+        A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image
+        overlap by m. At half the rate only a part of it is seen, half of its power on average.
+        """
+        amplitude = self.amplitude(frequency_hz)
+        mirror = complex(self._window @ np.exp(-4j * np.pi * frequency_hz * self._time_s))
+        if abs(mirror) ** 2 >= OVERLAP:
+            return 0.5, amplitude / 2
+        sine = (amplitude - mirror * np.conj(amplitude)) / (1 - abs(mirror) ** 2)
+        return float(np.mean(np.abs(sine) ** 2)) / self.power(frequency_hz), sine
+
+
 def find_hum(scans: RestScans) -> Hum | None:
-    """The mains hum that is in the scans, or None."""
-    if len(scans.codes) < LEAST_SCANS or not np.ptp(scans.codes, axis=0).any():
+    """The mains hum in the scans; None if there is none, or none can be seen."""
+    if not np.ptp(scans.codes, axis=0).any():
         return None
-    rest = scans.codes - scans.mean
-    window = np.hanning(len(rest) + 2)[1:-1]
-    weighted = np.asarray((window / window.sum())[:, None] * rest.reshape(len(rest), -1))
-    noise = 4 * float((rest**2).mean()) * float(np.sum((window / window.sum()) ** 2))
-    offsets_s = reading_offsets_s(scans.board)
-    seconds = float(np.ptp(scans.time_s))
-    hidden = _hidden(scans.board.rate_hz, seconds)
-
-    def amplitude(frequency_hz: float) -> Complex:
-        turn = np.exp(-2j * np.pi * frequency_hz * scans.time_s)
-        return np.asarray(2 * (turn @ weighted).reshape(offsets_s.shape))
-
-    found: list[tuple[float, float, Hum]] = []
-    for mains_hz in MAINS_HZ:
-        if mains_hz in hidden:
-            continue
-        near = [(mains_hz + off, amplitude(mains_hz + off)) for off in MAINS_SEARCH_HZ]
-        power = [float(np.mean(np.abs(each) ** 2)) for _, each in near]
-        best = int(np.argmax(power))
-        frequency_hz, strongest = near[best]
-        beside = np.median(
-            [
-                np.mean(np.abs(amplitude(frequency_hz + side * far / seconds)) ** 2)
-                for side in (-1, 1)
-                for far in (4, 5, 6, 7)
-            ]
-        )
-        turn = np.exp(-4j * np.pi * frequency_hz * scans.time_s)
-        share, fitted = _sine(strongest, complex(window @ turn / window.sum()))
-        lsb = max(share * (power[best] - noise), 0.0) ** 0.5
-        clear = power[best] > noise * (1 + HUM_OVER_NOISE / strongest.size**0.5)
-        if lsb > HUM_LSB and clear and power[best] > HUM_OVER_BESIDE * float(beside):
-            at_reading = strongest * np.exp(-2j * np.pi * frequency_hz * offsets_s)
-            agree = float(np.abs(at_reading.mean()) / np.abs(at_reading).mean())
-            name = f"{mains_hz:.0f} Hz"
-            found.append((power[best], agree, Hum(frequency_hz, name, fitted, lsb)))
-    return _one_of(found)
+    spectrum = _Spectrum(scans)
+    heard = [
+        _hum_at(mains_hz, spectrum) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz
+    ]
+    match [hum for hum in heard if hum is not None]:
+        case [one, other]:
+            return _the_right_one(one, other, spectrum, reading_offsets_s(scans.board))
+        case some:
+            return some[0] if some else None
 
 
-def _sine(amplitude: Complex, mirror: complex) -> tuple[float, Complex]:
-    """The sine behind c, and what share of |c|^2 it has.
+def _hum_at(mains_hz: float, spectrum: _Spectrum) -> Hum | None:
+    """Hum near one of the mains, if it matters and stands out."""
+    frequency_hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=spectrum.power)
+    power = spectrum.power(frequency_hz)
+    share, sine = spectrum.sine(frequency_hz)
+    lsb = max(share * (power - spectrum.noise), 0.0) ** 0.5
+    beside = np.median([spectrum.power(frequency_hz + far / spectrum.seconds) for far in BESIDE])
+    over_noise = power > spectrum.noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
+    if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
+        return Hum((mains_hz,), frequency_hz, sine, lsb)
+    return None
 
-    c = a + mirror conj(a): near half the scan rate a sine and its mirror image overlap, and at it
-    only a part of each sine is seen, half of the power on average.
-    """
-    if abs(mirror) ** 2 < _OVERLAP:
-        fitted = (amplitude - mirror * np.conj(amplitude)) / (1 - abs(mirror) ** 2)
-        return float(np.mean(np.abs(fitted) ** 2) / np.mean(np.abs(amplitude) ** 2)), fitted
-    return 0.5, amplitude / 2
 
+def _the_right_one(one: Hum, other: Hum, spectrum: _Spectrum, offsets_s: Float) -> Hum:
+    """Of two mains that were found: the stronger one, or else the one with one phase, or both."""
 
-def _one_of(found: list[tuple[float, float, Hum]]) -> Hum | None:
-    """Of the mains that pass, the one: by phase where both are alike, else by strength."""
-    if len(found) < 2:
-        return found[0][2] if found else None
-    (power, agree, one), (other_power, other_agree, other) = found
-    if max(power, other_power) > 2 * min(power, other_power):
+    def agreement(hum: Hum) -> float:
+        """1 if all readings have one phase, less if they have not."""
+        amplitude = spectrum.amplitude(hum.frequency_hz)
+        at_reading = amplitude * np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
+        return float(np.abs(at_reading.mean()) / np.abs(at_reading).mean())
+
+    power, other_power = (spectrum.power(each.frequency_hz) for each in (one, other))
+    if max(power, other_power) > ALIKE_POWER * min(power, other_power):
         return one if power > other_power else other
+    agree, other_agree = agreement(one), agreement(other)
     if max(agree, other_agree) > IN_PHASE * min(agree, other_agree):
         return one if agree > other_agree else other
-    return Hum(one.frequency_hz, f"{one.name} or {other.name}", one.amplitude, one.lsb)
+    return replace(one, mains_hz=one.mains_hz + other.mains_hz)
 
 
 def _seen_hz(mains_hz: float, rate_hz: float) -> float:
@@ -213,29 +264,24 @@ def _seen_hz(mains_hz: float, rate_hz: float) -> float:
     return abs(mains_hz - rate_hz * round(mains_hz / rate_hz))
 
 
-def _hidden(rate_hz: float, seconds: float) -> tuple[float, ...]:
+def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
     """Mains that this scan rate shows too slow to tell them from drift [Hz]."""
-    least_hz = 0.5 + 4 / max(seconds, 1e-3)
+    least_hz = STILL_HZ + 4 / max(seconds, 1e-3)
     return tuple(each for each in MAINS_HZ if _seen_hz(each, rate_hz) < least_hz)
 
 
-def hum_finding(hum: Hum, board: Hello) -> Finding:
-    """What is said of hum that a board showed."""
+def _hum_finding(hum: Hum, board: Hello) -> Finding:
+    """Hum of a board; cells: the worst one, if it has twice as much as others."""
     by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
-    worst = np.unravel_index(int(by_cell.argmax()), by_cell.shape)
-    where = "whole skin"
-    if by_cell.max() > 2 * np.median(by_cell):
-        where = f"most at {named([(int(worst[0]), int(worst[1]))])}"
-    seen_hz = _seen_hz(hum.frequency_hz, board.rate_hz)
-    return Finding(
-        "hum",
-        "warning",
-        where,
-        f"{hum.name} of amplitude {hum.lsb:.1f} LSB; at {board.rate_hz:.1f} scans/s it looks like "
-        f"{seen_hz:.1f} Hz",
-        f"below {HUM_LSB} LSB",
-        "ground the robot and the board together, keep the skin's wires short and away from mains "
-        "cables, run a laptop from its battery to compare",
+    worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
+    return found(
+        Kind.HUM,
+        Place.of_cells(worst),
+        mains_hz=hum.mains_hz,
+        amplitude_lsb=hum.lsb,
+        most_lsb=HUM_LSB,
+        rate_hz=board.rate_hz,
+        seen_hz=_seen_hz(hum.frequency_hz, board.rate_hz),
     )
 
 
@@ -252,34 +298,21 @@ def _moved(rest: Float, variance: Float) -> Bool:
 
 
 def _noise(cell_lsb: Float) -> list[Finding]:
-    """Noise of each cell [LSB], (R, C), against that of the converter alone."""
+    """Noise of each cell [LSB], (R, C), against that of a sound board: lines, or else cells."""
     usual = float(np.median(cell_lsb))
-    places = []
-    for axis, what in enumerate(("row", "column")):
-        if cell_lsb.shape[axis] > 1:
-            level = np.median(cell_lsb, axis=1 - axis)
-            bad = level > max(NOISY_CELL_LSB, NOISY_SHARE * usual)
-            places += [(f"{what} {line}", float(level[line])) for line in np.flatnonzero(bad)]
-    if not places and cell_lsb.size > 1:
-        bad_cells = np.argwhere(cell_lsb > max(NOISY_CELL_LSB, NOISY_SHARE * usual))
-        places += [(named([(r, c)]), float(cell_lsb[r, c])) for r, c in bad_cells[:6]]
-    if not places and usual <= NOISY_LSB:
+    limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
+    row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
+    rows, columns = lines_of(row_lsb > limit), lines_of(column_lsb > limit)
+    cells = () if rows or columns else Place.of_cells(cell_lsb > limit).cells
+    lsb = usual
+    if rows or columns:
+        lsb = float(max(row_lsb.max(), column_lsb.max()))
+    elif cells:
+        lsb = float(cell_lsb.max())
+    elif usual <= NOISY_LSB:
         return []
-    where = ", ".join(place for place, _ in places) or "whole skin"
-    most = max([lsb for _, lsb in places], default=usual)
-    return [
-        Finding(
-            "noise",
-            "warning",
-            where,
-            f"{most:.2f} LSB a reading",
-            f"{SOUND_NOISE_LSB:.2f} LSB: rounding and {ADC_NOISE_LSB} LSB of the converter",
-            "power the board from a clean supply with its capacitors, shorten the skin's wires, "
-            "keep motors' cables away; loose contacts are noisy too"
-            if not places
-            else f"check the contacts of {where}: loose ones are noisy",
-        )
-    ]
+    place, sound = Place(rows, columns, cells), SOUND_NOISE_LSB
+    return [found(Kind.NOISE, place, noise_lsb=lsb, sound_lsb=sound, adc_lsb=ADC_NOISE_LSB)]
 
 
 # ------------------------------------------------------------------------------------ settling
@@ -291,14 +324,12 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     The settle time is longer, where it can be; the rate is one at which no mains stands still.
     """
     readings = board.rows * board.columns * board.readings_per_cell
-    slot_us = 1e6 / (readings * min(board.rate_hz, _LEAST_HZ))
-    most_us = min(CONSTANTS["settle_us_max"], int(slot_us - 1e6 * SELECT_S))
-    longer_us = min(max(_LONGER * board.settle_us, _LEAST_LONGER_US), most_us)
-    if not _is_longer(longer_us, board.settle_us) and not _hidden(board.rate_hz, REST_S):
+    spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
+    most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
+    longer_us = min(max(LONGER * board.settle_us, LEAST_LONGER_US), most_us)
+    if not _is_longer(longer_us, board.settle_us) and not _hidden_hz(board.rate_hz, REST_S):
         return None
-    prescaler = ENUMS["adc_prescaler"].values.get(board.adc_prescaler, 0)
-    conversion_us = 1e6 * 14 * prescaler / board.clock_hz
-    slot_us = max(longer_us + 1e6 * SELECT_S, conversion_us)
+    slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
     rates_hz = np.linspace(0.7, 1.0, 31) * fastest_hz
     best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(each, rate_hz) for each in MAINS_HZ))
@@ -306,41 +337,33 @@ def comparison(board: Hello) -> tuple[int, float] | None:
 
 
 def _is_longer(settle_us: int, than_us: int) -> bool:
-    return settle_us > _NOT_LONGER * than_us
+    return settle_us > NOT_LONGER * than_us
 
 
 def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding], float]:
     """Means at the usual settle time against a longer one; the largest clear difference [LSB]."""
-    if not _is_longer(settled.board.settle_us, usual.board.settle_us):
+    settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
+    if not _is_longer(longer_us, settle_us):
         return [], 0.0
-    difference = np.abs(usual.mean - settled.mean)
-    spread = np.maximum(usual.deviation(), settled.deviation())
-    std = (
-        np.maximum(spread, SETTLED_NOISE_LSB)
-        * (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
-    )
-    clear = difference - CLEAR_STDS * std
-    most = float(clear.max())
-    if most <= UNSETTLED_LSB:
-        return [], max(most, 0.0)
-    bad = (clear > UNSETTLED_LSB).any(axis=2)
+    change = np.abs(usual.mean - settled.mean)
+    scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
+    in_mean = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
+    clear = change - CLEAR_STDS * np.maximum(scatter, SETTLED_NOISE_LSB) * in_mean
+    most_lsb = float(clear.max())
+    if most_lsb <= UNSETTLED_LSB:
+        return [], max(most_lsb, 0.0)
+    cells = (clear > UNSETTLED_LSB).any(axis=2)
     # A node that is left with e of its swing S after t settles with tau = t / ln(S / e).
     swing = float(np.ptp(settled.mean, axis=2).max())
-    remnant = min(float(difference.max()), 0.9 * swing)
-    longer_us = settled.board.settle_us
-    enough_us = min(
-        usual.board.settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant),
-        CONSTANTS["settle_us_max"],
+    remnant = min(float(change.max()), 0.9 * swing)
+    needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
+    finding = found(
+        Kind.SETTLING,
+        WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
+        change_lsb=float(change.max()),
+        most_lsb=UNSETTLED_LSB,
+        settle_us=settle_us,
+        longer_us=longer_us,
+        needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
     )
-    share = bad.mean()
-    finding = Finding(
-        "settling",
-        "fault",
-        "whole skin" if share > 0.5 else named(np.argwhere(bad)),
-        f"readings change by up to {difference.max():.0f} LSB when {usual.board.settle_us} us of "
-        f"settling become {longer_us} us",
-        f"no change by more than {UNSETTLED_LSB:.0f} LSB",
-        f"shorter wires settle sooner; else wait longer, and scan as fast as that lets: 'ohmskin "
-        f"configure PORT --settle {np.ceil(enough_us):.0f} --rate 0', then run this again",
-    )
-    return [finding], most
+    return [finding], most_lsb

@@ -1,201 +1,356 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an untouched skin tells of its wires: little, so every figure carries its deviation.
+"""The wires of a skin against nominal ones: of an untouched skin, and of three pressed corners.
+
+Both compare port resistances with those of a model, and find by least squares what the wires have
+to be for both to agree. A figure carries its deviation, which says whether it is worth anything.
 
 Symbols
 
-====== ============ ==================================================================
+====== ============ =====================================================================
 symbol shape        meaning
-====== ============ ==================================================================
-z      (RC,)        port resistance now, less that of the model [ohm]
+====== ============ =====================================================================
+z      (RC,)        port resistances read, less those of the model [ohm]
+n      (RC,)        deviations of what was read [ohm]
+B      (RC, RC)     slopes of the model by the cells' log resistances [ohm]
+W      (RC, 2RC)    slopes of the model by the segments' log resistances [ohm]
+s      ()           deviation of a cell's log resistance from the model's, to be found
 x      (2+R+C,)     what the wires have more than nominal, as a share: all top wires, all
                     bottom ones, those of each row, those of each column
-A      (RC, 2+R+C)  slopes of z by x [ohm]
-B      (RC, RC)     slopes of z by the cells' log resistances [ohm]
-s      ()           deviation of a cell's log resistance from the model's, to be found
-====== ============ ==================================================================
+A      (RC, 2+R+C)  slopes of the model by x: sums of W [ohm]
+y      ()           log of the wires over nominal
+u      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
+====== ============ =====================================================================
 
-The model is the nominal wires and, where there are readings of an earlier rest, the cells that
-these show; else equal cells. With z = A x + B (common + each) + noise, x is the generalised least
-squares answer under wide priors; s is chosen so that the residual has the size it should. Cells of
-1 MOhm hide wires of 100 ohm behind their own scatter: without earlier readings only gross changes
-show, and with them a factor of two does so on large skins alone. Touches show more: `doctor_press`.
+Untouched skin. The model is the nominal wires and the cells that an earlier rest shows; without
+one, equal cells. With z = A x + B (common + each) + noise, x is the generalised least squares
+answer under wide priors; s is chosen so that the residual has the size it should. Cells of 1 MOhm
+hide wires of 100 ohm behind their own scatter: without an earlier rest only gross changes show, and
+with one a factor of two shows on large skins alone.
+
+Pressed corners. A pressed cell hides the wires behind it, too, because its own resistance is in the
+same reading. Three corners of a rectangle do not: with (a, b) the one between the other two,
+(a, b') and (a', b), the current of the fourth goes through all three in series, so that four ports
+see three unknown cells. But for the untouched cells,
+
+    rho[a,b] + rho[a,b'] + rho[a',b] - rho[a',b'] = 2 (top + bottom)
+
+with top the wire of row a from its electrode up to the nearer of columns b and b', and bottom that
+of column b up to the nearer of rows a and a'. So only the sum of both layers is seen, and they are
+taken to have changed alike. With index 0 for the untouched skin and 1 for the pressed one, the
+untouched cells follow from what was read of them, dc = B0^-1 (z0 - W0 dy), so
+
+    r = z1 - B1 B0^-1 z0 = W dy + B1 du + noise ,   W = W1 - B1 B0^-1 W0
+
+    S = n1^2 + B1 B0^-1 n0^2 B0^-T B1^T + SEGMENT_STD^2 W W^T + B1 V B1^T
+
+with V wide for the free cells, narrow for others. With w the sum of W over all segments, a
+Gauss-Newton step is dy = w^T S^-1 r / (w^T S^-1 w), but for a weak prior of y. Free are the three
+cells and their neighbours, since a fingertip may press these as well. What stays unexplained widens
+the deviation.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
-from ohmskin.doctor.findings import NOT_KNOWN, Finding
-from ohmskin.doctor.signal import mean_std_lsb
-from ohmskin.estimate.base import SkinKnowledge
-from ohmskin.estimate.methods import make_estimator
+from ohmskin.doctor.circuit import matrix_estimator
+from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
+from ohmskin.doctor.signal import rounding_std_lsb
+from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
-from ohmskin.link.messages import Hello
+from ohmskin.link.messages import Hello, Scan
 
-LAYER_STD: Final = 30.0  # prior deviations of shares: wide
-LINE_STD: Final = 0.05  # lines of a layer change alike
-ODD_LINE_STD: Final = 30.0  # but for the one that is asked about
-COMMON_STD: Final = 1.0
-LEAST_STD: Final = 0.001  # of a cell: nothing is more alike than this
-CHANGED: Final = 0.25  # share of a layer's nominal wires that matters
-LINE_CHANGED: Final = 0.75
-CLEAR_STDS: Final = 5.0
-TO_DO: Final = (
-    "is the skin stretched or bent, a stripe worn or a crimp loose? If it is to stay so, calibrate "
-    "anew"
-)
-UNKNOWN: Final = f"{NOT_KNOWN}: an untouched skin hides its wires, --press asks for touches"
-KNOWN: Final = 0.15  # deviation of a share from which a layer counts as known
+Corners = tuple[Cell, Cell, Cell]
+Bool = NDArray[np.bool_]
+
+LAYERS: Final = ("top", "bottom")
+
+# What is told. Shares are over the nominal wires, deviations of pressed ones those of logs.
+KNOWN: Final = 0.15  # largest deviation of a share that is told: half of what is a change
+CHANGED: Final = 0.25  # a change that matters: estimators expect smaller ones of every layer
+LINE_CHANGED: Final = 0.75  # a change of one line that matters: it moves fewer cells
+CLEAR_STDS: Final = 5.0  # deviations of a clear change: up to 34 shares are looked at
+PRESSED_CLEAR_STDS: Final = 3.5  # the same of presses: two or three shares are looked at
+
+# What is expected of an untouched skin: deviations of shares and of log resistances.
+LAYER_STD: Final = 30.0  # of a layer: wide, so that the readings decide
+LINE_STD: Final = 0.05  # of a line from its layer, because lines of a layer change alike
+ODD_LINE_STD: Final = 30.0  # of the one line that is asked about
+COMMON_STD: Final = 1.0  # log, of what all cells have in common: it drifts, and tells no wires
+LEAST_STD: Final = 0.001  # log, of each cell: no two cells are more alike than this
+
+# What is expected of presses.
+PRESS_S: Final = 1.0  # seconds of scans with the same corners: 90 scans even the noise out
+PRESSED_SIEMENS: Final = 2e-5  # a firm press: 20 times a cell at rest, so that wires show
+FOURTH_SHARE: Final = 0.5  # what any other cell may conduct, over the weakest corner
+HELD_SHARE: Final = 0.5  # scans of corners that count, over those held longest: not in passing
+BEFORE_STD: Final = 2.0  # of y before anything is pressed: a factor of 7
+DRIFT_STD: Final = 0.01  # log, of an untouched cell since it was read, seconds ago
+MOST_STEPS: Final = 20  # Gauss-Newton steps: as a rule five are enough
+LONGEST_STEP: Final = 1.0  # log: further away the slopes are others
+CLOSE: Final = 1e-4  # log: a last step, far below any deviation
 
 
-@dataclass(frozen=True, eq=False)
-class Wires:
-    """Wires over nominal: of the layers (2,), each row (R,) and column (C,), with deviations."""
+def _port_ohm(ratio: Float, noise_lsb: Float | float, board: Hello) -> tuple[Float, Float]:
+    """Port resistances of readings (R, C, 4) and their deviations [ohm], each (RC,).
 
-    layer: Float
-    layer_std: Float
-    line: Float
-    line_std: Float
+    noise_lsb: deviation of a port's reading, one for all or (R, C).
+    """
+    refs = (board.ref_top_ohm, board.ref_bottom_ohm)
+    loop_ohm = (1 / np.maximum(current_from_ratio(ratio, *refs), 1e-9)).ravel()
+    std_siemens = current_std(2.0**-board.adc_bits, *refs) * np.ravel(noise_lsb)
+    return loop_ohm - sum(refs), std_siemens * loop_ohm**2
 
 
-def measure_wires(
+# ------------------------------------------------------------------------- the untouched skin
+
+
+def measure_untouched(
     mean_codes: Float,
-    noise_lsb: float,
-    scans: int,
+    mean_std: float,
     board: Hello,
     wire_ohm: tuple[float, float],
     rest_ratio: Float | None,
-) -> Wires:
-    """Wires against `wire_ohm` of a segment (top, bottom), from mean codes (R, C, 4)."""
-    rows, columns = mean_codes.shape[:2]
-    refs = (board.ref_top_ohm, board.ref_bottom_ohm)
-    knowledge = SkinKnowledge(rows, columns, *refs, adc_bits=board.adc_bits)
-    top, bottom = (np.full((rows, columns), ohm) for ohm in wire_ohm)
-    now_ohm = port_ohm(ratio_from_codes(mean_codes, board.adc_bits), refs)
-    estimator = make_estimator("matrix", knowledge)
+) -> list[WireShare]:
+    """Shares of both layers, of each row, and of each column.
+
+    mean_codes: of rest, (R, C, 4), with the deviation mean_std [LSB]. wire_ohm: nominal ones of a
+    segment, top and bottom. rest_ratio: readings (R, C, 4) of an earlier rest.
+    """
+    shape = rows, columns = mean_codes.shape[:2]
+    ratio = ratio_from_codes(mean_codes, board.adc_bits)
+    known_ratio = ratio if rest_ratio is None else rest_ratio
+    cell = matrix_estimator(board, rows, columns).estimate(known_ratio).cell_siemens
     if rest_ratio is None:
-        level = estimator.estimate(ratio_from_codes(mean_codes, board.adc_bits)).cell_siemens
-        cell = np.full((rows, columns), float(np.exp(np.mean(np.log(level)))))
-        model = port_sensitivity(cell, top, bottom)
-        z = now_ohm - model.port_ohm
+        cell = np.full(shape, float(np.exp(np.mean(np.log(cell)))))
     else:
-        cell = estimator.estimate(rest_ratio).cell_siemens
-        model = port_sensitivity(cell, top, bottom)
-        z = now_ohm - port_ohm(rest_ratio, refs)
+        mean_std *= 2**0.5  # an earlier rest is a mean of such codes as well
+    model = port_sensitivity(cell, *(np.full(shape, ohm) for ohm in wire_ohm))
+    now_ohm, noise_ohm = _port_ohm(ratio, mean_std, board)
+    expected_ohm = model.port_ohm if rest_ratio is None else _port_ohm(rest_ratio, 0.0, board)[0]
+    z, by_cell = now_ohm - expected_ohm, model.by_cell
     by_wire = model.by_wires().reshape(-1, 2, rows, columns)
     slopes = np.concatenate(
         [by_wire.sum(axis=(2, 3)), by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1
     )
-    # An earlier rest is a mean of such codes as well.
-    reading_lsb = mean_std_lsb(noise_lsb, scans) * (1 if rest_ratio is None else 2**0.5)
-    std_siemens = current_std(reading_lsb / 2**board.adc_bits, *refs)
-    noise_ohm = std_siemens * (now_ohm + sum(refs)) ** 2
-    return _fit(z, slopes, model.by_cell, noise_ohm, (rows, columns))
-
-
-def port_ohm(ratio: Float, refs: tuple[float, float]) -> Float:
-    """Port resistances (RC,) [ohm], means of all four readings (R, C, 4)."""
-    current = current_from_ratio(ratio, *refs)
-    return np.asarray((1 / np.maximum(current, 1e-9) - sum(refs)).ravel())
-
-
-def _fit(
-    z: Float, slopes: Float, by_cell: Float, noise_ohm: Float, shape: tuple[int, int]
-) -> Wires:
-    lines = sum(shape)
-    prior = np.concatenate([[LAYER_STD] * 2, [LINE_STD] * lines])
-    common = by_cell.sum(axis=1)
-    known = COMMON_STD**2 * np.outer(common, common) + np.diag(noise_ohm**2)
-    scatter = by_cell @ by_cell.T
-    wide = known + (slopes * prior) @ (slopes * prior).T
+    alike = np.array([LAYER_STD] * 2 + [LINE_STD] * (rows + columns))
+    common = COMMON_STD * by_cell.sum(axis=1)
     for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
-        # The smallest scatter that, with all else, explains the readings.
-        covariance = wide + float(cell_std) ** 2 * scatter
-        if z @ np.linalg.solve(covariance, z) < len(z):
+        # The smallest scatter of cells that, with all else, explains the readings.
+        but_wires = np.outer(common, common) + np.diag(noise_ohm**2)
+        but_wires += float(cell_std) ** 2 * by_cell @ by_cell.T
+        if z @ np.linalg.solve(but_wires + (slopes * alike**2) @ slopes.T, z) < len(z):
             break
-    alike = _posterior(z, slopes, covariance, prior)
-    layer = [_sum_of(alike, [each]) for each in (0, 1)]
-    line = []
-    for number in range(lines):
-        # Each line in turn may be unlike the others of its layer.
-        at = 2 + number
-        odd = prior.copy()
-        odd[at] = ODD_LINE_STD
-        more = np.outer(slopes[:, at], slopes[:, at]) * (ODD_LINE_STD**2 - LINE_STD**2)
-        answer = _posterior(z, slopes, covariance + more, odd)
-        line.append(_sum_of(answer, [0 if number < shape[0] else 1, at]))
-    (layer_share, layer_std), (line_share, line_std) = (
-        np.array(pairs).T for pairs in (layer, line)
-    )
-    return Wires(1 + layer_share, layer_std, 1 + line_share, line_std)
+
+    shares: list[WireShare] = []
+    for at in range(len(alike)):
+        line, layer = at - 2, at
+        place, prior, least = WHOLE_SKIN, alike, CHANGED
+        if line >= 0:
+            layer = int(line >= rows)
+            place = Place(columns=(line - rows,)) if layer else Place(rows=(line,))
+            # Each line in turn may be unlike the others of its layer.
+            prior = np.where(np.arange(len(alike)) == at, ODD_LINE_STD, alike)
+            least = np.inf if shares[layer].differs else LINE_CHANGED
+        spread = slopes * prior**2
+        gain = np.linalg.solve(but_wires + spread @ slopes.T, spread)
+        posterior = np.diag(prior**2) - spread.T @ gain
+        summed = sorted({layer, at})
+        more = float((gain.T @ z)[summed].sum())
+        std = max(float(posterior[np.ix_(summed, summed)].sum()), 0.0) ** 0.5
+        differs = abs(more) > max(least, CLEAR_STDS * std)
+        shares.append(WireShare((LAYERS[layer],), place, 1 + more, std, std < KNOWN, differs))
+    return shares
 
 
-def _posterior(z: Float, slopes: Float, covariance: Float, prior: Float) -> tuple[Float, Float]:
-    """Mean (n,) and covariance (n, n) of x."""
-    spread = slopes * prior**2
-    gain = np.linalg.solve(covariance, spread)
-    return gain.T @ z, np.diag(prior**2) - spread.T @ gain
+# --------------------------------------------------------------------------- pressed corners
 
 
-def _sum_of(posterior: tuple[Float, Float], which: list[int]) -> tuple[float, float]:
-    """Sum of some of x, and its deviation."""
-    mean, spread = posterior
-    variance = float(spread[np.ix_(which, which)].sum())
-    return float(mean[which].sum()), max(variance, 0.0) ** 0.5
+def suggested_corners(rows: int, columns: int) -> Corners:
+    """Where to press: far from the electrodes, and apart.
+
+    :raises ValueError: a skin of one row or column has no rectangle.
+    """
+    if min(rows, columns) < 2:
+        raise ValueError(f"a {rows}x{columns} skin has no rectangle to press: leave out --press")
+    row, column = (max(0, count - 1 - max(2, count // 2 - 1)) for count in (rows, columns))
+    return (row, column), (row, columns - 1), (rows - 1, column)
 
 
-def wire_findings(wires: Wires, wire_ohm: tuple[float, float], rows: int) -> list[Finding]:
-    """Layers, or else single lines, whose wires are clearly not as they were."""
-    findings = []
-    for layer, (what, axis) in enumerate((("rows", "top"), ("columns", "bottom"))):
-        share, std = float(wires.layer[layer]), float(wires.layer_std[layer])
-        lines = slice(0, rows) if layer == 0 else slice(rows, None)
-        own, own_std = wires.line[lines], wires.line_std[lines]
-        if abs(share - 1) > max(CHANGED, CLEAR_STDS * std):
-            findings.append(_finding(f"all {what} ({axis} layer)", share, std, wire_ohm[layer]))
-            continue
-        for line in np.flatnonzero(
-            np.abs(own - 1) > np.maximum(LINE_CHANGED, CLEAR_STDS * own_std)
-        ):
-            where = f"{what[:-1]} {line}"
-            findings.append(
-                _finding(where, float(own[line]), float(own_std[line]), wire_ohm[layer])
-            )
-    return findings
+def moved_across(corners: Corners) -> Corners:
+    """The same, with the corner between the others moved to the fourth: it shows other wires."""
+    _, beside, below = corners
+    return (below[0], beside[1]), below, beside
 
 
-def _finding(where: str, share: float, std: float, nominal_ohm: float) -> Finding:
-    return Finding(
-        "wires",
-        "warning",
-        where,
-        f"{share * nominal_ohm:.0f} +- {std * nominal_ohm:.0f} ohm a segment, {share:.2f} times "
-        "nominal",
-        f"{nominal_ohm:.0f} ohm a segment",
-        TO_DO,
-    )
+def pressed_corners(siemens: Float) -> Corners | None:
+    """The firmly pressed cells of conductances (R, C), the one between the others first.
+
+    None if they are not three corners of a rectangle.
+    """
+    order = np.argsort(siemens, axis=None)[::-1]
+    level = siemens.ravel()[order[:4]]
+    if len(level) < 4 or level[2] < PRESSED_SIEMENS or level[3] > FOURTH_SHARE * level[2]:
+        return None
+    cells = [divmod(int(cell), siemens.shape[1]) for cell in order[:3]]
+    for corner, beside, below in permutations(cells):
+        if beside[0] == corner[0] and below[1] == corner[1]:
+            return corner, beside, below
+    return None
 
 
-def wires_in_words(wires: Wires, wire_ohm: tuple[float, float]) -> str:
-    """What is known of the layers, for the page."""
-    words = [
-        f"{layer} {share * ohm:.0f} +- {std * ohm:.0f} ohm a segment"
-        for share, std, ohm, layer in zip(
-            wires.layer, wires.layer_std, wire_ohm, ("top", "bottom"), strict=True
+class CornerScans:
+    """Scans of a skin on which somebody presses three corners, and then has moved one across.
+
+    wanted: the corners to press next. pressed: all cells that the last scan shows pressed. hold:
+    these are corners that are to be held still. again: the first corners are done. done: so are the
+    second.
+
+    :raises ValueError: a skin of one row or column has no rectangle.
+    """
+
+    def __init__(self, board: Hello) -> None:
+        self.wanted = suggested_corners(board.rows, board.columns)
+        self.pressed: tuple[Cell, ...] = ()
+        self.hold = self.again = self.done = False
+        self._board = board
+        self._matrix = matrix_estimator(board, board.rows, board.columns)
+        self._codes: defaultdict[Corners, list[Float]] = defaultdict(list)
+        self._first: Corners | None = None
+
+    def take(self, scan: Scan) -> None:
+        """Keep a scan if three corners are pressed in it, and nothing else is.
+
+        A scan of another size is left out: the board was reset meanwhile.
+        """
+        if scan.codes.shape[:2] != (self._board.rows, self._board.columns):
+            return
+        siemens = self._matrix.estimate(scan.ratio).cell_siemens
+        self.pressed = Place.of_cells(siemens > PRESSED_SIEMENS).cells
+        corners = pressed_corners(siemens)
+        self.hold = corners is not None and corners != self._first
+        if corners is None:
+            return
+        self._codes[corners].append(scan.codes.astype(np.float64))
+        if self.hold and len(self._codes[corners]) >= PRESS_S * self._board.rate_hz:
+            self.hold, self.again, self.done = False, True, self.again
+            self._first, self.wanted = corners, moved_across(corners)
+
+    def measure(
+        self,
+        rest_codes: Float,
+        rest_scans: int,
+        noise_lsb: float,
+        wire_ohm: tuple[float, float],
+    ) -> list[WireShare]:
+        """The share of both layers, then that of each row and column; none if none was pressed.
+
+        rest_codes: mean codes (R, C, 4) of so many scans of the untouched skin, each reading with
+        this noise. wire_ohm: nominal ones of a segment, top and bottom.
+        """
+        rest = self._look(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
+        most = max(map(len, self._codes.values()), default=0)
+        found = []
+        for corners, codes in self._codes.items():
+            if len(codes) < HELD_SHARE * most:
+                continue
+            # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
+            scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
+            pressed = self._look(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
+            free = _free(rest.log_ohm.shape, corners)
+            found.append((corners[0], *_pressed_fit(rest, pressed, free, wire_ohm)))
+        return shares_of(found)
+
+    def _look(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Look:
+        ratio = ratio_from_codes(mean, self._board.adc_bits)
+        variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1) + noise_lsb**2 / scans
+        port_ohm, std_ohm = _port_ohm(ratio, np.sqrt(variance), self._board)
+        return _Look(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
+
+
+def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
+    """The share of all wires that were seen, if any, then that of each row and column.
+
+    found: row and column, y, and its deviation. All wires together are the mean by precision; the
+    others tell a change only where this mean does not explain them.
+    """
+    if not found:
+        return []
+    y, std = (np.array([each[at] for each in found]) for at in (1, 2))
+    mean, mean_std = float(np.average(y, weights=std**-2.0)), float(np.sum(std**-2.0) ** -0.5)
+    alike = bool(np.all(np.abs(y - mean) < PRESSED_CLEAR_STDS * std))
+
+    def share(y: float, std: float, tells: bool, place: Place = WHOLE_SKIN) -> WireShare:
+        clear = abs(y) > max(float(np.log(1 + CHANGED)), PRESSED_CLEAR_STDS * std)
+        known, times = std <= KNOWN, float(np.exp(y))
+        return WireShare(LAYERS, place, times, times * std, known, tells and known and clear)
+
+    each = [share(y, std, not alike, Place((row,), (column,))) for (row, column), y, std in found]
+    return [share(mean, mean_std, alike), *each]
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Port resistances and deviations (RC,) [ohm]; log resistances of the cells by `matrix`."""
+
+    port_ohm: Float
+    std_ohm: Float
+    log_ohm: Float
+
+
+def _pressed_fit(
+    rest: _Look, pressed: _Look, free: Bool, wire_ohm: tuple[float, float]
+) -> tuple[float, float]:
+    """y and its deviation."""
+    shape = free.shape
+    log_share = 0.0
+    untouched = rest.log_ohm.ravel()
+    lift = np.where(free, pressed.log_ohm - rest.log_ohm, 0.0).ravel()
+    variance = np.where(free, UNLIMITED_STD, DRIFT_STD).ravel() ** 2
+    for _ in range(MOST_STEPS):
+        top, bottom = (np.full(shape, ohm * np.exp(log_share)) for ohm in wire_ohm)
+        before, now = (
+            port_sensitivity(np.exp(-cell).reshape(shape), top, bottom)
+            for cell in (untouched, untouched + lift)
         )
-        if std < KNOWN
-    ]
-    return "; ".join(words) or UNKNOWN
+        at_rest = np.linalg.inv(before.by_cell)
+        through = now.by_cell @ at_rest
+        by_rest_wires = before.by_wires()
+        off_rest = rest.port_ohm - before.port_ohm
+        residual = pressed.port_ohm - now.port_ohm - through @ off_rest
+        by_segment = now.by_wires() - through @ by_rest_wires
+        slopes = by_segment.sum(axis=1)
+        spread = now.by_cell * variance
+        covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
+        covariance += (through * rest.std_ohm**2) @ through.T + np.diag(pressed.std_ohm**2)
+        weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
+        known = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
+        pull = float(slopes @ weighed[:, 1]) - log_share * BEFORE_STD**-2
+        step = float(np.clip(pull / known, -LONGEST_STEP, LONGEST_STEP))
+        log_share += step
+        untouched = untouched + at_rest @ (off_rest - step * by_rest_wires.sum(axis=1))
+        more = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
+        lift += np.where(free.ravel(), np.clip(more, -LONGEST_STEP, LONGEST_STEP), 0.0)
+        if abs(step) < CLOSE:
+            break
+    misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
+    return log_share, (max(misfit, 1.0) / known) ** 0.5
 
 
-def lines_in_words(wires: Wires, rows: int) -> list[str]:
-    """Each line over nominal, with its deviation."""
-    return [
-        f"{f'row {at}' if at < rows else f'column {at - rows}'}: {share:.2f} +- {std:.2f}"
-        for at, (share, std) in enumerate(zip(wires.line, wires.line_std, strict=True))
-    ]
+def _free(shape: tuple[int, ...], corners: Corners) -> Bool:
+    """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
+    cells = np.array([*corners, moved_across(corners)[0]])
+    rows, columns = np.indices(shape)[..., None]
+    near = np.maximum(np.abs(rows - cells[:, 0]), np.abs(columns - cells[:, 1])) <= 1
+    free = near[..., :3].any(axis=-1) & ~near[..., 3]
+    free[tuple(np.transpose(corners))] = True
+    return np.asarray(free)

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boards without hardware: simulated skins, lines and boards behind the interface of a port.
+"""Boards without hardware, behind the interface of a port.
+
+`board` is an emulated board, `simavr` the built firmware in a simulator. `scenes` and `press` are
+their skins; `skin_faults` and `line_faults` are what is wrong with skin and line. `pty_server` puts
+an emulated board at a pseudo-terminal.
 
 Takes a scene and its faults, gives a `Link`. The emulated board shares the circuit model with the
-estimators: a round trip through both proves little.
+estimators, so a round trip through both proves little.
 
 May import: `ohmskin.circuit` and what is below it.
 """

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A skin board without hardware: ``emulator://8x8?scene=ghost&seed=1``.
 
-`EmulatedBoard` speaks the board's side of the protocol, sans-IO and without a clock of its own:
-bytes go in with `receive`, time with `advance`, which returns the bytes the board has sent by then.
-`EmulatorLink` runs one in real time behind the interface of a serial port.
+`EmulatedBoard` speaks the board's side of the protocol, without input, output or a clock of its
+own. `receive` takes bytes from the host; `advance` lets time pass and returns the bytes that the
+board has sent by then. `EmulatorLink` runs a board in real time behind the interface of a port.
 
-Not modelled: how long a line takes (a scan's bytes come all at once at its end, and no scan is
-dropped for want of line speed), EEPROM beyond the life of the object, the self-test's findings (the
-emulated board is sound; what is wrong with the skin is told by `skin_faults`). For these
-there is ``simavr://``, which runs the firmware itself.
+Not modelled:
+
+- the speed of the line: a scan's bytes come all at once at the scan's end, and none is dropped;
+- EEPROM beyond the life of the object;
+- findings of the self-test: the board itself is sound (`skin_faults` are faults of the skin).
+
+``simavr://`` has all these, for it runs the firmware itself.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READING_OFFSET
+from ohmskin.circuit.skin import DEFAULT_REF_OHM, READING_OFFSET
 from ohmskin.emulate.line_faults import Faults
 from ohmskin.errors import DeviceLost
 from ohmskin.link import framing, protocol
@@ -33,14 +36,15 @@ from ohmskin.link.serial_port import READ_TIMEOUT_S
 RatioAt = Callable[[float], Float]
 Sampled = Callable[[Float, float, float, float], Float]
 
-VERSION = (0, 1, 0)
+VERSION = {"version_major": 0, "version_minor": 1, "version_patch": 0}
 CLOCK_HZ = 16_000_000
+DEFAULT_RATE_HZ = 90.0
 _CONSTANTS = protocol.CONSTANTS
 _PRESCALERS = protocol.ENUMS["adc_prescaler"].values
 _REASONS = protocol.ENUMS["result"].docs
 _DEFAULT_PRESCALER = "clock_500khz"
-DEFAULT_RATE_HZ = 90.0
-# From the hold of a reading to the change of pins, at most (firmware/src/core/scan_plan.h).
+# Longest time from the hold of a reading to the change of pins [cycles], and the longest slot
+# (firmware/src/core/scan_plan.h).
 _SELECT_CYCLES = 120
 _SELECT_CYCLES_FREE_RUNNING = 180
 _SLOT_CYCLES_MAX = 60_000
@@ -49,10 +53,10 @@ _SLOT_CYCLES_MAX = 60_000
 class EmulatedBoard:
     """A board whose skin reads `ratio_at(seconds)`, shape (rows, columns, 4).
 
-    rate_hz: at boot; None: 90, or as fast as the converter runs where that is slower.
+    rate_hz: the scan rate at boot; None: 90, or as fast as the converter runs if that is less.
     noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed: of the noise.
-    sampled: what becomes of the readings of a scan that starts at a time [s], one each slot [s],
-    each so long after the change of pins [s].
+    sampled(readings, start_s, slot_s, settle_s): what the converter reads, (rows, columns, 4), in a
+    scan that starts at a time, with one reading a slot, each so long after the change of pins.
 
     :raises ValueError: a board cannot do that.
     """
@@ -67,8 +71,6 @@ class EmulatedBoard:
         noise_lsb: float = 0.0,
         seed: int = 0,
         unit_id: int = 0,
-        ref_top_ohm: int = 30_000,
-        ref_bottom_ohm: int = 30_000,
         layout_crc: int = protocol.LAYOUT_CRC,
         sampled: Sampled | None = None,
     ) -> None:
@@ -79,7 +81,6 @@ class EmulatedBoard:
         self._skin_shape = (rows, columns)
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
         self._random = np.random.default_rng(seed)
-        self._refs_ohm = (ref_top_ohm, ref_bottom_ohm)
         self._layout_crc = layout_crc
         self._defaults = {
             "unit_id": unit_id,
@@ -90,7 +91,7 @@ class EmulatedBoard:
             "adc_prescaler": _DEFAULT_PRESCALER,
         }
         try:
-            self._checked(self._defaults)
+            _scan_plan(self._defaults)
         except _Refused as refusal:
             if rate_hz is not None:
                 raise ValueError(f"{refusal}: {_REASONS[str(refusal)]}") from None
@@ -105,7 +106,7 @@ class EmulatedBoard:
         self._settings_source = "stored" if self._stored else "defaults_blank"
         self._reset_cause = cause
         self._boot_s = self.now_s
-        self._plan = self._checked(self._settings)
+        self._plan = _scan_plan(self._settings)
         self._baud = _CONSTANTS["baud_default"]
         self._sequence = 0
         self._scan = 0
@@ -114,14 +115,12 @@ class EmulatedBoard:
         self._send_hello()
 
     def reset(self) -> None:
-        """What the reset button does: scanning stops, unsaved settings are lost."""
+        """Do what the reset button does: scanning stops, unsaved settings are lost."""
         self._boot("external")
-
-    # ---------------------------------------------------------------------------------- time
 
     @property
     def next_scan_s(self) -> float | None:
-        """When the scan in progress will be complete; None when none is."""
+        """When the scan in progress ends [s]; None if there is none."""
         if self._started_s is None:
             return None
         return self._started_s + (self._scan + 1) * self._period_s
@@ -131,7 +130,7 @@ class EmulatedBoard:
         return self._plan["scan_cycles"] / CLOCK_HZ
 
     def advance(self, now_s: float) -> bytes:
-        """Let time pass; what the board has sent since the last call."""
+        """Let time pass until `now_s`. Returns what the board has sent since the last call."""
         while (end := self.next_scan_s) is not None and end <= now_s:
             self.now_s = end
             self._send_scan(end - self._period_s)
@@ -140,8 +139,14 @@ class EmulatedBoard:
         self._out.clear()
         return sent
 
+    def heard(self, faults: Faults, now_s: float) -> bytes:
+        """As `advance`, at the other end of a bad line; `faults` may also reset the board."""
+        if faults.resets(now_s):
+            self.reset()
+        return faults.apply(self.advance(now_s), now_s)
+
     def codes_at(self, time_s: float) -> NDArray[np.uint16]:
-        """What the converter reads, shape (rows, columns, 4); lines beyond the skin are open."""
+        """Codes of a scan, shape (rows, columns, 4); lines beyond the skin are open."""
         rows, columns = self._settings["rows"], self._settings["columns"]
         ratio = np.empty((rows, columns, protocol.READINGS_PER_CELL))
         ratio[:] = READING_OFFSET  # no current flows
@@ -157,7 +162,7 @@ class EmulatedBoard:
     # ------------------------------------------------------------------------------ commands
 
     def receive(self, octets: bytes) -> None:
-        """Bytes from the host."""
+        """Take bytes from the host."""
         for raw in self._decoder.feed(octets):
             frame = protocol.FRAMES_BY_ID.get(raw.type)
             if frame is None or frame.sender != "host":
@@ -176,7 +181,11 @@ class EmulatedBoard:
             case "get_hello":
                 self._send_hello()
             case "configure":
-                return self._configure(values)
+                try:
+                    self._plan = _scan_plan(values)
+                except _Refused as refusal:
+                    return str(refusal)
+                self._settings.update(values)
             case "start" if not scanning:
                 self._started_s, self._scan = self.now_s, 0
             case "stop" if scanning:
@@ -187,70 +196,24 @@ class EmulatedBoard:
                 self._stored = dict(self._settings)
             case "load_defaults":
                 self._settings = dict(self._defaults)
-                self._plan = self._checked(self._settings)
+                self._plan = _scan_plan(self._settings)
             case "self_test":
-                self._send_report()
+                cells = self.codes_at(self.now_s).reshape(-1, protocol.READINGS_PER_CELL)
+                least, most = (tuple(codes.tolist()) for codes in (cells.min(0), cells.max(0)))
+                self._send("self_test_report", findings=(), code_min=least, code_max=most)
             case "set_baud":
                 if values["baud"] not in (_CONSTANTS["baud_default"], _CONSTANTS["baud_fast"]):
                     return "bad_baud"
                 self._baud = values["baud"]
         return "ok"
 
-    def _configure(self, wanted: dict[str, Any]) -> str:
-        try:
-            self._plan = self._checked(wanted)
-        except _Refused as refusal:
-            return str(refusal)
-        self._settings.update(wanted)
-        return "ok"
-
-    def _checked(self, wanted: dict[str, Any]) -> dict[str, int]:
-        """How a configuration would be scanned, as the firmware plans it."""
-        rate, settle = wanted["rate_mhz"], wanted["settle_us"]
-        if not 1 <= wanted["rows"] <= _CONSTANTS["rows_max"]:
-            raise _Refused("bad_rows")
-        if not 1 <= wanted["columns"] <= _CONSTANTS["columns_max"]:
-            raise _Refused("bad_columns")
-        if rate and not _CONSTANTS["rate_mhz_min"] <= rate <= _CONSTANTS["rate_mhz_max"]:
-            raise _Refused("bad_rate")
-        if settle > _CONSTANTS["settle_us_max"]:
-            raise _Refused("bad_settle")
-        if wanted["adc_prescaler"] not in _PRESCALERS:
-            raise _Refused("bad_prescaler")
-        prescaler = _PRESCALERS[wanted["adc_prescaler"]]
-        readings = wanted["rows"] * wanted["columns"] * protocol.READINGS_PER_CELL
-        slot = 13 * prescaler + prescaler // 2 + 4
-        if settle:
-            slot = max(slot, settle * CLOCK_HZ // 1_000_000 + _SELECT_CYCLES)
-        select = _SELECT_CYCLES
-        if not rate:
-            if not settle and wanted["adc_prescaler"] == _DEFAULT_PRESCALER:
-                slot, select = 13 * prescaler, _SELECT_CYCLES_FREE_RUNNING
-            shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
-            period = slot * max(readings, math.ceil(shortest / slot))
-        else:
-            period = round(CLOCK_HZ * 1000 / rate)
-            if period < slot * readings:
-                raise _Refused("too_fast")
-            # Equal slots fill the period: as short as the settle time lets them be, or long ones.
-            slots = period // slot if settle else max(readings, -(-period // _SLOT_CYCLES_MAX))
-            slot = period // slots
-        return {
-            "scan_cycles": period,
-            "slot_cycles": slot,
-            "settle_us": (slot - select) * 1_000_000 // CLOCK_HZ,
-        }
-
     # ------------------------------------------------------------------------------- sending
 
-    def _send(self, name: str, tail: bytes = b"", **values: protocol.Value) -> None:
+    def _send(self, name: str, tail: bytes = b"", /, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
         payload = frame.pack(**values) + tail
         self._out += framing.encode(frame.id, self._sequence, payload)
         self._sequence += 1
-
-    def _board_us(self, time_s: float) -> int:
-        return round((time_s - self._boot_s) * 1e6) % (1 << 32)
 
     def _send_scan(self, start_s: float) -> None:
         codes = self.codes_at(start_s)
@@ -258,7 +221,7 @@ class EmulatedBoard:
             "scan",
             protocol.pack_codes(codes),
             scan=self._scan % (1 << 32),
-            time_us=self._board_us(start_s),
+            time_us=round((start_s - self._boot_s) * 1e6) % (1 << 32),
             dropped=0,
             rx_errors=self._decoder.stats.damaged % (1 << 16),
             rows=codes.shape[0],
@@ -270,22 +233,17 @@ class EmulatedBoard:
         self._send(
             "hello",
             layout_crc=self._layout_crc,
-            version_major=VERSION[0],
-            version_minor=VERSION[1],
-            version_patch=VERSION[2],
+            **{name: self._settings[name] for name in ("unit_id", "rows", "columns")},
+            **self._plan,
+            **VERSION,
             board="emulated",
-            unit_id=self._settings["unit_id"],
-            rows=self._settings["rows"],
-            columns=self._settings["columns"],
             readings_per_cell=protocol.READINGS_PER_CELL,
             adc_bits=protocol.ADC_BITS,
-            ref_top_ohm=self._refs_ohm[0],
-            ref_bottom_ohm=self._refs_ohm[1],
+            ref_top_ohm=round(DEFAULT_REF_OHM),
+            ref_bottom_ohm=round(DEFAULT_REF_OHM),
             rate_asked_mhz=self._settings["rate_mhz"],
-            scan_cycles=self._plan["scan_cycles"],
             clock_hz=CLOCK_HZ,
             settle_asked_us=self._settings["settle_us"],
-            settle_us=min(self._plan["settle_us"], 0xFFFF),
             adc_prescaler=self._settings["adc_prescaler"],
             baud=self._baud,
             settings=self._settings_source,
@@ -293,18 +251,47 @@ class EmulatedBoard:
             scanning=int(self._started_s is not None),
         )
 
-    def _send_report(self) -> None:
-        codes = self.codes_at(self.now_s).reshape(-1, protocol.READINGS_PER_CELL)
-        self._send(
-            "self_test_report",
-            findings=(),
-            code_min=tuple(int(c) for c in codes.min(axis=0)),
-            code_max=tuple(int(c) for c in codes.max(axis=0)),
-        )
-
 
 class _Refused(Exception):
     """Carries the name of a `result`."""
+
+
+def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
+    """How the firmware would scan: `scan_cycles`, `slot_cycles` and `settle_us` of `hello`.
+
+    It is core/scan_plan.cpp without the search for the number of slots that keeps the rate best.
+    """
+    rate, settle = wanted["rate_mhz"], wanted["settle_us"]
+    limits = {
+        "bad_rows": 1 <= wanted["rows"] <= _CONSTANTS["rows_max"],
+        "bad_columns": 1 <= wanted["columns"] <= _CONSTANTS["columns_max"],
+        "bad_rate": not rate or _CONSTANTS["rate_mhz_min"] <= rate <= _CONSTANTS["rate_mhz_max"],
+        "bad_settle": settle <= _CONSTANTS["settle_us_max"],
+        "bad_prescaler": wanted["adc_prescaler"] in _PRESCALERS,
+    }
+    for result, kept in limits.items():
+        if not kept:
+            raise _Refused(result)
+    prescaler = _PRESCALERS[wanted["adc_prescaler"]]
+    readings = wanted["rows"] * wanted["columns"] * protocol.READINGS_PER_CELL
+    select = _SELECT_CYCLES
+    slot = 13 * prescaler + prescaler // 2 + 4
+    if settle:
+        slot = max(slot, settle * CLOCK_HZ // 1_000_000 + select)
+    if not rate:
+        if not settle and wanted["adc_prescaler"] == _DEFAULT_PRESCALER:
+            slot, select = 13 * prescaler, _SELECT_CYCLES_FREE_RUNNING
+        shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
+        period = slot * max(readings, math.ceil(shortest / slot))
+    else:
+        period = round(CLOCK_HZ * 1000 / rate)
+        if period < slot * readings:
+            raise _Refused("too_fast")
+        # Equal slots fill the period: as short as the settle time lets them be, or long ones.
+        slots = period // slot if settle else max(readings, -(-period // _SLOT_CYCLES_MAX))
+        slot = period // slots
+    settle_us = (slot - select) * 1_000_000 // CLOCK_HZ
+    return {"scan_cycles": period, "slot_cycles": slot, "settle_us": settle_us}
 
 
 class EmulatorLink:
@@ -316,7 +303,7 @@ class EmulatorLink:
         self._faults = faults or Faults()
         self._begin_s = time.monotonic()
         self._wake = threading.Condition()
-        self._waiting = bytearray()  # bytes that commands have caused
+        self._waiting = bytearray()  # bytes that the host has not read yet
         self._closed = False
 
     def _now_s(self) -> float:
@@ -327,28 +314,27 @@ class EmulatorLink:
         with self._wake:
             deadline = self._now_s() + READ_TIMEOUT_S
             while True:
-                now = self._now_s()
-                if self._closed or self._faults.vanished(now):
-                    raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
-                if self._faults.resets(now):
-                    self._board.reset()
-                self._waiting += self._faults.apply(self._board.advance(now), now)
+                now = self._listen()
                 if self._waiting or now >= deadline:
                     octets = bytes(self._waiting)
                     self._waiting.clear()
                     return octets
-                due = self._board.next_scan_s
-                self._wake.wait(min(deadline, deadline if due is None else due) - now)
+                self._wake.wait(min(deadline, self._board.next_scan_s or deadline) - now)
 
     def write(self, octets: bytes) -> None:
         """See `Link.write`."""
         with self._wake:
-            now = self._now_s()
-            if self._closed or self._faults.vanished(now):
-                raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
-            self._waiting += self._faults.apply(self._board.advance(now), now)
+            self._listen()
             self._board.receive(octets)
             self._wake.notify_all()
+
+    def _listen(self) -> float:
+        """Take what arrives from the board by now; returns now."""
+        now = self._now_s()
+        if self._closed or self._faults.vanished(now):
+            raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
+        self._waiting += self._board.heard(self._faults, now)
+        return now
 
     def set_baud(self, baud: int) -> None:
         """See `Link.set_baud`: an emulated line has no speed."""

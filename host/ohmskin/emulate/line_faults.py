@@ -1,36 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a line, for an emulated one: to see that a host gets over it."""
+"""What can be wrong with the line to an emulated board, to see that a host gets over it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Annotated, Final, get_args, get_type_hints
 
 import numpy as np
 
-FAULTS: Final = {
-    "drop": "share of sent chunks that never arrive",
-    "bitflip": "share of bits that arrive inverted",
-    "garbage": "share of sent chunks after which random bytes come",
-    "reset": "seconds between resets of the board",
-    "stall": "seconds for which the board says nothing, once, 2 s after its start",
-    "vanish": "seconds until the board is unplugged",
-    "silent": "1: the board never says anything",
-}
 _STALL_AFTER_S: Final = 2.0
+
+
+def texts_of(faults: type) -> dict[str, str]:
+    """The texts beside the types of a class's fields, by field."""
+    hints = get_type_hints(faults, include_extras=True)
+    return {name: hint.__metadata__[0] for name, hint in hints.items() if get_args(hint)}
 
 
 @dataclass
 class Faults:
-    """Faults by the names in `FAULTS`; zero is none. seed: of all that is random here."""
+    """Faults by the names in `FAULTS`; 0 is none. seed: of all that is random here.
 
-    drop: float = 0.0
-    bitflip: float = 0.0
-    garbage: float = 0.0
-    reset: float = 0.0
-    stall: float = 0.0
-    vanish: float = 0.0
-    silent: float = 0.0
+    Raises ValueError for a share or a time that cannot be.
+    """
+
+    drop: Annotated[float, "share of sent chunks that never arrive"] = 0.0
+    bitflip: Annotated[float, "share of bits that arrive inverted"] = 0.0
+    garbage: Annotated[float, "share of sent chunks after which random bytes come"] = 0.0
+    reset: Annotated[float, "seconds between resets of the board"] = 0.0
+    stall: Annotated[float, "seconds of silence, once, 2 s after the board's start"] = 0.0
+    vanish: Annotated[float, "seconds until the board is unplugged"] = 0.0
+    silent: Annotated[float, "1: the board never says anything"] = 0.0
     seed: int = 0
     _resets_done: int = field(default=0, init=False)
 
@@ -52,18 +52,15 @@ class Faults:
         if self.drop and self._random.random() < self.drop:
             chunk = b""
         if self.bitflip:
-            chunk = self._flipped(chunk)
+            octets = np.frombuffer(chunk, dtype=np.uint8)
+            flips = self._random.random((octets.size, 8)) < self.bitflip
+            chunk = (octets ^ np.packbits(flips, axis=1)[:, 0]).tobytes()
         if self.garbage and self._random.random() < self.garbage:
             chunk += self._random.bytes(int(self._random.integers(1, 64)))
         return chunk
 
-    def _flipped(self, chunk: bytes) -> bytes:
-        octets = np.frombuffer(chunk, dtype=np.uint8)
-        flips = self._random.random((octets.size, 8)) < self.bitflip
-        return (octets ^ np.packbits(flips, axis=1)[:, 0]).tobytes()
-
     def resets(self, now_s: float) -> bool:
-        """True once for every reset that is due."""
+        """Whether a reset is due; True once for each."""
         due = int(now_s / self.reset) if self.reset else 0
         if due <= self._resets_done:
             return False
@@ -73,3 +70,6 @@ class Faults:
     def vanished(self, now_s: float) -> bool:
         """Whether the board has been unplugged by now."""
         return bool(self.vanish) and now_s >= self.vanish
+
+
+FAULTS: Final = texts_of(Faults)

@@ -17,16 +17,17 @@ G      (n, R, C)     rise of the cell's conductance above rest                  
 
     creep       e = (F + a y) / (1 + a),  T dy/dt = F - y            standard linear solid [Findley]
     hysteresis  p = max(e, min(u(e), p before)),  u(e) = e + h e / (e + h)   generalised play [BS]
-    contact     c = k p^b exp(w),  G = c / (1 + c / full)      contact grows, until all is contact
+    contact     c = k p^b exp(w),  G = c / (1 + c / full)      contact grows until all is in contact
     noise       w = n(t) + d(t), two Ornstein-Uhlenbeck processes: n fast (contacts come and go),
-                d slow (the same press does not give the same twice)
+                d slow (a press repeated does not give the same)
 
-u(e) is the unloading branch: h above the loading branch at large force, none at zero force. So no
-force, for good, is no rise. k and b differ from cell to cell, log-normally.
+u(e) is the unloading branch. It lies h above the loading branch at a large force and meets it at no
+force, so that a cell without force returns to no rise. k and b differ between cells, log-normally.
 
-The defaults are fitted to the shape of public measurements of a piezoresistive cell
-(TAMS-Group/tams_tactile_sensor_array_hardware); no data of theirs are part of this project. Three
-series of 7 to 11 presses up to 7 to 8 N, one for each cover, by a cylindrical tip; measured there:
+The defaults fit the shape of public measurements of a piezoresistive cell
+(TAMS-Group/tams_tactile_sensor_array_hardware), whose data are no part of this project. There, a
+cylindrical tip pressed the cell up to 7 or 8 N, in three series of 7 to 11 presses, one for each of
+three covers:
 
 ================================================= ====================== =======================
 quantity                                          the three series       here
@@ -44,12 +45,12 @@ correlation of that from sample to sample         0.33, 0.48, 0.66       time co
 scatter of whole presses, relative                0.11, 0.13, 0.13       0.12
 ================================================= ====================== =======================
 
-Chosen, not measured: their rate is not told, and taken as 10 samples/s; cells differ by 20 % in k
-and 3 % in b; the slow noise has a minute's time constant (in two series each press conducted less
-than the one before). Their cell falls to its short, all at once, at 3 to 4 N; a knitted cell is
-taken to have nothing to break through, so here contact only saturates. k is in the range
-of theirs and gives a knitted skin's resistances: 33 kOhm at 1 N, 0.5 MOhm at 0.2 N, 1 kOhm at 9 N.
-Not modelled: a threshold below which the layers do not touch, pressure that spreads to neighbours.
+Not measured but chosen are: a rate of 10 samples/s, as theirs is not told; cells that differ by
+20 % in k and 3 % in b; a time constant of a minute for the slow noise (in two series each press
+conducted less than the one before). Their cell breaks through to a short at 3 to 4 N; a knitted
+cell has nothing to break through, so here contact only saturates. k is in the range of theirs and
+gives the resistances of a knitted skin: 0.5 MOhm at 0.2 N, 33 kOhm at 1 N, 1 kOhm at 9 N. Not
+modelled are a force below which the layers do not touch, and pressure that spreads to neighbours.
 
 [BS] Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, section 2.4.
 [Findley] Findley, Lai and Onaran, "Creep and Relaxation of Nonlinear Viscoelastic Materials", 1976.
@@ -66,21 +67,22 @@ from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Float
 
+# A robot's press [s]: the pause before it, its rise (as long as its fall), and its hold.
+PAUSE_S: Final = (0.3, 0.9)
 RAMP_S: Final = 1.0
 HOLD_S: Final = 0.3
-PAUSE_S: Final = (0.3, 0.9)
-# So long after its last press a cell's creep has faded to nanosiemens.
+# This long after its last press a cell's creep has faded to nanosiemens [s].
 LEAVE_S: Final = 2.5
 
 
 @dataclass(frozen=True)
 class PressModel:
-    """The cells of one skin under force; equations and where the defaults come from: the module.
+    """The cells of one skin under force, by the equations of the module.
 
-    siemens_at_1n: k [S/N^b]. exponent: b. full_contact_siemens [S]. play_n: h [N]. creep: a.
+    siemens_at_1n: k [S/N^b]. exponent: b. full_contact_siemens: full [S]. play_n: h [N]. creep: a.
     creep_time_s: T. noise, drift: standard deviations of n and d. noise_time_s, drift_time_s: their
-    time constants. gain_spread, exponent_spread: of ln k and ln b between cells. seed: of the cells
-    and of the noise. Raises ValueError for a value that cannot be.
+    time constants. gain_spread, exponent_spread: those of ln k and ln b between cells. seed: of the
+    cells and of the noise. Raises ValueError for a value that cannot be.
     """
 
     siemens_at_1n: float = 30e-6
@@ -103,30 +105,26 @@ class PressModel:
             value = getattr(self, field.name)
             above = field.name in above_zero or field.name.endswith("_time_s")
             if not (np.isfinite(value) and (value > 0 if above else value >= 0)):
-                raise ValueError(
-                    f"{field.name} is {value}, it must be {'above' if above else '>='} 0"
-                )
+                least = "above 0" if above else "0 or more"
+                raise ValueError(f"{field.name} is {value}, it must be {least}")
 
     def without_memory(self) -> PressModel:
-        """The same cells and the same noise, no hysteresis and no creep."""
+        """The same cells and the same noise, without hysteresis and creep."""
         return replace(self, play_n=0.0, creep=0.0)
 
     def rise(self, time_s: ArrayLike, force_n: ArrayLike) -> Float:
         """Conductance above rest G [S] over a history of forces [N], both (n,) or (n, R, C).
 
-        time_s (n,) rising. The first force counts as having been there for ever. The same
-        arguments give the same answer. Raises ValueError, naming the row, for times that do not
-        rise and for forces below 0.
+        time_s (n,) rises. The first force has always been there. The same arguments give the same
+        answer. Raises ValueError, which names the row, for times that do not rise and for forces
+        below 0.
         """
         times, forces = _checked(time_s, force_n)
         cells = forces.reshape(len(times), -1)
         random = np.random.default_rng(self.seed)
-        gain = self.siemens_at_1n * np.exp(
-            self.gain_spread * random.standard_normal(cells.shape[1])
-        )
-        exponent = self.exponent * np.exp(
-            self.exponent_spread * random.standard_normal(cells.shape[1])
-        )
+        log_gain = self.gain_spread * random.standard_normal(cells.shape[1])
+        log_exponent = self.exponent_spread * random.standard_normal(cells.shape[1])
+        gain, exponent = self.siemens_at_1n * np.exp(log_gain), self.exponent * np.exp(log_exponent)
         log_noise = self.noise * _wander(times, cells.shape[1], self.noise_time_s, random)
         log_noise += self.drift * _wander(times, cells.shape[1], self.drift_time_s, random)
         contact = gain * self._pressing(times, cells) ** exponent * np.exp(log_noise)
@@ -136,7 +134,7 @@ class PressModel:
         """p of the module's table [N], (n, cells)."""
         steps = np.diff(times) / self.creep_time_s
         stays = np.exp(-steps)
-        # Exact for forces that are straight between the times.
+        # Exact where forces are straight between the times.
         of_step = 1 + np.expm1(-steps) / steps
         pressing = np.empty_like(forces)
         crept = before = forces[0]
@@ -172,7 +170,7 @@ def robot_presses(
 
 
 def _wander(times: Float, cells: int, time_constant_s: float, random: np.random.Generator) -> Float:
-    """Ornstein-Uhlenbeck processes of unit variance, (n, cells), exact at any steps of time."""
+    """Ornstein-Uhlenbeck processes of unit variance, (n, cells), exact for any steps of time."""
     values = random.standard_normal((len(times), cells))
     stays = np.exp(-np.diff(times) / time_constant_s)
     fresh = np.sqrt(1 - stays**2)
@@ -191,7 +189,7 @@ def _checked(time_s: ArrayLike, force_n: ArrayLike) -> tuple[Float, Float]:
             f"force_n has shape {forces.shape}, it must be ({len(times)},) or "
             f"({len(times)}, rows, columns)"
         )
-    # Both written so that NaN fails too.
+    # Both conditions are written so that NaN fails too.
     rising = np.isfinite(times) & np.append(True, np.diff(times) > 0)
     if not rising.all():
         row = int(np.argmin(rising))

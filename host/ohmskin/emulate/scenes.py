@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Skins that do not exist, and what touches them: simulation, for demos and tests.
+"""Simulated skins, and what touches them, for demos and tests.
 
-A scene is a skin whose cells at rest and wires are drawn from a seed, and touches that are a
-function of time alone, so that a scene can be asked twice and answers the same.
+A scene is a skin, whose wires and cells at rest are drawn from a seed, and touches that depend on
+time alone. So a scene always gives the same answer for the same time.
 """
 
 from __future__ import annotations
@@ -12,16 +12,21 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.press import LEAVE_S, PressModel, robot_presses
 from ohmskin.emulate.skin_faults import SkinFaults
 
+# Medians of an untouched cell and of the wire segments of rows and of columns [ohm], in the range
+# of a knitted skin. Single ones are spread log-normally, by this share.
 REST_OHM: Final = 1.0e6
 TOP_WIRE_OHM: Final = 100.0
 BOTTOM_WIRE_OHM: Final = 200.0
-_SPREAD: Final = 0.1  # relative, of rest resistances and wires
+_SPREAD: Final = 0.1
+# A cell counts as touched where a touch adds as much as a cell at rest has [S].
+_TOUCHED_SIEMENS: Final = 1e-6
 
 SCENES: Final = {
     "rest": "nothing touches the skin",
@@ -32,17 +37,21 @@ SCENES: Final = {
     "moving": "one fingertip on a closed curve over the whole skin, once in 4 s",
     "press": "a robot presses cell after cell, six times each with 0.4 to 8 N, 20 s a cell, once",
 }
+# The scene "moving": its period, the radius of the fingertip's pressure and its peak.
 _MOVING_PERIOD_S: Final = 4.0
+_FINGER_CELLS: Final = 0.7
+_FINGER_SIEMENS: Final = 2e-4
+# The scene "corners": its times, and resistances that tremble as fingers do, by a share, at rates.
 _CORNERS_BEGIN_S: Final = 5.5
 _CORNERS_HELD_S: Final = 1.5
 _CORNER_OHM: Final = (5e3, 8e3, 6e3)
 _TREMBLE: Final = 0.05
 _TREMBLE_HZ: Final = (3.1, 4.7, 6.1)
-_FINGER_CELLS: Final = 0.7  # radius of the fingertip's pressure
-_FINGER_SIEMENS: Final = 2e-4
+# The scene "press": time before the first press, peak forces and their relative spread to either
+# side, and the step of time at which a press is simulated.
 _UNTOUCHED_S: Final = 2.0
 _PEAKS_N: Final = (0.5, 0.9, 1.5, 2.6, 4.4, 7.3)
-_PEAK_SPREAD: Final = 0.1  # relative, to either side
+_PEAK_SPREAD: Final = 0.1
 _PRESS_STEP_S: Final = 0.01
 
 
@@ -50,7 +59,8 @@ class Scene:
     """A scene by name (see `SCENES`) on a rows x columns skin.
 
     Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns). faults: what is
-    wrong with the skin; those that depend on the instant of a reading are the board's.
+    wrong with the skin; an `EmulatedBoard` adds those that depend on the instant of a reading.
+    `moves`: whether touches change with time.
 
     :raises ValueError: no such scene, or a skin too small for it or for the faults.
     """
@@ -62,8 +72,6 @@ class Scene:
         columns: int = 8,
         *,
         seed: int = 0,
-        ref_top_ohm: float = 30_000.0,
-        ref_bottom_ohm: float = 30_000.0,
         faults: SkinFaults | None = None,
     ) -> None:
         if name not in SCENES:
@@ -73,6 +81,7 @@ class Scene:
         self.name = name
         self.rows = rows
         self.columns = columns
+        self.moves = name in ("corners", "moving", "press")
         self._faults = faults or SkinFaults()
         self._faults.check(rows, columns)
         random = np.random.default_rng(seed)
@@ -80,21 +89,10 @@ class Scene:
         def spread(middle: float) -> Float:
             return middle * np.exp(_SPREAD * random.standard_normal((rows, columns)))
 
-        self._rest = Skin(
-            cell_siemens=1 / spread(REST_OHM),
-            top_wire_ohm=spread(TOP_WIRE_OHM),
-            bottom_wire_ohm=spread(BOTTOM_WIRE_OHM),
-            ref_top_ohm=ref_top_ohm,
-            ref_bottom_ohm=ref_bottom_ohm,
-        )
+        self._rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
         self._touches = self._place(random)
         self._robot = _Robot(rows, columns, seed) if name == "press" else None
         self._still_ratio = lru_cache(maxsize=1)(lambda: self._readings(0.0))
-
-    @property
-    def moves(self) -> bool:
-        """Whether the touches change with time."""
-        return self.name in ("corners", "moving", "press")
 
     @property
     def rest_ratio(self) -> Float:
@@ -102,7 +100,7 @@ class Scene:
         return self._faults.readings(self._faults.damaged(self._rest))
 
     def skin(self, time_s: float) -> Skin:
-        """The truth: every resistance at a time."""
+        """Every resistance of the skin at a time."""
         if self._robot is not None:
             touch = self._robot.touch(time_s)[0]
         elif self.name == "corners":
@@ -113,9 +111,9 @@ class Scene:
         return self._faults.damaged(touched)
 
     def force_n(self, time_s: float) -> Float:
-        """The truth of the scene "press": force on every cell [N], (rows, columns).
+        """Force on every cell in the scene "press" [N], shape (rows, columns).
 
-        :raises ValueError: a scene that presses with conductances: no force is known.
+        :raises ValueError: other scenes press with conductances, and no force is known.
         """
         if self._robot is not None:
             return self._robot.touch(time_s)[1]
@@ -123,13 +121,10 @@ class Scene:
             return np.zeros((self.rows, self.columns))
         raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
 
-    def touched(self, time_s: float) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
-        """Cells whose conductance a touch raises by 1 microsiemens or more, (rows, columns)."""
-        untouched = self._faults.damaged(self._rest)
-        cells: np.ndarray[tuple[int, int], np.dtype[np.bool_]] = (
-            self.skin(time_s).cell_siemens - untouched.cell_siemens >= 1e-6
-        )
-        return cells
+    def touched(self, time_s: float) -> NDArray[np.bool_]:
+        """Cells whose conductance a touch raises by 1 uS or more, shape (rows, columns)."""
+        rest_siemens = self._faults.damaged(self._rest).cell_siemens
+        return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= _TOUCHED_SIEMENS)
 
     def ratio(self, time_s: float) -> Float:
         """Exact readings at a time, shape (rows, columns, 4)."""
@@ -144,8 +139,8 @@ class Scene:
             touches[self.rows // 2, self.columns // 2] = 1 / 5e3
         elif self.name == "ghost":
             (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
-            # Light touches: heavy ones leave a trace at the fourth corner wherever a method
-            # neglects the wires.
+            # The touches are light: with heavy ones, methods that neglect the wires show a trace at
+            # the fourth corner.
             touches[top, left] = 1 / 30e3
             touches[top, right] = 1 / 40e3
             touches[bottom, left] = 1 / 35e3
@@ -182,7 +177,7 @@ def _two_of(count: int) -> tuple[int, int]:
 
 
 class _Robot:
-    """Forces and rises of the scene "press", cell by cell: one alone is pressed at any time."""
+    """Forces and rises of the scene "press": one cell after the other is pressed."""
 
     def __init__(self, rows: int, columns: int, seed: int) -> None:
         self._shape = (rows, columns)
@@ -195,7 +190,7 @@ class _Robot:
             starts_s.append(float(knots_s[-1]) + LEAVE_S)
             times_s = np.arange(starts_s[-2], starts_s[-1], _PRESS_STEP_S)
             forces_n = np.interp(times_s, knots_s, knots_n)
-            # A model of its own for each cell: one of all cells takes 64 times the memory.
+            # Each cell has its own model: one of all cells would take 64 times the memory.
             model = PressModel(seed=int(random.integers(1 << 32)))
             self._histories.append((times_s, forces_n, model.rise(times_s, forces_n)))
         self._starts_s = np.array(starts_s)

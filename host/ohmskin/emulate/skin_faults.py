@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a skin and its wiring, for a simulated one: to see that it is found.
+"""What can be wrong with a simulated skin and its wiring, to see that it is found.
 
-Faults of resistances change a `Skin` (`SkinFaults.damaged`); shorted lines join electrodes of its
-network (`joined_readings`); hum and slow settling act on each reading at its own instant
-(`SkinFaults.sampled`). Faults of the line are in `ohmskin.emulate.line_faults`.
+Faults of resistances change a `Skin` (`SkinFaults.damaged`). Shorted lines join electrodes of its
+network (`joined_readings`). Hum and slow settling change each reading at its own instant
+(`SkinFaults.sampled`). Faults of the serial line are in `ohmskin.emulate.line_faults`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Final, Self
+from dataclasses import dataclass, replace
+from itertools import accumulate
+from typing import Annotated, Final, Self
 
 import numpy as np
-import scipy.signal
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
@@ -23,48 +23,44 @@ from ohmskin.circuit.skin import (
     ratio_from_current,
     readings,
 )
+from ohmskin.emulate.line_faults import texts_of
 from ohmskin.link.protocol import ADC_BITS
 
+# Resistance of a wire that is open [ohm], a million times that of a cell at rest.
 OPEN_OHM: Final = 1e12
+# Conductance of a short, 0.1 ohm [S].
 SHORT_SIEMENS: Final = 10.0
-_LEAST_SIEMENS: Final = 1e-13  # an open cell in a network that must be connected
+# Conductance of an open cell [S] where a network must be connected: 10 TOhm.
+_LEAST_SIEMENS: Final = 1e-13
 
-SKIN_FAULTS: Final = {
-    "open_row": "number of a row that is not connected to the board",
-    "open_column": "number of a column that is not connected to the board",
-    "short_rows": "two rows, as 2,3, that touch each other",
-    "short_columns": "two columns, as 2,3, that touch each other",
-    "dead": "row and column, as 1,2, of a cell that never conducts",
-    "saturated": "row and column, as 1,2, of a cell whose layers are shorted",
-    "ref_top": "true ohms of the reference resistor of the rows; the board goes on saying 30000",
-    "ref_bottom": "the same of the columns",
-    "wires": "factor on all wires",
-    "hum": "hertz of the mains that every reading picks up",
-    "hum_lsb": "amplitude of the hum in LSB, 3 unless told",
-    "tau_us": "microseconds of the time constant with which the sense nodes settle",
-}
+_LINES: Final = ("open_row", "open_column")
+_PAIRS: Final = ("short_rows", "short_columns", "dead", "saturated")
 Pair = tuple[int, int]
+Line = int | None
+Lines = Pair | None
+Cell = Pair | None
+Ohm = float | None
 
 
 @dataclass(frozen=True)
 class SkinFaults:
-    """Faults by the names in `SKIN_FAULTS`; None, or zero, or a factor of 1, is none.
+    """Faults by the names in `SKIN_FAULTS`. None, zero or a factor of 1 stands for no fault.
 
     Raises ValueError for a value that cannot be.
     """
 
-    open_row: int | None = None
-    open_column: int | None = None
-    short_rows: Pair | None = None
-    short_columns: Pair | None = None
-    dead: Pair | None = None
-    saturated: Pair | None = None
-    ref_top: float | None = None
-    ref_bottom: float | None = None
-    wires: float = 1.0
-    hum: float = 0.0
-    hum_lsb: float = 3.0
-    tau_us: float = 0.0
+    open_row: Annotated[Line, "number of a row that is not connected to the board"] = None
+    open_column: Annotated[Line, "number of a column that is not connected to the board"] = None
+    short_rows: Annotated[Lines, "two rows, as 2,3, that touch each other"] = None
+    short_columns: Annotated[Lines, "two columns, as 2,3, that touch each other"] = None
+    dead: Annotated[Cell, "row and column, as 1,2, of a cell that never conducts"] = None
+    saturated: Annotated[Cell, "row and column, as 1,2, of a cell whose layers are shorted"] = None
+    ref_top: Annotated[Ohm, "true ohms of the rows' reference resistor; hello says 30000"] = None
+    ref_bottom: Annotated[Ohm, "the same of the columns"] = None
+    wires: Annotated[float, "factor on all wires"] = 1.0
+    hum: Annotated[float, "hertz of the mains that every reading picks up"] = 0.0
+    hum_lsb: Annotated[float, "amplitude of the hum in LSB, 3 unless told"] = 3.0
+    tau_us: Annotated[float, "microseconds of the sense nodes' time constant of settling"] = 0.0
 
     def __post_init__(self) -> None:
         for name in ("ref_top", "ref_bottom", "wires"):
@@ -81,21 +77,21 @@ class SkinFaults:
 
     @classmethod
     def from_texts(cls, texts: Mapping[str, str]) -> Self:
-        """The faults that the options of a URL name; other options are left alone."""
+        """The faults that the options of a URL name; other options are left alone.
+
+        Raises ValueError for a text that is no such value.
+        """
         values: dict[str, int | float | Pair] = {}
-        for field in fields(cls):
-            if field.name not in texts:
-                continue
-            text, kind = texts[field.name], str(field.type)
+        for name in SKIN_FAULTS.keys() & texts.keys():
             try:
-                if kind.startswith("Pair"):
-                    first, second = text.split(",")
-                    values[field.name] = (int(first), int(second))
+                if name in _PAIRS:
+                    first, second = texts[name].split(",")
+                    values[name] = (int(first), int(second))
                 else:
-                    values[field.name] = int(text) if kind.startswith("int") else float(text)
+                    values[name] = (int if name in _LINES else float)(texts[name])
             except ValueError:
-                wanted = "two numbers, as 1,2" if kind.startswith("Pair") else "a number"
-                raise ValueError(f"{field.name} is {wanted}, not '{text}'") from None
+                wanted = "two numbers, as 1,2" if name in _PAIRS else "a number"
+                raise ValueError(f"{name} is {wanted}, not '{texts[name]}'") from None
         return cls(**values)  # type: ignore[arg-type]
 
     @property
@@ -109,21 +105,17 @@ class SkinFaults:
         return self.tau_us > 0 or (self.hum > 0 and self.hum_lsb > 0)
 
     def check(self, rows: int, columns: int) -> None:
-        """Raise ValueError unless a rows x columns skin has the lines and cells that are named."""
-        named = {
-            "row": [self.open_row, *(self.short_rows or ())],
-            "column": [self.open_column, *(self.short_columns or ())],
-        }
-        for row, column in filter(None, (self.dead, self.saturated)):
-            named["row"].append(row)
-            named["column"].append(column)
-        for what, count in (("row", rows), ("column", columns)):
-            for line in named[what]:
+        """Raise ValueError for a line or a cell that a rows x columns skin does not have."""
+        cells = [cell for cell in (self.dead, self.saturated) if cell is not None]
+        named_rows = [self.open_row, *(self.short_rows or ()), *(row for row, _ in cells)]
+        named_columns = [self.open_column, *(self.short_columns or ()), *(c for _, c in cells)]
+        for what, named, count in (("row", named_rows, rows), ("column", named_columns, columns)):
+            for line in named:
                 if line is not None and not 0 <= line < count:
                     raise ValueError(f"no {what} {line}: the skin has {what}s 0 to {count - 1}")
 
     def damaged(self, skin: Skin) -> Skin:
-        """`skin` with all faults of resistances but shorted lines."""
+        """`skin` with all faults of resistances except shorted lines."""
         if not self.of_resistances:
             return skin
         cell = skin.cell_siemens.copy()
@@ -144,7 +136,7 @@ class SkinFaults:
         return hurt if self.open_column is None else cut(hurt, "bottom", self.open_column)
 
     def readings(self, damaged: Skin) -> Float:
-        """Exact readings (R, C, 4) of a skin that `damaged` has made, lines shorted."""
+        """Exact readings (R, C, 4) of a skin that `damaged` has made, with its lines shorted."""
         rows = damaged.shape[0]
         joints = [] if self.short_rows is None else [self.short_rows]
         if self.short_columns is not None:
@@ -152,58 +144,52 @@ class SkinFaults:
         return joined_readings(damaged, joints) if joints else readings(damaged)
 
     def sampled(self, ratio: Float, start_s: float, slot_s: float, settle_s: float) -> Float:
-        """What the converter meets: readings (R, C, 4) of a scan, one each slot [s], in its order.
+        """What the converter reads of a scan with settled readings `ratio` (R, C, 4), same shape.
 
-        With x the settled voltages of a node, slot by slot, a node of time constant tau reads
-        v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau), as after many equal scans, and hum adds
-        hum_lsb sin(2 pi hum t) at the reading's own time t.
+        The scan starts at start_s and takes one reading a slot, in the order of the link. A node
+        that would settle to the voltages x[n], slot by slot, has in slot n the voltage
+        v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau), with an equal scan before this one. Hum
+        adds hum_lsb sin(2 pi hum t) at the reading's own time t.
         """
         order = ratio.transpose(1, 0, 2)  # cells are column-major: rows run fastest
         read = order.reshape(-1)
         if self.tau_us:
             kept = float(np.exp(-settle_s / (1e-6 * self.tau_us)))
-            read = read.copy()
-            for senses_top in (True, False):
-                at = np.tile(senses_top == READING_SENSES_TOP, len(read) // 4)
-                read[at] = _settled(_node_voltage(order, senses_top), kept)[at]
+            # A pair of readings with the same drive sets both nodes, whichever of them is read.
+            top, bottom = (
+                _settled(order[..., pairs].reshape(-1), kept)
+                for pairs in ([0, 0, 3, 3], [1, 1, 2, 2])
+            )
+            read = np.where(np.resize(READING_SENSES_TOP, read.shape), top, bottom)
         if self.hum:
             time_s = start_s + slot_s * np.arange(len(read))
             read = read + self.hum_lsb / 2**ADC_BITS * np.sin(2 * np.pi * self.hum * time_s)
         return np.asarray(read.reshape(order.shape).transpose(1, 0, 2))
 
 
-def _node_voltage(order: Float, top: bool) -> Float:
-    """Settled voltage of one sense node in every slot: in A and B, then in C and D, it is driven
-    alike, whichever of the nodes is read.
-    """
-    first, second = (0, 3) if top else (1, 2)
-    return np.asarray(order[..., [first, first, second, second]].reshape(-1))
+SKIN_FAULTS: Final = texts_of(SkinFaults)
 
 
 def _settled(voltage: Float, kept: float) -> Float:
-    """v[n] = x[n] + (v[n-1] - x[n]) kept, after a scan of the same voltages before it."""
-    twice = np.concatenate([voltage, voltage])
-    start = [kept * voltage[-1]]
-    settled, _ = scipy.signal.lfilter([1 - kept], [1.0, -kept], twice, zi=start)
-    return np.asarray(settled[len(voltage) :])
+    """v[n] = x[n] + (v[n-1] - x[n]) kept, after a scan of the same voltages x."""
+    settled = goals = voltage.tolist()
+    for _ in range(2):
+        settled = list(accumulate(goals, lambda v, x: x + (v - x) * kept, initial=settled[-1]))[1:]
+    return np.array(settled)
 
 
 def cut(skin: Skin, layer: str, line: int, place: int = 0) -> Skin:
     """`skin` with segment `place` of a row ("top") or column ("bottom") open; 0: all of it."""
-    if layer == "top":
-        top = skin.top_wire_ohm.copy()
-        top[line, place] = OPEN_OHM
-        return replace(skin, top_wire_ohm=top)
-    bottom = skin.bottom_wire_ohm.copy()
-    bottom[place, line] = OPEN_OHM
-    return replace(skin, bottom_wire_ohm=bottom)
+    wires = {"top": skin.top_wire_ohm.copy(), "bottom": skin.bottom_wire_ohm.copy()}
+    wires[layer][(line, place) if layer == "top" else (place, line)] = OPEN_OHM
+    return replace(skin, top_wire_ohm=wires["top"], bottom_wire_ohm=wires["bottom"])
 
 
 def joined_readings(skin: Skin, joints: Iterable[Pair]) -> Float:
-    """`circuit.readings`, pairs of electrodes (rows first) joined by 0.1 ohm.
+    """As `circuit.skin.readings`, with pairs of electrodes (rows first) joined by 0.1 ohm each.
 
-    A joint adds its conductance to Y of the skin; rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] with Z
-    the inverse of Y, any one electrode grounded. Open cells are taken for 10 TOhm.
+    A joint adds its conductance to the skin's Y. Z is the inverse of Y with any one electrode
+    grounded, and rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j]. Open cells are taken for 10 TOhm.
     """
     rows = skin.shape[0]
     conducting = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, _LEAST_SIEMENS))

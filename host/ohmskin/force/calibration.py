@@ -30,7 +30,7 @@ import json
 import os
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,13 +39,15 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
-from ohmskin.files import whole_file
+from ohmskin.files import naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel
 from ohmskin.record.readings import MAX_CELLS
 
 FORMAT: Final = "ohmskin calibration"
 SCHEMA: Final = 1
-MAX_FILE_BYTES: Final = 4_000_000  # 4096 cells of 13 fields take about 1 MB
+# 4096 cells of 13 fields take about 1 MB.
+MAX_FILE_BYTES: Final = 4_000_000
+# A unit id has 32 bits on the link.
 MAX_UNIT_ID: Final = 2**32 - 1
 # Far beyond the slope of any power law in siemens, and predictions do not overflow.
 MAX_NUMBER: Final = 1e60
@@ -53,6 +55,8 @@ _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 _RESTS: Final = ("rest", "tare")
 _WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,14 +179,14 @@ class Calibration:
         content |= dict(zip(_WIRES, self.nominal_wire_ohm, strict=True))
         content["indenter_area_m2"] = self.indenter_area_m2
         for name in _RESTS:
-            content[name] = _rest_content(getattr(self, name))
+            rest = getattr(self, name)
+            content[name] = None if rest is None else vars(rest)
         for name in _MODEL_FIELDS:
-            nested = getattr(self.model, name).tolist()
-            if name in _NULL_FIELDS:
-                nested = [[None if x != x else x for x in row] for row in nested]
-            content[name] = nested
+            array = getattr(self.model, name)
+            null = np.isnan(array) if name in _NULL_FIELDS else np.False_
+            content[name] = np.where(null, None, array)
         text = ",\n".join(
-            f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
+            f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False, default=np.ndarray.tolist)}"
             for name, value in content.items()
         )
         with whole_file(path) as file:
@@ -196,43 +200,20 @@ def _check_date(date: str) -> None:
         raise ValueError(f"date is {date[:40]!r}, not ISO 8601") from None
 
 
-def _rest_content(rest: Rest | None) -> dict[str, Any] | None:
-    if rest is None:
-        return None
-    return {"date": rest.date, "ratio": rest.ratio.tolist(), "level": rest.level.tolist()}
-
-
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Read and check a calibration file.
 
     Raises ValueError, one line that names the file and the field, for whatever is wrong with it.
     """
-    try:
-        return _from_content(_read_json(path))
-    except ValueError as error:
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"{os.fspath(path)}: {reason}") from error
-
-
-def _read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    try:
-        with open(path, "rb") as file:
-            encoded = file.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise ValueError(f"cannot be read: {error.strerror or error}") from error
-    if len(encoded) > MAX_FILE_BYTES:
-        raise ValueError(f"more than {MAX_FILE_BYTES} bytes")
-    try:
-        content = json.loads(
-            encoded.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_repeats
-        )
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"no JSON of ours: {error}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
-    if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
-        raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
-    return content
+    with naming(path):
+        octets = read_bounded(path, MAX_FILE_BYTES)
+        try:
+            content = json.loads(
+                octets.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_repeats
+            )
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"no JSON of ours: {error}") from error
+        return _from_content(content)
 
 
 def _no_constant(name: str) -> float:
@@ -248,24 +229,25 @@ def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def _from_content(content: dict[str, Any]) -> Calibration:
+def _from_content(content: Any) -> Calibration:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
+    if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
+        raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
     known = {"format", "schema", "unit_id", "date", "method", "rows", "columns", *_RESTS}
     _require_fields(content, known | {*_WIRES, "indenter_area_m2", *_MODEL_FIELDS})
-    for name in ("unit_id", "rows", "columns"):
-        if type(content[name]) is not int:
-            raise ValueError(f"{name} is not an integer")
-    for name in ("date", "method"):
-        if not isinstance(content[name], str):
-            raise ValueError(f"{name} is not text")
-    shape = (content["rows"], content["columns"])
-    if min(shape) < 1 or max(shape) > MAX_CELLS or shape[0] * shape[1] > MAX_CELLS:
+    rows, columns, unit_id = (
+        _of_type(name, content[name], int) for name in ("rows", "columns", "unit_id")
+    )
+    if min(rows, columns) < 1 or rows * columns > MAX_CELLS:
         raise ValueError(f"rows and columns: not 1 to {MAX_CELLS} cells")
+    shape = (rows, columns)
     arrays = {name: _array(name, content[name], shape) for name in _MODEL_FIELDS}
     wires = (None if content[name] is None else _number(name, content[name]) for name in _WIRES)
     return Calibration(
-        unit_id=content["unit_id"],
-        date=content["date"],
-        method=content["method"],
+        unit_id=unit_id,
+        date=_of_type("date", content["date"], str),
+        method=_of_type("method", content["method"], str),
         rest=_rest("rest", content["rest"], shape),
         tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
         model=ForceModel(**arrays),
@@ -282,51 +264,41 @@ def _require_fields(content: dict[str, Any], known: set[str], place: str = "") -
 
 
 def _rest(name: str, content: Any, shape: tuple[int, int]) -> Rest:
-    if not isinstance(content, dict):
-        raise ValueError(f"{name} is not an object")
-    _require_fields(content, {"date", "ratio", "level"}, f"{name}.")
-    if not isinstance(content["date"], str):
-        raise ValueError(f"{name}.date is not text")
-    try:
-        ratio = np.array(content["ratio"])
-    except (ValueError, OverflowError):
-        ratio = np.array(None)
-    expected = (*shape, READINGS_PER_CELL)
-    if ratio.dtype.kind not in "fi" or ratio.shape != expected:
-        raise ValueError(f"{name}.ratio is not an array of numbers of shape {expected}")
+    _require_fields(_of_type(name, content, dict), {"date", "ratio", "level"}, f"{name}.")
+    date = _of_type(f"{name}.date", content["date"], str)
+    ratio = _array(f"{name}.ratio", content["ratio"], (*shape, READINGS_PER_CELL))
     level = _array(f"{name}.level", content["level"], shape)
     try:
-        return Rest(content["date"], ratio.astype(np.float64), level)
+        return Rest(date, ratio, level)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _array(name: str, nested: Any, shape: tuple[int, int]) -> NDArray[Any]:
-    rows, columns = shape
-    if not (
-        isinstance(nested, list)
-        and len(nested) == rows
-        and all(isinstance(row, list) and len(row) == columns for row in nested)
-    ):
-        raise ValueError(f"{name} is not {rows} lists of {columns}")
-    flat = [cell for row in nested for cell in row]
-    if name == "kind":
-        if not all(isinstance(cell, str) and len(cell) <= 16 for cell in flat):
-            raise ValueError("kind holds something other than names of curves")
-        return np.array(flat).reshape(shape)
+def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """A field's lists in lists as an array of this shape: of bool, of text, or of numbers."""
+    cells = np.array(nested, dtype=object)
+    if cells.shape != shape:
+        raise ValueError(f"{name} has not the shape {shape}")
     if name == "pooled":
-        if not all(isinstance(cell, bool) for cell in flat):
-            raise ValueError("pooled holds something other than true and false")
-        return np.array(flat).reshape(shape)
-    if name in _NULL_FIELDS:
-        numbers = [np.nan if cell is None else _number(name, cell) for cell in flat]
-    else:
-        numbers = [_number(name, cell) for cell in flat]
+        return np.array([_of_type(name, cell, bool) for cell in cells.flat]).reshape(shape)
+    if name == "kind":
+        # Cut, because a long text makes all cells as long.
+        return np.array([_of_type(name, cell, str)[:16] for cell in cells.flat]).reshape(shape)
+    may_be_null = name in _NULL_FIELDS
+    numbers = [
+        np.nan if cell is None and may_be_null else _number(name, cell) for cell in cells.flat
+    ]
     return np.array(numbers, dtype=np.float64).reshape(shape)
 
 
+def _of_type(name: str, value: Any, wanted: type[_T]) -> _T:
+    if type(value) is not wanted:
+        raise ValueError(f"{name} holds {type(value).__name__}, not {wanted.__name__}")
+    return value
+
+
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if type(value) not in (int, float):
         raise ValueError(f"{name} holds {type(value).__name__}, not numbers")
     try:
         number = float(value)

@@ -3,23 +3,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
-from scipy.optimize import linear_sum_assignment
 
 from ohmskin.arrays import Float
 
-# Between two scans at 30 Hz a finger at 0.5 m/s passes over 1.7 cells of 1 cm.
+# A contact moves by at most so many cells between two scans: at 30 Hz a finger at 0.5 m/s passes
+# over 1.7 cells of 1 cm.
 FARTHEST_CELLS: Final = 2.0
-# A light touch flickers about its threshold; it stays the same contact.
+# A contact that is gone for less [us] stays the same: a light touch flickers about its threshold.
 MEMORY_US: Final = 100_000
-# What the scan before had is remembered for longer, since boards may scan slowly.
+# Contacts of the scan before are remembered for so long [us], because boards may scan slowly.
 SLOWEST_SCAN_US: Final = 20 * MEMORY_US
+# Cells that adjoin, for scipy: along an edge or at a corner.
 _EIGHT_NEIGHBOURS: Final = np.ones((3, 3), dtype=np.int_)
+# Distance of what must not be matched, in cells: more than any skin has.
 _FAR: Final = 1e6
 
 
@@ -45,7 +46,7 @@ class ContactTracker:
     """Finds the contacts of each scan, and tells which of them were there before.
 
     Contacts of two scans are matched so that the sum of the distances of their centres is least
-    (the assignment problem); none is taken for one farther than `FARTHEST_CELLS` away. One that is
+    (the assignment problem). None is taken for one farther than `FARTHEST_CELLS` away. One that is
     gone is remembered for `MEMORY_US`. Where two merge, one number ends.
     """
 
@@ -65,41 +66,41 @@ class ContactTracker:
             if 0 <= time_us - each[1] <= limits_us.get(each[1], MEMORY_US)
         ]
         self._before_us = time_us
-        found = _blobs(touched, force_n, force_n_std)
+        found = _found(touched, force_n, force_n_std)
         same = self._matches(found)
-        contacts = []
-        for index, blob in enumerate(found):
-            before = same.get(index)
-            if before is None:
-                self._last += 1
-            identity = self._last if before is None else self._known[before][0].identity
-            contacts.append(Contact(identity, *blob))
-        contacts.sort(key=lambda contact: contact.identity)
-        taken = set(same.values())
-        gone = [each for index, each in enumerate(self._known) if index not in taken]
-        self._known = [*gone, *((contact, time_us) for contact in contacts)]
-        return tuple(contacts)
+        for index, contact in enumerate(found):
+            if index in same:
+                identity = self._known[same[index]][0].identity
+            else:
+                self._last = identity = self._last + 1
+            found[index] = replace(contact, identity=identity)
+        found.sort(key=lambda contact: contact.identity)
+        gone = [each for index, each in enumerate(self._known) if index not in same.values()]
+        self._known = [*gone, *((contact, time_us) for contact in found)]
+        return tuple(found)
 
-    def _matches(self, found: list[_Blob]) -> dict[int, int]:
-        """Index of the known contact that each blob is, by index of the blob."""
+    def _matches(self, found: list[Contact]) -> dict[int, int]:
+        """By the index of a contact that is found, the index of the known contact that it is."""
+        from scipy.optimize import linear_sum_assignment
+
         if not found or not self._known:
             return {}
-        new = np.array([blob[:2] for blob in found])
+        new = np.array([(contact.row, contact.column) for contact in found])
         old = np.array([(known.row, known.column) for known, _ in self._known])
         away = np.hypot(*(new[:, None] - old[None]).transpose(2, 0, 1))
         away[away > FARTHEST_CELLS] = _FAR
         pairs = zip(*linear_sum_assignment(away), strict=True)
-        return {int(blob): int(known) for blob, known in pairs if away[blob, known] < _FAR}
+        return {int(one): int(other) for one, other in pairs if away[one, other] < _FAR}
 
 
-_Blob = tuple[float, float, float, float, NDArray[np.bool_]]
+def _found(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> list[Contact]:
+    """The contacts of a scan, without their numbers."""
+    from scipy.ndimage import label
 
-
-def _blobs(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> list[_Blob]:
     if not touched.any():
         return []
     labels, count = label(touched, structure=_EIGHT_NEIGHBOURS)
-    blobs = []
+    contacts = []
     for number in range(1, count + 1):
         cells = labels == number
         rows, columns = np.nonzero(cells)
@@ -107,13 +108,14 @@ def _blobs(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> li
         total_n = float(weights.sum())
         if total_n <= 0:  # too light for its curve: all cells alike
             weights = np.ones(rows.size)
-        blobs.append(
-            (
-                float(np.average(rows, weights=weights)),
-                float(np.average(columns, weights=weights)),
-                total_n,
-                float(np.sqrt(np.sum(force_n_std[cells] ** 2))),
-                cells,
+        contacts.append(
+            Contact(
+                identity=0,
+                row=float(np.average(rows, weights=weights)),
+                column=float(np.average(columns, weights=weights)),
+                force_n=total_n,
+                force_n_std=float(np.sqrt(np.sum(force_n_std[cells] ** 2))),
+                cells=cells,
             )
         )
-    return blobs
+    return contacts

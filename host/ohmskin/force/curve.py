@@ -24,12 +24,13 @@ Standard deviation of a force, with J the derivatives of F by the cell's free co
 
     F_std^2 = d^2 + s0^2 + (s1 F)^2 + J K J^T ,     d = max(F(x + dx) - F(x), F(x) - F(x - dx)) .
 
-For a line d = a dx; for x^b with b < 1 the differential is infinite at rest, the difference is not.
-`force_regression` learns the curves.
+For a line d = a dx. For x^b with b < 1 the differential is infinite at rest, the difference is not.
+`regression` learns the curves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Final
 
@@ -40,6 +41,7 @@ from ohmskin.arrays import Float
 
 LINEAR: Final = "linear"
 POWER: Final = "power"
+# Exponents that a fit may give: presses of known skins lie well inside.
 MIN_EXPONENT: Final = 0.2
 MAX_EXPONENT: Final = 5.0
 
@@ -107,11 +109,8 @@ class ForceModel:
         x, dx = self._checked("rise", rise), self._checked("rise_std", rise_std)
         _require("rise", np.isfinite(x), "not finite")
         _require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
-        force_n = self._curve(x)
-        known_dx = np.nan_to_num(dx)
-        spread = np.maximum(
-            self._curve(x + known_dx) - force_n, force_n - self._curve(x - known_dx)
-        )
+        force_n = self._force(x)
+        of_rise = spread(self._force, x, np.nan_to_num(dx))
         power = self.kind == POWER
         above = np.maximum(x, 0.0)
         safe = np.where(above > 0, above, 1.0)
@@ -124,18 +123,35 @@ class ForceModel:
         of_fit = by_slope**2 + by_other**2 + 2 * self.correlation * by_slope * by_other
         reported_n = np.maximum(force_n, 0.0)
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
-        variance = spread**2 + scatter + np.maximum(of_fit, 0.0)
+        variance = of_rise**2 + scatter + np.maximum(of_fit, 0.0)
         return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))
 
-    def _curve(self, x: Float) -> Float:
-        powered = self.slope * np.maximum(x, 0.0) ** self.exponent
-        return np.where(self.kind == POWER, powered, self.slope * x + self.intercept)
+    def _force(self, x: Float) -> Float:
+        return force_by(self.kind, self.slope, self.exponent, self.intercept, x)
 
     def _checked(self, name: str, values: ArrayLike) -> Float:
         array = np.asarray(values, dtype=np.float64)
         if array.shape != self.kind.shape:
             raise ValueError(f"{name} has shape {array.shape}, this calibration {self.kind.shape}")
         return array
+
+
+def force_by(
+    kind: str | NDArray[np.str_],
+    slope: float | Float,
+    exponent: float | Float,
+    intercept: float | Float,
+    x: Float,
+) -> Float:
+    """F of the module's equations [N], before forces below 0 are cut, shape of x."""
+    power = slope * np.maximum(x, 0.0) ** exponent
+    return np.where(np.asarray(kind) == POWER, power, slope * x + intercept)
+
+
+def spread(force: Callable[[Float], Float], x: Float, dx: Float) -> Float:
+    """d of the module [N]: how far the force is off if x is off by dx."""
+    here = force(x)
+    return np.maximum(force(x + dx) - here, here - force(x - dx))
 
 
 def _require(name: str, good: NDArray[np.bool_], what: str) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a board's clock to the host's, by when its scans arrived.
+"""From a board's clock to the host's, learned from when its scans arrived.
 
 Symbols
 
@@ -12,13 +12,13 @@ q      rate: seconds of the host in a second of the board                       
 h(u)   host time of u: h(u) = t_0 + q (u - u_0)                                              s
 ====== ===================================================================================== ====
 
-What lies between a board and a program (a USB bridge's latency timer, buffers, a busy machine) only
-ever delays: t >= h(u). Hence h is the line below all points (u, t) whose distances to them have the
-least sum [Moon1999]. It is the edge of their lower convex hull above or below the mean of u
-[Zhang2002]: late points, however many and however late, change nothing as long as some are on time.
-A mean, as least squares is one, moves with the load of the machine.
+A USB bridge's latency timer, buffers and a busy machine can only delay what a board sends, so that
+t >= h(u). Therefore h is the line below all points (u, t) whose distances to the points have the
+least sum [Moon1999]. This line is the edge of the points' lower convex hull at the mean of u
+[Zhang2002]. Late points change nothing, however many and however late they are, as long as some
+points are on time. A line of least squares would move with the load of the machine.
 
-A delay that all scans have cannot be seen from here, and is in h.
+A delay that all scans have in common cannot be seen and is part of h.
 
 [Moon1999]: S. B. Moon, P. Skelly, D. Towsley, "Estimation and removal of clock skew from network
 delay measurements", INFOCOM 1999. [Zhang2002]: L. Zhang, Z. Liu, C. H. Xia, "Clock synchronization
@@ -29,36 +29,37 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.link.messages import Scan
 
-# A ceramic resonator warms: by 10 ppm a second it bends the line by 1 ms in so long.
+# Board time of the points that a line is fitted to [s]. A ceramic resonator that warms drifts by up
+# to 10 ppm a second, which bends the line by 1 ms in this time.
 WINDOW_S: Final = 30.0
-# A ceramic resonator is 0.5 % off, a crystal 0.01 %.
+# Largest |q - 1|: a ceramic resonator is up to 0.5 % off, a crystal 0.01 %.
 MAX_RATE_ERROR: Final = 0.006
-# Earlier than this, or later for so long, and one of the clocks has stepped.
+# A scan that comes this much before h shows that a clock has stepped [s]. So do scans that come
+# this much after h for `STEP_AFTER_S`.
 STEP_S: Final = 0.05
 STEP_AFTER_S: Final = 2.0
-# Of so much board time one point is kept, the earliest: the others are on no hull.
+# Of each block of so much board time only the earliest point is kept [s].
 _BLOCK_S: Final = 0.25
-# How fast a better line takes effect: times never go back, and never jump.
+# A better line takes effect within this time [s], so that times never jump or go back.
 _SLEW_S: Final = 1.0
-_JITTER_SCANS: Final = 2048
+# The jitter is this percentile of the delays of so many scans.
 _JITTER_PERCENT: Final = 95
+_JITTER_SCANS: Final = 2048
 
 _Point = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class _Line:
-    """h. rate: q; u_s, t_s: a point of it."""
+class _Line(NamedTuple):
+    """h: its rate q, and a point (u, t) [s] of it."""
 
     rate: float
     u_s: float
@@ -68,8 +69,8 @@ class _Line:
         return self.t_s + self.rate * (u_s - self.u_s)
 
 
-def _below(points: Sequence[_Point], rate: float) -> _Line:
-    """The line below points (u, t), u rising [Zhang2002]. rate: where one point tells none."""
+def _below(points: Collection[_Point], rate: float) -> _Line:
+    """The line below points (u, t) with rising u [Zhang2002]. rate: that of a single point."""
     hull: list[_Point] = []
     for u_s, t_s in points:
         while len(hull) > 1 and _turns_right(hull[-2], hull[-1], (u_s, t_s)):
@@ -93,26 +94,24 @@ def _turns_right(a: _Point, b: _Point, c: _Point) -> bool:
 class BoardClock:
     """Learns the clock of a board from scan after scan.
 
-    A board that restarts is followed at once, and so is a clock that steps, unless it makes scans
-    late: then after `STEP_AFTER_S`. Else times are smooth: what is learned later shifts coming
-    times alone, over a second.
+    It follows a restart of the board at once. It also follows a clock that steps, after
+    `STEP_AFTER_S` if the step makes scans late. Otherwise times are smooth: what it learns shifts
+    only later times, over a second.
     """
 
     def __init__(self) -> None:
         self._line: _Line | None = None
-        self._rate = 1.0
         self._points: deque[_Point] = deque()  # the earliest of each block
-        self._earliest = (0.0, 0.0)  # of the block that began at _block_u_s
-        self._block_u_s = self._last_u_s = 0.0
+        self._block_u_s = self._last_u_s = 0.0  # begin of the last block; the last time
         self._slew_s, self._slew_from_s = 0.0, 0.0
         self._late_since_s: float | None = None
         self._lates_s: deque[float] = deque(maxlen=_JITTER_SCANS)
         self._jitter_s = math.nan
 
     def add(self, time_us: float, host_time_s: float) -> None:
-        """Something that was at `time_us` of the board was known here at `host_time_s`, or earlier.
+        """Learn that something at `time_us` of the board's clock was known here at `host_time_s`.
 
-        Pairs come in the order of the board's clock; where it goes back, the board has restarted.
+        Calls come in the order of the board's clock. A time that goes back is a restart.
         """
         u_s, t_s = 1e-6 * time_us, host_time_s
         if self._line is None or u_s <= self._last_u_s or self._steps(u_s, t_s):
@@ -123,12 +122,12 @@ class BoardClock:
         self._lates_s.append(max(late_s, 0.0))
         ends_block = u_s - self._block_u_s >= _BLOCK_S
         if ends_block:
-            self._points.append(self._earliest)
             while self._points and u_s - self._points[0][0] > WINDOW_S:
                 self._points.popleft()
-            self._block_u_s, self._earliest = u_s, (u_s, t_s)
-        elif late_s < self._earliest[1] - self._line.at(self._earliest[0]):
-            self._earliest = (u_s, t_s)
+            self._points.append((u_s, t_s))
+            self._block_u_s = u_s
+        elif late_s < self._points[-1][1] - self._line.at(self._points[-1][0]):
+            self._points[-1] = (u_s, t_s)
         if ends_block or late_s < 0:
             self._learn(u_s)
         if ends_block:
@@ -137,7 +136,7 @@ class BoardClock:
     def host_s(self, time_us: float) -> float:
         """Host time at which the board's clock showed `time_us`, on `time.monotonic()` [s].
 
-        Meant for times about that of the last `add`. Raises ValueError before the first.
+        It is exact for times near that of the last `add`. Raises ValueError before the first.
         """
         if self._line is None:
             raise ValueError("no scan has been added: its arrival tells the time")
@@ -147,13 +146,13 @@ class BoardClock:
 
     @property
     def jitter_s(self) -> float:
-        """95 % of the last 2048 scans were no later than this after h [s]; NaN for 0.25 s."""
+        """95 % of the last 2048 scans came at most this much after h [s]; at first NaN."""
         return self._jitter_s
 
     def _restart(self, u_s: float, t_s: float) -> None:
-        self._line = _Line(self._rate, u_s, t_s)  # the rate is the crystal's: it stays
-        self._points.clear()
-        self._earliest = (u_s, t_s)
+        rate = self._line.rate if self._line else 1.0  # a restart does not change the resonator
+        self._line = _Line(rate, u_s, t_s)
+        self._points = deque([(u_s, t_s)])
         self._last_u_s = self._block_u_s = u_s
         self._slew_s = 0.0
         self._late_since_s = None
@@ -169,10 +168,10 @@ class BoardClock:
         return t_s - self._late_since_s > STEP_AFTER_S
 
     def _learn(self, u_s: float) -> None:
+        assert self._line is not None
         before_s = self.host_s(1e6 * u_s)
-        self._line = _below([*self._points, self._earliest], self._rate)
-        self._rate = self._line.rate
-        # So little that times still rise while it is made up for.
+        self._line = _below(self._points, self._line.rate)
+        # So little that times go on rising while it fades.
         self._slew_s = min(max(before_s - self._line.at(u_s), -STEP_S), STEP_S)
         self._slew_from_s = u_s
 
@@ -180,8 +179,8 @@ class BoardClock:
 def scan_times_s(scans: list[Scan]) -> Float:
     """Times of recorded scans on the host's clock [s], (n,), without the jitter of their arrival.
 
-    All late by the same: about the time that a scan takes. For each run of the board's clock, h of
-    30 s about each of its points; between these points, linear.
+    All are late by the same time, about that of a scan. Every 15 s of each run of the board's clock
+    there is a knot with the h of the 30 s around it; between knots, times are interpolated.
     """
     host_s = np.array([scan.host_time_s for scan in scans])
     board_s = 1e-6 * np.array([scan.time_us for scan in scans])

@@ -12,7 +12,8 @@ from ohmskin.arrays import Float
 from ohmskin.link.protocol import ADC_BITS
 
 DEFAULT_ADC_BITS: Final = ADC_BITS
-# Readings called exact come from a circuit solver or an average: nine digits are trusted.
+# Standard deviation of a ratio that is called exact [V/Vdd]: a circuit solver or an average gives
+# nine digits.
 EXACT_RATIO_STD: Final = 1e-9
 
 
@@ -24,7 +25,7 @@ def check_adc_bits(bits: int) -> int:
 
 
 def quantise(ratio: ArrayLike, bits: int = DEFAULT_ADC_BITS) -> NDArray[np.uint16]:
-    """ADC codes min(2^bits - 1, floor(ratio * 2^bits)), same shape; a ratio below 0 gives 0.
+    """ADC codes min(2^bits - 1, floor(ratio 2^bits)), same shape; a ratio below 0 gives 0.
 
     Raises ValueError for a ratio that is not a number.
     """
@@ -36,11 +37,11 @@ def quantise(ratio: ArrayLike, bits: int = DEFAULT_ADC_BITS) -> NDArray[np.uint1
 
 
 def ratio_from_codes(codes: ArrayLike, bits: int = DEFAULT_ADC_BITS) -> Float:
-    """Ratio in the middle of a code's interval: (code + 0.5) / 2^bits, same shape."""
+    """Ratio in the middle of each code's interval, (code + 0.5) / 2^bits, same shape."""
     full_scale = 1 << check_adc_bits(bits)
     return np.asarray((np.asarray(codes, dtype=np.float64) + 0.5) / full_scale, dtype=np.float64)
 
 
 def ratio_std(bits: int | None) -> float:
-    """Standard deviation of one reading: 1 / (2^bits sqrt(12)), 1e-9 for exact ones (None)."""
+    """Standard deviation of a reading [V/Vdd]: 1 / (2^bits sqrt(12)); None: that of exact ones."""
     return EXACT_RATIO_STD if bits is None else 1.0 / ((1 << check_adc_bits(bits)) * 12**0.5)

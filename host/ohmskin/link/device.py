@@ -1,94 +1,113 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A connected skin board: scans as they come, commands with answers, counts of what was lost."""
+"""What gives scans, as programs see it: a board, or a recording that is played."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.errors import DeviceLost, RecordingEnded
+from ohmskin.errors import DeviceLost
 from ohmskin.files import Closing
 from ohmskin.link import protocol
+from ohmskin.link.feed import ScanFeed
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.link.serial_port import Link
-from ohmskin.link.session import COMMAND_TRIES, ScanQueue, Session, configuration
+from ohmskin.link.session import COMMAND_TRIES, configuration
 
-# Silence after which a scanning board counts as lost.
+# A device that should scan and is silent for so long counts as lost [s].
 SILENCE_TIMEOUT_S = 5.0
 
 
-class Device(Closing):
-    """A board at a `Link`. Made by `ohmskin.open`; closes with ``with`` or `close`.
+class Source(Protocol):
+    """What a `Device` is made of: a board's `Session`, or a recording.
 
-    Two ways to read, for two needs: iterating gives every scan, in order, and tells which are
-    missing; `latest` gives the newest and skips the rest. Both may be used at once, from several
-    threads.
-
-    :raises DeviceSilent: nothing that is a skin board answers.
-    :raises ProtocolMismatch: the board was built from another protocol definition.
-    :raises DeviceLost: the port went away meanwhile.
+    feed: its scans. report: of the last self-test. want_scans: it is to scan. commands: held for
+    as long as one command, or a few that belong together, take.
     """
 
-    def __init__(self, link: Link, *, start: bool = True, baud: int | None = None) -> None:
-        self._session = Session(link)
+    feed: ScanFeed
+    commands: threading.RLock
+    report: SelfTestReport | None
+    want_scans: bool
+
+    @property
+    def hello(self) -> Hello:
+        """What it has last said of itself."""
+
+    @property
+    def stats(self) -> BoardStats:
+        """Counts since the connection was made, as a copy."""
+
+    def command(self, name: str, **values: protocol.Value) -> None:
+        """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
+
+    def refresh(self) -> Hello:
+        """Ask for `hello` anew."""
+
+    def close(self) -> None:
+        """Give the port or file back. May be called again."""
+
+
+class Device(Closing):
+    """A source of scans: a board, or a recording that is played. Made by `ohmskin.open`.
+
+    There are two ways to read, for two needs. Iterating gives every scan, in order, and tells which
+    are missing. `latest` gives the newest scan and skips the rest. Both may be used at once, from
+    several threads. ``with`` closes a device, and so does `close`.
+    """
+
+    def __init__(self, source: Source, *, start: bool = True) -> None:
+        self._source = source
+        self._feed = source.feed
         self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
-        try:
-            if baud is not None and baud != self.info.baud:
-                self._session.command("set_baud", baud=baud)
-                link.set_baud(baud)
-                self._session.refresh()
-            if start:
+        if start:
+            try:
                 self.start()
-        except BaseException:
-            self.close()
-            raise
+            except BaseException:
+                self.close()
+                raise
 
     # ------------------------------------------------------------------------------- reading
+
+    @property
+    def info(self) -> Hello:
+        """What the board has last said of itself."""
+        return self._source.hello
+
+    @property
+    def stats(self) -> BoardStats:
+        """Counts since the connection was made, as a copy."""
+        return self._source.stats
+
+    @property
+    def name(self) -> str:
+        """The port's name."""
+        return self._feed.name
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan from now on; ``missed`` of each counts what was lost before it.
 
-        An iterator that falls behind by more than `session.QUEUE_SCANS` loses the oldest scans,
-        which are counted too.
-
-        Ends with the recording at a ``replay://`` port.
+        An iterator that falls behind by more than `feed.QUEUE_SCANS` loses the oldest scans, which
+        are counted too. It ends with the recording at a ``replay://`` port.
 
         :raises DeviceLost: the board went away, or said nothing for `SILENCE_TIMEOUT_S`.
         """
         self.start()
-        return self._scans(self._session.queue())
-
-    def _scans(self, queue: ScanQueue) -> Iterator[Scan]:
-        session = self._session
-        while True:
-            with session.changed:
-                try:
-                    session.wait(lambda: bool(queue.scans), self._silence_s())
-                except RecordingEnded:
-                    return
-                scan = queue.take()
-                session.balance()
-            yield scan
+        return self._feed.scans(self._silence_s)
 
     def latest(self, timeout_s: float | None = None) -> Scan:
-        """The newest scan, each one once: waits for the next if this one was given out already.
+        """The newest scan. Each is given once: waits for the next if this one was given already.
 
         timeout_s: how long to wait [s], by default `SILENCE_TIMEOUT_S`, or longer for slow scans.
 
         :raises DeviceLost: the board went away, or no scan came in time.
         """
         self.start()
-        session = self._session
-        with session.changed:
-            session.balance()
-            limit_s = self._silence_s() if timeout_s is None else timeout_s
-            session.wait(lambda: session.newest is not None and not session.newest_taken, limit_s)
-            session.newest_taken = True
-            assert session.newest is not None
-            return session.newest
+        return self._feed.latest(self._silence_s() if timeout_s is None else timeout_s)
 
     def mean_ratio(self, seconds: float) -> Float:
         """Mean readings of the coming scans, shape (R, C, 4): of so many seconds, at least one.
@@ -97,7 +116,7 @@ class Device(Closing):
         """
         ratios: list[Float] = []
         first_us = 0
-        for scan in Device.__iter__(self):
+        for scan in self:
             if ratios and scan.ratio.shape != ratios[0].shape:
                 ratios.clear()  # somebody has configured the board
             first_us = first_us if ratios else scan.time_us
@@ -111,45 +130,29 @@ class Device(Closing):
     def _silence_s(self) -> float:
         return SILENCE_TIMEOUT_S + 2 / self.info.rate_hz
 
-    @property
-    def info(self) -> Hello:
-        """What the board has last said of itself."""
-        return self._session.hello
-
-    @property
-    def name(self) -> str:
-        """The port's name."""
-        return self._session.link.name
-
-    @property
-    def stats(self) -> BoardStats:
-        """Counts since the connection was made, as a copy."""
-        return self._session.stats
-
     # ------------------------------------------------------------------------------ commands
 
     def start(self) -> None:
-        """Start scanning. Does nothing when the board scans already."""
-        session = self._session
-        with session.commands:
-            if session.want_scans:
+        """Start scanning. Does nothing when the device scans already."""
+        source = self._source
+        with source.commands:
+            if source.want_scans:
                 return
             for _ in range(COMMAND_TRIES):
                 self._restore()
-                with session.changed:
-                    session.newest = None  # it may be of another configuration
-                session.command("start")
+                self._feed.forget_newest()
+                source.command("start")
                 # The hello of a reset that came in between was read before this ack.
                 if self._is_as_wanted():
                     break
-                session.command("stop")
-            session.want_scans = True
+                source.command("stop")
+            source.want_scans = True
 
     def stop(self) -> None:
         """Stop scanning, after a whole scan."""
-        with self._session.commands:
-            self._session.want_scans = False
-            self._session.command("stop")
+        with self._source.commands:
+            self._source.want_scans = False
+            self._source.command("stop")
 
     def configure(
         self,
@@ -168,6 +171,7 @@ class Device(Closing):
 
         :raises ValueError: a value that no board could be sent.
         :raises CommandRefused: a value out of range, or too much for the rate; nothing changes.
+            A recording refuses this and all commands below.
         """
         given = {
             "rows": rows,
@@ -179,54 +183,54 @@ class Device(Closing):
         with self._paused():
             wanted = configuration(self.info)
             wanted.update({name: value for name, value in given.items() if value is not None})
-            self._session.command("configure", **wanted)
+            self._source.command("configure", **wanted)
             self._wanted = wanted
-            self._session.refresh()
+            self._source.refresh()
             self._restore()
             return self.info
 
     def set_unit_id(self, unit_id: int) -> None:
         """Name this skin; `save` makes the name last."""
-        with self._session.commands:
-            self._session.command("set_unit_id", unit_id=unit_id)
-            self._session.refresh()
+        with self._source.commands:
+            self._source.command("set_unit_id", unit_id=unit_id)
+            self._source.refresh()
 
     def save(self) -> None:
         """Keep configuration and unit id in the board's EEPROM.
 
         :raises CommandRefused: the EEPROM is worn out.
         """
-        self._session.command("save")
+        self._source.command("save")
 
     def load_defaults(self) -> Hello:
         """Return to the built-in configuration; the EEPROM keeps what it holds until `save`."""
         with self._paused():
-            self._session.command("load_defaults")
+            self._source.command("load_defaults")
             self._wanted = None
-            return self._session.refresh()
+            return self._source.refresh()
 
     def self_test(self) -> SelfTestReport:
         """Read both sense nodes with each drive at all multiplexer inputs, and judge them."""
-        session = self._session
+        source = self._source
         with self._paused():
-            session.report = None
-            session.command("self_test")
-            if session.report is None:
+            source.report = None
+            source.command("self_test")
+            if source.report is None:
                 raise DeviceLost(f"{self.name}: the report of the self-test was lost: try again")
-            return session.report
+            return source.report
 
     @contextmanager
     def _paused(self) -> Iterator[None]:
         """Hold the scan for commands that are refused meanwhile, and go on whatever they did."""
-        session = self._session
-        with session.commands:
-            was_scanning = session.want_scans
+        source = self._source
+        with source.commands:
+            was_scanning = source.want_scans
             if was_scanning:
                 self.stop()
             try:
                 yield
             finally:
-                if was_scanning and session.failure is None:
+                if was_scanning and self._feed.failure is None:
                     self.start()
 
     def _is_as_wanted(self) -> bool:
@@ -237,11 +241,11 @@ class Device(Closing):
         for _ in range(COMMAND_TRIES):
             if self._is_as_wanted() or self._wanted is None:
                 return
-            self._session.command("configure", **self._wanted)
-            self._session.refresh()
+            self._source.command("configure", **self._wanted)
+            self._source.refresh()
 
     # ------------------------------------------------------------------------------- closing
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
-        self._session.close()
+        self._source.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames from bytes and bytes from frames; no port, no thread, no clock.
+"""Frames from bytes, and bytes from frames, without port, thread or clock.
 
 encode   type, sequence, payload  ->  0x00 COBS(type sequence payload crc16) 0x00
 Decoder  bytes as they come       ->  whole, valid frames, and counts of what was not
@@ -8,11 +8,11 @@ Decoder  bytes as they come       ->  whole, valid frames, and counts of what wa
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ohmskin.link import protocol
 
+# The longest COBS block [bytes]: its length byte and 254 others.
 _MAX_BLOCK = 0xFF
 _HEADER_SIZE = 2
 _CRC = struct.Struct("<H")
@@ -22,13 +22,13 @@ _LARGEST_CONTENT = (
     + protocol.codes_size(protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
     + _CRC.size
 )
-# The longest run of bytes between two delimiters that can be a frame.
+# The longest stretch between two delimiters that can be a frame [bytes].
 LARGEST_FRAME = _LARGEST_CONTENT + 1 + _LARGEST_CONTENT // (_MAX_BLOCK - 1)
 
 
 @dataclass(frozen=True)
 class RawFrame:
-    """A frame whose CRC is right: `type` may still be unknown to this host."""
+    """A frame whose CRC is right. This host may still not know its `type`."""
 
     type: int
     sequence: int
@@ -37,37 +37,36 @@ class RawFrame:
 
 @dataclass
 class DecoderStats:
-    """What a `Decoder` has seen, in frames unless said otherwise."""
+    """What a `Decoder` has seen: bytes (octets), valid frames, and damaged stretches.
+
+    crc_errors: COBS with a wrong CRC. cobs_errors: not COBS, or too short for a frame. overlong:
+    longer than any frame.
+    """
 
     octets: int = 0
     frames: int = 0
     crc_errors: int = 0
-    """Right COBS, wrong CRC."""
     cobs_errors: int = 0
-    """No COBS at all, or too short for a frame."""
     overlong: int = 0
-    """More bytes without a delimiter than any frame has."""
 
     @property
     def damaged(self) -> int:
-        """Stretches between two delimiters that were no valid frame."""
+        """All stretches between two delimiters that were no valid frame."""
         return self.crc_errors + self.cobs_errors + self.overlong
 
 
 def cobs_encode(content: bytes) -> bytes:
     """`content` without zero bytes (consistent overhead byte stuffing, Cheshire & Baker 1999)."""
     out = bytearray()
-    stretches = content.split(protocol.DELIMITER)
-    last = len(stretches) - 1
-    for i, stretch in enumerate(stretches):
-        while len(stretch) >= _MAX_BLOCK - 1:
-            out.append(_MAX_BLOCK)
-            out += stretch[: _MAX_BLOCK - 1]
-            stretch = stretch[_MAX_BLOCK - 1 :]
-            if not stretch and i == last:
-                return bytes(out)
-        out.append(len(stretch) + 1)
-        out += stretch
+    for stretch in content.split(protocol.DELIMITER):
+        *full, rest = (
+            stretch[at : at + _MAX_BLOCK - 1] for at in range(0, len(stretch) + 1, _MAX_BLOCK - 1)
+        )
+        for block in full:
+            out += bytes([_MAX_BLOCK]) + block
+        out += bytes([len(rest) + 1]) + rest
+    if full and not rest:
+        out.pop()  # nothing follows a full block at the end
     return bytes(out)
 
 
@@ -95,9 +94,9 @@ def encode(frame_type: int, sequence: int, payload: bytes) -> bytes:
 
 
 class Decoder:
-    """Finds the frames in a byte stream, however it is cut into chunks.
+    """Finds the frames in a byte stream, however the stream is cut into chunks.
 
-    The buffer never holds more than one frame's bytes; nothing that arrives raises.
+    It never keeps more bytes than one frame has, and nothing that arrives raises.
 
     >>> decoder = Decoder()
     >>> [f.payload for f in decoder.feed(encode(3, 0, b"ok"))]
@@ -107,34 +106,28 @@ class Decoder:
     def __init__(self) -> None:
         self.stats = DecoderStats()
         self._partial = b""
-        self._skipping = False  # inside a stretch that is already too long
+        self._skipping = False  # inside a stretch that is too long already
 
     def feed(self, chunk: bytes) -> list[RawFrame]:
         """The frames that `chunk` completes, in order."""
         self.stats.octets += len(chunk)
-        stretches = (self._partial + chunk).split(protocol.DELIMITER)
-        self._partial = stretches.pop()
-        frames = list(self._frames(stretches))
+        *stretches, self._partial = (self._partial + chunk).split(protocol.DELIMITER)
+        frames = [frame for each in stretches if (frame := self._decode(each)) is not None]
         if len(self._partial) > LARGEST_FRAME:
             self._partial = b""
-            if not self._skipping:
-                self._skipping = True
-                self.stats.overlong += 1
+            self.stats.overlong += not self._skipping
+            self._skipping = True
         return frames
 
-    def _frames(self, stretches: list[bytes]) -> Iterator[RawFrame]:
-        for stretch in stretches:
-            if self._skipping:
-                self._skipping = False  # the rest of it: counted when it became too long
-            elif len(stretch) > LARGEST_FRAME:
-                self.stats.overlong += 1
-            elif stretch:
-                frame = self._decode(stretch)
-                if frame is not None:
-                    self.stats.frames += 1
-                    yield frame
-
     def _decode(self, stretch: bytes) -> RawFrame | None:
+        if self._skipping:
+            self._skipping = False  # this is its rest: it was counted when it became too long
+            return None
+        if not stretch:
+            return None
+        if len(stretch) > LARGEST_FRAME:
+            self.stats.overlong += 1
+            return None
         content = cobs_decode(stretch)
         if content is None or len(content) < _HEADER_SIZE + _CRC.size:
             self.stats.cobs_errors += 1
@@ -143,4 +136,5 @@ class Decoder:
         if _CRC.unpack_from(content, len(body))[0] != protocol.crc16(body):
             self.stats.crc_errors += 1
             return None
+        self.stats.frames += 1
         return RawFrame(body[0], body[1], body[_HEADER_SIZE:])

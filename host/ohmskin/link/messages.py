@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a board says, as Python objects, decoded from bytes without port or thread."""
+"""What a board says, as Python objects. They are decoded from bytes, without port or thread."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,13 @@ from ohmskin.link import protocol
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.framing import Decoder, DecoderStats, RawFrame
 
+# Scan numbers and board times wrap at 2^32, the counter of dropped scans at 2^16 (frames.toml).
 _COUNTER_SPAN = 1 << 32
 _DROPPED_SPAN = 1 << 16
+# The first field of `hello` is the same in every definition [bytes].
 _LAYOUT_CRC_SIZE = 2
+# A ceramic resonator is up to 0.5 % off.
+_RATE_ERROR = 0.005
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class Hello:
     ref_bottom_ohm: int
     rate_asked_mhz: int
     scan_cycles: int
+    slot_cycles: int
     clock_hz: int
     settle_asked_us: int
     settle_us: int
@@ -58,7 +63,7 @@ class Hello:
 
 @dataclass(frozen=True)
 class ForeignHello:
-    """A `hello` of another protocol definition: nothing in it but the CRC can be read."""
+    """A `hello` of another protocol definition. Only its CRC can be read."""
 
     layout_crc: int
 
@@ -76,8 +81,8 @@ class Ack:
 class SelfTestReport:
     """What the sense nodes read over all multiplexer inputs.
 
-    `findings`: names of what no skin can cause, empty on a sound board. `code_min`, `code_max`:
-    per configuration A to D.
+    findings: names of the members of the enum `finding`; empty on a sound board. code_min,
+    code_max: smallest and largest code of the configurations A to D.
     """
 
     findings: tuple[str, ...]
@@ -93,6 +98,7 @@ class Scan:
     since the board was started. time_us: board time at the scan's start [us], without wraps, from
     the board's start. host_time_s: `time.monotonic()` when its last byte was read [s]. missed:
     scans made since the one before this that never came, dropped there or damaged on the way.
+    rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
     """
 
     codes: NDArray[np.uint16]
@@ -100,6 +106,7 @@ class Scan:
     time_us: int
     host_time_s: float
     missed: int
+    rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
 
     @property
     def ratio(self) -> NDArray[np.float64]:
@@ -122,38 +129,38 @@ Message = Hello | ForeignHello | Ack | SelfTestReport | Scan
 
 @dataclass
 class BoardStats:
-    """Counts since the connection was made; what went missing is here, never only in a log."""
+    """Counts since the connection was made. All that went missing is counted here.
+
+    line: bytes, frames and damaged frames. scans: that arrived whole. missed: that the board made
+    and that never came. dropped_by_board: those of them that the board dropped because the line was
+    full; the others were damaged on the line. board_rx_errors: damaged commands that the board
+    reports. unknown: valid frames whose type or size this host does not know. restarts: times that
+    the board restarted or was reset. overflowed: scans lost to iterators slower than the board.
+    """
 
     line: DecoderStats = field(default_factory=DecoderStats)
-    """Bytes, frames and damaged frames on the line."""
     scans: int = 0
-    """Scans received whole."""
     missed: int = 0
-    """Scans the board made that never came: `dropped_by_board`, and those damaged on the line."""
     dropped_by_board: int = 0
-    """Of these, the scans that the board dropped whole because the line was full."""
     board_rx_errors: int = 0
-    """Damaged commands that the board reports."""
     unknown: int = 0
-    """Valid frames whose type or size this host does not know."""
     restarts: int = 0
-    """Times the board has restarted by itself, or was reset."""
     overflowed: int = 0
-    """Scans lost to iterators that were slower than the board."""
 
 
 class BoardDecoder:
-    """Messages from a board's bytes: `feed` takes any chunk, and never raises for what is in it.
+    """Messages from a board's bytes. `feed` takes any chunk and never raises for what is in it.
 
-    The state between scans (wrapping counters, gaps in their numbers) is kept here.
+    It keeps what connects one scan with the next: counters that wrap, and gaps in the numbers.
     """
 
     def __init__(self) -> None:
         self._frames = Decoder()
         self.stats = BoardStats(line=self._frames.stats)
-        self._number: int | None = None  # of the last scan; None: unknown, -1: none since start
+        # Of the last scan. -1: none since the board was started; None: not known.
+        self._number: int | None = None
         self._time_us = 0
-        self._host_time_s: float | None = None  # of the last scan
+        self._host_time_s: float | None = None
         self._dropped = 0
 
     def feed(self, chunk: bytes, host_time_s: float) -> list[Message]:
@@ -182,7 +189,6 @@ class BoardDecoder:
         return Ack(**values) if frame.name == "ack" else SelfTestReport(**values)
 
     def _hello(self, frame: protocol.Frame, payload: bytes) -> Message | None:
-        # The first field is the same in every definition; the rest may not be.
         if len(payload) < _LAYOUT_CRC_SIZE:
             return None
         layout_crc = int.from_bytes(payload[:_LAYOUT_CRC_SIZE], "little")
@@ -198,7 +204,7 @@ class BoardDecoder:
         number, dropped = values["scan"], values["dropped"]
         step = 1 if self._number is None else (number - self._number) % _COUNTER_SPAN
         if self._number is None or self._number < 0 or not 0 < step < _COUNTER_SPAN // 2:
-            # The first scan since a start; numbers that go back tell of one nobody has seen.
+            # The first scan since a start: numbers that go back show a start that was not seen.
             missed = 0 if self._number is None else number
             self._dropped = dropped if self._number is None else 0
             self._time_us = self._time_at_start(values["time_us"], host_time_s)
@@ -215,26 +221,18 @@ class BoardDecoder:
         return Scan(codes, number, self._time_us, host_time_s, missed)
 
     def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
-        """Goes on, with its wraps, for a board that was only stopped; small after a reset."""
+        """Board time of the first scan since a start [us].
+
+        It goes on where the board was only stopped, with all wraps, and is small after a reset.
+        """
         if self._host_time_s is None:
             return counter_us
         elapsed_us = (host_time_s - self._host_time_s) * 1e6
         expected_us = self._time_us + elapsed_us
         time_us = counter_us + _COUNTER_SPAN * round((expected_us - counter_us) / _COUNTER_SPAN)
-        # A resonator may be 0.5 % off.
-        near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + 0.005 * elapsed_us
+        near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + _RATE_ERROR * elapsed_us
         return time_us if near else counter_us
 
     def snapshot(self) -> BoardStats:
         """The counts now, as a copy."""
         return replace(self.stats, line=replace(self.stats.line))
-
-
-def _check_definition() -> None:
-    for cls, name in ((Hello, "hello"), (Ack, "ack"), (SelfTestReport, "self_test_report")):
-        declared = [f.name for f in fields(cls)]
-        if declared != [f.name for f in protocol.FRAMES[name].fields]:
-            raise AssertionError(f"{cls.__name__} does not match frames.toml")
-
-
-_check_definition()

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The link's definition, read from ``protocol/frames.toml``: the only source of its numbers.
 
-``FRAMES`` maps names to `Frame`; a `Frame` packs and unpacks payloads as dictionaries whose enum
-fields are names. Nothing here knows about framing (`ohmskin.link.framing`) or ports.
+``FRAMES`` maps names to `Frame`. A `Frame` packs and unpacks payloads as dictionaries, in which the
+value of an enum field is a name. Framing and ports are not known here.
 """
 
 from __future__ import annotations
 
 import binascii
 import json
+import math
 import struct
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 _PACKAGE_DIR = Path(__file__).parents[1]
 # A wheel carries the definition in the package; a checkout has it in protocol/.
 _PLACES = (_PACKAGE_DIR / "frames.toml", _PACKAGE_DIR.parents[1] / "protocol" / "frames.toml")
-_STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I"}
+_STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I"}  # by the names of types in frames.toml
 
 Value = int | str | tuple[str, ...] | tuple[int, ...]
 
@@ -31,16 +33,44 @@ Value = int | str | tuple[str, ...] | tuple[int, ...]
 class Field:
     """One integer, or `count` of them, in a payload.
 
-    ``enum``: the value is one member's name; ``flags``: the names of the members whose bit is set.
+    ``enum``: the value is the name of one member. ``flags``: the value is a tuple of the names of
+    all members whose bit is set.
     """
 
     name: str
     type: str
-    count: int
-    enum: str | None
-    flags: str | None
-    unit: str | None
     doc: str
+    count: int = 1
+    enum: str | None = None
+    flags: str | None = None
+    unit: str | None = None
+
+    def integers(self, value: Value) -> tuple[int, ...]:
+        """The integers that stand for a value.
+
+        :raises ValueError: no member has this name, or a number does not fit the type.
+        """
+        if self.enum and isinstance(value, str):
+            members = ENUMS[self.enum].values
+            if value not in members:
+                raise ValueError(f"{self.name}: {value!r} is none of {', '.join(members)}")
+            value = members[value]
+        elif self.flags and isinstance(value, tuple):
+            value = sum(ENUMS[self.flags].values[str(name)] for name in value)
+        integers = tuple(map(int, value if isinstance(value, tuple) else (value,)))
+        most = (1 << int(self.type[1:])) - 1
+        if len(integers) != self.count or not all(0 <= each <= most for each in integers):
+            many = f"{self.count} numbers " if self.count > 1 else ""
+            raise ValueError(f"{self.name} is {value}: must be {many}from 0 to {most}")
+        return integers
+
+    def value(self, integers: tuple[int, ...]) -> Value:
+        """The value that integers of a payload stand for."""
+        if self.enum:
+            return ENUMS[self.enum].name_of(integers[0])
+        if self.flags:
+            return ENUMS[self.flags].names_in(integers[0])
+        return integers if self.count > 1 else integers[0]
 
 
 @dataclass(frozen=True)
@@ -50,7 +80,6 @@ class Enum:
     name: str
     values: dict[str, int]
     docs: dict[str, str]
-    flags: bool
 
     def name_of(self, value: int) -> str:
         """The member's name, or ``"unknown_<value>"`` for a value of a newer definition."""
@@ -71,16 +100,8 @@ class Frame:
         self.doc: str = entry["doc"]
         self.tail: Mapping[str, str] | None = entry.get("tail")
         self.fields = tuple(
-            Field(
-                name=f["name"],
-                type=f["type"],
-                count=constants[f["count"]] if "count" in f else 1,
-                enum=f.get("enum"),
-                flags=f.get("flags"),
-                unit=f.get("unit"),
-                doc=f["doc"],
-            )
-            for f in entry["fields"]
+            Field(**{**field, "count": constants[field["count"]] if "count" in field else 1})
+            for field in entry["fields"]
         )
         codes = (f"{f.count if f.count > 1 else ''}{_STRUCT_CODES[f.type]}" for f in self.fields)
         self.struct = struct.Struct("<" + "".join(codes))
@@ -94,17 +115,7 @@ class Frame:
         if values.keys() != names:
             odd = ", ".join(sorted(values.keys() ^ names))
             raise ValueError(f"{self.name}: missing or unknown field: {odd}")
-        flat: list[int] = []
-        for f in self.fields:
-            integers = _integers(f, values[f.name])
-            most = (1 << 8 * struct.calcsize(_STRUCT_CODES[f.type])) - 1
-            if not all(0 <= n <= most for n in integers):
-                raise ValueError(f"{f.name} is {values[f.name]}: must be from 0 to {most}")
-            flat.extend(integers)
-        try:
-            return self.struct.pack(*flat)
-        except struct.error as exc:
-            raise ValueError(f"{self.name}: a value does not fit its field: {exc}") from None
+        return self.struct.pack(*(n for f in self.fields for n in f.integers(values[f.name])))
 
     def unpack(self, payload: bytes) -> dict[str, Any]:
         """The fields of a payload by name; a tail is left alone.
@@ -114,32 +125,8 @@ class Frame:
         size = self.struct.size
         if len(payload) < size or (self.tail is None and len(payload) != size):
             raise ValueError(f"{self.name}: payload of {len(payload)} bytes, {size} expected")
-        flat = self.struct.unpack_from(payload)
-        values: dict[str, Any] = {}
-        at = 0
-        for f in self.fields:
-            part = flat[at : at + f.count]
-            at += f.count
-            if f.enum:
-                values[f.name] = ENUMS[f.enum].name_of(part[0])
-            elif f.flags:
-                values[f.name] = ENUMS[f.flags].names_in(part[0])
-            else:
-                values[f.name] = part if f.count > 1 else part[0]
-        return values
-
-
-def _integers(field: Field, value: Value) -> tuple[int, ...]:
-    if field.enum and isinstance(value, str):
-        members = ENUMS[field.enum].values
-        if value not in members:
-            raise ValueError(f"{field.name}: {value!r} is none of {', '.join(members)}")
-        return (members[value],)
-    if field.flags and isinstance(value, tuple):
-        return (sum(ENUMS[field.flags].values[str(name)] for name in value),)
-    if isinstance(value, tuple):
-        return tuple(int(v) for v in value)
-    return (int(value),)
+        flat = iter(self.struct.unpack_from(payload))
+        return {f.name: f.value(tuple(islice(flat, f.count))) for f in self.fields}
 
 
 def _load() -> dict[str, Any]:
@@ -172,7 +159,6 @@ ENUMS: dict[str, Enum] = {
         name,
         {m["name"]: m["value"] for m in e["members"]},
         {m["name"]: m["doc"] for m in e["members"]},
-        e.get("flags", False),
     )
     for name, e in DEFINITION["enums"].items()
 }
@@ -184,17 +170,15 @@ LAYOUT_CRC = crc16(
 
 READINGS_PER_CELL = CONSTANTS["readings_per_cell"]
 ADC_BITS = CONSTANTS["adc_bits"]
-_CODE_MASK = (1 << ADC_BITS) - 1
-# Four codes fill this many whole bytes whatever adc_bits is (10 bits: 5 bytes).
-_GROUP_CODES = 4
-_GROUP_BYTES = _GROUP_CODES * ADC_BITS // 8
-_SHIFTS = np.arange(_GROUP_CODES, dtype=np.uint64) * np.uint64(ADC_BITS)
+_LARGEST_CODE = (1 << ADC_BITS) - 1
+_BIT_VALUES = 1 << np.arange(ADC_BITS, dtype=np.uint16)
 
 
 def rate_mhz(rate_hz: float) -> int:
     """A scan rate in the unit of the link [mHz].
 
-    :raises ValueError: it is not finite, or so small that it would become 0: as fast as possible.
+    :raises ValueError: it is not finite, or so small that it would be rounded to 0, which means as
+        fast as possible.
     """
     if not abs(rate_hz) < float("inf") or (rate_hz and not round(rate_hz * 1000)):
         raise ValueError(f"no board scans {rate_hz} times a second")
@@ -215,16 +199,14 @@ def unpack_codes(packed: bytes, rows: int, columns: int) -> NDArray[np.uint16]:
     """
     if len(packed) != codes_size(rows, columns):
         raise ValueError(f"{len(packed)} bytes of codes do not make {rows}x{columns} cells")
-    count = rows * columns * READINGS_PER_CELL
-    groups = -(-count // _GROUP_CODES)
-    words = np.zeros((groups, 8), dtype=np.uint8)
-    octets = np.frombuffer(packed, dtype=np.uint8)
-    if len(octets) < groups * _GROUP_BYTES:
-        octets = np.pad(octets, (0, groups * _GROUP_BYTES - len(octets)))
-    words[:, :_GROUP_BYTES] = octets.reshape(groups, _GROUP_BYTES)
-    spread = (words.view("<u8") >> _SHIFTS) & np.uint64(_CODE_MASK)
-    codes: NDArray[np.uint16] = spread.astype(np.uint16).reshape(-1)[:count]
-    return codes.reshape(columns, rows, READINGS_PER_CELL).transpose(1, 0, 2)
+    shape = (columns, rows, READINGS_PER_CELL)
+    bits = np.unpackbits(
+        np.frombuffer(packed, dtype=np.uint8),
+        count=math.prod(shape) * ADC_BITS,
+        bitorder="little",
+    )
+    codes: NDArray[np.uint16] = bits.reshape(*shape, ADC_BITS) @ _BIT_VALUES
+    return codes.transpose(1, 0, 2)
 
 
 def pack_codes(codes: NDArray[np.uint16]) -> bytes:
@@ -232,11 +214,8 @@ def pack_codes(codes: NDArray[np.uint16]) -> bytes:
 
     :raises ValueError: a code does not fit adc_bits.
     """
-    if codes.size and int(codes.max()) > _CODE_MASK:
-        raise ValueError(f"code above {_CODE_MASK}")
-    rows, columns, _ = codes.shape
-    flat = codes.transpose(1, 0, 2).reshape(-1).astype(np.uint64)
-    flat = np.pad(flat, (0, -len(flat) % _GROUP_CODES))
-    words = (flat.reshape(-1, _GROUP_CODES) << _SHIFTS).sum(axis=1, dtype=np.uint64)
-    octets: NDArray[np.uint8] = words.astype("<u8").view(np.uint8).reshape(-1, 8)[:, :_GROUP_BYTES]
-    return octets.tobytes()[: codes_size(rows, columns)]
+    if codes.size and int(codes.max()) > _LARGEST_CODE:
+        raise ValueError(f"code above {_LARGEST_CODE}")
+    in_order = np.ascontiguousarray(codes.transpose(1, 0, 2), dtype="<u2").reshape(-1, 1)
+    bits = np.unpackbits(in_order.view(np.uint8), axis=1, count=ADC_BITS, bitorder="little")
+    return np.packbits(bits, bitorder="little").tobytes()

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A way for bytes to and from a board, and the serial port as one."""
+"""Ways for bytes to and from a board: `Link`, and the serial ports of this machine."""
 
 from __future__ import annotations
 
 import errno
+import os
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Final, Protocol
 
 import serial
 from serial.tools import list_ports
@@ -13,8 +15,15 @@ from serial.tools import list_ports
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.link import protocol
 
-# How long a read waits when nothing comes; closing a device takes at most this long.
-READ_TIMEOUT_S = 0.2
+# A read waits so long when nothing comes [s]. Closing a device takes at most this long.
+READ_TIMEOUT_S: Final = 0.2
+# A write waits at most so long for the system's buffer [s], which empties in a tenth of this.
+_WRITE_TIMEOUT_S: Final = 2.0
+# Linux shows the settings of USB serial bridges there.
+USB_SERIAL: Final = Path("/sys/bus/usb-serial/devices")
+# Arduino's USB vendor ids, and what its product ids stand for (boards.txt of its AVR core).
+_ARDUINO: Final = (0x2341, 0x2A03)
+_BOARDS: Final = {0x0001: "uno", 0x0043: "uno", 0x0010: "megaatmega2560", 0x0042: "megaatmega2560"}
 
 
 class Link(Protocol):
@@ -23,7 +32,7 @@ class Link(Protocol):
     name: str
 
     def read(self) -> bytes:
-        """What has arrived, or ``b""`` when nothing does for about `READ_TIMEOUT_S`.
+        """What has arrived. It is ``b""`` when nothing arrives for about `READ_TIMEOUT_S`.
 
         :raises DeviceLost: the port has gone.
         """
@@ -35,18 +44,10 @@ class Link(Protocol):
         """
 
     def set_baud(self, baud: int) -> None:
-        """Change the speed of the line, where it has one."""
+        """Change the speed of the line, if it has one."""
 
     def close(self) -> None:
         """Give the port back. May be called again."""
-
-
-@runtime_checkable
-class PausableLink(Link, Protocol):
-    """A link whose scans can wait, such as those of a file."""
-
-    def pause(self, paused: bool) -> None:
-        """Hold scans back while nobody takes them. It begins paused."""
 
 
 class SerialLink:
@@ -59,21 +60,19 @@ class SerialLink:
         self.name = path
         try:
             self._port = serial.Serial(
-                path, baud, timeout=READ_TIMEOUT_S, write_timeout=2.0, exclusive=True
+                path, baud, timeout=READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as exc:
-            raise PortError(_explain(path, exc)) from exc
+            raise PortError(*_explain(path, exc)) from exc
 
     def read(self) -> bytes:
         """See `Link.read`: waits for one byte, then takes all there are."""
         try:
             octets: bytes = self._port.read(1)
-            if octets:
-                octets += self._port.read(self._port.in_waiting)
+            return octets and octets + self._port.read(self._port.in_waiting)
         except (serial.SerialException, OSError, TypeError) as exc:
             # pyserial raises TypeError when another thread closes the port meanwhile.
             raise DeviceLost(f"{self.name} is gone: is the board still plugged in?") from exc
-        return octets
 
     def write(self, octets: bytes) -> None:
         """See `Link.write`."""
@@ -94,21 +93,23 @@ class SerialLink:
         self._port.close()
 
 
-def _explain(path: str, exc: Exception) -> str:
+def _explain(path: str, exc: Exception) -> tuple[str, str]:
+    """Problem and remedy."""
     number = getattr(exc, "errno", None)
     text = str(exc)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFound" in text:
-        return f"no port {path}: 'ohmskin ports' lists the ports there are"
+        return f"no port {path}", "'ohmskin ports' lists the ports there are"
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return f"{path} is busy: close the other program that uses it"
+        return f"{path} is busy", "close the other program that uses it"
     if number in (errno.EACCES, errno.EPERM) or "PermissionError" in text:
         return (
-            f"no permission for {path}: on Linux run 'sudo usermod -aG dialout $USER' and log in "
-            "again; on Windows close the other program that uses it"
+            f"no permission for {path}",
+            "on Linux run 'sudo usermod -aG dialout $USER' and log in again; on Windows close the "
+            "other program that uses it",
         )
     if number in (errno.ENOTTY, errno.EINVAL):
-        return f"{path} is no serial port: 'ohmskin ports' lists the ports there are"
-    return f"cannot open {path}: {text}"
+        return f"{path} is no serial port", "'ohmskin ports' lists the ports there are"
+    return f"cannot open {path}: {text}", ""
 
 
 @dataclass(frozen=True)
@@ -120,25 +121,30 @@ class SerialPort:
     board: str
 
 
-# USB vendor and product ids of the boards and of the bridges their copies use.
-_BOARDS = {
-    (0x2341, 0x0043): "uno",
-    (0x2341, 0x0001): "uno",
-    (0x2A03, 0x0043): "uno",
-    (0x2341, 0x0010): "megaatmega2560",
-    (0x2341, 0x0042): "megaatmega2560",
-    (0x2A03, 0x0042): "megaatmega2560",
-}
-
-
 def serial_ports() -> list[SerialPort]:
     """The serial ports of this machine, by path."""
     found = [
         SerialPort(
             port.device,
             "" if port.description in (None, "n/a") else port.description,
-            _BOARDS.get((port.vid or 0, port.pid or 0), ""),
+            _BOARDS.get(port.pid or 0, "") if port.vid in _ARDUINO else "",
         )
         for port in list_ports.comports()
     ]
     return sorted(found, key=lambda port: port.path)
+
+
+def latency_timer_file(port: str, devices: Path = USB_SERIAL) -> Path:
+    """Where Linux sets the latency timer of a port; the file exists if the port has one.
+
+    A USB serial bridge holds back a few bytes until this timer ends. `port` may be a link.
+    """
+    return devices / Path(os.path.realpath(port)).name / "latency_timer"
+
+
+def latency_ms(port: str, devices: Path = USB_SERIAL) -> int | None:
+    """The latency timer of a port [ms]; None if none can be read, as on other systems."""
+    try:
+        return int(latency_timer_file(port, devices).read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None

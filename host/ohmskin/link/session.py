@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The conversation with a board: one thread that reads, commands that wait for their answers.
+"""The conversation with a board: one thread reads, and commands wait for their answers.
 
-`ohmskin.link.device` is made of it; programs use that.
+Programs use `ohmskin.link.device.Device`, which has a session.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-import weakref
-from collections import deque
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import framing, protocol
+from ohmskin.link.feed import ScanFeed
 from ohmskin.link.messages import (
     Ack,
     BoardDecoder,
@@ -26,53 +24,52 @@ from ohmskin.link.messages import (
     Scan,
     SelfTestReport,
 )
-from ohmskin.link.serial_port import Link, PausableLink
+from ohmskin.link.serial_port import Link
 
-# A board that is reset by the opening of its port is silent for up to 3 s.
+# Opening a port resets some boards, which are then silent for up to 3 s.
 CONNECT_TIMEOUT_S = 4.0
+# Time between two questions to a board that has not said hello yet [s].
 _HELLO_EVERY_S = 0.3
+# Time that a board has for its answer, besides the rest of a scan [s].
 _COMMAND_TIMEOUT_S = 1.0
+# Times that a command is sent before the board counts as lost.
 COMMAND_TRIES = 3
-# Silence, or nothing but damage, after which a scanning board is asked who it is.
+# A scanning board that sends no valid frame for so long is asked who it is [s].
 _SPEED_LOST_S = 2.5
-# Scans kept for an iterator that is slower than the board: 11 s at 90 Hz.
-QUEUE_SCANS = 1024
 
 
 class Session:
-    """A board at a `Link` that has said hello. Everything waits on one condition, `changed`.
+    """A board at a `Link` that has said hello.
 
-    hello, report, newest: what the board has said last. newest_taken: whether anyone has had
-    `newest`. want_scans: the board is to scan, and is brought back to it after a reset.
+    feed: its scans; everything here waits on its condition. hello, report: what the board has said
+    last. want_scans: the board is to scan; a board that was reset is started again. baud: speed of
+    the line to change to.
 
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
     :raises DeviceLost: the port went away meanwhile.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link, baud: int | None = None) -> None:
         self.link = link
-        self.changed = threading.Condition()
+        self.feed = ScanFeed(link.name)
         self.commands = threading.RLock()
-        """Held for as long as one command, or a few that belong together, take."""
         self.report: SelfTestReport | None = None
-        self.newest: Scan | None = None
-        self.newest_taken = False
         self.want_scans = False
-        self.failure: OhmskinError | None = None
-        # Weak: an iterator that is dropped unused takes its queue along.
-        self._queues: weakref.WeakSet[ScanQueue] = weakref.WeakSet()
         self._decoder = BoardDecoder()
         self._hello: Hello | ForeignHello | None = None
         self._acks: dict[int, Ack] = {}
         self._closing = False
-        self._overflowed = 0
         self._restarts = 0
         self._sequence = 0
         self._thread = threading.Thread(target=self._read, name=f"read {link.name}", daemon=True)
         self._thread.start()
         try:
             self._connect()
+            if baud is not None and baud != self.hello.baud:
+                self.command("set_baud", baud=baud)
+                link.set_baud(baud)
+                self.refresh()
         except BaseException:
             self.close()
             raise
@@ -86,43 +83,26 @@ class Session:
     @property
     def stats(self) -> BoardStats:
         """Counts since the connection was made, as a copy."""
-        with self.changed:
+        with self.feed.changed:
             return replace(
-                self._decoder.snapshot(), restarts=self._restarts, overflowed=self._overflowed
+                self._decoder.snapshot(),
+                restarts=self._restarts,
+                overflowed=self.feed.overflowed,
             )
-
-    def queue(self) -> ScanQueue:
-        """A queue that gets every scan from now on, for as long as anyone holds it."""
-        queue = ScanQueue()
-        with self.changed:
-            self._queues.add(queue)
-            self.balance()
-        return queue
-
-    def balance(self) -> None:
-        """Let a port that can wait do so while its scans are not taken. `changed` is held."""
-        if isinstance(self.link, PausableLink):
-            if self._queues:
-                behind = any(len(queue.scans) >= QUEUE_SCANS // 2 for queue in self._queues)
-            else:
-                behind = self.newest is not None and not self.newest_taken
-            self.link.pause(behind)
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
         if self._closing:
             return
-        if self.want_scans and self.failure is None:
+        if self.want_scans and self.feed.failure is None:
             with suppress(OhmskinError):  # it may be gone already
                 self.send("stop")
         self._closing = True
         self._thread.join()
         self.link.close()
-        with self.changed:
-            self.want_scans = False
-            self.newest = None
-            self.failure = self.failure or DeviceLost(f"{self.link.name} was closed")
-            self.changed.notify_all()
+        self.want_scans = False
+        self.feed.forget_newest()
+        self.feed.fail(self.feed.failure or DeviceLost(f"{self.link.name} was closed"))
 
     # ------------------------------------------------------------------------------ commands
 
@@ -130,7 +110,7 @@ class Session:
         """Send a command and return its sequence number; nothing waits for the answer."""
         frame = protocol.FRAMES[name]
         payload = frame.pack(**values)
-        with self.changed:
+        with self.feed.changed:
             self._sequence = (self._sequence + 1) & 0xFF
             sequence = self._sequence
             self._acks.pop(sequence, None)
@@ -147,12 +127,12 @@ class Session:
             for _ in range(COMMAND_TRIES):
                 sequence = self.send(name, **values)
                 try:
-                    with self.changed:
-                        self.wait(lambda: sequence in self._acks, self._command_s())  # noqa: B023
+                    with self.feed.changed:
+                        self.feed.wait(lambda: sequence in self._acks, self._command_s())  # noqa: B023
                         ack = self._acks.pop(sequence)
                     break
                 except DeviceLost:
-                    if self.failure is not None:
+                    if self.feed.failure is not None:
                         raise
             else:
                 raise DeviceLost(
@@ -172,17 +152,6 @@ class Session:
         self.command("get_hello")
         return self.hello
 
-    def wait(self, ready: Callable[[], bool], limit_s: float) -> None:
-        """Wait, holding `changed`, until `ready()`; a failure of the reader is raised here."""
-        self.changed.wait_for(lambda: ready() or self.failure is not None, limit_s)
-        if ready():
-            return
-        if self.failure is not None:
-            raise self.failure
-        raise DeviceLost(
-            f"{self.link.name} has said nothing for {limit_s:.1f} s: unplug and plug it"
-        )
-
     # --------------------------------------------------------------------------- connecting
 
     def _connect(self) -> None:
@@ -194,18 +163,19 @@ class Session:
             self.link.set_baud(speeds[1] if tries % 5 == 4 else speeds[0])
             self.send("get_hello")
             tries += 1
-            with self.changed:
+            with self.feed.changed:
                 try:
-                    self.wait(self._greeted, _HELLO_EVERY_S)
+                    self.feed.wait(self._greeted, _HELLO_EVERY_S)
                 except DeviceLost:
-                    if self.failure is not None:
+                    if self.feed.failure is not None:
                         raise
             if not self._greeted() and time.monotonic() > deadline:
                 raise DeviceSilent(self._silence())
         if isinstance(self._hello, ForeignHello):
             raise ProtocolMismatch(
                 f"{self.link.name}: board speaks layout 0x{self._hello.layout_crc:04X}, this host "
-                f"0x{protocol.LAYOUT_CRC:04X}: flash it with 'ohmskin flash'"
+                f"0x{protocol.LAYOUT_CRC:04X}",
+                "flash it with 'ohmskin flash'",
             )
         if self.hello.scanning:
             self.command("stop")
@@ -240,28 +210,22 @@ class Session:
                     self.link.set_baud(protocol.CONSTANTS["baud_default"])
                     self.send("get_hello")
         except OhmskinError as exc:
-            with self.changed:
-                self.failure = exc
-                self.changed.notify_all()
+            self.feed.fail(exc)
 
     def _take(self, chunk: bytes) -> bool:
         host_time_s = time.monotonic()
-        with self.changed:
+        with self.feed.changed:
             messages = self._decoder.feed(chunk, host_time_s)
             for message in messages:
                 self._keep(message)
-                if isinstance(message, Scan):
-                    self.balance()
             if messages:
-                self.changed.notify_all()
+                self.feed.changed.notify_all()
         return bool(messages)
 
     def _keep(self, message: Message) -> None:
         match message:
             case Scan():
-                self.newest, self.newest_taken = message, False
-                for queue in self._queues:
-                    self._overflowed += queue.put(message)
+                self.feed.publish(message)
             case Ack():
                 self._acks[message.command_sequence] = message
             case SelfTestReport():
@@ -295,26 +259,3 @@ def configuration(board: Hello) -> dict[str, protocol.Value]:
         "settle_us": board.settle_asked_us,
         "adc_prescaler": board.adc_prescaler,
     }
-
-
-class ScanQueue:
-    """The scans an iterator has not taken yet."""
-
-    def __init__(self) -> None:
-        self.scans: deque[Scan] = deque()
-        self._lost = 0
-
-    def put(self, scan: Scan) -> int:
-        """Append; returns how many old scans had to go for it."""
-        self.scans.append(scan)
-        if len(self.scans) <= QUEUE_SCANS:
-            return 0
-        oldest = self.scans.popleft()
-        self._lost += 1 + oldest.missed
-        return 1
-
-    def take(self) -> Scan:
-        """The oldest, with what was lost before it added to ``missed``."""
-        scan, lost = self.scans.popleft(), self._lost
-        self._lost = 0
-        return replace(scan, missed=scan.missed + lost) if lost else scan

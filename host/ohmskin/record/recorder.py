@@ -11,16 +11,21 @@ import json
 import os
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from io import RawIOBase
 from pathlib import Path
 from typing import IO, Any, Final, cast
 
+import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
+from ohmskin.arrays import Float
 from ohmskin.errors import RecordingError
 from ohmskin.files import Closing
+from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recording import (
     LARGEST_RECORD,
@@ -32,23 +37,27 @@ from ohmskin.record.recording import (
     Tare,
 )
 
+# A recording that is killed lacks at most what came in so long [s].
 FLUSH_EVERY_S: Final = 0.5
 
 
 class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed or the disk is full.
 
-    hello: the board's, which comes first. file: for tests, written to instead of a new file `path`.
+    board: what the board says of itself, which comes first. file: for tests, written to instead of
+    a new file `path`. scans, missed, forces: counts of what was added. tare: the newest one.
 
     :raises RecordingError: the file is there already, or cannot be written. From then on nothing
         more is written, and what was written before can be read.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], hello: Hello, *, file: RawIOBase | None = None
+        self, path: str | os.PathLike[str], board: Hello, *, file: RawIOBase | None = None
     ) -> None:
         self.path = Path(path)
-        self.scans = self.missed = 0
+        self.scans = self.missed = self.forces = 0
+        self.board = board
+        self.tare: Tare | None = None
         self._failure: RecordingError | None = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
@@ -68,7 +77,7 @@ class Recorder(Closing):
         self._channels = {name: self._channel(name) for name in SCHEMAS}
         self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
         try:
-            self.add(hello)
+            self.add(board)
             self._flush()
         except BaseException:
             self._tail.close()
@@ -97,57 +106,54 @@ class Recorder(Closing):
         match message:
             case Hello():
                 self._write("hello", {"host_time_s": time.monotonic(), **asdict(message)})
+                self.board = message
             case Scan(codes=codes):
                 content = {
                     "number": message.number,
                     "time_us": message.time_us,
                     "host_time_s": message.host_time_s,
                     "missed": message.missed,
-                    "rows": message.rows,
-                    "columns": message.columns,
-                    "codes": codes.reshape(-1).tolist(),
+                    **_cells("codes", codes),
                 }
                 self._write("scan", content, sequence=message.number & 0xFFFFFFFF)
                 self.scans += 1
                 self.missed += message.missed
-            case Tare(rest_ratio=rest_ratio):
-                content = {
-                    "host_time_s": message.host_time_s,
-                    "rows": rest_ratio.shape[0],
-                    "columns": rest_ratio.shape[1],
-                    "rest_ratio": rest_ratio.reshape(-1).tolist(),
-                }
+            case Tare(rest_ratio, host_time_s):
+                content = {"host_time_s": host_time_s, **_cells("rest_ratio", rest_ratio)}
                 self._write("tare", content)
+                self.tare = message
             case Mark():
                 self._write("mark", asdict(message))
             case ForceSample():
                 self._write("force", asdict(message))
+                self.forces += 1
 
     def _write(self, name: str, content: dict[str, Any], sequence: int = 0) -> None:
         octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
         log_ns = self._epoch_ns + round(content["host_time_s"] * 1e9)
-        with self._lock:
-            if self._failure is not None:
-                raise self._failure
+        with self._writing():
             if self._closed.is_set():
                 raise RecordingError(f"{self.path}: the recording is closed")
             self._writer.add_message(self._channels[name], log_ns, octets, log_ns, sequence)
 
     def _flush(self) -> None:
+        with self._writing():
+            self._writer.flush()  # type: ignore[no-untyped-call]
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """One thread at a time, and none after the file could not be written once."""
         with self._lock:
             if self._failure is not None:
                 raise self._failure
             try:
-                self._writer.flush()  # type: ignore[no-untyped-call]
+                yield
             except OSError as exc:
-                self._fail(exc)
-
-    def _fail(self, exc: OSError) -> None:
-        self._failure = RecordingError(
-            f"{self.path}: recording ended after {self.scans} scans: {exc.strerror or exc}; "
-            "what is in the file can be read"
-        )
-        raise self._failure from exc
+                self._failure = RecordingError(
+                    f"{self.path}: recording ended after {self.scans} scans: "
+                    f"{exc.strerror or exc}; what is in the file can be read"
+                )
+                raise self._failure from exc
 
     def _flush_often(self) -> None:
         # A thread, because a board that falls silent must not keep its last scans from the file.
@@ -167,15 +173,64 @@ class Recorder(Closing):
         self._closed.set()
         self._flusher.join()
         try:
-            self._flush()
-            with self._lock:
-                try:
-                    self._writer.finish()  # type: ignore[no-untyped-call]
-                    self._tail.flush(sync=True)
-                except OSError as exc:
-                    self._fail(exc)
+            with self._writing():
+                self._writer.flush()  # type: ignore[no-untyped-call]
+                self._writer.finish()  # type: ignore[no-untyped-call]
+                self._tail.flush(sync=True)
         finally:
             self._tail.close()
+
+
+def record(
+    skin: Device,
+    recorder: Recorder,
+    scans: Iterable[Scan],
+    *,
+    count: int = 0,
+    seconds: float = 0.0,
+    tare_s: float = 0.0,
+    beside: Callable[[Scan], None] = lambda scan: None,
+) -> None:
+    """Record these scans of `skin`: all of them, or so many, or those of so many seconds (0: all).
+
+    What the board says of itself is recorded whenever it changes. tare_s: the mean of the scans of
+    so many seconds at first is recorded as a tare, also if less of them come. beside: is called
+    after each scan.
+
+    :raises RecordingError: as `Recorder.add`.
+    """
+    first_s: float | None = None
+    untouched: list[Float] = []
+    try:
+        for scan in scans:
+            first_s = scan.host_time_s if first_s is None else first_s
+            elapsed_s = scan.host_time_s - first_s
+            if skin.info is not recorder.board:
+                recorder.add(skin.info)
+            recorder.add(scan)
+            if tare_s and elapsed_s <= tare_s:
+                untouched.append(scan.ratio)
+            elif untouched:
+                recorder.add(_tare(untouched))
+                untouched = []
+            beside(scan)
+            if recorder.scans == count or (seconds and elapsed_s >= seconds):
+                return
+    finally:
+        if untouched:
+            recorder.add(_tare(untouched))
+
+
+def _tare(untouched: list[Float]) -> Tare:
+    newest = untouched[-1].shape  # somebody may have configured the board meanwhile
+    of_size = [ratio for ratio in untouched if ratio.shape == newest]
+    return Tare(np.mean(of_size, axis=0), time.monotonic())
+
+
+def _cells(name: str, readings: NDArray[Any]) -> dict[str, Any]:
+    """Codes or ratios (R, C, 4) as JSON has them."""
+    rows, columns, _ = readings.shape
+    return {"rows": rows, "columns": columns, name: readings.reshape(-1).tolist()}
 
 
 class _Tail:

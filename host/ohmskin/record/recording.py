@@ -280,7 +280,12 @@ def _message(name: str, octets: bytes) -> Recorded:
 def _hello(content: dict[str, Any]) -> Hello:
     values: dict[str, Any] = {}
     for each in fields(Hello):
-        if each.type == "int":
+        if each.name == "slot_cycles" and each.name not in content:
+            # Older boards did not say it: their readings filled the scan, in slots of at most
+            # 60,000 cycles, unless a settle time was asked for.
+            readings = values["rows"] * values["columns"] * values["readings_per_cell"]
+            values[each.name] = min(values["scan_cycles"] // max(readings, 1), 60_000)
+        elif each.type == "int":
             values[each.name] = _integer(content, each.name)
         elif each.type == "str":
             values[each.name] = str(content[each.name])

@@ -6,12 +6,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from itertools import takewhile
 from pathlib import Path
 
 from ohmskin.errors import OhmskinError
 from ohmskin.files import Closing
 from ohmskin.link.device import Device
-from ohmskin.record.recorder import Recorder
+from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
 
 
@@ -35,7 +36,7 @@ class BoardRecording(Closing):
         try:
             if tare is not None:
                 self._recorder.add(tare)
-            self._scans = Device.__iter__(skin)
+            self._scans = iter(skin)
         except BaseException:
             self._recorder.close()
             raise
@@ -57,26 +58,13 @@ class BoardRecording(Closing):
     def _work(self) -> None:
         trouble = ""
         try:
-            self._record()
+            with self._recorder as recorder:
+                in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, self._scans)
+                record(self._skin, recorder, in_time)
         except OhmskinError as exc:
             trouble = f"; {exc}"
-        try:
-            self._recorder.close()
-        except OhmskinError as exc:
-            trouble = f"; {exc}"
-        counted = self._recorder
-        self.text = f"{self.path}: {counted.scans} scans, missed {counted.missed}{trouble}"
+        self.text = f"{self.path}: {recorder.scans} scans, missed {recorder.missed}{trouble}"
         self._ended()
-
-    def _record(self) -> None:
-        board = self._skin.info
-        for scan in self._scans:
-            if scan.host_time_s > self._until_s:
-                return
-            if self._skin.info is not board:
-                board = self._skin.info
-                self._recorder.add(board)
-            self._recorder.add(scan)
 
     def close(self) -> None:
         """End with the scans that have come until now. Returns when the file is whole."""

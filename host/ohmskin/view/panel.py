@@ -22,8 +22,8 @@ from anyio.abc import TaskGroup
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ohmskin.errors import OhmskinError, TareRefused
+from ohmskin.view.boards import ViewedBoard
 from ohmskin.view.shown import Shown
-from ohmskin.view.viewed_board import ViewedBoard
 
 _GONE: Final = 4001  # close code: the board was closed, by this page or another
 _Command = Callable[[], str]
@@ -73,7 +73,7 @@ class Panel:
                 said = state
                 await self._say("state", **state)
             if shown is not None and shown is not self._sent and self._awaited is None:
-                self._sent, self._awaited = shown, shown.scan.number
+                self._sent, self._awaited = shown, shown.found.number
                 await self._socket.send_bytes(shown.message)
 
     async def _say(self, kind: str, **content: Any) -> None:

@@ -24,8 +24,8 @@ from starlette.websockets import WebSocket
 from ohmskin.errors import OhmskinError
 from ohmskin.link.serial_port import serial_ports
 from ohmskin.view.access import Guard, is_loopback
+from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.panel import Panel
-from ohmskin.view.viewed_boards import ViewedBoards
 
 _PAGE: Final = Path(__file__).parent / "page"
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}

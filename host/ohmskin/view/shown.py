@@ -23,36 +23,25 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate
 from ohmskin.force.contacts import Contact
-from ohmskin.link.messages import Scan
-
-
-@dataclass(frozen=True)
-class Counts:
-    """What is counted since the board was connected, and its scan rate [Hz] of late."""
-
-    rate_hz: float
-    missed: int
-    damaged: int
-    restarts: int
-    recorded: int
+from ohmskin.force.reader import ForceScan
+from ohmskin.link.messages import BoardStats
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One scan. raw: method `ohm`, what the electrodes show as they are read.
+    """One scan of a page. raw: by the method `ohm`, what the electrodes read, ghosts included.
 
-    force_n, force_n_std: (R, C) [N]; None where the method has no calibration. contacts: their
-    forces are in newtons, or without forces the rise of their conductance in siemens.
+    method: that of `found`. has_forces: there are newtons. stats: of the connection. rate_hz: the
+    scan rate of late [Hz]. recorded: scans in the recording that goes on, if one does.
     """
 
-    scan: Scan
+    found: ForceScan
     raw: Estimate
-    estimate: Estimate
     method: str
-    contacts: tuple[Contact, ...]
-    force_n: Float | None
-    force_n_std: Float | None
-    counts: Counts
+    has_forces: bool
+    stats: BoardStats
+    rate_hz: float
+    recorded: int
 
     @cached_property
     def message(self) -> bytes:
@@ -60,19 +49,19 @@ class Shown:
         planes: dict[str, Float | NDArray[np.bool_]] = {
             "raw": self.raw.cell_siemens,
             "raw_touched": self.raw.touched,
-            "siemens": self.estimate.cell_siemens,
-            "siemens_std": self.estimate.cell_siemens_std,
-            "touched": self.estimate.touched,
+            "siemens": self.found.estimate.cell_siemens,
+            "siemens_std": self.found.estimate.cell_siemens_std,
+            "touched": self.found.estimate.touched,
         }
-        if self.force_n is not None and self.force_n_std is not None:
-            planes |= {"force": self.force_n, "force_std": self.force_n_std}
+        if self.has_forces:
+            planes |= {"force": self.found.force_n, "force_std": self.found.force_n_std}
         header = json.dumps(self._header(list(planes)), allow_nan=False).encode()
         header += b" " * (-len(header) % 4)
         values = np.stack(list(planes.values())).astype("<f4")
         return struct.pack("<I", len(header)) + header + values.tobytes()
 
     def _header(self, planes: list[str]) -> dict[str, Any]:
-        scan, estimate, counts = self.scan, self.estimate, self.counts
+        scan, estimate, stats = self.found, self.found.estimate, self.stats
         return {
             "scan": scan.number,
             "host_time_s": scan.host_time_s,
@@ -84,12 +73,12 @@ class Shown:
             "iterations": estimate.iterations,
             "estimate_s": estimate.seconds,
             "text": estimate.message,
-            "rate_hz": counts.rate_hz,
-            "missed": counts.missed,
-            "damaged": counts.damaged,
-            "restarts": counts.restarts,
-            "recorded": counts.recorded,
-            "contacts": [[each.identity, *map(_number, _numbers(each))] for each in self.contacts],
+            "rate_hz": self.rate_hz,
+            "missed": stats.missed,
+            "damaged": stats.line.damaged,
+            "restarts": stats.restarts,
+            "recorded": self.recorded,
+            "contacts": [[each.identity, *map(_number, _numbers(each))] for each in scan.contacts],
         }
 
 

@@ -4,26 +4,71 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections import deque
 from typing import Final
 
-from ohmskin.calibrate.force_log import ForceLineDecoder
 from ohmskin.errors import DeviceLost
 from ohmskin.files import Closing
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.record.recording import ForceSample
 
+# Speed of the sensor's line, unless told: that of most sketches.
 DEFAULT_BAUD: Final = 115_200
-# The opening of its port resets an Arduino: 2 s in its bootloader, then the sketch zeroes the cell.
+# A sensor without a number for so long counts as lost [s]. The opening of its port resets an
+# Arduino: it is 2 s in its bootloader, and then the sketch zeroes the sensor.
 SILENCE_S: Final = 5.0
-# 20 s of the fastest: who takes less often does not want all.
+# Samples that are kept for a slow reader: 20 s of the fastest sensor.
 QUEUE_SAMPLES: Final = 2000
-# Lines that arrive together were printed one after another: no sensor is slower than 10 Hz.
+# Lines that arrive together were printed one after another. No sensor takes longer for one [s].
 _LONGEST_STEP_S: Final = 0.1
-# Where the clock's steps are coarser than the samples'.
+# Times rise by so much [s] where the clock's steps are longer than those of the samples.
 _SHORTEST_STEP_S: Final = 1e-6
+_NUMBER: Final = re.compile(rb"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*N?\s*")
+
+
+class ForceLineDecoder:
+    """Forces from what a serial sensor prints: one number a line, perhaps with the unit N.
+
+    What comes before the first end of a line is part of a line, and is dropped. damaged: how many
+    lines since then were not blank and no such number. Holds at most `LARGEST_LINE` bytes.
+    """
+
+    LARGEST_LINE: Final = 64
+
+    def __init__(self, newtons_per_unit: float = 1.0) -> None:
+        self.damaged = 0
+        self._newtons_per_unit = newtons_per_unit
+        self._line = bytearray()
+        self._skips = True  # the rest of this line: of the first one, or of one that is too long
+
+    def feed(self, octets: bytes) -> list[float]:
+        """The forces [N] of the lines that these bytes complete, in order."""
+        forces_n: list[float] = []
+        *ends, rest = re.split(rb"[\r\n]", octets)
+        for end in ends:
+            self._keep(end)
+            if self._line.strip():
+                number = _NUMBER.fullmatch(self._line)
+                force_n = self._newtons_per_unit * float(number[1]) if number else math.inf
+                if math.isfinite(force_n):
+                    forces_n.append(force_n)
+                else:
+                    self.damaged += 1
+            self._line.clear()
+            self._skips = False
+        self._keep(rest)
+        return forces_n
+
+    def _keep(self, part: bytes) -> None:
+        if not self._skips:
+            self._line += part[: self.LARGEST_LINE + 1]
+            if len(self._line) > self.LARGEST_LINE:
+                self.damaged += 1
+                self._line.clear()
+                self._skips = True
 
 
 class ForceSensor(Closing):
@@ -41,11 +86,10 @@ class ForceSensor(Closing):
             raise ValueError(f"scale is {newtons_per_unit:g}: give the newtons of one unit")
         self.path = path
         self.dropped = 0
+        """Samples that nobody took in time."""
         self._baud = baud
-        self._newtons_per_unit = newtons_per_unit
         self._link = SerialLink(path, baud)
-        self._decoder = ForceLineDecoder()
-        self._overflows = 0
+        self._decoder = ForceLineDecoder(newtons_per_unit)
         self._octets = 0  # since the last force
         self._changed = threading.Condition()
         self._waiting: deque[ForceSample] = deque()
@@ -58,12 +102,12 @@ class ForceSensor(Closing):
     @property
     def damaged(self) -> int:
         """How many lines were no number."""
-        return self._decoder.damaged + self._overflows
+        return self._decoder.damaged
 
     def take(self) -> list[ForceSample]:
         """The samples since the last call, in order, their times rising. Never waits.
 
-        At most `QUEUE_SAMPLES`; `dropped` counts the older ones that had to go.
+        There are at most `QUEUE_SAMPLES`; `dropped` counts the older ones that had to go.
 
         :raises DeviceLost: there are none, and the sensor has gone, or has printed no number for
             `SILENCE_S`.
@@ -94,7 +138,7 @@ class ForceSensor(Closing):
             )
         raise DeviceLost(
             f"{self.path} prints no numbers ({self.damaged} damaged lines): it must print one "
-            f"number a line and nothing else; is --baud {self._baud} what its sketch says?"
+            f"number a line and nothing else; does its sketch print at {self._baud} baud?"
         )
 
     # ------------------------------------------------------------------------- reader thread
@@ -115,22 +159,17 @@ class ForceSensor(Closing):
     def _keep(self, octets: bytes, now_s: float) -> None:
         with self._changed:
             self._octets += len(octets)
-            numbers = self._decoder.feed(octets)
-            forces_n = [self._newtons_per_unit * number for number in numbers]
-            finite_n = [force_n for force_n in forces_n if math.isfinite(force_n)]
-            self._overflows += len(forces_n) - len(finite_n)
-            if not finite_n:
+            forces_n = self._decoder.feed(octets)
+            if not forces_n:
                 return
-            count = len(finite_n)
-            step_s = min((now_s - self._last_s) / count, _LONGEST_STEP_S)
-            for index, force_n in enumerate(finite_n):
-                arrived_s = now_s - (count - 1 - index) * step_s
-                self._last_s = max(arrived_s, self._last_s + _SHORTEST_STEP_S)
+            self._octets = 0
+            step_s = min((now_s - self._last_s) / len(forces_n), _LONGEST_STEP_S)
+            for later, force_n in zip(reversed(range(len(forces_n))), forces_n, strict=True):
+                self._last_s = max(now_s - later * step_s, self._last_s + _SHORTEST_STEP_S)
                 self._waiting.append(ForceSample(force_n, self._last_s, source=self.path))
             while len(self._waiting) > QUEUE_SAMPLES:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._octets = 0
             self._changed.notify_all()
 
     def close(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One board of the page: opened, read and estimated in a thread, and opened again if it goes."""
+"""The boards of the page: a thread opens and reads each, and opens it again if it goes away."""
 
 from __future__ import annotations
 
@@ -7,28 +7,38 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from ohmskin.arrays import Float
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import Closing
-from ohmskin.force.calibrated_device import TARE_S
 from ohmskin.force.calibration import Calibration
+from ohmskin.force.contacts import MEMORY_US
+from ohmskin.force.reader import TARE_S, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.opening import open_link
+from ohmskin.opening import open_device
 from ohmskin.record.recording import Mark, Tare
-from ohmskin.record.replay import ReplayLink
 from ohmskin.view.board_recording import BoardRecording
-from ohmskin.view.shown import Counts, Shown
-from ohmskin.view.skin_reader import SkinReader
+from ohmskin.view.shown import Shown
 
-AGAIN_S: Final = 1.0  # until a port that is not there is tried again
+# The paper's programmes take minutes for a frame of 8x8.
+LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
+# Boards of one page at most: each is a thread that may use a good part of a core.
+MOST_BOARDS: Final = 16
+# Time until a port that is not there is tried again [s].
+AGAIN_S: Final = 1.0
+# The scan rate that is shown is a mean over so long [s].
 _RATE_OVER_S: Final = 2.0
+# `close` waits so long for the thread: a port that never answers must not hold it up [s].
 _CLOSE_S: Final = 1.0
+# Characters of a mark at most.
 _LONGEST_MARK: Final = 1000
 
 
@@ -93,10 +103,10 @@ class ViewedBoard(Closing):
                 "columns": board.columns,
                 "rate_hz": board.rate_hz,
             },
-            "methods": [] if reader is None else reader.methods,
+            "methods": [] if reader is None else _methods(reader),
             "method": "" if reader is None else reader.method,
-            "force_method": None if reader is None else reader.force_method,
-            "rest_date": rest and rest[1],
+            "force_method": None if reader is None else _force_method(reader),
+            "rest_date": rest and rest.date,
             "tared": reader is not None and reader.is_tared,
             "recording": "" if recording is None or recording.text else str(recording.path),
             "recorded": "" if recording is None else recording.text,
@@ -110,7 +120,11 @@ class ViewedBoard(Closing):
 
     def use(self, method: str) -> str:
         """Estimate by another method. Commands return what was done, and raise why it was not."""
-        self._there()[1].use(method)
+        _, reader = self._there()
+        if method not in _methods(reader):
+            methods = ", ".join(_methods(reader))
+            raise ValueError(f"no method '{method[:40]}': there are {methods}")
+        reader.use(method)
         self._changed()
         return f"method {method}"
 
@@ -121,19 +135,17 @@ class ViewedBoard(Closing):
         """
         with self._one_at_a_time():
             skin, reader = self._there()
-            rest_ratio = skin.mean_ratio(TARE_S)
-            reader.tare(rest_ratio, force=force)
-            self._record_rest(rest_ratio)
-        lasts = "" if reader.force_method is None else "; 'ohmskin tare' makes one that lasts"
+            self._record_rest(reader.tare(skin.mean_ratio(TARE_S), force=force))
+        lasts = "; 'ohmskin tare' makes one that lasts" if _force_method(reader) else ""
         return f"tared, until this program ends{lasts}"
 
     def undo_tare(self) -> str:
         """Return to the rest before the last tare."""
         with self._one_at_a_time():
-            rest_ratio = self._there()[1].undo_tare()
-            if rest_ratio is None:
+            rest = self._there()[1].undo_tare()
+            if rest is None:
                 return "the tare is undone: rest is not known"
-            self._record_rest(rest_ratio)
+            self._record_rest(rest)
         return "the tare is undone: rest is as it was before"
 
     def record(self) -> str:
@@ -144,7 +156,7 @@ class ViewedBoard(Closing):
                 raise OhmskinError(f"{running.path} is being recorded already")
             tare = None
             if reader.is_tared and reader.rest is not None:
-                tare = Tare(reader.rest[0], time.monotonic())
+                tare = Tare(reader.rest.ratio, time.monotonic())
             path = self._new_file(reader.board.unit_id)
             self._recording = BoardRecording(skin, path, tare, self._changed)
         self._changed()
@@ -188,9 +200,9 @@ class ViewedBoard(Closing):
         recording = self._recording
         return None if recording is None or recording.text else recording
 
-    def _record_rest(self, rest_ratio: Float) -> None:
+    def _record_rest(self, rest: Tare) -> None:
         if (recording := self._running()) is not None:
-            recording.add(Tare(rest_ratio, time.monotonic()))
+            recording.add(rest)
 
     def _new_file(self, unit_id: int) -> Path:
         stem = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
@@ -221,22 +233,27 @@ class ViewedBoard(Closing):
         self._changed()
 
     def _follow(self) -> None:
-        link, baud = open_link(self.port)
-        with Device(link, baud=baud) as skin:
+        with open_device(self.port) as skin:
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
+            raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
             try:
-                rate, followed = _Rate(), None
+                rate, seen = _Rate(), _SeenTime()
                 while not self._closing.is_set():
                     scan = skin.latest()
-                    if isinstance(link, ReplayLink):
-                        tare = link.tare_at(scan.host_time_s)
-                        if tare is not None and tare is not followed:
-                            followed = tare
-                            reader.replayed(tare.rest_ratio)
-                    counts = self._counts(skin, rate.of(scan))
-                    # A method takes a good part of a core: not while nobody looks.
-                    self.shown = reader.read(scan, counts) if self._watchers else None
+                    rate_hz, running = rate.of(scan), self._running()
+                    self.shown = None
+                    # An estimate takes a good part of a core: none is made while nobody looks.
+                    if self._watchers:
+                        self.shown = Shown(
+                            reader.read(seen.at(scan)),
+                            raw.estimate(scan.ratio),
+                            reader.method,
+                            reader.has_forces,
+                            skin.stats,
+                            rate_hz,
+                            0 if running is None else running.scans,
+                        )
                     if self._status != "scanning":
                         self._status, self._text = "scanning", ""
                     self._changed()
@@ -261,17 +278,7 @@ class ViewedBoard(Closing):
             else:
                 self._note = ""
                 return reader
-        return SkinReader(board, None)
-
-    def _counts(self, skin: Device, rate_hz: float) -> Counts:
-        stats, recording = skin.stats, self._running()
-        return Counts(
-            rate_hz,
-            stats.missed,
-            stats.line.damaged,
-            stats.restarts,
-            0 if recording is None else recording.scans,
-        )
+        return SkinReader(board)
 
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""
@@ -303,6 +310,85 @@ class _Rate:
         return 1e6 * (scan.number - scans[0][0]) / (scan.time_us - scans[0][1])
 
 
+class _SeenTime:
+    """Board time without gaps: contacts that nobody looked at meanwhile have not gone."""
+
+    def __init__(self) -> None:
+        self._newest_us: int | None = None
+        self._time_us = 0
+
+    def at(self, scan: Scan) -> Scan:
+        """The scan at the time that was looked at until it."""
+        if self._newest_us is not None:
+            step_us = max(scan.time_us - self._newest_us, 0)
+            self._time_us += min(step_us, MEMORY_US // 2)
+        self._newest_us = scan.time_us
+        return replace(scan, time_us=self._time_us)
+
+
+def _force_method(reader: SkinReader) -> str | None:
+    """The method that gives newtons, if there is one."""
+    return None if reader.calibration is None else reader.calibration.method
+
+
+def _methods(reader: SkinReader) -> tuple[str, ...]:
+    """The methods that the page offers."""
+    own = _force_method(reader)
+    return LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
+
+
 def _same(one: Hello, other: Hello) -> bool:
     names = ("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
     return all(getattr(one, name) == getattr(other, name) for name in names)
+
+
+class ViewedBoards(Closing):
+    """The boards of one page, by number, from 0. `ViewedBoard` says what the arguments are."""
+
+    def __init__(
+        self,
+        ports: Sequence[str] = (),
+        calibrations: Sequence[Calibration] = (),
+        folder: Path = Path(),
+        *,
+        force: bool = False,
+    ) -> None:
+        self._calibrations, self._folder, self._force = calibrations, folder, force
+        self._boards: dict[int, ViewedBoard] = {}
+        self._last = -1
+        for port in ports:
+            self.add(port)
+
+    def add(self, port: str) -> int:
+        """The number of the board at `port`, which is opened if it is new.
+
+        :raises ValueError: there are `MOST_BOARDS` already.
+        """
+        for number, board in self._boards.items():
+            if board.port == port:
+                return number
+        if len(self._boards) >= MOST_BOARDS:
+            raise ValueError(f"there are {MOST_BOARDS} boards: close one first")
+        self._last += 1
+        folder = self._folder.resolve()
+        self._boards[self._last] = ViewedBoard(port, self._calibrations, folder, force=self._force)
+        return self._last
+
+    def find(self, number: int) -> ViewedBoard | None:
+        """The board of that number, if there is one."""
+        return self._boards.get(number)
+
+    def ports(self) -> dict[int, str]:
+        """The port of each board, by number."""
+        return {number: board.port for number, board in self._boards.items()}
+
+    def remove(self, number: int) -> None:
+        """Close a board; nothing happens if there is none of that number."""
+        board = self._boards.pop(number, None)
+        if board is not None:
+            board.close()
+
+    def close(self) -> None:
+        """Close all. May be called again."""
+        with ThreadPoolExecutor(MOST_BOARDS) as pool:  # some may have to be waited for
+            list(pool.map(self.remove, tuple(self._boards)))

@@ -12,51 +12,15 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin.arrays import Float
-from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from calibrations import NEWTON_SIEMENS, calibration, of_scene
+from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import DeviceLost, TareRefused
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS
-from ohmskin.force.calibrated_device import CalibratedDevice
-from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.force_reader import ForceScan
-from ohmskin.force.regression import ForceRegression
+from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 
-NEWTON_SIEMENS = 20e-6  # of every cell, in these tests
 GHOST = "emulator://8x8?scene=ghost&seed=1"
-
-
-def calibration(
-    rest_ratio: Float, method: str = "touch", unit_id: int = 0, siemens: float = NEWTON_SIEMENS
-) -> Calibration:
-    """One of cells of which each is linear: `siemens` (for "voltage" 1) a newton."""
-    rows, columns = rest_ratio.shape[:2]
-    knowledge = SkinKnowledge(
-        rows,
-        columns,
-        adc_bits=10,
-        rest_ratio=rest_ratio,
-        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
-    )
-    force_n = np.arange(1.0, 11.0)
-    cells = np.arange(force_n.size) % (rows * columns)
-    found = ForceRegression().fit(cells, siemens * force_n, force_n, shape=(rows, columns))
-    return Calibration(
-        unit_id=unit_id,
-        date="2025-03-01",
-        method=method,
-        rest=Rest.of(method, knowledge, "2025-03-01"),
-        model=found.model_,
-        indenter_area_m2=1e-4,
-        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
-    )
-
-
-def of_scene(name: str, **options: object) -> Calibration:
-    scene = Scene(name, 8, 8, seed=1)
-    return calibration(scene.rest_ratio, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
@@ -175,12 +139,12 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
                 recorder.add(board.undo_tare())
     assert len(load_recording(path).tares) == 2
     with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
-        assert isinstance(board, CalibratedDevice)
+        assert isinstance(board, CalibratedSkin)
         assert_same_forces(live, list(board))
     # The tare was of consequence.
-    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
-        board._recorded = None
-        untared = list(board)
+    with ohmskin.open(f"replay://{path}?speed=0") as recording:
+        reader = SkinReader(recording.info, of_skin)
+        untared = [reader.read(replace(scan, rest_ratio=None)) for scan in recording]
     assert live[10].force_n.tobytes() == untared[10].force_n.tobytes()
     assert live[30].force_n.tobytes() != untared[30].force_n.tobytes()
 

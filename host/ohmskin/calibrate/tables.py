@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers from CSV files: what a force sensor logged, and presses of cells by known forces.
+
+A force log has the columns time_s [s], by any clock, and force_n [N], a press being positive. Its
+further columns are ignored.
+
+A table of presses has these columns and no others, for a misspelt name would lose a column:
+
+=============== ============================================================
+column          meaning
+=============== ============================================================
+row, column     the cell, counted from 0
+force_n         force on it [N]
+conductance     of the cell meanwhile [S]
+conductance_std standard deviation of that [S]; the column may be absent: 0
+=============== ============================================================
+
+Columns stand in any order under a header, with commas between them and points in their numbers.
+Nothing is guessed: a file that is not plainly so raises a ValueError of one line, which names the
+file, the row (the header is row 1) and the column, and says what to do.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import math
+import os
+import re
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import InitVar, dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.files import naming, read_bounded, whole_file
+from ohmskin.record.readings import MAX_CELLS
+
+# An hour of a sensor at 1 kHz, with columns of other things.
+MAX_FILE_BYTES: Final = 100_000_000
+# No force, time or conductance in any unit is larger, and sums of squares do not overflow.
+MAX_NUMBER: Final = 1e60
+# A cell of 1 ohm has less resistance than its wires [S]: more is a number in another unit.
+MAX_CONDUCTANCE: Final = 1.0
+# A message shows so many characters of what stands in the file.
+_SHOWN: Final = 60
+
+# Fewer samples of a force are no session of presses.
+MIN_SAMPLES: Final = 10
+# A step between two samples is a gap if it is longer than this [s], and than so many median steps:
+# slow sensors have long steps, fast ones have short hiccups.
+GAP_S: Final = 0.5
+GAP_STEPS: Final = 10.0
+# Noise about zero goes below it by so much [N], or by this share of the largest force.
+NEGATIVE_N: Final = 0.05
+NEGATIVE_SHARE: Final = 0.02
+
+_CELL: Final = ("row", "column")
+_NEEDED: Final = (*_CELL, "force_n", "conductance")
+_COLUMNS: Final = (*_NEEDED, "conductance_std")
+# Type of one press; columns and units as above.
+PRESS: Final = np.dtype([(name, np.int64 if name in _CELL else np.float64) for name in _COLUMNS])
+# Presses (n,), each of the type `PRESS`.
+PressTable = NDArray[np.void]
+
+# What to do with a column of another unit, by the column that is missing.
+_UNITS: Final = {
+    "time_s": " (seconds: 0.001 times milliseconds)",
+    "force_n": " (newtons: 0.00980665 times grams)",
+    "conductance": " (siemens: 1e-6 times microsiemens, or 1 / ohms)",
+}
+
+
+# ---------------------------------------------------------------------------------- force logs
+
+
+@dataclass(frozen=True, eq=False)
+class ForceLog:
+    """Forces by the sensor's clock: time_s (n,) [s], increasing; force_n (n,) [N]; source: what by.
+
+    Raises ValueError for fewer than 10 samples, for times that do not increase, for a force that
+    never changes, and for presses that are negative. Sensor noise about zero may be negative: down
+    to 0.05 N, or 2 % of the largest force. rows: where in a file each sample stands, for the texts
+    of errors.
+    """
+
+    time_s: Float
+    force_n: Float
+    source: str
+    rows: InitVar[NDArray[np.int64] | None] = None
+
+    def __post_init__(self, rows: NDArray[np.int64] | None) -> None:
+        time_s, force_n = self.time_s, self.force_n
+        if time_s.ndim != 1 or time_s.shape != force_n.shape:
+            raise ValueError(
+                f"time_s has shape {time_s.shape}, force_n {force_n.shape}: not (n,) both"
+            )
+        if time_s.size < MIN_SAMPLES:
+            raise ValueError(f"too few samples: {time_s.size}, {MIN_SAMPLES} are needed")
+        later = np.diff(time_s, prepend=-np.inf) > 0
+        _require(later, "time_s", time_s, "it must be later than the one before", rows)
+        if np.ptp(force_n) == 0:
+            raise ValueError(f"force_n is {force_n[0]:g} throughout: does the sensor measure?")
+        limit = max(NEGATIVE_N, NEGATIVE_SHARE * float(force_n.max()))
+        if np.count_nonzero(force_n < -limit) > np.count_nonzero(force_n > limit):
+            least = float(force_n.min())
+            raise ValueError(f"forces go down to {least:g} N, a press is negative: turn the sign")
+        must = f"below -{limit:.2g} N: zero the sensor"
+        _require(force_n >= -limit, "force_n", force_n, must, rows)
+
+    def at(self, time_s: ArrayLike) -> Float:
+        """Force [N] at these times of the sensor's clock, of any shape: linear between samples.
+
+        NaN before the first sample, after the last, and inside gaps.
+        """
+        return between_gaps(time_s, self.time_s, self.force_n)
+
+
+def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
+    """`values` (n,) of increasing times `time_s` (n,), interpolated at `at_s` of any shape.
+
+    NaN outside of `time_s`, and inside its gaps: steps above `GAP_S` and `GAP_STEPS` median steps.
+    """
+    wanted = np.asarray(at_s, dtype=np.float64)
+    found = np.asarray(np.interp(wanted, time_s, values, left=np.nan, right=np.nan))
+    steps = np.diff(time_s)
+    is_gap = (steps > GAP_S) & (steps > GAP_STEPS * np.median(steps))
+    after = np.searchsorted(time_s, wanted).clip(1, time_s.size - 1)
+    inside = (wanted > time_s[after - 1]) & (wanted < time_s[after])
+    return np.where(inside & is_gap[after - 1], np.nan, found)
+
+
+def load_force_log(path: str | os.PathLike[str]) -> ForceLog:
+    """Read a force log; its source is the file's name. Raises ValueError: see the module."""
+    with naming(path):
+        columns, rows = _read(path, ("time_s", "force_n"), others=True)
+        return ForceLog(**columns, source=os.path.basename(os.fspath(path)), rows=rows)
+
+
+# ---------------------------------------------------------------------------- tables of presses
+
+
+def load_press_table(path: str | os.PathLike[str]) -> PressTable:
+    """Read a table of presses, (n,) of `PRESS`, at least one. Raises ValueError: see the module."""
+    with naming(path):
+        columns, rows = _read(path, _NEEDED, _COLUMNS[len(_NEEDED) :], others=False)
+        if not rows.size:
+            raise ValueError("no press is in it")
+        for name, values in columns.items():
+            _check_presses(name, values, rows)
+        table = np.zeros(rows.size, PRESS)
+        for name, values in columns.items():
+            table[name] = values
+        return table
+
+
+def _check_presses(name: str, values: Float, rows: NDArray[np.int64]) -> None:
+    """Raise ValueError for values that cannot be. Whether the skin has such a cell is not known."""
+    if name in _CELL:
+        must = f"it must be a whole number from 0 to {MAX_CELLS - 1}"
+        good = (values >= 0) & (values < MAX_CELLS) & (values == np.floor(values))
+    elif name == "force_n":
+        must = "it must be 0 or more: zero the force sensor, or leave the row out"
+        good = values >= 0
+    else:
+        must = "it must be 0 to 1 S: of microsiemens, write 1e-6 times as much"
+        good = (values >= 0) & (values <= MAX_CONDUCTANCE)
+    _require(good, name, values, must, rows)
+
+
+def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
+    """Write a file that is either complete or not there, and is read back bit for bit.
+
+    Raises ValueError if it cannot be written.
+    """
+    with whole_file(path) as file:
+        text = io.TextIOWrapper(file, encoding="ascii", newline="", write_through=True)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        writer.writerows(table.tolist())
+        text.detach()
+
+
+def _require(
+    good: NDArray[np.bool_], name: str, values: Float, must: str, rows: NDArray[np.int64] | None
+) -> None:
+    """Raise ValueError, naming the first value that is not good, and its row in the file if any."""
+    if not good.all():
+        at = int(np.argmin(good))
+        place = f"sample {at}" if rows is None else f"row {rows[at]}"
+        raise ValueError(f"{place}: {name} is {values[at]:.12g}, {must}")
+
+
+# ------------------------------------------------------------------------------------ CSV files
+
+
+def _read(
+    path: str | os.PathLike[str],
+    needed: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    others: bool,
+) -> tuple[dict[str, Float], NDArray[np.int64]]:
+    """Columns (n,) by name, and the number (n,) in the file of each row.
+
+    needed, optional: names, matched whatever their case. others: ignore further columns, in which
+    may stand what is no UTF-8; else refuse them. Empty rows count, but hold nothing.
+    """
+    octets = read_bounded(path, MAX_FILE_BYTES)
+    if octets.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ValueError("it is UTF-16: save it as UTF-8")
+    lines = _rows(io.TextIOWrapper(io.BytesIO(octets), "utf-8-sig", errors="replace", newline=""))
+    _, header = next(lines, (1, []))
+    places = _places(header, needed, optional, others=others)
+    columns = {name: array("d") for name in places}
+    rows = array("q")
+    for row, cells in lines:
+        if len(cells) != len(header):
+            raise ValueError(
+                f"row {row} has {len(cells)} fields, the header {len(header)}: give each column "
+                "one field, and write a point, no comma, in numbers"
+            )
+        rows.append(row)
+        for name, place in places.items():
+            columns[name].append(_number(cells[place], name, row))
+    return {name: np.array(each) for name, each in columns.items()}, np.array(rows, np.int64)
+
+
+def _rows(text: io.TextIOWrapper) -> Iterator[tuple[int, list[str]]]:
+    """The rows that are not empty, each with its number."""
+    reader = csv.reader(text, strict=True)
+    while True:
+        row = reader.line_num + 1
+        try:
+            cells = next(reader, None)
+        except csv.Error as error:
+            raise ValueError(f"row {row} is damaged: {error}: mend it, or leave it out") from error
+        if cells is None:
+            return
+        if len(cells) > 1 or "".join(cells).strip():
+            yield row, cells
+
+
+def _places(
+    header: list[str], needed: Sequence[str], optional: Sequence[str], *, others: bool
+) -> dict[str, int]:
+    """In which field of a row each of our columns stands."""
+    names = [name.strip().lower() for name in header]
+    ours = [*needed, *optional]
+    for name in needed:
+        if name not in names:
+            shown = ",".join(header)[:_SHOWN]
+            hint = ": separate columns by commas" if re.search("[;\t]", shown) else ""
+            raise ValueError(
+                f"no column {name}{_UNITS.get(name, '')}: row 1 must be the header "
+                f"{','.join(needed)}, it is {shown!r}{hint}"
+            )
+    for title, name in zip(header, names, strict=True):
+        if name not in ours and not others:
+            known = ", ".join(ours)
+            raise ValueError(f"unknown column {title[:_SHOWN]!r}: leave it out; known are {known}")
+        if name in ours and names.count(name) > 1:
+            raise ValueError(f"column {name} stands twice")
+    return {name: names.index(name) for name in ours if name in names}
+
+
+def _number(cell: str, name: str, row: int) -> float:
+    try:
+        number = math.nan if "_" in cell else float(cell)  # Python takes 1_000 for a number
+    except ValueError:
+        number = math.nan
+    if not abs(number) <= MAX_NUMBER:
+        must = "write a finite number, with a point and no comma, or leave the row out"
+        raise ValueError(f"row {row}: {name} is {cell[:_SHOWN]!r}: {must}")
+    return number

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a scan to forces: the one way that the whole package takes.
+
+    scan -> estimate (a method, told the untouched skin) -> forces (a calibration) -> contacts
+
+`SkinReader` goes it for one scan after the other. `CalibratedSkin` is a device and such readers.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.errors import TareRefused
+from ohmskin.estimate.base import NO_WIRES, Estimate, SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.files import Closing
+from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.contacts import Contact, ContactTracker
+from ohmskin.link.device import Device
+from ohmskin.link.messages import BoardStats, Hello, Scan
+from ohmskin.record.recording import Tare
+
+# The method where neither a calibration nor the user says one.
+DEFAULT_METHOD: Final = "joint"
+# Scans of so many seconds make a tare, unless told.
+TARE_S: Final = 1.0
+# An error text names so many touched cells at most.
+_NAMED_CELLS: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ForceScan(Scan):
+    """A scan, and what it shows.
+
+    force_n, force_n_std: normal force of each cell and its standard deviation, (R, C) [N]; NaN
+    where `ForceModel.predict` has none, and everywhere without a calibration. contacts: touched
+    cells that adjoin; without a calibration the rise of their conductance [S] takes the place of
+    their force. estimate: what all of this is from; its ``message`` says where the readings cannot
+    be trusted.
+    """
+
+    force_n: Float
+    force_n_std: Float
+    contacts: tuple[Contact, ...]
+    estimate: Estimate
+
+
+@dataclass(frozen=True, eq=False)
+class Untouched:
+    """Readings (R, C, 4) of the untouched skin, and when they were taken (ISO 8601)."""
+
+    ratio: Float
+    date: str
+
+
+class _Rests:
+    """The rests before each tare, and the one in force, of all readers of one skin."""
+
+    def __init__(self, rests: list[Untouched | None]) -> None:
+        self.all = rests
+        self._replayed: list[Float] = []
+        self._lock = threading.Lock()
+
+    @property
+    def newest(self) -> Untouched | None:
+        """The rest in force."""
+        return self.all[-1]
+
+    def replay(self, ratio: Float) -> None:
+        """Take a recorded tare, when the first reader comes to it."""
+        with self._lock:
+            if not any(ratio is each for each in self._replayed):
+                self._replayed.append(ratio)
+                self.all.append(Untouched(ratio, now()))
+
+
+class SkinReader:
+    """Reads scan after scan of one skin: the same scans in the same order give the same forces.
+
+    board: the one that scans it. calibration: gives newtons, as long as the method is its own.
+    method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
+    rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration.
+
+    A recorded tare (`Scan.rest_ratio`) and a tare taken by `tare` both become the rest; the later
+    one counts. Scans are read by one thread; all else may be called from any thread.
+
+    :raises ValueError: no such method, or the board scans other cells than were calibrated.
+    """
+
+    def __init__(
+        self,
+        board: Hello,
+        calibration: Calibration | None = None,
+        *,
+        method: str = "",
+        rest_ratio: Float | None = None,
+    ) -> None:
+        self.board = board
+        self._calibration = calibration
+        if calibration is not None:
+            calibration.check(calibration.unit_id, board.rows, board.columns)
+        rests: list[Untouched | None] = [None]
+        if rest_ratio is not None:
+            rests = [Untouched(rest_ratio, now())]
+        if calibration is not None:
+            known = (calibration.rest, calibration.tare)
+            rests = [Untouched(each.ratio, each.date) for each in known if each is not None]
+        self._rests = _Rests(rests)
+        self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
+        self._tracker = ContactTracker()
+        self._make()
+
+    def another(self) -> Self:
+        """A reader of the same skin, with the same tares, for another way of reading its scans."""
+        other = type(self)(self.board, self._calibration, method=self._wanted)
+        other._rests = self._rests
+        other._make()
+        return other
+
+    # ------------------------------------------------------------------------- what is known
+
+    @property
+    def method(self) -> str:
+        """The method in use."""
+        return self._wanted
+
+    @property
+    def has_forces(self) -> bool:
+        """Whether scans get newtons: there is a calibration, and the method is its own."""
+        return self._calibration is not None and self._calibration.method == self._made[0]
+
+    @property
+    def rest(self) -> Untouched | None:
+        """The rest in force; None where it is not known."""
+        return self._rests.newest
+
+    @property
+    def is_tared(self) -> bool:
+        """Whether there is a tare to undo."""
+        return len(self._rests.all) > 1
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration with the latest tare; `Calibration.save` makes that last."""
+        rest, calibration = self._rests.newest, self._calibration
+        if calibration is None or rest is None:
+            return calibration
+        tare = self._in_file(rest)
+        if tare is None:
+            tare = Rest.of(calibration.method, self._knowledge(rest), rest.date)
+        if tare is calibration.rest:
+            tare = None
+        return calibration if tare is calibration.tare else replace(calibration, tare=tare)
+
+    def use(self, method: str) -> None:
+        """Go on with another method, from the next scan on. Raises ValueError for no such."""
+        make_estimator(method, self._knowledge(self.rest))
+        self._wanted = method
+
+    # --------------------------------------------------------------------------------- rest
+
+    def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
+        """Take these readings (R, C, 4) for the rest, from the next scan on.
+
+        force: even if cells seem touched: rest may have drifted. Returns what a `Recorder` keeps.
+
+        :raises TareRefused: something touches the skin.
+        """
+        touched = self.another().estimate(rest_ratio).touched
+        if touched.any() and not force:
+            raise TareRefused(
+                f"{touched_cells(touched)}: take everything off the skin, or force the tare if "
+                "nothing is on it"
+            )
+        self._rests.all.append(Untouched(rest_ratio, now()))
+        return Tare(rest_ratio, time.monotonic())
+
+    def undo_tare(self) -> Tare | None:
+        """Return to the rest before the last tare. Returns that, for a `Recorder`, if it is known.
+
+        :raises TareRefused: there is no tare.
+        """
+        if not self.is_tared:
+            raise TareRefused("there is no tare to undo")
+        self._rests.all.pop()
+        rest = self._rests.newest
+        return None if rest is None else Tare(rest.ratio, time.monotonic())
+
+    # -------------------------------------------------------------------------------- scans
+
+    def estimate(self, ratio: Float) -> Estimate:
+        """What readings (R, C, 4) show, without forces. Raises ValueError for other cells."""
+        return self._estimator.estimate(ratio)
+
+    def rise(self, found: Estimate) -> Float:
+        """Level above rest, (R, C) [S; 1 for `voltage`]; above its median where rest is unknown."""
+        at_rest = float(np.median(found.level)) if self._rest_level is None else self._rest_level
+        return np.asarray(found.level - at_rest)
+
+    def read(self, scan: Scan) -> ForceScan:
+        """What a scan shows. Raises ValueError if it is of other cells."""
+        if scan.rest_ratio is not None and scan.rest_ratio.shape == scan.codes.shape:
+            self._rests.replay(scan.rest_ratio)
+        if self._made != (self._wanted, self._rests.newest):
+            self._make()
+        found = self.estimate(scan.ratio)
+        rise = self.rise(found)
+        if self._calibration is not None and self.has_forces:
+            force_n, force_n_std = self._calibration.model.predict(rise, found.level_std)
+            weight, weight_std = force_n, force_n_std
+        else:
+            force_n = force_n_std = np.full(rise.shape, np.nan)
+            weight, weight_std = np.maximum(rise, 0.0), found.level_std
+        contacts = self._tracker.update(scan.time_us, found.touched, weight, weight_std)
+        return ForceScan(
+            scan.codes,
+            scan.number,
+            scan.time_us,
+            scan.host_time_s,
+            scan.missed,
+            rest_ratio=scan.rest_ratio,
+            force_n=force_n,
+            force_n_std=force_n_std,
+            contacts=contacts,
+            estimate=found,
+        )
+
+    def _make(self) -> None:
+        """Begin anew with the method and the rest that are in force."""
+        self._made = self._wanted, self._rests.newest
+        method, rest = self._made
+        self._estimator = make_estimator(method, self._knowledge(rest))
+        in_file = self._in_file(rest) if self.has_forces else None
+        self._rest_level: Float | None = None
+        if in_file is not None:
+            self._rest_level = in_file.level
+        elif rest is not None:
+            self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
+
+    def _in_file(self, rest: Untouched | None) -> Rest | None:
+        """The rest or tare of the calibration that has these readings, if one has."""
+        known = self._calibration
+        if known is None or rest is None:
+            return None
+        if known.tare is not None and rest.ratio is known.tare.ratio:
+            return known.tare
+        return known.rest if rest.ratio is known.rest.ratio else None
+
+    def _knowledge(self, rest: Untouched | None) -> SkinKnowledge:
+        wires = NO_WIRES if self._calibration is None else self._calibration.nominal_wire_ohm
+        return SkinKnowledge.of(self.board, None if rest is None else rest.ratio, wires)
+
+
+class CalibratedSkin(Closing):
+    """A device whose scans carry forces, and which can be tared. Made by ``ohmskin.open``.
+
+    device: the board or recording alone, with all its commands. force: take the calibration of
+    another unit. Iterating and `latest` are those of `Device`, with forces.
+
+    :raises ValueError: the calibration is of another unit or geometry.
+    """
+
+    def __init__(self, device: Device, calibration: Calibration, *, force: bool = False) -> None:
+        self.device = device
+        board = device.info
+        calibration.check(board.unit_id, board.rows, board.columns, force=force)
+        self._reader = SkinReader(board, calibration)  # even forced, it must have the same cells
+        self._newest = self._reader.another()
+        self._newest_lock = threading.Lock()
+
+    @property
+    def name(self) -> str:
+        """See `Device.name`."""
+        return self.device.name
+
+    @property
+    def info(self) -> Hello:
+        """See `Device.info`."""
+        return self.device.info
+
+    @property
+    def stats(self) -> BoardStats:
+        """See `Device.stats`."""
+        return self.device.stats
+
+    @property
+    def calibration(self) -> Calibration:
+        """What forces are read by, with the latest tare; `Calibration.save` makes it last."""
+        found = self._reader.calibration
+        assert found is not None
+        return found
+
+    def start(self) -> None:
+        """See `Device.start`."""
+        self.device.start()
+
+    def __iter__(self) -> Iterator[ForceScan]:
+        """Every scan from now on, with its forces."""
+        return map(self._reader.another().read, self.device)
+
+    def latest(self, timeout_s: float | None = None) -> ForceScan:
+        """The newest scan, with its forces."""
+        scan = self.device.latest(timeout_s)
+        with self._newest_lock:
+            return self._newest.read(scan)
+
+    def tare(self, seconds: float = TARE_S, *, force: bool = False) -> Tare:
+        """Take the mean of the coming scans, of so many seconds, for the skin's rest.
+
+        force, and what is returned: see `SkinReader.tare`.
+
+        :raises TareRefused: something touches the skin.
+        :raises DeviceLost: as `Device.mean_ratio`.
+        """
+        return self._reader.tare(self.device.mean_ratio(seconds), force=force)
+
+    def undo_tare(self) -> Tare:
+        """Return to the rest before the last tare. Returns that, for a `Recorder`.
+
+        :raises TareRefused: there is no tare.
+        """
+        undone = self._reader.undo_tare()
+        assert undone is not None  # a calibration has a rest
+        return undone
+
+    def close(self) -> None:
+        """Close the device. May be called again."""
+        self.device.close()
+
+
+def now() -> str:
+    """The date and time of the host, ISO 8601, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def touched_cells(touched: NDArray[np.bool_]) -> str:
+    """Which cells are touched, in words."""
+    cells = [f"({row}, {column})" for row, column in np.argwhere(touched)]
+    more = len(cells) - _NAMED_CELLS
+    text = ", ".join(cells[:_NAMED_CELLS]) + (f" and {more} more" if more > 0 else "")
+    return f"cell {text} is touched" if len(cells) == 1 else f"cells {text} are touched"

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations of simulated skins whose cells are all alike, for several test files."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.regression import ForceRegression
+
+NEWTON_SIEMENS = 20e-6  # of every cell, in these tests
+
+
+def calibration(
+    rest_ratio: Float, method: str = "touch", unit_id: int = 0, siemens: float = NEWTON_SIEMENS
+) -> Calibration:
+    """One of cells of which each is linear: `siemens` (for "voltage" 1) a newton."""
+    rows, columns = rest_ratio.shape[:2]
+    knowledge = SkinKnowledge(
+        rows,
+        columns,
+        adc_bits=10,
+        rest_ratio=rest_ratio,
+        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    )
+    force_n = np.arange(1.0, 11.0)
+    cells = np.arange(force_n.size) % (rows * columns)
+    found = ForceRegression().fit(cells, siemens * force_n, force_n, shape=(rows, columns))
+    return Calibration(
+        unit_id=unit_id,
+        date="2025-03-01",
+        method=method,
+        rest=Rest.of(method, knowledge, "2025-03-01"),
+        model=found.model_,
+        indenter_area_m2=1e-4,
+        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    )
+
+
+def of_scene(name: str, **options: object) -> Calibration:
+    scene = Scene(name, 8, 8, seed=1)
+    return calibration(scene.rest_ratio, **options)  # type: ignore[arg-type]

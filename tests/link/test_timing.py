@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When readings are taken and when scans arrive: against the emulated and the simulated board."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lockstep import CPU_HZ, Rig, first_holds
+from ohmskin.arrays import Float
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.link.timing import line_delay_s, reading_offsets_s, scan_s, slot_s
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "rate_hz"),
+    [(8, 8, None), (16, 16, None), (8, 8, 20), (3, 5, 0), (1, 1, None), (1, 1, 1)],
+)
+def test_readings_are_timed_as_the_emulated_board_takes_them(
+    rows: int, columns: int, rate_hz: float | None
+) -> None:
+    slots_s = []
+
+    def sampled(ratio: Float, start_s: float, slot_s: float, settle_s: float) -> Float:
+        slots_s.append(slot_s)
+        return ratio
+
+    still = np.full((rows, columns, 4), 0.5)
+    board = EmulatedBoard(lambda _: still, rows, columns, rate_hz=rate_hz, sampled=sampled)
+    board.codes_at(0.0)
+    (hello,) = BoardDecoder().feed(board.advance(0.0), 0.0)
+    assert isinstance(hello, Hello)
+    assert slot_s(hello) == slots_s[0]
+    offsets_s = reading_offsets_s(hello)
+    assert offsets_s.shape == (rows, columns, 4)
+    in_order = offsets_s.transpose(1, 0, 2).reshape(-1)  # cells are column-major
+    np.testing.assert_allclose(in_order, slots_s[0] * np.arange(in_order.size))
+    assert in_order[-1] < scan_s(hello) <= hello.scan_cycles / hello.clock_hz
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize(
+    "scan",
+    [
+        {},
+        {"rows": 4, "columns": 4},
+        {"rows": 16, "columns": 16, "rate_mhz": 20_000},
+        {"rate_mhz": 30_000, "settle_us": 40},
+    ],
+)
+def test_the_line_delay_is_that_of_the_firmware(scan: dict[str, int]) -> None:
+    random = np.random.default_rng(1)
+    step_s = 25e-6
+    with Rig("uno") as rig:
+        rig.run(0.3)
+        rig.start_scan(**scan)
+        board = Hello(**rig.hello())
+        numbers, left_s, modelled_s = [], [], []
+        while len(left_s) < 20:
+            before = len(rig.scans)
+            rig.run(step_s)
+            if len(rig.scans) > before:
+                now_s = rig.sim.stats()["cycles"] / CPU_HZ
+                received = rig.scans[-1]
+                header = received.header
+                numbers.append(header["scan"])
+                left_s.append(now_s - step_s / 2)
+                found = Scan(received.codes, header["scan"], header["time_us"], 0.0, 0)
+                modelled_s.append(scan_s(board) + line_delay_s(found, board))
+                # Codes with few zeros, and with many.
+                rig.sim.set_table(random.random((16, 16, 4)) ** random.integers(1, 9))
+        holds = rig.holds()
+    took_s = np.array(left_s) - holds["cycle"][first_holds(holds)[numbers]] / CPU_HZ
+    error_s = (took_s - modelled_s)[2:]  # at first, acks go before scans
+    spread_s = np.ptp(took_s[2:])
+    print(f"{scan}: error {1e6 * np.abs(error_s).max():.0f} us of {1e6 * spread_s:.0f} us")
+    assert np.abs(error_s).max() < 0.4e-3
+    assert spread_s > 1e-3
