@@ -20,17 +20,13 @@ from ohmskin.estimate.paper import (
     initial_states,
     program_for,
 )
-from ohmskin.link.codes import quantise, ratio_from_codes
 from places import DATA
+from skins import ten_bits
 
 METHODS = (LsqEstimator, RegularizedEstimator)
 both_methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 
 pytestmark = pytest.mark.filterwarnings("error")
-
-
-def ten_bits(ratio: np.ndarray) -> np.ndarray:
-    return ratio_from_codes(quantise(ratio, 10), 10)
 
 
 def a_skin(rows: int, columns: int, cell_ohm: float = 2e4) -> Skin:
