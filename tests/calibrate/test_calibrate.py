@@ -232,7 +232,7 @@ def test_bad_tables(run: Run, tmp_path: Path) -> None:
     header, *rows = good.splitlines()
     for text, words in (
         (header, ["no press"]),
-        (f"{header}\n{rows[0]}", ["1 press is too few"]),
+        (f"{header}\n{rows[0]}", ["too few presses: 1"]),
         ("\n".join([header, *rows[:6]]), ["all presses are on cell (0, 0)"]),
         (good.replace("0,0,1,", "2,0,1,"), ["row 3: cell (2, 0) is not on this 2x3 skin"]),
         (good.replace("0,0,1,", "0,0,-1,"), ["row 3", "force_n is -1"]),

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ohmskin.calibrate.guide import CERTAIN_S, Guide, Press, State, SteadyPress, Step, still_wanted
+from ohmskin.calibrate.guide import CERTAIN_S, Guide, Press, State, Step, still_wanted
 
 RATE_HZ = 50.0
-FIRST, SECOND = Press(0, 1, 1.0), Press(1, 0, 2.0)
+FIRST, SECOND = Press((0, 1), 1.0), Press((1, 0), 2.0)
 AT_FIRST, AT_SECOND = (0, 1), (1, 0)
 # Rise of a cell [S] as a function of the time since it was touched [s].
 Course = Callable[[float], float]
@@ -43,12 +43,13 @@ class Scripted:
         return steps
 
 
-def read(steps: list[Step]) -> list[SteadyPress]:
-    return [step.read for step in steps if step.read is not None]
+def read(steps: list[Step]) -> list[Step]:
+    """Those which complete a press."""
+    return [step for step in steps if step.rise is not None]
 
 
 def seconds_until_read(steps: list[Step]) -> float:
-    return next(i for i, step in enumerate(steps) if step.read is not None) / RATE_HZ
+    return next(i for i, step in enumerate(steps) if step.rise is not None) / RATE_HZ
 
 
 def test_a_steady_press_is_read_once_and_the_next_is_asked() -> None:
@@ -56,14 +57,14 @@ def test_a_steady_press_is_read_once_and_the_next_is_asked() -> None:
     assert {step.state for step in person.put(1)} == {State.PUT}
     steps = person.put(5, c01=40e-6)
     (press,) = read(steps)
-    assert press.press == FIRST
+    assert press.wanted == FIRST
     assert press.rise == pytest.approx(40e-6, rel=0.002)
     assert press.rise_std == pytest.approx(0.002 * 40e-6 / np.sqrt(RATE_HZ), rel=0.4)
     assert 1.0 <= seconds_until_read(steps) < 1.5
     assert steps[-1].state is State.TAKE_OFF
     off = person.put(1)
     assert off[-1] == Step(State.PUT, SECOND)
-    assert read(person.put(2, c10=80e-6))[0].press == SECOND
+    assert read(person.put(2, c10=80e-6))[0].wanted == SECOND
     assert person.put(1)[-1].state is State.DONE
     assert read(person.put(2, c10=80e-6)) == []
 
@@ -151,7 +152,7 @@ def test_a_second_cell_in_between_begins_the_second_anew() -> None:
 
 
 def test_a_weight_that_stays_is_asked_off() -> None:
-    again = Press(0, 1, 1.0)
+    again = Press((0, 1), 1.0)
     person = Scripted(FIRST, again)
     person.put(2, c01=40e-6)
     steps = person.put(20, c01=40e-6)
@@ -175,7 +176,7 @@ def test_a_board_that_was_reset_begins_the_second_anew() -> None:
 def test_slow_scans_take_longer_not_fewer() -> None:
     person = Scripted(FIRST, rate_hz=4.0)
     steps = person.put(6, c01=40e-6)
-    first = next(i for i, step in enumerate(steps) if step.read is not None)
+    first = next(i for i, step in enumerate(steps) if step.rise is not None)
     assert first >= 8
 
 
@@ -187,11 +188,11 @@ def test_what_is_read_is_not_asked_again() -> None:
     asked = [FIRST, SECOND, FIRST, SECOND]
     assert still_wanted(asked, []) == asked
     # From a file, or another way to compute it.
-    close = Press(0, 1, 1.0 + 1e-12)
+    close = Press((0, 1), 1.0 + 1e-12)
     assert still_wanted(asked, [SECOND, close]) == [FIRST, SECOND]
     assert still_wanted(asked, [FIRST] * 5) == [SECOND, SECOND]
-    other = Press(0, 1, 1.001)
-    assert still_wanted(asked, [other, Press(1, 1, 1.0)]) == asked
+    other = Press((0, 1), 1.001)
+    assert still_wanted(asked, [other, Press((1, 1), 1.0)]) == asked
 
 
 def test_redone_cells_are_asked_again() -> None:

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
@@ -51,6 +52,11 @@ def calibration(pressed: int = 5) -> Calibration:
         indenter_area_m2=1e-4,
         nominal_wire_ohm=WireOhm(100.0),
     )
+
+
+def forces(of_skin: Calibration, level: Float) -> Float:
+    """At these levels (2, 3), above the rest in force."""
+    return of_skin.model.predict(level - of_skin.untouched.level, np.full((2, 3), 1e-7))[0]
 
 
 def assert_same_rest(first: Rest | None, second: Rest | None) -> None:
@@ -95,22 +101,8 @@ def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
     loaded.save(again)
     assert again.read_bytes() == path.read_bytes()
     level = saved.rest.level + 30e-6
-    for one, other in zip(
-        saved.predict(level, np.full((2, 3), 1e-7)),
-        loaded.predict(level, np.full((2, 3), 1e-7)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_prediction_starts_at_rest() -> None:
-    of_skin = calibration()
-    level_std = np.full((2, 3), 1e-7)
-    force, std = of_skin.predict(of_skin.rest.level, level_std)
-    assert not force.any()
-    np.testing.assert_array_equal(std, of_skin.model.predict(np.zeros((2, 3)), level_std)[1])
-    with pytest.raises(ValueError, match=r"^level has shape \(3, 2\), this calibration \(2, 3\)$"):
-        of_skin.predict(np.zeros((3, 2)), level_std)
+    np.testing.assert_array_equal(forces(saved, level), forces(loaded, level))
+    assert not forces(loaded, saved.rest.level).any()
 
 
 def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
@@ -121,11 +113,9 @@ def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
     loaded = load_calibration(path)
     assert_same_bits(tared, loaded)
     assert loaded.tare is not None
-    level_std = np.full((2, 3), 1e-7)
-    assert not loaded.predict(loaded.tare.level, level_std)[0].any()
-    assert loaded.predict(loaded.rest.level, level_std)[0].any()
-    undone = replace(loaded, tare=None)
-    assert not undone.predict(before.rest.level, level_std)[0].any()
+    assert not forces(loaded, loaded.tare.level).any()
+    assert forces(loaded, loaded.rest.level).any()
+    assert not forces(replace(loaded, tare=None), before.rest.level).any()
 
 
 def test_rest_is_what_the_method_reads() -> None:
@@ -324,7 +314,7 @@ def test_whatever_a_field_holds_it_is_taken_or_refused_in_one_line(
     edited.write_text(json.dumps(content))
     refusal = ""
     try:
-        load_calibration(edited).predict(np.full((2, 3), 1e-5), np.full((2, 3), 1e-7))
+        forces(load_calibration(edited), np.full((2, 3), 1e-5))
     except ValueError as error:
         refusal = str(error)
     assert not refusal or refusal.startswith(f"{edited}: ")

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From presses of single cells to a calibration.
 
-Takes a recording or a table of presses and the forces of the same time, gives a
-`ohmskin.force.calibration.Calibration`.
+Takes scans and the forces of the same time, from a recording or a log (`tables`), or a table of
+presses. Finds the clocks' offset (`alignment`) and the presses (`presses`), and gives a
+`ohmskin.force.calibration.Calibration` (`calibrator`). `guide` leads a person who presses.
 
 May import: `ohmskin.force` and what is below it.
 """

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ohmskin.calibrate.alignment import Alignment, align
-from ohmskin.calibrate.presses import LevelHistory, Presses, find_presses
-from ohmskin.calibrate.tables import ForceLog, PressTable
+from ohmskin.calibrate.presses import LevelHistory, Presses
+from ohmskin.calibrate.tables import PressTable
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.force.calibration import Calibration, Rest
@@ -120,13 +119,3 @@ class Calibrator:
             nominal_wire_ohm=self.knowledge.nominal_wire_ohm,
         )
         return calibration, found.message_
-
-
-def presses_in_log(history: LevelHistory, log: ForceLog) -> tuple[Presses, Alignment]:
-    """The presses in scans, with the force sensor's clock aligned to the skin's.
-
-    Raises ValueError as `align` and `find_presses`.
-    """
-    rise = np.where(history.touched, history.rise, 0.0).sum(axis=(1, 2))
-    alignment = align(history.time_s, rise, log)
-    return find_presses(history, log, alignment.offset_s), alignment

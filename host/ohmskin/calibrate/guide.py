@@ -33,29 +33,10 @@ MAX_SCATTER: Final = 0.05
 
 
 class Press(NamedTuple):
-    """A press of one cell by a known force [N]."""
+    """A press of one cell (row, column) by a known force [N]."""
 
-    row: int
-    column: int
+    cell: tuple[int, int]
     force_n: float
-
-    @property
-    def cell(self) -> tuple[int, int]:
-        """(row, column)."""
-        return self.row, self.column
-
-
-class SteadyPress(NamedTuple):
-    """What a cell showed under a press.
-
-    rise: mean of its conductance above rest over the window [S]. rise_std: standard error of that
-    mean, from the scatter of the scans [S]; what all of them share, such as the rounding by the
-    converter, is not in it.
-    """
-
-    press: Press
-    rise: float
-    rise_std: float
 
 
 class State(Enum):
@@ -71,16 +52,19 @@ class State(Enum):
 class Step(NamedTuple):
     """Where a scan has led to.
 
-    wanted: the press that is wanted, or that was read and is to be taken off; None when all are
-    done. cells: what is pressed. change: of the cell's rise from one half of the window to the
-    other, relative; None before a whole window. read: the press that this scan completes.
+    wanted: the press that is wanted, or was read and is to be taken off; None when all are done.
+    cells: what is pressed. change: of the rise from one half of the window to the other, relative;
+    None before a whole window. rise: mean conductance of the cell above rest over the window [S],
+    if this scan completes the press; else None. rise_std: standard error of that mean, from the
+    scatter of the scans [S]; what all of them share, such as rounding, is not in it.
     """
 
     state: State
     wanted: Press | None
     cells: Cells = ()
     change: float | None = None
-    read: SteadyPress | None = None
+    rise: float | None = None
+    rise_std: float = math.nan
 
 
 def pressed_cells(rise: Float, touched: NDArray[np.bool_]) -> Cells:
@@ -178,18 +162,21 @@ class Guide:
             return Step(State.WRONG if cells else State.PUT, press, cells)
         if pressed == cells:
             self._window.append((time_s, float(rise[press.cell])))
-        change, read = self._judge(press)
-        self._is_read = read is not None
-        return Step(State.TAKE_OFF if read else State.HOLD, press, cells, change, read)
+        change, is_steady, rises = self._judge()
+        if not is_steady:
+            return Step(State.HOLD, press, cells, change)
+        self._is_read = True
+        std = float(rises.std(ddof=1)) / math.sqrt(rises.size)
+        return Step(State.TAKE_OFF, press, cells, change, float(rises.mean()), std)
 
-    def _judge(self, press: Press) -> tuple[float | None, SteadyPress | None]:
-        """How much the rise changes over the window, and the press if it is steady."""
+    def _judge(self) -> tuple[float | None, bool, Float]:
+        """How much the rises change over the window, whether they are steady, and they (n,)."""
         window = self._window
         while len(window) > MIN_SCANS and window[-1][0] - window[1][0] >= WINDOW_S:
             window.popleft()
-        if len(window) < MIN_SCANS or window[-1][0] - window[0][0] < WINDOW_S:
-            return None, None
         x = np.array([rise for _, rise in window])
+        if x.size < MIN_SCANS or window[-1][0] - window[0][0] < WINDOW_S:
+            return None, False, x
         mean, half = float(x.mean()), x.size // 2
         noise = float(np.mean(np.diff(x) ** 2)) / 2
         change = abs(float(x[half:].mean() - x[:half].mean()))
@@ -197,5 +184,4 @@ class Guide:
             change <= MAX_CHANGE * mean + 2 * math.sqrt(4 * noise / x.size)
             and float(x.var()) - noise <= (MAX_SCATTER * mean) ** 2
         )
-        std = float(x.std(ddof=1)) / math.sqrt(x.size)
-        return change / mean, SteadyPress(press, mean, std) if is_steady else None
+        return change / mean, is_steady, x

@@ -67,14 +67,21 @@ class Presses:
 
 @dataclass(frozen=True, eq=False)
 class LevelHistory:
-    """What n scans showed. time_s (n,): of their middles [s]; levels above rest, their standard
-    deviations [S, or 1 for `voltage`] and touched cells: rise, rise_std, touched (n, R, C).
+    """What n scans showed, by the times (n,) of their middles [s].
+
+    rise, rise_std (n, R, C): levels above rest and their standard deviations [S, or 1 for
+    `voltage`]. touched (n, R, C).
     """
 
     time_s: Float
     rise: Float
     rise_std: Float
     touched: NDArray[np.bool_]
+
+    @property
+    def of_skin(self) -> Float:
+        """Rise of all touched cells together, (n,)."""
+        return np.asarray(np.sum(self.rise, axis=(1, 2), where=self.touched))
 
 
 def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Presses:

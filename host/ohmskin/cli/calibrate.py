@@ -16,9 +16,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 import ohmskin
 from ohmskin.arrays import Float
-from ohmskin.calibrate.calibrator import Calibrator, presses_in_log
-from ohmskin.calibrate.guide import Cells, Guide, Press, State, SteadyPress, Step, still_wanted
-from ohmskin.calibrate.presses import Presses
+from ohmskin.calibrate.alignment import align
+from ohmskin.calibrate.calibrator import Calibrator
+from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step, still_wanted
+from ohmskin.calibrate.presses import Presses, find_presses
 from ohmskin.calibrate.tables import (
     PRESS,
     ForceLog,
@@ -59,8 +60,7 @@ BottomWire = Annotated[
 
 calibrate = typer.Typer(
     no_args_is_help=True,
-    help="Learn each cell's force from presses of single cells: a calibration file (.json). With a "
-    "force sensor: 'ohmskin record --force-port', then 'recording'.",
+    help="Learn each cell's force from presses of single cells: a calibration file (.json).",
 )
 _out = Console(soft_wrap=True)
 
@@ -102,8 +102,8 @@ def weights(
         shape = skin.info.rows, skin.info.columns
         _check_cells([*only, *again], shape)
         wanted = [
-            Press(row, column, force_n)
-            for row, column in only or np.ndindex(shape)
+            Press(cell, force_n)
+            for cell in only or np.ndindex(shape)
             for _ in range(repeats)
             for force_n in forces_n
         ]
@@ -156,7 +156,9 @@ def recording(
     with naming(recording), _progress(method, len(given.scans)) as progress:
         log = log or _force_log(given)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s))
-        presses, alignment = presses_in_log(calibrator.measure(given.scans, progress), log)
+        history = calibrator.measure(given.scans, progress)
+        alignment = align(history.time_s, history.of_skin, log)
+        presses = find_presses(history, log, alignment.offset_s)
     notes = [
         f"offset of the clocks {alignment.offset_s:+.3f} s, correlation "
         f"{alignment.correlation:.2f} over {alignment.overlap_s:.0f} s; zero of the force sensor "
@@ -292,13 +294,12 @@ class _KeptPresses:
     @property
     def presses(self) -> list[Press]:
         """Cell and force of each."""
-        return [Press(*press) for press in self.table[["row", "column", "force_n"]].tolist()]
+        return [Press((row, column), force_n) for row, column, force_n, *_ in self.table.tolist()]
 
-    def add(self, read: SteadyPress, rest: Float) -> None:
-        """Keep one more press. rest: conductance of all cells at rest (R, C) [S]."""
+    def add(self, press: Press, conductance: float, std: float) -> None:
+        """Keep one more press, under which the cell had this conductance [S]."""
         # The table has no conductance below 0.
-        conductance = max(read.rise + rest[read.press.cell], 0.0)
-        one = np.array([(*read.press, conductance, read.rise_std)], PRESS)
+        one = np.array([(*press.cell, press.force_n, max(conductance, 0.0), std)], PRESS)
         self._keep(np.concatenate([self.table, one]))
 
     def drop(self, cells: Cells) -> None:
@@ -324,8 +325,8 @@ def _guided(
         for scan in watched(iter(skin.latest, None)):
             found = estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
-            if step.read is not None:
-                kept.add(step.read, rest)
+            if step.wanted is not None and step.rise is not None:
+                kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
                 left -= 1
             voice.say(step, total - left)
             if step.state is State.DONE:
@@ -352,15 +353,16 @@ class _Voice:
     def say(self, step: Step, done: int) -> None:
         """Say what a scan has led to; nothing twice."""
         line, press = "", step.wanted
-        if step.read is not None:
+        if step.rise is not None:
             _out.bell()
             line = (
-                f"{done} of {self._total}: {1e6 * step.read.rise:.2f} +- "
-                f"{1e6 * step.read.rise_std:.2f} microsiemens above rest: take it off"
+                f"{done} of {self._total}: {1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} "
+                "microsiemens above rest: take it off"
             )
         elif press is not None and step.state is State.PUT:
             weight = f"{1e3 * press.force_n / GRAVITY:.6g} g ({press.force_n:.3f} N)"
-            line = f"put {weight} on cell {press.cell}, row {press.row}, column {press.column}"
+            row, column = press.cell
+            line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
         elif press is not None and step.state is State.WRONG:
             cells = ", ".join(map(str, step.cells))
             pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Final, TypeVar
@@ -36,8 +36,8 @@ from ohmskin.record.recording import Mark, load_recording
 
 # With a force sensor the first scans are a tare of so many seconds, unless told.
 FORCE_TARE_S: Final = 2.0
-# A terminal shows ten pictures a second [s].
-_SHOW_EVERY_S: Final = 0.1
+# A display looks at ten scans a second [s].
+_SEE_EVERY_S: Final = 0.1
 # How long the end of a recording may wait for the thread that reads typed lines [s].
 _TYPED_EVERY_S: Final = 0.2
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -74,32 +74,35 @@ def record(
     """
     if tare_s is None:
         tare_s = FORCE_TARE_S if force_port else 0.0
-    with (
-        ohmskin.open(port, start=False) as skin,
-        ForceSensor(force_port, force_baud, force_scale) if force_port else nullcontext() as sensor,
-    ):
-        if sensor is not None:
+    with ExitStack() as stack:
+        skin, sensor = stack.enter_context(ohmskin.open(port, start=False)), None
+        if force_port:
+            sensor = stack.enter_context(ForceSensor(force_port, force_baud, force_scale))
             sensor.wait()
-        with (
-            Recorder(file, skin.info) as recorder,
-            until_stopped() as watched,
-            _marks_typed(recorder),
-            _forces_kept(recorder, sensor, tare_s) as keep_forces,
-        ):
-            for text in mark or ():
-                recorder.add(Mark(text, time.monotonic()))
-            try:
-                recording.record(
-                    skin,
-                    recorder,
-                    watched(skin),
-                    count=scans,
-                    seconds=seconds,
-                    tare_s=tare_s,
-                    beside=keep_forces,
-                )
-            except DeviceLost as exc:
-                raise DeviceLost(f"{exc} (what came before is in {file})") from exc
+        recorder = stack.enter_context(Recorder(file, skin.info))
+        for text in mark or ():
+            recorder.add(Mark(text, time.monotonic()))
+        see = None
+        if sensor is not None:
+            _out.print(f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it")
+            if _out.is_terminal:
+                display = PressDisplay(recorder)
+                live = Live(get_renderable=display.picture, console=_out, transient=True)
+                stack.enter_context(live)
+                see = display.see
+        stack.enter_context(_marks_typed(recorder))
+        watched = stack.enter_context(until_stopped())
+        try:
+            recording.record(
+                *(skin, recorder, watched(skin)),
+                count=scans,
+                seconds=seconds,
+                tare_s=tare_s,
+                sensor=sensor,
+                beside=see,
+            )
+        except DeviceLost as exc:
+            raise DeviceLost(f"{exc} (what came before is in {file})") from exc
     done = f"{recorder.scans} scans, missed {recorder.missed}, {file.stat().st_size} bytes"
     if sensor is not None:
         done += f", {recorder.forces} forces, {sensor.damaged} lines that are no numbers"
@@ -145,80 +148,58 @@ def until_stopped() -> Iterator[Callable[[Iterable[_T]], Iterator[_T]]]:
             signal.signal(number, handler)
 
 
-@contextmanager
-def _forces_kept(
-    recorder: Recorder, sensor: ForceSensor | None, tare_s: float
-) -> Iterator[Callable[[Scan], None]]:
-    """Gives what is called after each scan: it records the forces, and shows them in a terminal."""
-    if sensor is None:
-        yield lambda scan: None
-        return
-    _out.print(f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it")
-    display = PressDisplay(recorder)
-    with Live(console=_out, transient=True, auto_refresh=False) as live:
-
-        def keep(scan: Scan) -> None:
-            for sample in sensor.take():
-                recorder.add(sample)
-                display.force_n = sample.force_n
-            if _out.is_terminal and display.see(scan):
-                live.update(display.picture(), refresh=True)
-
-        yield keep
-
-
 class PressDisplay:
     """What a person sees who presses cells while they are recorded, and so which are missing.
 
-    counts: presses of each cell (R, C), of one cell alone, for `CERTAIN_S`. force_n: the newest.
+    counts: presses of each cell (R, C), of one cell alone, for `CERTAIN_S`.
     """
 
     def __init__(self, recorder: Recorder) -> None:
         self.counts = np.zeros((recorder.board.rows, recorder.board.columns), dtype=np.intp)
-        self.force_n = float("nan")
         self._recorder = recorder
         self._reader: SkinReader | None = None
         self._on = OnSkin()
-        self._shown_s = float("-inf")
+        self._seen_s = float("-inf")
 
-    def see(self, scan: Scan) -> bool:
-        """A scan that was recorded. Returns whether it is time for a new picture."""
-        if scan.host_time_s - self._shown_s < _SHOW_EVERY_S:
-            return False
-        self._shown_s = scan.host_time_s
+    def see(self, scan: Scan) -> None:
+        """Look at a scan that was recorded; at some of them, for estimates take time."""
         tare = self._recorder.tare
-        if tare is not None and tare.rest_ratio.shape == scan.codes.shape:
-            if self._reader is None:
-                self._reader = SkinReader(self._recorder.board, rest_ratio=tare.rest_ratio)
+        if tare is None or scan.host_time_s - self._seen_s < _SEE_EVERY_S:
+            return
+        self._seen_s = scan.host_time_s
+        if self._reader is None:
+            self._reader = SkinReader(self._recorder.board, rest_ratio=tare.rest_ratio)
+        if scan.codes.shape == tare.rest_ratio.shape:
             found = self._reader.estimate(scan.ratio)
             pressed = pressed_cells(self._reader.rise(found), found.touched)
             if self._on.see(scan.host_time_s, pressed) and len(self._on.cells) == 1:
                 self.counts[self._on.cells[0]] += 1
-        return True
 
     def picture(self) -> Group:
         """All of it, for a terminal."""
-        pressed = f"pressed: {', '.join(map(str, self._on.cells)) or 'none'}"
-        now = "touch nothing yet" if self._reader is None else pressed
-        head = f"{self._recorder.scans} scans   force {self.force_n:.2f} N   {now}"
-        counts = [
+        force, on = self._recorder.force, self._on.cells
+        now = "touch nothing yet"
+        if self._reader is not None:
+            now = f"pressed: {', '.join(map(str, on)) or 'none'}"
+        force_n = float("nan") if force is None else force.force_n
+        head = f"{self._recorder.scans} scans   force {force_n:.2f} N   {now}"
+        styled = [
             [
-                Text(str(count), style="reverse" if (row, column) in self._on.cells else "")
+                Text(str(count), "reverse" * ((row, column) in on))
                 for column, count in enumerate(counts)
             ]
             for row, counts in enumerate(self.counts)
         ]
-        return Group(Text(head), cell_table(counts, "presses of each cell"))
+        return Group(Text(head), cell_table(styled, "presses of each cell"))
 
 
 def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
     """A text for each cell, row by row, beside the numbers of rows and columns."""
-    table = Table("", *map(str, range(len(cells[0]))), box=None, title=title)
+    table = Table(box=None, title=title)
+    for heading in ("", *map(str, range(len(cells[0])))):
+        table.add_column(heading, justify="right")
     for row, texts in enumerate(cells):
         table.add_row(str(row), *texts)
-    for column in table.columns:
-        column.justify = "right"
-    table.columns[0].style = "dim"
     return table
 
 

@@ -20,6 +20,9 @@ kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
 
+Forces are `model.predict` of levels above `untouched.level`. The error of rest is in every press
+alike, so the curves hold it already.
+
 Numbers are written so that they are read back bit for bit. A file from elsewhere is data: its size,
 its fields, their types, shapes and ranges are checked before anything is made of them.
 """
@@ -33,7 +36,7 @@ from datetime import datetime
 from typing import Any, Final, Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
@@ -141,7 +144,7 @@ class Calibration:
     def check(self, unit_id: int, rows: int, columns: int, *, force: bool = False) -> None:
         """Raise ValueError unless this calibration is of this board's skin, or `force` is given.
 
-        Forced onto another number of cells it passes here, but `predict` refuses the arrays.
+        Forced onto another number of cells it passes here, but `model.predict` refuses the arrays.
         """
         if force:
             return
@@ -155,18 +158,6 @@ class Calibration:
                 f"this calibration is of unit {self.unit_id}, the board is unit {unit_id}: "
                 "calibrate this skin, or force it if the same skin has a new board"
             )
-
-    def predict(self, level: ArrayLike, level_std: ArrayLike) -> tuple[Float, Float]:
-        """Force and its standard deviation [N], (R, C): by `model`, of level - untouched.level.
-
-        level, level_std (R, C): those of an `Estimate` by `method`, [S], or [1] for `voltage`. The
-        error of rest is in every press alike, so the curves hold it already. Raises ValueError.
-        """
-        levels = np.asarray(level, dtype=np.float64)
-        at_rest = self.untouched.level
-        if levels.shape != at_rest.shape:
-            raise ValueError(f"level has shape {levels.shape}, this calibration {at_rest.shape}")
-        return self.model.predict(levels - at_rest, level_std)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file that is either complete or not there: a temporary file, then a rename.

@@ -44,7 +44,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from itertools import product
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -115,21 +115,17 @@ def fit_line(x: Float, force: Float, floor_n: float = 0.0, *, intercept: bool) -
     design = np.column_stack([x / unit, np.ones_like(x)] if intercept else [x / unit])
     root = variance(force, floor_n) ** -0.5
     weighted = design * root[:, None]
-    inverse = np.linalg.pinv(weighted.T @ weighted)
-    found = inverse @ weighted.T @ (force * root)
+    found = np.linalg.pinv(weighted.T @ weighted) @ weighted.T @ (force * root)
     if not found[0] > 0:
         return None
-    covariance = _square_of_s((force - design @ found) * root, found.size) * inverse
+    covariance = _covariance(weighted, (force - design @ found) * root)
     errors = np.sqrt(np.diag(covariance))
     curve = Curve(LINEAR, float(found[0] / unit), float(errors[0] / unit))
-    if not intercept:
-        return curve
-    return replace(
-        curve,
-        intercept=float(found[1]),
-        intercept_std=float(errors[1]),
-        correlation=_correlation(covariance),
-    )
+    if intercept:
+        c, c_std = float(found[1]), float(errors[1])
+        correlation = _correlation(covariance)
+        curve = replace(curve, intercept=c, intercept_std=c_std, correlation=correlation)
+    return curve
 
 
 def fit_power(
@@ -159,37 +155,35 @@ def fit_power(
     best = int(np.argmin([sum_of_squares(exponent) for exponent in exponents]))
     if best in (0, exponents.size - 1):
         return None
-    bounds = (exponents[best - 1], exponents[best + 1])
-    options = {"xatol": 1e-10}
+    bounds, options = (exponents[best - 1], exponents[best + 1]), {"xatol": 1e-10}
     b = float(minimize_scalar(sum_of_squares, bounds=bounds, method="bounded", options=options).x)
     a = scale(b)
     if not a > 0:
         return None
     logs = np.log(np.where(z > 0, z, 1.0))
-    jacobian = np.column_stack([z**b, a * z**b * logs]) * np.sqrt(weight)[:, None]
-    inverse = np.linalg.pinv(jacobian.T @ jacobian)
+    root = np.sqrt(weight)
+    jacobian = np.column_stack([z**b, a * z**b * logs]) * root[:, None]
     # From a per unit^b to a per S^b: a_S = a unit^-b.
     to_si = np.array([[unit**-b, -a * unit**-b * np.log(unit)], [0.0, 1.0]])
-    square = _square_of_s((force - a * z**b) * np.sqrt(weight), 2)
-    covariance = square * to_si @ inverse @ to_si.T
-    errors = np.sqrt(np.diag(covariance))
+    covariance = to_si @ _covariance(jacobian, (force - a * z**b) * root) @ to_si.T
+    a_std, b_std = np.sqrt(np.diag(covariance)).tolist()
     return Curve(
-        POWER,
-        slope=float(a * unit**-b),
-        slope_std=float(errors[0]),
-        correlation=_correlation(covariance),
+        *(POWER, a * unit**-b, a_std),
         exponent=b,
-        exponent_std=float(errors[1]),
+        exponent_std=b_std,
+        correlation=_correlation(covariance),
     )
 
 
-def _square_of_s(residual: Float, coefficients: int) -> float:
-    """s^2; 0 where nothing is left (a training fold)."""
-    freedom = residual.size - coefficients
-    return float(residual @ residual) / freedom if freedom > 0 else 0.0
+def _covariance(jacobian: Float, residual: Float) -> Float:
+    """K, of J (n, p) and F - f(x) (n,), both times v^-1/2; 0 where a training fold tells no s."""
+    count, coefficients = jacobian.shape
+    freedom = count - coefficients
+    square = float(residual @ residual) / freedom if freedom > 0 else 0.0
+    return np.asarray(square * np.linalg.pinv(jacobian.T @ jacobian))
 
 
-def _correlation(covariance: NDArray[np.floating[Any]]) -> float:
+def _correlation(covariance: Float) -> float:
     scale = float(np.sqrt(covariance[0, 0] * covariance[1, 1]))
     return float(np.clip(covariance[0, 1] / scale, -1.0, 1.0)) if scale > 0 else 0.0
 
@@ -414,8 +408,7 @@ class _Trial:
         return np.asarray(-0.5 * np.log(v) - 0.5 * error**2 / v)
 
 
-@dataclass(frozen=True)
-class _Choice:
+class _Choice(NamedTuple):
     """A fitted curve, F0 of its scatter, and s of the presses fitted and of those held out."""
 
     fitted: Curve
@@ -425,9 +418,8 @@ class _Choice:
 
     def curve(self, s: float) -> Curve:
         """The curve with this s."""
-        if not self.floor_n:
-            return replace(self.fitted, residual_std=s, residual_share=0.0)
-        return replace(self.fitted, residual_std=s * self.floor_n, residual_share=s)
+        s0, s1 = (s * self.floor_n, s) if self.floor_n else (s, 0.0)
+        return replace(self.fitted, residual_std=s0, residual_share=s1)
 
 
 def _is_clear(gain: Float, errors: float) -> bool:
@@ -453,14 +445,16 @@ def _checked(
     """The arguments of `ForceRegression.fit` as arrays. Raises ValueError as it does."""
     if min(shape) < 1:
         raise ValueError(f"a skin has at least 1x1 cells, not {shape[0]}x{shape[1]}")
-    force = _column("force_n", force_n)
-    count = force.size
+    force = _array("force_n", force_n, (np.size(force_n),))
+    if not force.size:
+        raise ValueError("force_n is empty: there are no presses")
+    known = force.shape
     rows = _Rows(
-        x=_column("rise", rise, count),
+        x=_array("rise", rise, known),
         force=force,
-        dx=np.zeros(count) if rise_std is None else _column("rise_std", rise_std, count),
-        cell=_flat_cells(cells, count, shape),
-        press=np.arange(count) if press is None else _integers("press", press, (count,)),
+        dx=np.zeros(known) if rise_std is None else _array("rise_std", rise_std, known),
+        cell=_flat_cells(cells, force.size, shape),
+        press=np.arange(force.size) if press is None else _array("press", press, known, np.intp),
     )
     for name, values in (("force_n", force), ("rise_std", rows.dx)):
         if values.min() < 0:
@@ -469,56 +463,43 @@ def _checked(
             raise ValueError(f"row {row}: {name} is {values[row]:g}, it must be 0 or more{hint}")
     number = np.unique(rows.press).size
     if number < MIN_PRESSES:
-        are = "press is" if number == 1 else "presses are"
-        raise ValueError(f"{number} {are} too few: {MIN_PRESSES} are needed")
+        raise ValueError(f"too few presses: {number}, {MIN_PRESSES} are needed")
     if np.ptp(force) == 0:
-        raise ValueError(f"all {count} forces are {force[0]:g} N: press with different forces")
+        raise ValueError(f"all {force.size} forces are {force[0]:g} N: press with different forces")
     return rows
 
 
-def _column(name: str, values: ArrayLike, count: int | None = None) -> Float:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is not an array of numbers") from error
-    if array.ndim != 1 or array.size != (array.size if count is None else count):
-        expected = "(n,)" if count is None else f"({count},) as force_n"
-        raise ValueError(f"{name} has shape {array.shape}, it must be {expected}")
-    if not array.size:
-        raise ValueError(f"{name} is empty: there are no presses")
-    if not np.isfinite(array).all():
-        row = int(np.argmin(np.isfinite(array)))
-        raise ValueError(f"row {row}: {name} is {array[row]:g}, it must be finite")
-    return array
-
-
-def _integers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.intp]:
+def _array(name: str, values: ArrayLike, shape: tuple[int, ...], dtype: Any = np.float64) -> Any:
     array = np.asarray(values)
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, it must be {shape}")
-    if array.dtype.kind not in "iu":
-        raise ValueError(f"{name} holds {array.dtype}, it must hold integers")
-    return array.astype(np.intp)
+    kinds, what = ("iu", "integers") if dtype is np.intp else ("iuf", "numbers")
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{name} holds {array.dtype}, it must hold {what}")
+    if not np.isfinite(array).all():
+        row = int(np.argmin(np.isfinite(array)))
+        raise ValueError(f"row {row}: {name} is {array[row]:g}, it must be finite")
+    return array.astype(dtype)
 
 
 def _flat_cells(cells: ArrayLike, count: int, shape: tuple[int, int]) -> NDArray[np.intp]:
-    rows, columns = shape
     pairs = np.ndim(cells) == 2
-    array = _integers("cells", cells, (count, 2) if pairs else (count,))
-    indices = array if pairs else array[:, None]
-    outside = ((indices < 0) | (indices >= (shape if pairs else rows * columns))).any(axis=1)
+    array = _array("cells", cells, (count, 2) if pairs else (count,), np.intp)
+    indices, limits = (array, shape) if pairs else (array[:, None], (shape[0] * shape[1],))
+    outside = ((indices < 0) | (indices >= limits)).any(axis=1)
     if outside.any():
         row = int(np.argmax(outside))
-        raise ValueError(f"row {row}: no cell {array[row].tolist()} on a {rows}x{columns} skin")
-    return np.asarray(array @ [columns, 1] if pairs else array, dtype=np.intp)
+        raise ValueError(
+            f"row {row}: no cell {array[row].tolist()} on a {shape[0]}x{shape[1]} skin"
+        )
+    return np.asarray(array @ [shape[1], 1] if pairs else array)
 
 
 def _pooled_message(pooled: NDArray[np.bool_], pressed: NDArray[np.intp], skin: Curve) -> str:
     """Which cells have no curve of their own. pressed: flat indices of those with presses."""
-    number = int(pooled.sum())
-    if not number:
+    if not pooled.any():
         return ""
-    message = f"{number} of {pooled.size} cells take the curve of all presses"
+    message = f"{pooled.sum()} of {pooled.size} cells take the curve of all presses"
     if pressed.size == 1:
         message += f", all on cell {divmod(int(pressed[0]), pooled.shape[1])}"
     unknown = np.isnan(skin.residual_std)

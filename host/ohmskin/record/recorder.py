@@ -27,6 +27,7 @@ from ohmskin.errors import RecordingError
 from ohmskin.files import Closing
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.force_sensor import ForceSensor
 from ohmskin.record.recording import (
     LARGEST_RECORD,
     SCHEMAS,
@@ -45,7 +46,8 @@ class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed or the disk is full.
 
     board: what the board says of itself, which comes first. file: for tests, written to instead of
-    a new file `path`. scans, missed, forces: counts of what was added. tare: the newest one.
+    a new file `path`. scans, missed, forces: counts of what was added. board, tare, force: the
+    newest that was added.
 
     :raises RecordingError: the file is there already, or cannot be written. From then on nothing
         more is written, and what was written before can be read.
@@ -58,6 +60,7 @@ class Recorder(Closing):
         self.scans = self.missed = self.forces = 0
         self.board = board
         self.tare: Tare | None = None
+        self.force: ForceSample | None = None
         self._failure: RecordingError | None = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
@@ -126,6 +129,7 @@ class Recorder(Closing):
                 self._write("mark", asdict(message))
             case ForceSample():
                 self._write("force", asdict(message))
+                self.force = message
                 self.forces += 1
 
     def _write(self, name: str, content: dict[str, Any], sequence: int = 0) -> None:
@@ -189,15 +193,17 @@ def record(
     count: int = 0,
     seconds: float = 0.0,
     tare_s: float = 0.0,
-    beside: Callable[[Scan], None] = lambda scan: None,
+    sensor: ForceSensor | None = None,
+    beside: Callable[[Scan], None] | None = None,
 ) -> None:
     """Record these scans of `skin`: all of them, or so many, or those of so many seconds (0: all).
 
     What the board says of itself is recorded whenever it changes. tare_s: the mean of the scans of
-    so many seconds at first is recorded as a tare, also if less of them come. beside: is called
-    after each scan.
+    so many seconds at first is recorded as a tare, also if less of them come. sensor: its forces
+    are recorded as well. beside: is called after each scan.
 
     :raises RecordingError: as `Recorder.add`.
+    :raises DeviceLost: as `ForceSensor.take`.
     """
     first_s: float | None = None
     untouched: list[Float] = []
@@ -213,7 +219,10 @@ def record(
             elif untouched:
                 recorder.add(_tare(untouched))
                 untouched = []
-            beside(scan)
+            for sample in sensor.take() if sensor is not None else ():
+                recorder.add(sample)
+            if beside is not None:
+                beside(scan)
             if recorder.scans == count or (seconds and elapsed_s >= seconds):
                 return
     finally:
