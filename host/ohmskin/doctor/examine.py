@@ -17,11 +17,11 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, found
 from ohmskin.doctor.signal import RestScans, examine_settling, examine_signal, mean_std_lsb
 from ohmskin.doctor.wires import CornerScans, measure_untouched
-from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
