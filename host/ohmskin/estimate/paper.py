@@ -94,13 +94,17 @@ _IPOPT: Final[dict[str, Any]] = {
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
 }
-# More options, by where a solution starts from. A simulated circuit: the barrier is weak, so that the
-# answer stays near it. Another program's solution: as usual. This program's solution of the frame
-# before, with its multipliers: those of bounds that do not hold stay as weak as they were, or the
-# states drift.
-_FROM_CIRCUIT: Final = (("bound_mult_init_val", 1e-6),)
-_FROM_STEP: Final = ()
-_FROM_BEFORE: Final = (("warm_start_init_point", "yes"), ("warm_start_mult_bound_push", 1e-6))
+# More options, by where a solution starts from. From a simulated circuit, the barrier is weak, so
+# that the answer stays near it. From another program's solution, it is as usual. From this program's
+# solution of the frame before, with its multipliers, those of bounds that do not hold stay as weak
+# as they were, or the states drift.
+Options = tuple[tuple[str, Any], ...]
+_FROM_CIRCUIT: Final[Options] = (("bound_mult_init_val", 1e-6),)
+_FROM_STEP: Final[Options] = ()
+_FROM_BEFORE: Final[Options] = (
+    ("warm_start_init_point", "yes"),
+    ("warm_start_mult_bound_push", 1e-6),
+)
 # What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
 # without callbacks: numbers that are none end as Invalid_Number_Detected.
 _INTERRUPTED: Final = ("User_Requested_Stop", "NonIpopt_Exception_Thrown")
@@ -111,7 +115,7 @@ class Step(NamedTuple):
 
     number: int
     weights: tuple[float, float, float]
-    options: tuple[tuple[str, Any], ...]
+    options: Options
 
 
 STEP_3: Final = Step(3, (1e6, 1e6, 0.0), _FROM_CIRCUIT)
