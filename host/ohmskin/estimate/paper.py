@@ -95,7 +95,7 @@ _IPOPT: Final[dict[str, Any]] = {
     "nlp_scaling_method": "none",
 }
 # More options, by where a solution starts from. From a simulated circuit, the barrier is weak, so
-# that the answer stays near it. From another program's solution, it is as usual. From this program's
+# that the answer stays near it. From another program's solution, it is as usual. From this one's
 # solution of the frame before, with its multipliers, those of bounds that do not hold stay as weak
 # as they were, or the states drift.
 Options = tuple[tuple[str, Any], ...]
