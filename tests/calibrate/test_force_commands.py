@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrations import GHOST, of_scene
+from calibrations import of_scene
 from command_line import Done, assert_one_line
 from ohmskin.force.calibration import load_calibration
 
 REST = "emulator://8x8?seed=1"
+
+GHOST = "emulator://8x8?scene=ghost&seed=1"
 
 
 @pytest.fixture
