@@ -8,9 +8,9 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import Estimator, SkinKnowledge, WireOhm
+from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.link.codes import quantise, ratio_from_codes
+from skins import told
 from studies.trials import skin_at_rest, touch
 
 # Frames of each shape: enough to reach every branch of the estimators. Larger skins take longer.
@@ -55,25 +55,19 @@ def check(estimator: Estimator, ratio: Float) -> None:
         assert np.isfinite(found.bottom_wire_ohm).all()
 
 
-def knowledge_of(shape: tuple[int, int], told: str) -> SkinKnowledge:
+def knowledge_of(shape: tuple[int, int], what: str) -> SkinKnowledge:
     random = np.random.default_rng(1)
-    if told == "nothing":
+    if what == "nothing":
         return SkinKnowledge(*shape, adc_bits=10)
-    rest = random.random((*shape, 4)) if told == "nonsense" else readings(rest_of(shape))
-    return SkinKnowledge(
-        *shape,
-        adc_bits=10,
-        rest_ratio=ratio_from_codes(quantise(rest)),
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
-    )
+    return told(random.random((*shape, 4)) if what == "nonsense" else readings(rest_of(shape)))
 
 
-@pytest.mark.parametrize("told", ["all", "nothing", "nonsense"])
+@pytest.mark.parametrize("what", ["all", "nothing", "nonsense"])
 @pytest.mark.parametrize("shape", FRAMES)
 @pytest.mark.parametrize("method", ["joint", "touch"])
-def test_nonsense_is_answered(method: str, shape: tuple[int, int], told: str) -> None:
-    random = np.random.default_rng([*shape, len(told)])
-    estimator = make_estimator(method, knowledge_of(shape, told))
+def test_nonsense_is_answered(method: str, shape: tuple[int, int], what: str) -> None:
+    random = np.random.default_rng([*shape, len(what)])
+    estimator = make_estimator(method, knowledge_of(shape, what))
     for number in range(FRAMES[shape]):
         check(estimator, frame(KINDS[number % len(KINDS)], shape, random))
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from ohmskin.circuit.skin import Skin, ratio_from_current, readings
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import solve_ports, voltage_squared
-from ohmskin.estimate.methods import make_estimator
-from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
+from ohmskin.estimate.ohm import voltage_level
 from places import DATA
+from skins import ten_bits, told
 
 REST_OHM = 1e6
 
@@ -23,10 +24,6 @@ pytestmark = pytest.mark.filterwarnings("error")
 def wire_free_readings(cell_ohm: np.ndarray) -> np.ndarray:
     none = np.zeros(cell_ohm.shape)
     return readings(Skin(1 / cell_ohm, none, none))
-
-
-def ten_bits(ratio: np.ndarray) -> np.ndarray:
-    return ratio_from_codes(quantise(ratio, 10), 10)
 
 
 # The methods that neglect the wires: what is said of all of them holds where there are none.
@@ -306,6 +303,35 @@ def test_the_first_offending_cell_is_named(method: str, wrong: float) -> None:
 def test_another_shape_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="has shape"):
         make_estimator("ohm", SkinKnowledge(2, 3)).estimate(np.full(shape, 0.5))
+
+
+@pytest.mark.parametrize("method", LEVEL_METHODS)
+def test_levels_are_conductances_but_of_voltage_the_voltages(method: str) -> None:
+    rest, frame = (wire_free_readings(np.full((2, 2), ohm)) for ohm in (1e6, 2e5))
+    estimator = make_estimator(method, told(rest, wires=False))
+    found = estimator.estimate(ten_bits(frame))
+    if method == "voltage":
+        # (1 - A + B + 1 - C + D) / 4 of the readings in this order, and the noise of one of them.
+        level = (2 + ten_bits(frame) @ [-1, 1, -1, 1]) / 4
+        at_rest = (2 + ten_bits(rest) @ [-1, 1, -1, 1]) / 4
+        np.testing.assert_allclose(found.level, level, rtol=1e-12)
+        np.testing.assert_allclose(found.level_std, 1 / 1024 / np.sqrt(12))
+        np.testing.assert_allclose(voltage_level(ten_bits(frame)), level, rtol=1e-12)
+        by_ohm = make_estimator("ohm", told(rest, wires=False)).estimate(ten_bits(frame))
+        np.testing.assert_array_equal(found.cell_siemens, by_ohm.cell_siemens)
+        np.testing.assert_array_equal(found.touched, by_ohm.touched)
+    else:
+        at_rest = estimator.estimate(ten_bits(rest)).cell_siemens
+        np.testing.assert_array_equal(found.level, found.cell_siemens)
+        np.testing.assert_array_equal(found.level_std, found.cell_siemens_std)
+    np.testing.assert_allclose(estimator.rest_level(), at_rest, rtol=0.05)
+
+
+def test_the_level_of_an_unknown_rest_is_refused() -> None:
+    with pytest.raises(ValueError, match="the readings of the untouched skin are not known"):
+        make_estimator("ohm", SkinKnowledge(2, 2)).rest_level()
+    with pytest.raises(ValueError, match="must end in 4"):
+        voltage_level(np.ones((4, 3)))
 
 
 def test_an_unknown_method_is_answered_with_the_known_ones() -> None:

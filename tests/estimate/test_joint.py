@@ -15,12 +15,13 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm
-from ohmskin.estimate.joint import JointEstimator
+from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.prior import LAYER_STD, SEGMENT_STD
+from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, TAIL, CellPrior, WireBelief
 from ohmskin.link.codes import quantise as codes_of
 from ohmskin.link.codes import ratio_from_codes
 from places import DATA
+from skins import ten_bits, told
 from studies.trials import skin_at_rest, touch
 
 
@@ -156,21 +157,6 @@ def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
     assert np.all(error < 4 * estimate.cell_siemens_std)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 4), (3, 1), (2, 2), (4, 4)])
-def test_nonsense_gives_finite_numbers(size: tuple[int, int]) -> None:
-    random = np.random.default_rng(7)
-    frames = [np.zeros((*size, 4)), np.ones((*size, 4)), np.full((*size, 4), 0.5)]
-    frames += list(random.random((60, *size, 4)))
-    estimator = make_estimator("joint", SkinKnowledge(*size, adc_bits=10))
-    for frame in frames:
-        estimate = estimator.estimate(frame)
-        assert np.isfinite(estimate.cell_siemens).all()
-        assert np.isfinite(estimate.cell_siemens_std).all()
-        assert (estimate.cell_siemens_std > 0).all()
-        assert np.isfinite(estimate.top_wire_ohm).all()
-        assert np.isfinite(estimate.chi2)
-
-
 def test_a_frame_seen_before_takes_one_iteration() -> None:
     with np.load(DATA / "presses_8x8.npz", allow_pickle=False) as data:
         ratio, rest = rounded(data["ratio"][30], 10), rounded(data["rest_ratio"], 10)
@@ -188,33 +174,24 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
     """Against the posterior written out with dense matrices, along each of all 3RC resistances."""
     random = np.random.default_rng(8)
     rest = skin_at_rest(3, 4, random)
-    touched = touch(rest, 3, random)
-    knowledge = SkinKnowledge(
-        3,
-        4,
-        adc_bits=10,
-        rest_ratio=rounded(readings(rest), 10),
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
-    )
-    estimator = JointEstimator(knowledge)
-    measured = rounded(readings(touched), 10)
-    found = estimator.estimate(measured)
-    prior = estimator._prior
-    assert prior is not None
+    known, measured = told(readings(rest)), ten_bits(readings(touch(rest, 3, random)))
+    prior = CellPrior(-np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD), TAIL)
     layer = np.kron(np.eye(2), np.ones((12, 12)))
     inverse = np.linalg.inv(LAYER_STD**2 * layer + SEGMENT_STD**2 * np.eye(24))
     nominal = np.log(np.repeat([100.0, 200.0], 12))
-    current = current_from_ratio(measured, 3e4, 3e4)
+    current = current_from_ratio(measured, 3e4, 3e4).ravel()
 
     def cost(log_ohm: Float) -> float:
         cell, top, bottom = log_ohm.reshape(3, 3, 4)
         rho = port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom)))
-        residual = (current - 1 / (rho + 6e4)) / knowledge.current_std
+        residual = (current - 1 / (rho.ravel() + 6e4)) / known.current_std
         off = log_ohm[12:] - nominal
         return float(np.sum(residual**2) + prior.cost(log_ohm[:12]) + off @ inverse @ off)
 
-    wires = np.log([found.top_wire_ohm.ravel(), found.bottom_wire_ohm.ravel()]).ravel()
-    best = np.concatenate([-np.log(found.cell_siemens.ravel()), wires])
+    belief, std = WireBelief(3, 4, 100.0, 200.0), np.full(12, known.current_std)
+    found = FullFit(prior, belief, 6e4, current, std, [prior.expected])
+    assert not found.message
+    best = np.concatenate([found.cell, found.wires])
     lowest = cost(best)
     for resistor in range(36):
         for step in (-0.03, -0.003, 0.003, 0.03):

@@ -16,21 +16,16 @@ from ohmskin.estimate.paper import (
     LsqEstimator,
     PaperEstimator,
     RegularizedEstimator,
-    Start,
     initial_states,
     program_for,
 )
-from ohmskin.link.codes import quantise, ratio_from_codes
 from places import DATA
+from skins import ten_bits
 
 METHODS = (LsqEstimator, RegularizedEstimator)
 both_methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 
 pytestmark = pytest.mark.filterwarnings("error")
-
-
-def ten_bits(ratio: np.ndarray) -> np.ndarray:
-    return ratio_from_codes(quantise(ratio, 10), 10)
 
 
 def a_skin(rows: int, columns: int, cell_ohm: float = 2e4) -> Skin:
@@ -108,7 +103,7 @@ def test_every_state_of_a_solution_is_a_circuit_that_gives_its_reading() -> None
     ratio = readings(Skin(cells, wires[0], wires[1], *references))
     megohm = (references[0] / 1e6, references[1] / 1e6)
     x = initial_states(ratio, megohm, 1e-4)
-    found = program_for(2, 2).solve(ratio, megohm, (1e6, 1e6, 0.0), x, Start.CIRCUIT)
+    found = program_for(2, 2).solve(ratio, megohm, STEP_3, x)
     assert found.success
     for number, layers in enumerate(1e6 * found.megohm.reshape(16, 3, 2, 2)):
         top, bottom, cell = (layer.T for layer in layers)
@@ -244,7 +239,6 @@ def test_it_never_prints(capfd: pytest.CaptureFixture[str]) -> None:
         estimator.estimate(np.zeros((2, 2, 4)))
     # Not even when there is no number to start from.
     x = np.full((16, 20), np.nan)
-    half, start = np.full((2, 2, 4), 0.5), STEP_3.start
-    found = program_for(2, 2).solve(half, (0.03, 0.03), STEP_3.weights, x, start)
+    found = program_for(2, 2).solve(np.full((2, 2, 4), 0.5), (0.03, 0.03), STEP_3, x)
     assert not found.success
     assert capfd.readouterr() == ("", "")

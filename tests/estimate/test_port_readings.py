@@ -10,22 +10,17 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.link.codes import quantise, ratio_from_codes
+from skins import ten_bits, told
 from studies.conditions import shorted_readings
 from studies.trials import random_trial, skin_at_rest, touch
 
 
-def ten_bits(ratio: Float) -> Float:
-    return ratio_from_codes(quantise(ratio))
-
-
-def reader_of(rest_ratio: Float | None, wires: bool = True) -> PortReader:
-    known = WireOhm(100.0, 200.0) if wires else WireOhm()
-    return PortReader(
-        SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest_ratio, nominal_wire_ohm=known)
-    )
+def reader_of(rest_ratio: Float | None) -> PortReader:
+    """Of an 8x8 skin at rest, with its wires; without rest readings nothing is known of it."""
+    known = SkinKnowledge(8, 8, adc_bits=10) if rest_ratio is None else told(rest_ratio)
+    return PortReader(known)
 
 
 @pytest.fixture
@@ -64,14 +59,14 @@ def test_an_open_line_is_named(rest: Skin, touched: Skin, layer: str, line: str)
     wires = getattr(touched, f"{layer}_wire_ohm").copy()
     wires[(3, 0) if layer == "top" else (0, 3)] = 1e12
     cut = replace(touched, **{f"{layer}_wire_ohm": wires})
-    fault = reader_of(ten_bits(readings(rest))).read(ten_bits(readings(cut))).fault
+    fault = reader_of(readings(rest)).read(ten_bits(readings(cut))).fault
     assert "conducts less than at rest" in fault
     assert line in fault
 
 
 def test_a_skin_that_drifted_asks_for_new_rest_readings(rest: Skin) -> None:
     drifted = replace(rest, cell_siemens=0.7 * rest.cell_siemens)
-    fault = reader_of(ten_bits(readings(rest))).read(ten_bits(readings(drifted))).fault
+    fault = reader_of(readings(rest)).read(ten_bits(readings(drifted))).fault
     assert fault == "the whole skin conducts less than at rest: take the rest readings anew"
 
 
@@ -85,16 +80,16 @@ def test_a_line_open_since_rest_is_named(rest: Skin) -> None:
 @pytest.mark.parametrize(("first", "said"), [(4, "rows 4 and 5"), (8 + 1, "columns 1 and 2")])
 def test_shorted_lines_are_named(rest: Skin, touched: Skin, first: int, said: str) -> None:
     shorted = ten_bits(shorted_readings(touched, first, first + 1))
-    assert said in reader_of(ten_bits(readings(rest))).read(shorted).fault
+    assert said in reader_of(readings(rest)).read(shorted).fault
     at_rest = ten_bits(shorted_readings(rest, first, first + 1))
     assert said in reader_of(at_rest).read(at_rest).fault
 
 
 def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:
     shorted = ten_bits(shorted_readings(touched, 5, 8 + 6))
-    fault = reader_of(ten_bits(readings(rest))).read(shorted).fault
+    fault = reader_of(readings(rest)).read(shorted).fault
     assert fault == "cell (5, 6): less resistance than wires have: row and column shorted?"
-    assert not reader_of(None, wires=False).read(shorted).fault
+    assert not reader_of(None).read(shorted).fault
 
 
 @pytest.mark.parametrize("stuck", range(4))
@@ -102,7 +97,7 @@ def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:
 def test_one_stuck_reading_of_a_cell_is_left_out(
     rest: Skin, touched: Skin, stuck: int, at: float
 ) -> None:
-    reader = reader_of(ten_bits(readings(rest)))
+    reader = reader_of(readings(rest))
     ratio = ten_bits(readings(touched))
     good = reader.read(ratio)
     place = tuple(np.argwhere(touched.cell_siemens > rest.cell_siemens)[0])
@@ -115,7 +110,7 @@ def test_one_stuck_reading_of_a_cell_is_left_out(
 
 def test_readings_that_disagree_are_named(rest: Skin, touched: Skin) -> None:
     ratio = ten_bits(readings(touched))
-    reader = reader_of(ten_bits(readings(rest)))
+    reader = reader_of(readings(rest))
     ratio[2, 7, 1:3] = 0.9, 0.4
     assert "cell (2, 7): its readings disagree by" in reader.read(ratio).fault
     ratio[..., 0] = 0.0

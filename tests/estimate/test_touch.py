@@ -8,30 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
+from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import Scene
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, WireBelief
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
-from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import estimate_file, load_readings
 from places import DATA
+from skins import ten_bits, told
 from studies.trials import bent_trial, random_trial, skin_at_rest, touch, trial_of
-
-
-def ten_bits(ratio: Float) -> Float:
-    return ratio_from_codes(quantise(ratio))
-
-
-def knowledge_of(rest: Skin) -> SkinKnowledge:
-    return SkinKnowledge(
-        *rest.shape,
-        adc_bits=10,
-        rest_ratio=ten_bits(readings(rest)),
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
-    )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 1), (4, 5), (8, 8)])
@@ -113,10 +98,9 @@ def test_touch_finds_touches_in_a_large_skin_or_says_what_it_may_have_missed() -
 
 def test_without_rest_readings_touch_is_joint() -> None:
     trial = random_trial(4, 4, 3, 2, seed=5)
-    told = replace(trial.rounded(10), rest_ratio=None)
-    np.testing.assert_array_equal(
-        estimate_file(told, "touch")["cell_siemens"], estimate_file(told, "joint")["cell_siemens"]
-    )
+    frames = replace(trial.rounded(10), rest_ratio=None)
+    few, all_ = (estimate_file(frames, method)["cell_siemens"] for method in ("touch", "joint"))
+    np.testing.assert_array_equal(few, all_)
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])
@@ -157,14 +141,7 @@ def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
     """Two seconds of a fingertip with soft edges, once around half the skin."""
     scene = Scene("moving", 8, 8, seed=seed)
     rest = scene.skin(0.0).top_wire_ohm, scene.skin(0.0).bottom_wire_ohm
-    knowledge = SkinKnowledge(
-        8,
-        8,
-        adc_bits=10,
-        rest_ratio=ten_bits(scene.rest_ratio),
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
-    )
-    estimator = make_estimator(method, knowledge)
+    estimator = make_estimator(method, told(scene.rest_ratio))
     errors, away, converged = [], [], []
     for frame in range(180):
         found = estimator.estimate(ten_bits(scene.ratio(frame / 90)))

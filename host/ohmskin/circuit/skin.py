@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.circuit.cholesky import cholesky, solve_lower
 from ohmskin.link.protocol import ENUMS
 
@@ -158,12 +159,14 @@ def admittance_of(half: Float) -> Float:
     return admittance
 
 
+@one_blas_thread
 def electrode_admittance(skin: Skin) -> Float:
     """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
     root = np.sqrt(skin.cell_siemens)
     return admittance_of(factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
 
 
+@one_blas_thread
 def port_resistance_ohm(skin: Skin) -> Float:
     """rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] [ohm], shape (R, C), all other electrodes floating.
 

@@ -15,14 +15,7 @@ import typer
 from rich.console import Console
 
 import ohmskin
-from ohmskin.cli.doctor_words import (
-    FIELDS,
-    answer,
-    measured_in_words,
-    request,
-    verdict,
-    words_of,
-)
+from ohmskin.cli import doctor_words as words
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Severity, found
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
@@ -40,8 +33,8 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
-WAIT_S: Final = 30.0  # seconds for a person to press where they are asked to
-LONGEST: Final = 2.0  # times as long as usual, at most, where scans are slow
+WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
+LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
 
 _out = Console(soft_wrap=True)
@@ -105,14 +98,14 @@ def _terminal() -> Iterator[tuple[Progress, Ask]]:
         with errors.status("connecting") as status:
             yield (
                 status.update,
-                lambda presses: status.update(f"{request(presses)}; {answer(presses)}"),
+                lambda presses: status.update(f"{words.request(presses)}; {words.answer(presses)}"),
             )
         return
     said: list[str] = []
 
     def ask(presses: CornerScans) -> None:
-        if request(presses) not in said:
-            said.append(request(presses))
+        if words.request(presses) not in said:
+            said.append(words.request(presses))
             errors.print(said[-1], markup=False, highlight=False)
 
     yield lambda text: None, ask
@@ -133,8 +126,8 @@ def diagnose(
     ask: tells a person where to press; without, nobody is asked.
 
     :raises PortError: the URL is wrong.
-    :raises ValueError: the calibration is of another unit or geometry; a skin of one row or column
-        cannot be pressed as it would be asked for.
+    :raises ValueError: the calibration is of another unit or geometry, or somebody would be asked
+        to press a skin of one row or column.
     """
     try:
         device = ohmskin.open(port, start=False)
@@ -162,9 +155,9 @@ def gather(
     progress: Progress = lambda text: None,
     ask: Ask | None = None,
 ) -> None:
-    """Read what `examine` goes by into `evidence`, as far as the board lets; leave it as it was.
+    """Read into `evidence` what `examine` goes by, as far as the board lets. Leave it as it was.
 
-    :raises ValueError: a skin of one row or column cannot be pressed as it would be asked for.
+    :raises ValueError: somebody would be asked to press a skin of one row or column.
     """
     presses = None if ask is None else CornerScans(device.info)
     try:
@@ -219,17 +212,13 @@ def _scan_presses(device: Device, presses: CornerScans, ask: Ask) -> None:
 
 def _unanswered(port: str, error: OhmskinError) -> Finding:
     """Why there is nothing to examine. Raises what is a wrong use instead."""
-    match error:
-        case ProtocolMismatch():
-            kind = Kind.PROTOCOL_MISMATCH
-            return found(kind, port=port, problem=error.problem, remedy=error.remedy)
-        case DeviceSilent():
-            return found(Kind.NOTHING_ANSWERS, port=port, problem=str(error))
-        case DeviceLost():
-            return found(Kind.LOST, problem=error.problem)
-    if "://" in port or error.__cause__ is None:
-        raise error  # no port has refused: the URL is wrong
-    return found(Kind.PORT_UNUSABLE, port=port, problem=error.problem, remedy=error.remedy)
+    if isinstance(error, DeviceLost):
+        return found(Kind.LOST, problem=error.problem)
+    kinds = {ProtocolMismatch: Kind.PROTOCOL_MISMATCH, DeviceSilent: Kind.NOTHING_ANSWERS}
+    kind = kinds.get(type(error), Kind.PORT_UNUSABLE)
+    if kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None):
+        raise error  # no serial port has refused: the URL is wrong
+    return found(kind, port=port, problem=error.problem, remedy=error.remedy)
 
 
 # ----------------------------------------------------------------------------------- the page
@@ -240,13 +229,15 @@ def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
     findings = []
     for finding in diagnosis.findings:
         kind, data = finding.kind, {"place": asdict(finding.place), "values": finding.values}
-        findings.append({"id": kind.id, "severity": kind.severity, **words_of(finding), **data})
+        findings.append(
+            {"id": kind.id, "severity": kind.severity, **words.words_of(finding), **data}
+        )
     return {
         "port": port,
         "sound": not diagnosis.worse,
-        "verdict": verdict(diagnosis),
+        "verdict": words.verdict(diagnosis),
         "findings": findings,
-        "measured": measured_in_words(diagnosis),
+        "measured": words.measured_in_words(diagnosis),
     }
 
 
@@ -258,7 +249,7 @@ def _print(page: dict[str, Any]) -> None:
         severity, name = finding["severity"], finding["id"].replace("_", " ")
         show(f"\n{number}. ", end="")
         show(f"{severity}, {name}: {finding['where']}", style=_COLOURS[severity])
-        for field in FIELDS[1:]:
+        for field in words.FIELDS[1:]:
             show(f"   {field.replace('_', ' '):<10}  {finding[field]}")
     if page["measured"]:
         show("")

@@ -13,7 +13,7 @@ from ohmskin.doctor.wires import LAYERS, CornerScans
 from ohmskin.link.protocol import ENUMS
 
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
-MOST_CELLS: Final = 6  # cells that are named one by one
+MOST_CELLS: Final = 6  # [cells] More are not named one by one.
 
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
@@ -86,12 +86,9 @@ def named(place: Place) -> str:
     """Lines and cells by name."""
     cells = [f"({row}, {column})" for row, column in place.cells]
     more = f" and {len(cells) - MOST_CELLS} more" if len(cells) > MOST_CELLS else ""
+    names = {"row": place.rows, "column": place.columns, "cell": cells[:MOST_CELLS]}
     parts = []
-    for what, several in (
-        ("row", place.rows),
-        ("column", place.columns),
-        ("cell", cells[:MOST_CELLS]),
-    ):
+    for what, several in names.items():
         if several:
             listed = ", ".join(map(str, several))
             parts.append(f"{what}{'s' if len(several) > 1 else ''} {listed}")

@@ -39,7 +39,7 @@ _COMMANDS: Final = {
     "ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
     "calibrate.calibrate": "Learn each cell's force from presses of single cells: a calibration "
-    "file (.json). With a force sensor: 'ohmskin record --force-port', then 'recording'.",
+    "file (.json).",
 }
 
 

@@ -28,7 +28,7 @@ references included, changes none of them and cannot be known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
-from ohmskin.doctor.signal import mean_std_lsb
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
+from ohmskin.doctor.signal import RestScans, mean_std_lsb
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import ratio_from_codes
@@ -45,68 +45,56 @@ from ohmskin.link.messages import Hello
 
 Bool = NDArray[np.bool_]
 
-WIRE_OHM: Final = (100.0, 200.0)  # a segment, top and bottom, unless told: as of simulated skins
+WIRE_OHM: Final = (100.0, 200.0)  # [ohm] Top and bottom segments are so unless told otherwise.
 
-# No current, as it looks.
-DARK_LSB: Final = 0.7  # LSB, at most, without noise: half a code of rounding, and a little
-DARK_NOISE: Final = 0.4  # LSB more for each LSB of noise: negative noise is read as zero
-DARK_SHARE: Final = 0.08  # of the usual current: a cell at rest shows far more of it
-OFFSET_LSB: Final = 2.5  # LSB, at most: the converter's offset, which looks like a current
+# Open lines.
+DARK_LSB: Final = 0.7  # [LSB] No current is read as less than this, because of rounding.
+DARK_NOISE: Final = 0.4  # [1] Noise adds this share of itself, because no code is below zero.
+OFFSET_LSB: Final = 2.5  # [LSB] The converter's offset makes no current look like up to this.
+DARK_SHARE: Final = 0.08  # [1] No more than this share of the usual current is taken for offset.
 
-# Lines that are one electrode.
-ALIKE_LSB: Final = 0.05  # LSB between the means of two lines at a port, besides noise
-ALIKE_STDS: Final = 6.0  # and in deviations of it: many ports of many lines are compared
-DOUBLED: Final = 1.4  # least conductance over that of other lines: 2 is expected, cells differ
-ALIKE_PORTS: Final = 5  # ports that do not agree by chance
-RISE_STDS: Final = 3.0  # with fewer, the rise has to stand out of the other lines' scatter, too
+# Shorted lines.
+ALIKE_LSB: Final = 0.05  # [LSB] Mean readings of shorted lines differ by less, besides noise.
+ALIKE_STDS: Final = 6.0  # [deviations] The noise of hundreds of readings does not reach this.
+DOUBLED: Final = 1.4  # [1] `matrix` finds shorted lines more conductive by this; 2 is expected.
+ALIKE_PORTS: Final = 5  # [ports] So many do not agree by chance.
+RISE_STDS: Final = 3.0  # [deviations] With fewer, the rise must stand out of all lines' scatter.
 
 # Dead cells.
-DEAD_SHARE: Final = 0.3  # of the usual conductance, at most: cells at rest differ by less
-CLEAR_STDS: Final = 5.0  # deviations that the conductance is below it, beside touched cells
+DEAD_SHARE: Final = 0.3  # [1] A dead cell has less than this share of the usual conductance.
+CLEAR_STDS: Final = 5.0  # [deviations] Beside a touch, a dead cell is below that by this.
 
 # Touched and saturated cells.
-REST_QUANTILE: Final = 0.25  # of the cells, taken for one at rest: at least a quarter are
-MOST_AT_REST_SIEMENS: Final = 5e-6  # S: where all cells conduct more, all are touched
-TOUCHED_SHARE: Final = 2.0  # of the conductance at rest, at least
-TOUCHED_STDS: Final = 5.0  # and in deviations of the log of cells at rest, where these are known
-MANY_CELLS: Final = 8  # from which they are
-MOST_SPREAD: Final = 0.4  # log, largest deviation of cells at rest: if wider, many are touched
-SHORTED_OHM: Final = 350.0  # ohm that a saturated cell has at most: the hardest touch has 300
-WIRE_SPREAD: Final = 1.15  # of the wires to it over nominal: the segments differ by 10 %
+REST_QUANTILE: Final = 0.25  # [1] This share of the cells, at least, is taken to be at rest.
+MOST_AT_REST_SIEMENS: Final = 5e-6  # [S] No cell at rest conducts more; 1e-6 is usual.
+TOUCHED_SHARE: Final = 2.0  # [1] A touched cell conducts more than one at rest by this factor.
+TOUCHED_STDS: Final = 5.0  # [deviations] It also stands out of the scatter at rest by this.
+MANY_CELLS: Final = 8  # [cells] The scatter of fewer cells is not known.
+MOST_SPREAD: Final = 0.4  # [log] Cells at rest scatter less: a wider scatter is of touches.
+SHORTED_OHM: Final = 350.0  # [ohm] A saturated cell has less: the hardest touch has 300.
+WIRE_SPREAD: Final = 1.15  # [1] The wires to a cell are over nominal by less: segments scatter.
 
 # Reference resistors.
-RATIO_TOLERANCE: Final = 0.03  # of their ratio: resistors of 1 % differ by up to 2 %
-RATIO_STDS: Final = 3.0  # and in deviations by noise and rounding
-
-
-@dataclass(frozen=True, eq=False)
-class Circuit:
-    """What the means show. touched, wrong: cells (R, C); wrong are those of open or shorted lines,
-    dead and saturated ones. cell_siemens: (R, C), NaN where unknown. reference_ratio: R_top /
-    R_bottom, None where nothing conducts.
-    """
-
-    findings: list[Finding]
-    touched: Bool
-    wrong: Bool
-    cell_siemens: Float
-    reference_ratio: float | None
+RATIO_TOLERANCE: Final = 0.03  # [1] The ratio of two resistors of 1 % is off by up to 2 %.
+RATIO_STDS: Final = 3.0  # [deviations] Noise and rounding change the ratio by less than this.
 
 
 def examine_circuit(
-    mean_codes: Float,
+    rest: RestScans,
     noise_lsb: float,
-    scans: int,
-    board: Hello,
-    wire_ohm: tuple[float, float] = WIRE_OHM,
+    wire_ohm: tuple[float, float],
+    diagnosis: Diagnosis,
     *,
-    moved: bool = False,
-) -> Circuit:
-    """Findings from mean codes (R, C, 4) of so many scans, each reading with this noise [LSB].
+    moved: bool,
+) -> tuple[Bool, Bool]:
+    """Adds lines, cells and references to a diagnosis. Returns two masks of cells, (R, C): those
+    that are touched, and those that are dead or saturated or have an open or shorted line.
 
-    wire_ohm: a segment of the top and bottom layer. moved: something touches the skin and moves;
-    then shorted lines and dead cells are not judged, because the means are of no one skin.
+    noise_lsb: of a reading. wire_ohm: a segment of the top and bottom layer. moved: something
+    touches the skin and moves; then shorted lines and dead cells are not judged, because the means
+    are of no one skin.
     """
+    board, mean_codes, findings = rest.board, rest.mean, diagnosis.findings
     full = (1 << board.adc_bits) - 1
     shown = np.where(READING_SIGN > 0, mean_codes, full - mean_codes)
     current = shown.mean(axis=2)
@@ -116,10 +104,10 @@ def examine_circuit(
     dark = current < least
     nothing = np.zeros(current.shape, dtype=np.bool_)
     if dark.all():
-        finding = found(Kind.NOTHING_CONDUCTS, cell_count=dark.size)
-        return Circuit([finding], nothing, ~nothing, np.full(dark.shape, np.nan), None)
+        findings.append(found(Kind.NOTHING_CONDUCTS, cell_count=dark.size))
+        diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
+        return nothing, ~nothing
     no_row, no_column = dark.all(axis=1), dark.all(axis=0)
-    findings = []
     for kind, place, count, cells in (
         (Kind.OPEN_ROW, Place(rows=lines_of(no_row)), rows, columns),
         (Kind.OPEN_COLUMN, Place(columns=lines_of(no_column)), columns, rows),
@@ -130,7 +118,7 @@ def examine_circuit(
     siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
     shorted = nothing.copy()
     if not moved:
-        std = noise_lsb / (4 * scans) ** 0.5
+        std = noise_lsb / (4 * len(rest.codes)) ** 0.5
         row_groups = _shorted(current, siemens, std, out)
         column_groups = _shorted(current.T, siemens.T, std, out.T)
         for group in row_groups:
@@ -144,11 +132,13 @@ def examine_circuit(
         if shorted.any():
             # Shorted lines are one: the network without the others is right for all other cells.
             siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
-    judged = ~out & ~shorted
-    touched, bad, cell_findings = _judge_cells(siemens, siemens_std, judged, wire_ohm, moved)
-    ratio, ratio_findings = _references(shown[~dark], board, mean_std_lsb(noise_lsb, scans))
-    findings += cell_findings + ratio_findings
-    return Circuit(findings, touched, out | shorted | bad, siemens, ratio)
+    wrong = out | shorted
+    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, wire_ohm, findings, moved=moved)
+    mean_std = mean_std_lsb(noise_lsb, len(rest.codes))
+    ratio = _reference_ratio(shown[~dark], mean_std, board, findings)
+    cell_ohm = 1 / np.nanmedian(siemens)
+    diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
+    return touched, wrong | bad
 
 
 def _cells(mean_codes: Float, board: Hello, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
@@ -188,13 +178,18 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
 
 
 def _judge_cells(
-    siemens: Float, std: Float, judged: Bool, wire_ohm: tuple[float, float], moved: bool
-) -> tuple[Bool, Bool, list[Finding]]:
-    """Touched cells, cells that are dead or saturated, findings."""
+    siemens: Float,
+    std: Float,
+    judged: Bool,
+    wire_ohm: tuple[float, float],
+    findings: list[Finding],
+    *,
+    moved: bool,
+) -> tuple[Bool, Bool]:
+    """Adds dead and saturated cells to findings. Returns touched cells, and these."""
     dead: Bool = np.zeros(siemens.shape, dtype=np.bool_)
     if not judged.any():
-        return dead, dead, []
-    findings = []
+        return dead, dead
     rest = min(float(np.quantile(siemens[judged], REST_QUANTILE)), MOST_AT_REST_SIEMENS)
     high: Bool = judged & (siemens > _touched_share(siemens[judged]) * rest)
     if not moved and high.sum() < judged.sum() > 1:
@@ -213,7 +208,7 @@ def _judge_cells(
     if saturated.any():
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
         findings.append(found(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest))
-    return high & ~saturated, dead | saturated, findings
+    return high & ~saturated, dead | saturated
 
 
 def _touched_share(siemens: Float) -> float:
@@ -225,23 +220,19 @@ def _touched_share(siemens: Float) -> float:
     return max(TOUCHED_SHARE, float(np.exp(TOUCHED_STDS * spread)))
 
 
-def _references(lit: Float, board: Hello, mean_std: float) -> tuple[float, list[Finding]]:
-    """R_top / R_bottom, and whether it is far from what the board says.
+def _reference_ratio(lit: Float, mean_std: float, board: Hello, findings: list[Finding]) -> float:
+    """R_top / R_bottom. Adds to findings if it is far from what the board says.
 
     lit: what the ports (P, 4) with a current show of it, with the deviation mean_std [LSB].
     """
     ratio = float(lit[:, READING_SENSES_TOP].sum() / lit[:, ~READING_SENSES_TOP].sum())
-    nominal = board.ref_top_ohm / board.ref_bottom_ohm
     # Of A and D, one rounds as the other; the same of B and C.
     ratio_std = mean_std * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
-    off = ratio / nominal - 1
-    if abs(off) < RATIO_TOLERANCE + RATIO_STDS * ratio_std:
-        return ratio, []
-    finding = found(
-        Kind.REFERENCE_RATIO,
-        ratio=ratio,
-        off_percent=100 * off,
-        ref_top_ohm=board.ref_top_ohm,
-        ref_bottom_ohm=board.ref_bottom_ohm,
-    )
-    return ratio, [finding]
+    top, bottom = board.ref_top_ohm, board.ref_bottom_ohm
+    off = ratio * bottom / top - 1
+    if abs(off) >= RATIO_TOLERANCE + RATIO_STDS * ratio_std:
+        refs = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
+        findings.append(
+            found(Kind.REFERENCE_RATIO, WHOLE_SKIN, ratio=ratio, off_percent=100 * off, **refs)
+        )
+    return ratio

@@ -17,24 +17,18 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, found
-from ohmskin.doctor.signal import (
-    SOUND_NOISE_LSB,
-    RestScans,
-    examine_settling,
-    examine_signal,
-    mean_std_lsb,
-)
+from ohmskin.doctor.signal import RestScans, examine_settling, examine_signal, mean_std_lsb
 from ohmskin.doctor.wires import CornerScans, measure_untouched
-from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
-RATE_TOLERANCE: Final = 0.005  # of the rate that was asked for: a ceramic resonator is off by that
-SLOW_HOST: Final = 0.1  # of the scan rate: clocks are off by less, so the host has not kept up
-LEAST_SPAN_S: Final = 1.0  # seconds by the host's clock; in less, bursts of scans change the rate
-LEAST_TIMER_MS: Final = 1  # milliseconds, the least that a USB bridge's timer can be set to
-BAD_RESETS: Final = ("brown_out", "watchdog")  # causes of a reset that nobody means to bring about
+RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
+SLOW_HOST: Final = 0.1  # [1] Clocks differ by far less, so a host that is off by this is slow.
+LEAST_SPAN_S: Final = 1.0  # [s] Scans come in bursts, which hide the rate in less time.
+LEAST_TIMER_MS: Final = 1  # [ms] The timer of a USB bridge cannot be set to less.
+BAD_RESETS: Final = ("brown_out", "watchdog")  # A sound board is not reset by these.
 
 
 @dataclass
@@ -89,32 +83,18 @@ def examine(evidence: Evidence) -> Diagnosis:
 
 def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
     """Adds what the scans show: signal, circuit, and the wires if nothing hides them."""
-    board, wire_ohm = evidence.board, evidence.wire_ohm or WIRE_OHM
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
-    signal, best = examine_signal(usual, settled), usual
-    moves = bool(signal.moved.any())
-    if settled is not None and not moves:
-        unsettled, most_lsb = examine_settling(usual, settled)
-        diagnosis.findings += unsettled
-        diagnosis.measured["settling_lsb"] = round(most_lsb, 2)
-        best = settled if unsettled else usual
-    scans, noise_lsb = len(best.codes), signal.noise_lsb
-    circuit = examine_circuit(best.mean, noise_lsb, scans, board, wire_ohm, moved=moves)
-    diagnosis.findings += signal.findings + circuit.findings
-    known = circuit.cell_siemens[np.isfinite(circuit.cell_siemens)]
-    diagnosis.measured |= {
-        "noise_lsb": round(noise_lsb, 3),
-        "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
-        "hum_lsb": round(signal.hum_lsb, 2),
-        "hum_not_visible": list(signal.hidden_hz),
-        "reference_ratio": circuit.reference_ratio and round(circuit.reference_ratio, 4),
-        "cell_ohm": float(f"{1 / np.median(known):.3g}") if known.size else None,
-    }
-    touched = circuit.touched if circuit.touched.any() else signal.moved
+    noise_lsb, moved = examine_signal(usual, diagnosis, settled)
+    moves, rest = bool(moved.any()), usual
+    if settled is not None and not moves and examine_settling(usual, settled, diagnosis):
+        rest = settled
+    wire_ohm = evidence.wire_ohm or WIRE_OHM
+    touched, wrong = examine_circuit(rest, noise_lsb, wire_ohm, diagnosis, moved=moves)
+    touched = touched if touched.any() else moved
     if touched.any():
         diagnosis.findings.append(found(Kind.TOUCHED, Place.of_cells(touched), moves=moves))
-    elif not circuit.wrong.any():
-        _examine_wires(evidence, best, noise_lsb, diagnosis)
+    elif not wrong.any():
+        _examine_wires(evidence, rest, noise_lsb, diagnosis)
 
 
 def _examine_wires(

@@ -35,7 +35,7 @@ class Kind(Enum):
     """
 
     PORT_UNUSABLE = "port_unusable", _FAULT, "port problem remedy"
-    NOTHING_ANSWERS = "nothing_answers", _FAULT, "port problem"
+    NOTHING_ANSWERS = "nothing_answers", _FAULT, "port problem remedy"
     PROTOCOL_MISMATCH = "protocol_mismatch", _FAULT, "port problem remedy"
     LOST = "lost", _FAULT, "problem"
     SELF_TEST = "self_test", _FAULT, "name code_min code_max"

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Finding, Kind, Place, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
 from ohmskin.link.timing import reading_offsets_s, slot_s
@@ -43,39 +43,39 @@ from ohmskin.link.timing import reading_offsets_s, slot_s
 Bool = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
 
-REST_S: Final = 2.5  # seconds of scans as the board is configured: tells 50 from 52.5 Hz
-SETTLED_S: Final = 1.6  # seconds of the second look: with all else, the doctor takes under 10 s
-LEAST_SCANS: Final = 16  # from which noise and hum are judged: in fewer they are not known well
+REST_S: Final = 2.5  # [s] The first look takes this long: with all else, less than 10 s pass.
+SETTLED_S: Final = 1.6  # [s] The second look takes this long: it need not tell noise.
+LEAST_SCANS: Final = 16  # [scans] Noise and hum are not judged by fewer.
 
-MAINS_HZ: Final = (50.0, 60.0)  # Hz, the mains of the world
-MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)  # Hz: resonator and grid are off by 0.5 %
-HUM_LSB: Final = 0.5  # LSB, amplitude that matters: less changes a code by one at most
-# P over that of noise, in its deviation for M independent readings. The four readings of a cell
-# round alike, so that these are five true deviations.
+MAINS_HZ: Final = (50.0, 60.0)  # [Hz] The world has these mains.
+MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)  # [Hz] Resonator and grid are off by 0.5 %.
+HUM_LSB: Final = 0.5  # [LSB] Hum of a smaller amplitude changes a code by one, and is not told.
+# [deviations] P is above that of noise by so many deviations, if all readings were independent. The
+# four readings of a cell round alike, so that it is half as many.
 HUM_OVER_NOISE: Final = 10.0
-HUM_OVER_BESIDE: Final = 3.0  # P over that beside it: drift and other tones are as strong there
-BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)  # in 1 / duration: a Hann window's main lobe ends at 2
-ALIKE_POWER: Final = 2.0  # two mains whose P differ by less may be one that is seen twice
-IN_PHASE: Final = 1.5  # of those, the one is right whose phases agree so many times better
-OVERLAP: Final = 0.5  # of |c|^2, from which a sine and its mirror image cannot be told apart
-STILL_HZ: Final = 0.5  # Hz besides 4 / duration: mains that are seen slower look like drift
+HUM_OVER_BESIDE: Final = 3.0  # [1] P of drift and of other tones is as high beside.
+BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)  # [1 / duration] A Hann window's main lobe ends at 2.
+ALIKE_POWER: Final = 2.0  # [1] If two mains differ less in P, they may be one that is seen twice.
+IN_PHASE: Final = 1.5  # [1] The right one of these has phases that agree better by this factor.
+OVERLAP: Final = 0.5  # [1] From this |m|^2 on, a sine and its mirror image cannot be told apart.
+STILL_HZ: Final = 0.5  # [Hz] Mains that are seen below this plus 4 / duration look like drift.
 
-ADC_NOISE_LSB: Final = 0.3  # LSB, of a sound board's converter, as the emulated one has it
-SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5  # LSB, the same with rounding
-NOISY_LSB: Final = 0.8  # LSB, of most cells: twice that of a sound board
-NOISY_CELL_LSB: Final = 1.0  # LSB, of a line or cell: more, because the worst of many is taken
-NOISY_SHARE: Final = 1.7  # of a line or cell over the others: three times the power
+ADC_NOISE_LSB: Final = 0.3  # [LSB] A sound board's converter has this noise, as the emulated one.
+SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5  # [LSB] This is seen with rounding.
+NOISY_LSB: Final = 0.8  # [LSB] A board whose usual noise is above this, twice that, is noisy.
+NOISY_CELL_LSB: Final = 1.0  # [LSB] A noisy line or cell has more: the worst of many is looked at.
+NOISY_SHARE: Final = 1.7  # [1] It also has this factor over the usual noise: three times the power.
 
-BLOCKS: Final = 8  # parts of the scans whose means are compared: 0.3 s, shorter than a touch
-MOVED_LSB: Final = 3.0  # LSB from one mean to another: the lightest touch changes some 15
-CLEAR_STDS: Final = 6.0  # deviations of a clear difference: up to 1024 readings are looked at
+BLOCKS: Final = 8  # [parts] Means of so many parts of the scans, 0.3 s each, show what moves.
+MOVED_LSB: Final = 3.0  # [LSB] A touch changes these means by more: the lightest one by 15.
+CLEAR_STDS: Final = 6.0  # [deviations] By chance, none of 1024 readings differs so much.
 
-UNSETTLED_LSB: Final = 1.0  # LSB, change with a longer settle time that matters: one code
-SETTLED_NOISE_LSB: Final = 0.5  # LSB, least scatter: codes that do not scatter hide so much
-LONGER: Final = 4  # settle time of the second look: of what was left, its fourth power is left
-LEAST_LONGER_US: Final = 100  # microseconds, at least: ten time constants of 10 us
-NOT_LONGER: Final = 1.2  # a settle time that is longer by less shows nothing new
-LEAST_LOOK_HZ: Final = 4.0  # Hz of the second look, unless the board is slower: six scans
+UNSETTLED_LSB: Final = 1.0  # [LSB] A longer settle time changes settled readings by less: a code.
+SETTLED_NOISE_LSB: Final = 0.5  # [LSB] Scatter is taken for this at least: rounding hides as much.
+LONGER: Final = 4  # [1] The second look settles for so many times as long.
+LEAST_LONGER_US: Final = 100  # [us] It settles at least for this: ten time constants of 10 us.
+NOT_LONGER: Final = 1.2  # [1] A settle time that is longer by less than this shows nothing new.
+LEAST_LOOK_HZ: Final = 4.0  # [Hz] The second look is not slower, unless the board is.
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,23 +121,11 @@ class Hum:
     lsb: float
 
 
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """What scans show besides their means.
-
-    noise_lsb: of a reading, without hum. hum_lsb: amplitude, 0 for none. hidden_hz: mains that the
-    scans cannot show. moved: cells that changed meanwhile, (R, C).
-    """
-
-    findings: list[Finding]
-    noise_lsb: float
-    hum_lsb: float
-    hidden_hz: tuple[float, ...]
-    moved: Bool
-
-
-def examine_signal(scans: RestScans, other: RestScans | None = None) -> Signal:
-    """Hum, the noise that is left without it, and what moved meanwhile.
+def examine_signal(
+    scans: RestScans, diagnosis: Diagnosis, other: RestScans | None = None
+) -> tuple[float, Bool]:
+    """Adds hum and noise to a diagnosis. Returns the noise of a reading without hum [LSB], and the
+    cells that changed meanwhile, (R, C).
 
     other: scans at another rate, which may show a hum that these hide.
     """
@@ -148,15 +136,22 @@ def examine_signal(scans: RestScans, other: RestScans | None = None) -> Signal:
         rest -= np.real(turn[:, None, None, None] * hum.amplitude)
     # Differences from scan to scan: what moves slowly is no noise.
     variance = np.mean(np.diff(rest, axis=0) ** 2, axis=0) / 2
+    noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
     moved = _moved(rest, variance)
     if other is not None and hidden_hz and hum is None and not moved.any():
         hum = find_hum(other)
         hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
-    findings = [] if hum is None else [_hum_finding(hum, scans.board)]
+    if hum is not None:
+        diagnosis.findings.append(_hum_finding(hum, scans.board))
     if len(scans.codes) >= LEAST_SCANS and not moved.any():
-        findings += _noise(np.sqrt(variance.mean(axis=2)))
-    noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
-    return Signal(findings, noise_lsb, 0.0 if hum is None else hum.lsb, hidden_hz, moved)
+        diagnosis.findings += _noise(np.sqrt(variance.mean(axis=2)))
+    diagnosis.measured |= {
+        "noise_lsb": round(noise_lsb, 3),
+        "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
+        "hum_lsb": 0.0 if hum is None else round(hum.lsb, 2),
+        "hum_not_visible": list(hidden_hz),
+    }
+    return noise_lsb, moved
 
 
 def mean_std_lsb(noise_lsb: float, scans: int) -> float:
@@ -340,19 +335,20 @@ def _is_longer(settle_us: int, than_us: int) -> bool:
     return settle_us > NOT_LONGER * than_us
 
 
-def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding], float]:
-    """Means at the usual settle time against a longer one; the largest clear difference [LSB]."""
+def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis) -> bool:
+    """Adds to a diagnosis how means change with a longer settle time. Returns whether they do."""
     settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
+    diagnosis.measured["settling_lsb"] = 0.0
     if not _is_longer(longer_us, settle_us):
-        return [], 0.0
+        return False
     change = np.abs(usual.mean - settled.mean)
     scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
     in_mean = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
     clear = change - CLEAR_STDS * np.maximum(scatter, SETTLED_NOISE_LSB) * in_mean
-    most_lsb = float(clear.max())
-    if most_lsb <= UNSETTLED_LSB:
-        return [], max(most_lsb, 0.0)
+    diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
     cells = (clear > UNSETTLED_LSB).any(axis=2)
+    if not cells.any():
+        return False
     # A node that is left with e of its swing S after t settles with tau = t / ln(S / e).
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(float(change.max()), 0.9 * swing)
@@ -366,4 +362,5 @@ def examine_settling(usual: RestScans, settled: RestScans) -> tuple[list[Finding
         longer_us=longer_us,
         needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
     )
-    return [finding], most_lsb
+    diagnosis.findings.append(finding)
+    return True

@@ -75,30 +75,31 @@ Bool = NDArray[np.bool_]
 
 LAYERS: Final = ("top", "bottom")
 
-# What is told. Shares are over the nominal wires, deviations of pressed ones those of logs.
-KNOWN: Final = 0.15  # largest deviation of a share that is told: well below a change
-CHANGED: Final = 0.25  # a change that matters: estimators expect smaller ones of every layer
-LINE_CHANGED: Final = 0.75  # a change of one line that matters: it moves fewer cells
-CLEAR_STDS: Final = 5.0  # deviations of a clear change: up to 34 shares are looked at
-PRESSED_CLEAR_STDS: Final = 3.5  # the same of presses: two or three shares are looked at
+# What is told. Shares are over nominal; deviations of pressed ones are those of their logs.
+KNOWN: Final = 0.15  # [share] A deviation above this is too close to a change to tell the share.
+CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of a layer anyway.
+LINE_CHANGED: Final = 0.75  # [share] A line matters less than a layer: it moves fewer cells.
+CLEAR_STDS: Final = 5.0  # [deviations] By chance, none of up to 34 shares differs by this.
+PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
 
-# What is expected of an untouched skin: deviations of shares and of log resistances.
-LAYER_STD: Final = 30.0  # of a layer: wide, so that the readings decide
-LINE_STD: Final = 0.05  # of a line from its layer, because lines of a layer change alike
-ODD_LINE_STD: Final = 30.0  # of the one line that is asked about
-COMMON_STD: Final = 1.0  # log, of what all cells have in common: it drifts, and tells no wires
-LEAST_STD: Final = 0.001  # log, of each cell: no two cells are more alike than this
+# Standard deviations before the readings, of an untouched skin.
+LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
+LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
+ODD_LINE_STD: Final = 30.0  # [share] The line that is asked about may have changed by any factor.
+COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
+LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
+# Standard deviations before the readings, of a pressed skin.
+BEFORE_STD: Final = 2.0  # [log] All wires may have changed by a factor of seven.
+DRIFT_STD: Final = 0.01  # [log] An untouched cell drifts by this in the seconds since it was read.
 
-# What is expected of presses.
-PRESS_S: Final = 1.0  # seconds of scans with the same corners: 90 scans even the noise out
-PRESSED_SIEMENS: Final = 2e-5  # a firm press: 20 times a cell at rest, so that wires show
-FOURTH_SHARE: Final = 0.5  # what any other cell may conduct, over the weakest corner
-HELD_SHARE: Final = 0.5  # scans of corners that count, over those held longest: not in passing
-BEFORE_STD: Final = 2.0  # of y before anything is pressed: a factor of 7
-DRIFT_STD: Final = 0.01  # log, of an untouched cell since it was read, seconds ago
-MOST_STEPS: Final = 20  # Gauss-Newton steps: as a rule five are enough
-LONGEST_STEP: Final = 1.0  # log: further away the slopes are others
-CLOSE: Final = 1e-4  # log: a last step, far below any deviation
+# Presses.
+PRESS_S: Final = 1.0  # [s] Corners are held this long, so that scans even the noise out.
+PRESSED_SIEMENS: Final = 2e-5  # [S] A firm press conducts more: 20 times a cell at rest.
+FOURTH_SHARE: Final = 0.5  # [1] No other cell conducts more than this share of the weakest corner.
+HELD_SHARE: Final = 0.5  # [1] Corners with less than this share of the most scans were passed by.
+MOST_STEPS: Final = 20  # [steps] A fit that converges takes fewer.
+LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
+CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
 
 
 def _port_ohm(ratio: Float, noise_lsb: Float | float, board: Hello) -> tuple[Float, Float]:
@@ -258,7 +259,7 @@ class CornerScans:
         rest_codes: mean codes (R, C, 4) of so many scans of the untouched skin, each reading with
         this noise. wire_ohm: nominal ones of a segment, top and bottom.
         """
-        rest = self._look(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
+        rest = self._ports(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
         most = max(map(len, self._codes.values()), default=0)
         found = []
         for corners, codes in self._codes.items():
@@ -266,16 +267,16 @@ class CornerScans:
                 continue
             # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
             scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
-            pressed = self._look(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
+            pressed = self._ports(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
             free = _free(rest.log_ohm.shape, corners)
             found.append((corners[0], *_pressed_fit(rest, pressed, free, wire_ohm)))
         return shares_of(found)
 
-    def _look(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Look:
+    def _ports(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Ports:
         ratio = ratio_from_codes(mean, self._board.adc_bits)
         variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1) + noise_lsb**2 / scans
         port_ohm, std_ohm = _port_ohm(ratio, np.sqrt(variance), self._board)
-        return _Look(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
+        return _Ports(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
 
 
 def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
@@ -300,7 +301,7 @@ def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _Ports:
     """Port resistances and deviations (RC,) [ohm]; log resistances of the cells by `matrix`."""
 
     port_ohm: Float
@@ -309,7 +310,7 @@ class _Look:
 
 
 def _pressed_fit(
-    rest: _Look, pressed: _Look, free: Bool, wire_ohm: tuple[float, float]
+    rest: _Ports, pressed: _Ports, free: Bool, wire_ohm: tuple[float, float]
 ) -> tuple[float, float]:
     """y and its deviation."""
     shape = free.shape
@@ -324,12 +325,12 @@ def _pressed_fit(
             for cell in (untouched, untouched + lift)
         )
         at_rest = np.linalg.inv(before.by_cell)
-        through = now.by_cell @ at_rest
+        through = now.by_cell @ at_rest  # B1 B0^-1
         by_rest_wires = before.by_wires()
         off_rest = rest.port_ohm - before.port_ohm
-        residual = pressed.port_ohm - now.port_ohm - through @ off_rest
-        by_segment = now.by_wires() - through @ by_rest_wires
-        slopes = by_segment.sum(axis=1)
+        residual = pressed.port_ohm - now.port_ohm - through @ off_rest  # r
+        by_segment = now.by_wires() - through @ by_rest_wires  # W
+        slopes = by_segment.sum(axis=1)  # w
         spread = now.by_cell * variance
         covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
         covariance += (through * rest.std_ohm**2) @ through.T + np.diag(pressed.std_ohm**2)

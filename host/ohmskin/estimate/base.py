@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.circuit.skin import (
     CONFIGURATIONS,
     DEFAULT_REF_OHM,
@@ -25,7 +26,6 @@ from ohmskin.circuit.skin import (
     current_std,
     ratio_from_current,
 )
-from ohmskin.estimate.blas import one_blas_thread
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello

@@ -42,9 +42,8 @@ were taken and why, and what can be expected of the answers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from functools import lru_cache
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 import casadi
 import numpy as np
@@ -82,22 +81,7 @@ _FAULT_STDS: Final = 5.0  # a reading that is further from such ports is at faul
 # states are different circuits, and their mean is none of them.
 MISFIT_RATIO: Final = 1e-3
 _POOR_START_MEGOHM: Final = 10.0  # nearer to its bound, a solution is a poor start for the next
-_JUMP_RATIO: Final = (
-    0.02  # of a reading since the last frame, of Vdd: above it a frame starts afresh
-)
-
-
-class Start(Enum):
-    """Where a solution starts from, with Ipopt's options for it: they decide how barriers start."""
-
-    # A simulated circuit: the barrier is weak, so that the answer stays near it.
-    CIRCUIT = (("bound_mult_init_val", 1e-6),)
-    # Another program's solution.
-    STEP_3 = ()
-    # This program's solution of the frame before, with its multipliers. Those of bounds that do not
-    # hold stay as weak as they were, or the states drift.
-    PREVIOUS = (("warm_start_init_point", "yes"), ("warm_start_mult_bound_push", 1e-6))
-
+_JUMP_RATIO: Final = 0.02  # change of a reading, of Vdd: above it a frame starts afresh
 
 _IPOPT: Final[dict[str, Any]] = {
     "print_level": 0,
@@ -110,22 +94,32 @@ _IPOPT: Final[dict[str, Any]] = {
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
 }
+# More options, by where a solution starts from. From a simulated circuit, the barrier is weak, so
+# that the answer stays near it. From another program's solution, it is as usual. From this one's
+# solution of the frame before, with its multipliers, those of bounds that do not hold stay as weak
+# as they were, or the states drift.
+Options = tuple[tuple[str, Any], ...]
+_FROM_CIRCUIT: Final[Options] = (("bound_mult_init_val", 1e-6),)
+_FROM_STEP: Final[Options] = ()
+_FROM_BEFORE: Final[Options] = (
+    ("warm_start_init_point", "yes"),
+    ("warm_start_mult_bound_push", 1e-6),
+)
 # What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
 # without callbacks: numbers that are none end as Invalid_Number_Detected.
 _INTERRUPTED: Final = ("User_Requested_Stop", "NonIpopt_Exception_Thrown")
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One step of Algorithm 1. weights: alpha, beta and lambda of its objective."""
 
     number: int
     weights: tuple[float, float, float]
-    start: Start
+    options: Options
 
 
-STEP_3: Final = Step(3, (1e6, 1e6, 0.0), Start.CIRCUIT)
-STEP_4: Final = Step(4, (1.0, 1.0, 1e9), Start.STEP_3)
+STEP_3: Final = Step(3, (1e6, 1e6, 0.0), _FROM_CIRCUIT)
+STEP_4: Final = Step(4, (1.0, 1.0, 1e9), _FROM_STEP)
 
 
 # -------------------------------------------------------------------------------- the estimators
@@ -224,15 +218,12 @@ class PaperEstimator(Estimator):
         for place, step in enumerate(self.steps):
             before = previous[place] if previous else None
             if before is not None:
-                x, start = before.x, Start.PREVIOUS
+                x = before.x
             elif optima:
-                x, start = optima[-1].x, step.start
+                x = optima[-1].x
             else:
                 x = initial_states(ratio, self._reference_megohm, self.start_wire_megohm)
-                start = step.start
-            optima.append(
-                self._program.solve(ratio, self._reference_megohm, step.weights, x, start, before)
-            )
+            optima.append(self._program.solve(ratio, self._reference_megohm, step, x, before))
         layers = optima[-1].megohm.mean(axis=0).reshape(3, known.columns, known.rows)
         top, bottom, cell = (OHM_PER_MEGOHM * layer.T for layer in layers)
         skin = Skin(1.0 / cell, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
@@ -375,7 +366,10 @@ class Program:
             "g": casadi.vertcat(*(state.laws for state in states)),
             "p": casadi.vertcat(y, references, weights),
         }
-        self._solvers = {start: _make_solver(problem, start) for start in Start}
+        self._solvers = {
+            options: _make_solver(problem, dict(options))
+            for options in (_FROM_CIRCUIT, _FROM_STEP, _FROM_BEFORE)
+        }
         is_resistance = np.arange(5 * cells) < 3 * cells
         least = np.where(is_resistance, np.log(MIN_MEGOHM), -np.inf)
         most = np.where(is_resistance, np.log(MAX_MEGOHM), np.inf)
@@ -390,24 +384,25 @@ class Program:
         self,
         ratio: Float,
         reference_megohm: tuple[float, float],
-        weights: tuple[float, float, float],
+        step: Step,
         x: Float,
-        start: Start,
         previous: Optimum | None = None,
     ) -> Optimum:
         """Minimise from the states x (4N, 5N), which are the answer if Ipopt's has no numbers.
 
-        ratio: (R, C, 4); reference_megohm: top, bottom; weights: alpha, beta, lambda. `previous`,
-        for `Start.PREVIOUS`, brings the multipliers.
+        ratio: (R, C, 4); reference_megohm: top, bottom. previous: where x is from, if x is from the
+        frame before.
         """
         arguments = dict(self._bounds)
         if previous is not None:
             arguments["lam_x0"] = previous.bound_multipliers
             arguments["lam_g0"] = previous.constraint_multipliers
-        solver = self._solvers[start]
+        solver = self._solvers[step.options if previous is None else _FROM_BEFORE]
         # Column-major: rows run fastest, then columns.
         y = ratio.transpose(1, 0, 2).ravel()
-        found = solver(x0=x.ravel(), p=np.concatenate([y, reference_megohm, weights]), **arguments)
+        found = solver(
+            x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
+        )
         report = solver.stats()
         if report["return_status"] in _INTERRUPTED:
             raise KeyboardInterrupt
@@ -429,12 +424,12 @@ def program_for(rows: int, columns: int) -> Program:
     return Program(rows, columns)
 
 
-def _make_solver(problem: dict[str, Any], start: Start) -> Any:
-    options = {f"ipopt.{name}": value for name, value in (_IPOPT | dict(start.value)).items()}
+def _make_solver(problem: dict[str, Any], more: dict[str, Any]) -> Any:
+    options = {f"ipopt.{name}": value for name, value in (_IPOPT | more).items()}
     # Sensitivities to the parameters (lam_p) are not needed, and warn where Ipopt gave up.
     silent = ("print_time", "show_eval_warnings", "error_on_fail", "calc_lam_p")
     quiet = dict.fromkeys(silent, False)
-    return casadi.nlpsol(f"paper_{start.name.lower()}", "ipopt", problem, options | quiet)
+    return casadi.nlpsol("paper", "ipopt", problem, options | quiet)
 
 
 class _State:

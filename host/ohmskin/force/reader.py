@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,9 @@ from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
 from ohmskin.link.device import Device
 from ohmskin.link.messages import BoardStats, Hello, Scan
-from ohmskin.record.recording import Tare
+
+if TYPE_CHECKING:
+    from ohmskin.record.recording import Tare
 
 # The method where neither a calibration nor the user says one.
 DEFAULT_METHOD: Final = "joint"
@@ -182,7 +184,7 @@ class SkinReader:
                 "nothing is on it"
             )
         self._rests.all.append(Untouched(rest_ratio, now()))
-        return Tare(rest_ratio, time.monotonic())
+        return _recorded(rest_ratio)
 
     def undo_tare(self) -> Tare | None:
         """Return to the rest before the last tare. Returns that, for a `Recorder`, if it is known.
@@ -193,7 +195,7 @@ class SkinReader:
             raise TareRefused("there is no tare to undo")
         self._rests.all.pop()
         rest = self._rests.newest
-        return None if rest is None else Tare(rest.ratio, time.monotonic())
+        return None if rest is None else _recorded(rest.ratio)
 
     # -------------------------------------------------------------------------------- scans
 
@@ -335,6 +337,12 @@ class CalibratedSkin(Closing):
     def close(self) -> None:
         """Close the device. May be called again."""
         self.device.close()
+
+
+def _recorded(rest_ratio: Float) -> Tare:
+    from ohmskin.record.recording import Tare  # the library of recordings is loaded when needed
+
+    return Tare(rest_ratio, time.monotonic())
 
 
 def now() -> str:

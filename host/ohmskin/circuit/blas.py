@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One BLAS thread while a frame is estimated: for matrices of a skin's size, more are slower."""
+"""One BLAS thread while a circuit is solved: for matrices of a skin's size, more are slower."""
 
 from __future__ import annotations
 
 import threading
+from contextlib import ContextDecorator
 from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
 
-class _OneBlasThread:
-    """A context manager that any number of threads may be in at once.
+class _OneBlasThread(ContextDecorator):
+    """A context manager, or decorator, that any number of threads may be in at once.
 
     The limit is the process's: the first thread that comes in sets it, and the last one that leaves
     restores what was there before.
