@@ -38,8 +38,7 @@ from bars import at_least, at_most, report  # beside this file
 
 import ohmskin
 from ohmskin.arrays import Float
-from ohmskin.calibrate.calibrator import Calibrator
-from ohmskin.calibrate.presses import Presses
+from ohmskin.calibrate.presses import Calibrator, Presses
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration

@@ -180,11 +180,11 @@ def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], 
         lines = [np.polyfit(x[cell == k], force_n[cell == k], 1) for k in range(rows * columns)]
         slope, intercept = np.array(lines).T.reshape(2, rows, columns)
         return lambda seen: slope * seen + intercept
-    model = ForceRegression().fit(
+    learned = ForceRegression().fit(
         cell, x, force_n, shape=(rows, columns), press=trial.press[frames]
     )
     nothing = np.zeros((rows, columns))
-    return lambda seen: np.array([model.predict(frame, nothing)[0] for frame in seen])
+    return lambda seen: np.array([learned.model_.predict(frame, nothing)[0] for frame in seen])
 
 
 def _errors(trial: ForceTrial, rise: Float, regression: str) -> Float:

@@ -97,7 +97,7 @@ def session(
     return Session(
         scan_s + OFFSET_S,
         np.interp(scan_s, time_s, rise) + noise_s * random.standard_normal(scan_s.size),
-        ForceLog(log_s + 77.0, np.maximum(sensed_n, -0.04), "simulation"),
+        ForceLog(log_s + 77.0, np.maximum(sensed_n, -0.04)),
         OFFSET_S - 77.0,
     )
 
@@ -139,9 +139,7 @@ def test_clocks_of_different_rate_are_aligned_on_average() -> None:
 def test_the_log_of_a_part_is_enough() -> None:
     whole = session(3)
     part = slice(1600, 3200)
-    found = replace(
-        whole, log=ForceLog(whole.log.time_s[part], whole.log.force_n[part], "part")
-    ).aligned()
+    found = replace(whole, log=ForceLog(whole.log.time_s[part], whole.log.force_n[part])).aligned()
     assert abs(found.offset_s - whole.offset_s) < 0.02
     assert found.overlap_s == pytest.approx(20.0, abs=0.2)
     assert found.correlation > 0.8
@@ -173,7 +171,7 @@ def test_gaps_are_left_out() -> None:
     scans = without(whole.scan_time_s, [(5.0, 9.0), (30.2, 31.0)])
     samples = without(whole.log.time_s, [(15.0, 22.0), (40.0, 40.7), (50.0, 53.0)])
     # Forces in a gap that no press made: a line through it would show them.
-    log = ForceLog(whole.log.time_s[samples], whole.log.force_n[samples], "gaps")
+    log = ForceLog(whole.log.time_s[samples], whole.log.force_n[samples])
     found = align(whole.scan_time_s[scans], whole.rise[scans], log)
     assert abs(found.offset_s - whole.offset_s) < 0.01
     assert found.overlap_s == pytest.approx(60 - 4.8 - 10.7, abs=0.5)
@@ -193,7 +191,7 @@ def test_large_presses_that_only_one_of_them_saw_do_not_win() -> None:
     found = align(
         whole.scan_time_s[scans],
         (whole.rise * boost[0])[scans],
-        ForceLog(whole.log.time_s[samples], force_n[samples], "part"),
+        ForceLog(whole.log.time_s[samples], force_n[samples]),
     )
     assert abs(found.offset_s - whole.offset_s) < 0.02
     assert found.overlap_s == pytest.approx(20, abs=0.2)
@@ -203,7 +201,7 @@ def test_glitches_of_the_sensor_do_not_win() -> None:
     whole = session(5)
     force_n = whole.log.force_n.copy()
     force_n[np.random.default_rng(2).integers(0, force_n.size, 20)] = 1e4
-    found = replace(whole, log=ForceLog(whole.log.time_s, force_n, "glitches")).aligned()
+    found = replace(whole, log=ForceLog(whole.log.time_s, force_n)).aligned()
     assert abs(found.offset_s - whole.offset_s) < 0.01
 
 
@@ -237,7 +235,7 @@ def test_one_irregular_press_makes_even_ones_tell_the_time() -> None:
     varied = Session(
         even.scan_time_s,
         even.rise * weight[number],
-        ForceLog(even.log.time_s, even.log.force_n * weight[log_number], "varied"),
+        ForceLog(even.log.time_s, even.log.force_n * weight[log_number]),
         even.offset_s,
     )
     assert abs(varied.aligned().offset_s - varied.offset_s) < 0.02
@@ -257,7 +255,7 @@ def test_sessions_that_have_nothing_in_common_are_refused() -> None:
 
 TIME_S = np.arange(0.0, 30.0, 0.02)
 FORCE_N = 5.0 * (np.sin(TIME_S**1.5) > 0)
-LOG = ForceLog(TIME_S, FORCE_N, "test")
+LOG = ForceLog(TIME_S, FORCE_N)
 
 
 @pytest.mark.parametrize(
@@ -274,12 +272,12 @@ LOG = ForceLog(TIME_S, FORCE_N, "test")
         (TIME_S, np.full(1500, 1e-6), LOG, "the skin's rise does not rise: nothing was pressed"),
         (TIME_S, -FORCE_N, LOG, "the skin's rise does not rise: nothing was pressed"),
         (TIME_S / 100, FORCE_N, LOG, "the skin's rise lasts 0.3 s, 15 s are needed"),
-        (TIME_S, FORCE_N, ForceLog(TIME_S / 4, FORCE_N, ""), "the force lasts 7.5 s, 15 s are"),
+        (TIME_S, FORCE_N, ForceLog(TIME_S / 4, FORCE_N), "the force lasts 7.5 s, 15 s are"),
         (TIME_S * MAX_SPAN_S / 20, FORCE_N, LOG, "the skin's rise lasts 9.0 h, more than 6"),
         (
             np.where(TIME_S < 4, TIME_S, TIME_S + 100),
             np.where(TIME_S < 7, FORCE_N, 0.0),
-            ForceLog(np.where(TIME_S < 4, TIME_S, TIME_S + 50 * np.floor(TIME_S)), FORCE_N, ""),
+            ForceLog(np.where(TIME_S < 4, TIME_S, TIME_S + 50 * np.floor(TIME_S)), FORCE_N),
             "scans and force log overlap at no offset for 15 s, and for half of the shorter",
         ),
     ],

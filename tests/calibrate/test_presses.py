@@ -23,7 +23,7 @@ def history(rise: Float) -> LevelHistory:
 
 def log_of(force_n: Float, zero_n: float = 0.0) -> ForceLog:
     """A sensor that samples with the scans, on a clock of its own."""
-    return ForceLog(np.arange(force_n.size) / HZ - OFFSET_S, force_n + zero_n, "test")
+    return ForceLog(np.arange(force_n.size) / HZ - OFFSET_S, force_n + zero_n)
 
 
 def bump(scans: int, begin: int, end: int, peak: float) -> Float:

@@ -56,7 +56,6 @@ def test_a_log_is_read_however_it_was_written(tmp_path: Path, content: bytes) ->
     log = load_force_log(written(tmp_path, content))
     assert log.time_s.tolist() == [float(row.split(",")[0]) for row in ROWS]
     assert log.force_n.tolist() == [float(row.split(",")[1]) for row in ROWS]
-    assert log.source == "table.csv"
 
 
 BAD_LOGS: list[tuple[str | bytes, str]] = [
@@ -193,19 +192,19 @@ def ramp(count: int = 20, step_s: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
 def test_noise_about_zero_is_no_fault() -> None:
     time_s, force_n = ramp()
     force_n[3] = -0.02 * force_n.max()
-    ForceLog(time_s, force_n, "")
+    ForceLog(time_s, force_n)
     force_n[3] *= 1.01
     with pytest.raises(ValueError, match=r"sample 3: force_n is .*: zero the sensor"):
-        ForceLog(time_s, force_n, "")
+        ForceLog(time_s, force_n)
     weak = 0.01 * np.arange(20)
     weak[0] = -0.05
-    ForceLog(time_s, weak, "")
+    ForceLog(time_s, weak)
 
 
 def test_force_between_samples_and_nothing_in_gaps() -> None:
     time_s, force_n = ramp()  # 0 to 1.9 s, 20 N/s
     time_s[10:] += 1.0  # samples at 0.9 and 2.0 s: 1.1 s, 11 median steps
-    log = ForceLog(time_s, force_n, "")
+    log = ForceLog(time_s, force_n)
     wanted = np.array([[-0.1, 0.0, 0.05, time_s[9]], [0.91, 1.5, time_s[10], 2.25]])
     nan = np.nan
     np.testing.assert_allclose(log.at(wanted), [[nan, 0, 1, 18], [nan, nan, 20, 25]])
@@ -218,7 +217,7 @@ def test_force_between_samples_and_nothing_in_gaps() -> None:
 def test_what_is_long_or_unusual_but_not_both_is_no_gap(step_s: float, pause_s: float) -> None:
     time_s, force_n = ramp(step_s=step_s)
     time_s[10:] += pause_s - step_s
-    np.testing.assert_allclose(ForceLog(time_s, force_n, "").at((time_s[9] + time_s[10]) / 2), 19.0)
+    np.testing.assert_allclose(ForceLog(time_s, force_n).at((time_s[9] + time_s[10]) / 2), 19.0)
 
 
 # ---------------------------------------------------------------------------- tables of presses

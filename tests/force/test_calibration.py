@@ -41,8 +41,8 @@ def calibration(pressed: int = 5) -> Calibration:
     force_n = 10 * (rise / 1e-4) ** np.where(cells == 0, 0.5, 1.0)
     force_n = np.abs(force_n + 0.1 * random.standard_normal(cells.size))
     found = ForceRegression().fit(cells, rise, force_n, shape=(2, 3))
-    assert found.kind_[0, 0] == POWER
-    assert found.pooled_.any()
+    assert found.model_.kind[0, 0] == POWER
+    assert found.model_.pooled.any()
     return Calibration(
         unit_id=7,
         date="2025-03-01T12:00:00+00:00",

@@ -41,11 +41,11 @@ def test_line_with_intercept_is_linregress_and_polyfit() -> None:
     force_n = force_n + 1.0
     found = fit_one(rise, force_n, fit_intercept=True)
     expected = linregress(rise, force_n)
-    assert found.kind_[0, 0] == LINEAR
-    coefficients = [found.slope_[0, 0], found.intercept_[0, 0]]
+    assert found.model_.kind[0, 0] == LINEAR
+    coefficients = [found.model_.slope[0, 0], found.model_.intercept[0, 0]]
     np.testing.assert_allclose(coefficients, [expected.slope, expected.intercept], rtol=1e-9)
     np.testing.assert_allclose(coefficients, np.polyfit(rise, force_n, 1), rtol=1e-9)
-    errors = [found.slope_std_[0, 0], found.intercept_std_[0, 0]]
+    errors = [found.model_.slope_std[0, 0], found.model_.intercept_std[0, 0]]
     np.testing.assert_allclose(errors, [expected.stderr, expected.intercept_stderr], rtol=1e-9)
     _, covariance = np.polyfit(rise, force_n, 1, cov=True)
     correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
@@ -56,10 +56,10 @@ def test_line_through_rest_is_curve_fits() -> None:
     rise, force_n = presses(40, 2)
     found = fit_one(rise, force_n)
     slope, covariance = curve_fit(lambda x, a: a * x, rise, force_n, p0=[1e5])
-    assert found.kind_[0, 0] == LINEAR
-    np.testing.assert_allclose(found.slope_[0, 0], slope[0], rtol=1e-7)
-    np.testing.assert_allclose(found.slope_std_[0, 0], covariance[0, 0] ** 0.5, rtol=1e-6)
-    force_at_rest, _ = found.predict([[0.0]], [[0.0]])
+    assert found.model_.kind[0, 0] == LINEAR
+    np.testing.assert_allclose(found.model_.slope[0, 0], slope[0], rtol=1e-7)
+    np.testing.assert_allclose(found.model_.slope_std[0, 0], covariance[0, 0] ** 0.5, rtol=1e-6)
+    force_at_rest, _ = found.model_.predict([[0.0]], [[0.0]])
     assert force_at_rest[0, 0] == 0
 
 
@@ -67,24 +67,26 @@ def test_line_through_rest_is_curve_fits() -> None:
 def test_power_law_is_curve_fits(exponent: float) -> None:
     rise, force_n = presses(60, 3, exponent)
     found = fit_one(rise, force_n)
-    assert found.kind_[0, 0] == POWER
+    assert found.model_.kind[0, 0] == POWER
 
     def law(x: np.ndarray, log_slope: float, power: float) -> np.ndarray:
         return np.exp(log_slope) * (x / 50e-6) ** power  # another parametrisation than ours
 
     best, covariance = curve_fit(law, rise, force_n, p0=[1.0, 1.0], xtol=1e-14, ftol=1e-14)
-    np.testing.assert_allclose(found.exponent_[0, 0], best[1], rtol=1e-6)
-    np.testing.assert_allclose(found.exponent_std_[0, 0], covariance[1, 1] ** 0.5, rtol=1e-4)
-    np.testing.assert_allclose(found.slope_[0, 0], np.exp(best[0]) * 50e-6 ** -best[1], rtol=1e-5)
+    np.testing.assert_allclose(found.model_.exponent[0, 0], best[1], rtol=1e-6)
+    np.testing.assert_allclose(found.model_.exponent_std[0, 0], covariance[1, 1] ** 0.5, rtol=1e-4)
+    np.testing.assert_allclose(
+        found.model_.slope[0, 0], np.exp(best[0]) * 50e-6 ** -best[1], rtol=1e-5
+    )
     # The curve's own uncertainty does not depend on the parametrisation.
     at = np.array([5e-6, 30e-6, 90e-6])
     forces = law(at, *best)
     jacobian = np.column_stack([forces, forces * np.log(at / 50e-6)])
     of_fit = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)
     for rise_here, force_here, variance in zip(at, forces, of_fit, strict=True):
-        predicted, std = found.predict([[rise_here]], [[0.0]])
+        predicted, std = found.model_.predict([[rise_here]], [[0.0]])
         np.testing.assert_allclose(predicted[0, 0], force_here, rtol=1e-6)
-        own = std[0, 0] ** 2 - found.residual_std_[0, 0] ** 2
+        own = std[0, 0] ** 2 - found.model_.residual_std[0, 0] ** 2
         np.testing.assert_allclose(own, variance, rtol=1e-3)
 
 
@@ -98,22 +100,24 @@ def test_scatter_that_grows_with_force_is_seen_and_weighed(exponent: float) -> N
     exact = 1e-4 * (force_n / 10) ** (1 / exponent)
     rise = exact * np.exp(0.2 * random.standard_normal(cells.size))
     found = ForceRegression().fit(cells, rise, force_n, shape=shape)
-    assert np.all(found.residual_share_ > 0)
+    assert np.all(found.model_.residual_share > 0)
     most_n = force_n.reshape(100, 24).max(axis=1).reshape(shape)
-    np.testing.assert_allclose(found.residual_std_, 0.1 * most_n * found.residual_share_)
+    np.testing.assert_allclose(
+        found.model_.residual_std, 0.1 * most_n * found.model_.residual_share
+    )
     expected = []
     for cell in range(100):
         x, force = rise[cells == cell] / 1e-4, force_n[cells == cell]
         scatter = np.sqrt(force**2 + (0.1 * force.max()) ** 2)
         law, _ = curve_fit(lambda x, a, b: a * x**b, x, force, p0=[10, 1], sigma=scatter)
         expected.append(law[0] * 0.3 ** law[1])
-    power = found.kind_.ravel() == POWER
-    at, _ = found.predict(np.full(shape, 0.3e-4), np.zeros(shape))
+    power = found.model_.kind.ravel() == POWER
+    at, _ = found.model_.predict(np.full(shape, 0.3e-4), np.zeros(shape))
     np.testing.assert_allclose(at.ravel()[power], np.array(expected)[power], rtol=1e-4)
     assert np.mean(power) > 0.95 if exponent != 1 else np.mean(power) < 0.4
     for newton in (0.5, 2.0, 6.0):
         rise = 1e-4 * (newton / 10) ** (1 / exponent) * np.exp(0.2 * random.standard_normal(shape))
-        predicted, std = found.predict(rise, np.zeros(shape))
+        predicted, std = found.model_.predict(rise, np.zeros(shape))
         share = np.mean(np.abs(predicted - newton) <= 2 * std)
         print(f"{exponent}, {newton} N: {share:.0%} within 2 std of {np.median(std):.2f} N")
         assert share > 0.88
@@ -127,12 +131,12 @@ def test_held_out_error_finds_the_law(exponent: float, kind: str) -> None:
     rise, force_n = presses(cells.size, 5, exponent)
     order = random.permutation(cells.size)
     found = ForceRegression().fit(cells[order], rise, force_n, shape=(8, 8))
-    share = np.mean(found.kind_ == kind)
+    share = np.mean(found.model_.kind == kind)
     print(f"exponent {exponent}: {share:.0%} of cells {kind}")
     assert share > (0.8 if kind == LINEAR else 0.98)
-    assert not found.pooled_.any()
+    assert not found.model_.pooled.any()
     assert found.message_ == ""
-    assert np.all((found.held_out_rmse_ > 0.05) & (found.held_out_rmse_ < 0.2))
+    assert np.all((found.model_.held_out_rmse > 0.05) & (found.model_.held_out_rmse < 0.2))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +154,7 @@ def test_two_standard_deviations_cover_what_they_should(exponent: float, count: 
     )
     true_rise, true_force_n = (each.reshape(shape) for each in presses(144, 8, exponent))
     seen = true_rise + rise_std * random.standard_normal(shape)
-    predicted, std = found.predict(seen, np.full(shape, rise_std))
+    predicted, std = found.model_.predict(seen, np.full(shape, rise_std))
     share = np.mean(np.abs(predicted - true_force_n) <= 2 * std)
     print(f"exponent {exponent}, {count} presses: {share:.1%} within 2 std")
     assert 0.90 <= share <= 0.99
@@ -165,7 +169,7 @@ def test_noise_of_the_rise_is_not_counted_twice() -> None:
     found = ForceRegression().fit(
         cells, rise, force_n, shape=(10, 10), rise_std=np.full(cells.size, rise_std)
     )
-    _, std = found.predict(np.full((10, 10), 50e-6), np.full((10, 10), rise_std))
+    _, std = found.model_.predict(np.full((10, 10), 50e-6), np.full((10, 10), rise_std))
     expected = np.hypot(1e5 * rise_std, NOISE_N)
     print(f"{np.median(std):.3f} N, and {expected:.3f} N")
     assert np.median(std) == pytest.approx(expected, rel=0.12)
@@ -179,31 +183,31 @@ def test_cells_without_data_are_covered_too() -> None:
     cells = np.repeat(np.arange(200), 10)
     rise, force_n = presses(cells.size, 10)
     found = ForceRegression().fit(cells, rise * sensitivity[cells], force_n, shape=shape)
-    assert found.pooled_.sum() == 200
+    assert found.model_.pooled.sum() == 200
     assert found.message_ == "200 of 400 cells take the curve of all presses"
     rise, force_n = presses(400, 11)
-    predicted, std = found.predict((rise * sensitivity).reshape(shape), np.zeros(shape))
+    predicted, std = found.model_.predict((rise * sensitivity).reshape(shape), np.zeros(shape))
     miss = np.abs(predicted - force_n.reshape(shape)) / std
-    shares = [np.mean(miss[~found.pooled_] <= 2), np.mean(miss[found.pooled_] <= 2)]
+    shares = [np.mean(miss[~found.model_.pooled] <= 2), np.mean(miss[found.model_.pooled] <= 2)]
     print(f"within 2 std: {shares[0]:.1%} of calibrated cells, {shares[1]:.1%} of the others")
     assert all(0.90 <= share <= 0.99 for share in shares)
     # Pooled cells say how wrong they are on cells never seen: far more than the calibrated ones.
-    held_out = found.held_out_rmse_
-    assert held_out[found.pooled_].min() > 3 * held_out[~found.pooled_].max()
+    held_out = found.model_.held_out_rmse
+    assert held_out[found.model_.pooled].min() > 3 * held_out[~found.model_.pooled].max()
 
 
 def test_one_cell_alone_serves_the_others_without_a_standard_deviation() -> None:
     rise, force_n = presses(20, 12)
     found = ForceRegression().fit(np.full(20, 1), rise, force_n, shape=(2, 2))
-    np.testing.assert_array_equal(found.pooled_, [[True, False], [True, True]])
+    np.testing.assert_array_equal(found.model_.pooled, [[True, False], [True, True]])
     assert found.message_ == (
         "3 of 4 cells take the curve of all presses, all on cell (0, 1): "
         "how far they are off is unknown"
     )
-    force, std = found.predict(np.full((2, 2), 50e-6), np.zeros((2, 2)))
+    force, std = found.model_.predict(np.full((2, 2), 50e-6), np.zeros((2, 2)))
     np.testing.assert_allclose(force, force[0, 1])
-    np.testing.assert_array_equal(np.isnan(std), found.pooled_)
-    np.testing.assert_array_equal(np.isnan(found.held_out_rmse_), found.pooled_)
+    np.testing.assert_array_equal(np.isnan(std), found.model_.pooled)
+    np.testing.assert_array_equal(np.isnan(found.model_.held_out_rmse), found.model_.pooled)
 
 
 def test_cells_with_too_little_of_their_own_are_pooled() -> None:
@@ -211,7 +215,7 @@ def test_cells_with_too_little_of_their_own_are_pooled() -> None:
     cells = np.array([0] * 20 + [1] * 4 + [2] * 10)
     force_n[cells == 2] = 3.0  # the same force all over
     found = ForceRegression().fit(cells, rise, force_n, shape=(1, 3))
-    np.testing.assert_array_equal(found.pooled_, [[False, True, True]])
+    np.testing.assert_array_equal(found.model_.pooled, [[False, True, True]])
 
 
 def test_one_odd_cell_does_not_spoil_the_others() -> None:
@@ -219,10 +223,10 @@ def test_one_odd_cell_does_not_spoil_the_others() -> None:
     rise, force_n = presses(21, 22)
     rise[20] = -1e-7
     found = ForceRegression().fit([0] * 20 + [1], rise, force_n, shape=(1, 2))
-    np.testing.assert_array_equal(found.pooled_, [[False, True]])
-    np.testing.assert_array_equal(np.isnan(found.held_out_rmse_), [[False, True]])
+    np.testing.assert_array_equal(found.model_.pooled, [[False, True]])
+    np.testing.assert_array_equal(np.isnan(found.model_.held_out_rmse), [[False, True]])
     assert found.message_.endswith("all presses: how far they are off is unknown")
-    force, std = found.predict([[50e-6, 50e-6]], [[0.0, 0.0]])
+    force, std = found.model_.predict([[50e-6, 50e-6]], [[0.0, 0.0]])
     assert np.all(force > 0)
     np.testing.assert_array_equal(np.isnan(std), [[False, True]])
 
@@ -232,7 +236,7 @@ def test_pairs_are_flat_indices() -> None:
     cells = np.arange(60) % 6
     flat = ForceRegression().fit(cells, rise, force_n, shape=(2, 3))
     pairs = ForceRegression().fit(np.stack(divmod(cells, 3), 1), rise, force_n, shape=(2, 3))
-    np.testing.assert_array_equal(flat.slope_, pairs.slope_)
+    np.testing.assert_array_equal(flat.model_.slope, pairs.model_.slope)
 
 
 def test_rows_of_one_press_are_held_out_together() -> None:
@@ -245,7 +249,7 @@ def test_rows_of_one_press_are_held_out_together() -> None:
     by_press = ForceRegression().fit(
         np.zeros(300, dtype=int), rise, force_n, shape=ONE, press=press
     )
-    assert by_press.held_out_rmse_[0, 0] > by_row.held_out_rmse_[0, 0]
+    assert by_press.model_.held_out_rmse[0, 0] > by_row.model_.held_out_rmse[0, 0]
     with pytest.raises(ValueError, match=r"^too few presses: 4, 5 are needed$"):
         ForceRegression().fit(
             np.zeros(300, dtype=int), rise, force_n, shape=ONE, press=np.arange(300) % 4
@@ -266,7 +270,7 @@ def test_presses_recorded_in_many_rows_are_covered(number: int) -> None:
     )
     rise, force_n = presses(144, 21)
     force_n = force_n + 0.3 * random.standard_normal(144)
-    predicted, std = found.predict(rise.reshape(shape), np.zeros(shape))
+    predicted, std = found.model_.predict(rise.reshape(shape), np.zeros(shape))
     share = np.mean(np.abs(predicted - force_n.reshape(shape)) <= 2 * std)
     print(f"{number} presses of {rows} rows: {share:.1%} within 2 std")
     assert 0.90 <= share <= 0.99
@@ -277,17 +281,17 @@ def test_force_is_never_negative_and_keeps_its_standard_deviation() -> None:
     for exponent, intercept in ((1.0, False), (1.0, True), (0.5, False)):
         force_n = presses(40, 16, exponent)[1]
         found = fit_one(rise, force_n, fit_intercept=intercept)
-        force, std = found.predict([[-20e-6]], [[1e-6]])
+        force, std = found.model_.predict([[-20e-6]], [[1e-6]])
         assert force[0, 0] == 0
-        assert std[0, 0] >= found.residual_std_[0, 0] > 0
-    force, std = found.predict([[50e-6]], [[np.nan]])
+        assert std[0, 0] >= found.model_.residual_std[0, 0] > 0
+    force, std = found.model_.predict([[50e-6]], [[np.nan]])
     assert force[0, 0] > 0
     assert np.isnan(std[0, 0])
 
 
 def test_steep_laws_stay_finite_at_rest() -> None:
     found = fit_one(*presses(60, 17, 0.4))
-    _, std = found.predict([[0.0]], [[1e-6]])
+    _, std = found.model_.predict([[0.0]], [[1e-6]])
     expected = 10 * (1e-6 / 100e-6) ** 0.4  # the law's own force at one standard deviation
     assert expected * 0.8 < std[0, 0] < expected * 1.3
 
@@ -317,8 +321,8 @@ def test_voltage_baseline_takes_ghosts_for_forces() -> None:
     ):
         rise = levels[:-1].reshape(-1, 4)[np.arange(cells.size), cells]
         found = ForceRegression().fit(cells, rise, force_n, shape=(2, 2))
-        assert np.all(found.held_out_rmse_ < 0.1)
-        force, _ = found.predict(levels[-1], np.zeros((2, 2)))
+        assert np.all(found.model_.held_out_rmse < 0.1)
+        force, _ = found.model_.predict(levels[-1], np.zeros((2, 2)))
         np.testing.assert_allclose(force[0, 0], 1.0, atol=0.2)
         on_nobody[method] = force[1, 1]
         print(f"{method}: {force[1, 1]:.3f} N on the cell that nobody presses, 1 N on the others")
@@ -372,17 +376,15 @@ def test_bad_presses_are_refused(change: dict[str, Any], message: str) -> None:
 
 
 def test_bad_questions_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^nothing is learned yet: call fit first$"):
-        ForceRegression().predict([[0.0]], [[0.0]])
     with pytest.raises(ValueError, match=r"^folds must be at least 2, not 1$"):
         ForceRegression(folds=1)
     found = ForceRegression().fit(**GOOD)
     with pytest.raises(ValueError, match=r"^rise has shape \(2,\), this calibration \(1, 2\)$"):
-        found.predict([0.0, 0.0], [0.0, 0.0])
+        found.model_.predict([0.0, 0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match=r"^rise of cell \(0, 1\) is not finite$"):
-        found.predict([[0.0, np.nan]], [[0.0, 0.0]])
+        found.model_.predict([[0.0, np.nan]], [[0.0, 0.0]])
     with pytest.raises(ValueError, match=r"^rise_std of cell \(0, 0\) is negative or inf$"):
-        found.predict([[0.0, 0.0]], [[-1.0, 0.0]])
+        found.model_.predict([[0.0, 0.0]], [[-1.0, 0.0]])
 
 
 def test_models_that_no_fit_gives_are_refused() -> None:

@@ -80,7 +80,7 @@ _UNITS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class ForceLog:
-    """Forces by the sensor's clock: time_s (n,) [s], increasing; force_n (n,) [N]; source: what by.
+    """Forces by the sensor's clock: time_s (n,) [s], increasing; force_n (n,) [N].
 
     Raises ValueError for fewer than 10 samples, for times that do not increase, for a force that
     never changes, and for presses that are negative. Sensor noise about zero may be negative: down
@@ -90,7 +90,6 @@ class ForceLog:
 
     time_s: Float
     force_n: Float
-    source: str
     rows: InitVar[NDArray[np.int64] | None] = None
 
     def __post_init__(self, rows: NDArray[np.int64] | None) -> None:
@@ -135,10 +134,10 @@ def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
 
 
 def load_force_log(path: str | os.PathLike[str]) -> ForceLog:
-    """Read a force log; its source is the file's name. Raises ValueError: see the module."""
+    """Read a force log. Raises ValueError: see the module."""
     with naming(path):
         columns, rows = _read(path, ("time_s", "force_n"), others=True)
-        return ForceLog(**columns, source=os.path.basename(os.fspath(path)), rows=rows)
+        return ForceLog(**columns, rows=rows)
 
 
 # ---------------------------------------------------------------------------- tables of presses

@@ -17,9 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
-from ohmskin.calibrate.calibrator import Calibrator
 from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step, still_wanted
-from ohmskin.calibrate.presses import Presses, find_presses
+from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.tables import (
     PRESS,
     ForceLog,
@@ -225,7 +224,7 @@ def _force_log(given: Recording) -> ForceLog:
     if not given.forces:
         raise ValueError("no force in it: say --forces LOG.csv")
     time_s, force_n = np.array([(each.host_time_s, each.force_n) for each in given.forces]).T
-    return ForceLog(time_s, force_n, given.forces[0].source)
+    return ForceLog(time_s, force_n)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:

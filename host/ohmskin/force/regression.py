@@ -192,15 +192,13 @@ def _correlation(covariance: Float) -> float:
 
 
 class ForceRegression:
-    """Learns every cell's curve from single touches: `fit`, then `predict`.
+    """Learns every cell's curve from single touches.
 
     fit_intercept: give lines an intercept c, as the paper's regression has. Then untouched cells
     report c, too. folds: parts that the presses of a cell are split into, each held out once.
 
-    After `fit`: `model_` (a `ForceModel`) and its arrays (R, C) as `kind_`, `slope_`,
-    `slope_std_`, `exponent_`, `exponent_std_`, `intercept_`, `intercept_std_`, `correlation_`,
-    `residual_std_`, `residual_share_`, `pooled_`, `held_out_rmse_`; `message_`: which cells have no
-    curve of their own, empty if none.
+    After `fit`: `model_`, the curves; `message_`: which cells have no curve of their own, empty if
+    none.
     """
 
     def __init__(self, *, fit_intercept: bool = False, folds: int = 5) -> None:
@@ -242,16 +240,8 @@ class ForceRegression:
         }
         pooled = np.array([cell not in own for cell in every_cell]).reshape(shape)
         self.model_ = ForceModel(**arrays, pooled=pooled)
-        for field in fields(ForceModel):
-            setattr(self, f"{field.name}_", getattr(self.model_, field.name))
         self.message_ = _pooled_message(pooled, np.unique(rows.cell), of_skin)
         return self
-
-    def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
-        """`ForceModel.predict` of what was learned. Raises ValueError before `fit`."""
-        if not hasattr(self, "model_"):
-            raise ValueError("nothing is learned yet: call fit first")
-        return self.model_.predict(rise, rise_std)
 
     def _curve_of_skin(self, rows: _Rows) -> Curve:
         """The curve of all presses, for cells without a curve of their own."""
