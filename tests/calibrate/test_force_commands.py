@@ -15,6 +15,7 @@ from calibrations import of_scene
 from command_line import Done, assert_one_line
 from ohmskin.force.calibration import load_calibration
 
+GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?seed=1"
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"

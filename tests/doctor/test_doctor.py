@@ -8,7 +8,6 @@ else that is found besides is a failure, too.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, Severity, f
 from ohmskin.doctor.signal import RestScans, comparison, examine_signal, find_hum, mean_std_lsb
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
-from ohmskin.link.serial_port import latency_ms, latency_timer_file
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
 
@@ -305,23 +303,11 @@ def test_a_rate_that_is_not_kept(sound: Evidence) -> None:
     assert finding_of(sound, scans=slow).kind is Kind.SLOW_HOST
 
 
-def test_latency_timer(tmp_path: Path, sound: Evidence) -> None:
-    devices = tmp_path / "devices"
-    (devices / "ttyUSB3").mkdir(parents=True)
-    timer = devices / "ttyUSB3" / "latency_timer"
-    timer.write_text("16\n")
-    by_id = tmp_path / "by-id"
-    by_id.symlink_to("/dev/ttyUSB3")
-    for port in ("/dev/ttyUSB3", str(by_id)):
-        assert latency_timer_file(port, devices) == timer
-        assert latency_ms(port, devices) == 16
-    assert latency_ms("/dev/ttyACM0", devices) is None
-    timer.write_text("no number")
-    assert latency_ms("/dev/ttyUSB3", devices) is None
-    finding = finding_of(sound, latency=(16, str(timer)))
+def test_latency_timer(sound: Evidence) -> None:
+    finding = finding_of(sound, latency=(16, "/sys/timer"))
     assert finding.kind is Kind.USB_LATENCY
-    assert str(timer) in words_of(finding)["what_to_do"]
-    assert examine(replace(sound, latency=(1, str(timer)))).findings == []
+    assert "/sys/timer" in words_of(finding)["what_to_do"]
+    assert examine(replace(sound, latency=(1, "/sys/timer"))).findings == []
 
 
 # -------------------------------------------------------------------------- findings, words

@@ -15,9 +15,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +33,7 @@ from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
 from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
-from ohmskin.record.recorder import Recorder
+from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -143,6 +145,43 @@ def test_an_existing_file_is_left_alone(tmp_path: Path, hello: Hello) -> None:
     assert path.read_text() == "mine"
     with pytest.raises(RecordingError, match="No such file"):
         Recorder(tmp_path / "nowhere" / "a.mcap", hello)
+
+
+@pytest.mark.parametrize(
+    ("limits", "scans", "tared"),
+    [
+        ({}, 20, None),
+        ({"count": 7}, 7, None),
+        ({"seconds": 0.02}, 9, None),  # at 400 Hz, and the one that comes then
+        ({"tare_s": 0.01}, 20, slice(0, 5)),
+        ({"tare_s": 0.03}, 20, slice(10, 13)),  # of the later size
+        ({"tare_s": 1.0, "count": 15}, 15, slice(10, 15)),
+    ],
+)
+def test_the_record_loop(
+    tmp_path: Path, hello: Hello, limits: dict[str, Any], scans: int, tared: slice | None
+) -> None:
+    """Its board is configured anew after ten scans."""
+    path, board = tmp_path / "a.mcap", SimpleNamespace(info=hello)
+    given = [scan(n, rows=3 if n < 10 else 2) for n in range(20)]
+    seen: list[int] = []
+
+    def scanned() -> Iterator[Scan]:
+        for each in given:
+            if each.number == 10:
+                board.info = replace(hello, rows=2)
+            yield each
+
+    with Recorder(path, hello) as recorder:
+        record(board, recorder, scanned(), beside=lambda each: seen.append(each.number), **limits)
+    found = load_recording(path)
+    assert_same(found.scans, given[:scans])
+    assert seen == list(range(scans))
+    assert [each.rows for each in found.hellos] == ([3, 2] if scans > 10 else [3])
+    assert len(found.tares) == (tared is not None)
+    if tared is not None:
+        expected = np.mean([each.ratio for each in given[tared]], axis=0)
+        np.testing.assert_allclose(found.tares[0].rest_ratio, expected, rtol=1e-12)
 
 
 def test_a_closed_recording_takes_no_more(tmp_path: Path, hello: Hello) -> None:

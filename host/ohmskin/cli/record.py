@@ -105,7 +105,8 @@ def record(
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
     done = f"{recorder.scans} scans, missed {recorder.missed}, {file.stat().st_size} bytes"
     if sensor is not None:
-        done += f", {recorder.forces} forces, {sensor.damaged} lines that are no numbers"
+        done += f", {recorder.forces} forces"
+        done += f", {sensor.damaged} lines that are no numbers" if sensor.damaged else ""
     _out.print(f"{file}: {done}", markup=False)
 
 
