@@ -170,7 +170,7 @@ def test_the_lsl_outlet_pushes_forces_at_their_times(
     assert info.source_id == "ohmskin-unit-0"
     assert info.get_channel("label") == LABELS
     assert info.get_channel("unit") == ["newtons"] * 64
-    assert len(samples) > 30
+    assert len(samples) > 5
     times_s = np.array([timestamp for _, timestamp in samples])
     assert np.diff(times_s) == pytest.approx(1 / 90, abs=3e-3)
     assert begin_s < times_s[0] - CLOCK_OFFSET_S < times_s[-1] - CLOCK_OFFSET_S < time.monotonic()

@@ -347,6 +347,7 @@ def test_a_board_that_is_pulled_out_comes_back_by_itself(
         page.command(do="record")
         page.scan(lambda scan: scan["recorded"] > 10)
         recording = Path(page.state["recording"])
+        port.unlink()  # another test's board may get the same pseudo-terminal
         first.close()
         state = page.until_state(lambda state: state["status"] == "gone")
         assert str(port) in state["text"]
@@ -356,7 +357,6 @@ def test_a_board_that_is_pulled_out_comes_back_by_itself(
         assert "is gone" in page.state["recorded"]
         assert not load_recording(recording).cut_off
         second = pty_board(REST)
-        port.unlink()
         port.symlink_to(second.path)
         page.until_state(lambda state: state["status"] == "scanning")
         assert page.state["tared"]  # it is the same skin
