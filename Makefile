@@ -77,8 +77,8 @@ check-firmware: setup ## cppcheck
 sim: setup ## build the simulator that runs the firmware on an emulated skin
 	$(MAKE) -C firmware/sim
 
-test-host: setup firmware sim ## pytest
-	$(ONE_THREAD) $(BIN)/pytest
+test-host: setup firmware sim ## pytest, a process a core
+	$(ONE_THREAD) $(BIN)/pytest --numprocesses auto --dist loadfile
 
 STUDY := $(ONE_THREAD) PYTHONPATH=. $(BIN)/python -m studies
 

@@ -107,7 +107,8 @@ def test_two_boards_have_one_clock() -> None:
     times_s = [float(each[1]) for each in scans if each]
     assert len(times_s) == 39
     assert all(b - a > -0.002 for a, b in pairwise(times_s))
-    assert begin_s < times_s[0] < times_s[-1] < time.monotonic()
+    # A clock that is still learning may be ahead by 50 ms.
+    assert begin_s < times_s[0] < times_s[-1] < time.monotonic() + 0.1
     assert {each[2] for each in scans if each} == {"1", "2"}
 
 
@@ -173,7 +174,8 @@ def test_the_lsl_outlet_pushes_forces_at_their_times(
     assert len(samples) > 5
     times_s = np.array([timestamp for _, timestamp in samples])
     assert np.diff(times_s) == pytest.approx(1 / 90, abs=3e-3)
-    assert begin_s < times_s[0] - CLOCK_OFFSET_S < times_s[-1] - CLOCK_OFFSET_S < time.monotonic()
+    host_s = times_s - CLOCK_OFFSET_S
+    assert begin_s < host_s[0] < host_s[-1] < time.monotonic() + 0.1
     assert np.count_nonzero(np.array(samples[-1][0]) > 0.1) == 3
 
 
