@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ohmskin.arrays import Float
+from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
 from ohmskin.cli import main as cli
 from ohmskin.estimate.matrix import MatrixEstimator
@@ -74,43 +74,6 @@ def test_verdict(cells_us: list[float], std_us: list[float], expected: str) -> N
 # ------------------------------------------------------------------------------------ the faults
 
 
-def readings_by_laplacian(skin: Skin, short: tuple[int, int] | None = None) -> Float:
-    """All readings by a Laplacian of R + C + 2RC nodes with its references, solved port by port."""
-    rows, columns = skin.shape
-    nodes = rows + columns + 2 * rows * columns
-    laplacian = np.zeros((nodes, nodes))
-
-    def join(first: int, second: int, siemens: float) -> None:
-        laplacian[[first, second], [first, second]] += siemens
-        laplacian[[first, second], [second, first]] -= siemens
-
-    def top(i: int, j: int) -> int:
-        return rows + columns + i * columns + j if j >= 0 else i
-
-    def bottom(i: int, j: int) -> int:
-        return top(i, j) + rows * columns if i >= 0 else rows + j
-
-    for i in range(rows):
-        for j in range(columns):
-            join(top(i, j), bottom(i, j), float(skin.cell_siemens[i, j]))
-            join(top(i, j), top(i, j - 1), 1 / float(skin.top_wire_ohm[i, j]))
-            join(bottom(i, j), bottom(i - 1, j), 1 / float(skin.bottom_wire_ohm[i, j]))
-    if short is not None:
-        join(*short, 1 / 0.1)
-    ratio = np.empty((rows, columns, 4))
-    for i in range(rows):
-        for j in range(columns):
-            port = [i, rows + j]
-            to_pins = np.array([1 / skin.ref_top_ohm, 1 / skin.ref_bottom_ohm])
-            driven = laplacian.copy()
-            driven[port, port] += to_pins
-            current = np.zeros((nodes, 2))
-            current[port, [0, 1]] = to_pins  # one pin high at a time
-            by_top, by_bottom = np.linalg.solve(driven, current)[port].T
-            ratio[i, j] = [*by_top, *by_bottom[::-1]]
-    return ratio
-
-
 @pytest.fixture
 def skin() -> Skin:
     random = np.random.default_rng(5)
@@ -130,8 +93,8 @@ def skin() -> Skin:
 )
 def test_shorted_electrodes(skin: Skin, fault: str, short: tuple[int, int]) -> None:
     found = conditions._with_line_fault(skin, fault, (1, 2))
-    assert np.abs(found - readings_by_laplacian(skin, short)).max() < 1e-8
-    assert np.abs(found - readings_by_laplacian(skin)).max() > 1e-2
+    assert np.abs(found - laplacian_readings(skin, [short])).max() < 1e-8
+    assert np.abs(found - laplacian_readings(skin)).max() > 1e-2
 
 
 @pytest.mark.parametrize(
@@ -146,7 +109,7 @@ def test_cut_lines(skin: Skin, fault: str, layer: str, segment: tuple[int, int])
     wires = getattr(skin, layer).copy()
     wires[segment] = 1e12
     found = conditions._with_line_fault(skin, fault, (1, 2))
-    expected = readings_by_laplacian(replace(skin, **{layer: wires}))
+    expected = laplacian_readings(replace(skin, **{layer: wires}))
     assert np.abs(found - expected).max() < 1e-6
     no_current = np.abs(found - [1, 0, 1, 0]).max(axis=2) < 1e-6
     dead = {"row open": np.s_[1, :], "column open": np.s_[:, 2], "row cut midway": np.s_[:0]}
