@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from studies import conditions, stability, stability_figure
 from studies.__main__ import app
 from studies.conditions import SWEEPS, Case
 from studies.stability import Plan, Row, Task, Verdict, verdict
+from waiting import until
 
 TINY = Plan(skins=2, frames=2, paper_skins=0, paper_shape=(2, 2), shape=(3, 3))
 FAST = ("ohm", "matrix")
@@ -297,27 +297,17 @@ def test_ctrl_c_leaves_the_old_files_and_no_process(
 ) -> None:
     (tmp_path / "stability.csv").write_text("old")
     process = command("stability", "--jobs", "2", "--out", str(tmp_path), module="studies")
-    workers: list[int] = []
-    while len(workers) < 2:
-        assert process.poll() is None
-        time.sleep(0.1)
-        workers = children(process.pid)
+    until(lambda: len(children(process.pid)) >= 2)
     # A worker that is stopped while it starts prints a traceback, joblib's: let them begin to work.
-    deadline_s = time.monotonic() + 30
-    while max(map(processor_s, workers)) < 1.5:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
-        workers = children(process.pid)
+    until(lambda: max(map(processor_s, children(process.pid))) > 1.5)
+    workers = children(process.pid)
     process.send_signal(signal.SIGINT)  # to it alone: the terminal would tell its workers as well
     out, err = process.communicate(timeout=20)
     assert process.returncode == 130, err
     assert "picture" not in out
     assert [path.name for path in tmp_path.iterdir()] == ["stability.csv"]
     assert (tmp_path / "stability.csv").read_text() == "old"
-    deadline_s = time.monotonic() + 10
-    while any(Path(f"/proc/{worker}").exists() for worker in workers):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
+    until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
 
 def children(parent: int) -> list[int]:
