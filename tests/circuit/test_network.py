@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from network import Network, laplacian_readings, skin_network
@@ -55,6 +55,7 @@ def test_voltages_and_currents_agree_with_qucs(name: str) -> None:
         np.testing.assert_allclose(quantity, crossbar[key], rtol=0, atol=2e-14, err_msg=key)
 
 
+@settings(max_examples=50)
 @given(
     rows=st.integers(1, 5),
     columns=st.integers(1, 5),

@@ -29,6 +29,7 @@ from ohmskin.link import session
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import LAYOUT_CRC
 from places import DATA
+from waiting import until
 
 EMULATED = "emulator://4x6?scene=ghost&seed=2"
 
@@ -291,9 +292,7 @@ def test_ctrl_c_ends_a_stream(
     for pause_s in (0.3, 3.0, 20.0):  # a busy machine shows nothing in the first
         server = pty_board(EMULATED)  # one that does not scan yet
         process = command("stream", server.path, *arguments)
-        while server._board.next_scan_s is None:
-            assert process.poll() is None
-            time.sleep(0.01)
+        until(lambda: server._board.next_scan_s is not None)  # noqa: B023
         time.sleep(pause_s)
         process.send_signal(signal.SIGINT)
         done = finish(process)

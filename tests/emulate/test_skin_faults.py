@@ -6,36 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from network import Network, skin_network
-from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, ratio_from_current
+from network import laplacian_readings
+from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
 from ohmskin.errors import PortError
 from ohmskin.opening import emulated
 
 R, C = 4, 5
-
-
-def network_readings(skin: Skin, joints: list[tuple[int, int]]) -> Float:
-    """Readings from the currents of a network, node by node, with 0.1 ohm between electrodes."""
-    alone = skin_network(skin)
-    tail, head = zip(*joints, strict=True) if joints else ((), ())
-    network = Network(
-        alone.nodes,
-        np.append(alone.tail, tail).astype(np.intp),
-        np.append(alone.head, head).astype(np.intp),
-        np.append(alone.branch_ohm, [0.1] * len(joints)),
-    )
-    rows, columns = skin.shape
-    current = np.empty(skin.shape)
-    for i in range(rows):
-        for j in range(columns):
-            branch_a = network.solve({i: 1.0, rows + j: 0.0}).branch_a
-            port_a = branch_a[network.tail == i].sum() - branch_a[network.head == i].sum()
-            loop_ohm = 1 / max(port_a, 1e-15) + skin.ref_top_ohm + skin.ref_bottom_ohm
-            current[i, j] = 1 / loop_ohm
-    return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)
 
 
 FAULTS = {
@@ -72,7 +50,7 @@ def test_readings_are_those_of_the_network(name: str) -> None:
             case "saturated":
                 cell[place] = 10.0
     finite = [np.where(np.isinf(ohm), 1e15, ohm) for ohm in (top, bottom)]
-    expected = network_readings(Skin(cell, *finite), joints)
+    expected = laplacian_readings(Skin(cell, *finite), joints)
     found = Scene("rest", R, C, seed=4, faults=faults).ratio(0.0)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     changed = np.abs(found - Scene("rest", R, C, seed=4).ratio(0.0)).max()

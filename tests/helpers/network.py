@@ -32,7 +32,7 @@ IEEE Transactions on Circuits and Systems 22(6), 504-509.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,24 +164,27 @@ def skin_network(skin: Skin) -> Network:
     )
 
 
-def laplacian_readings(skin: Skin) -> Float:
+def laplacian_readings(skin: Skin, joints: Sequence[tuple[int, int]] = ()) -> Float:
     """What `circuit.readings` returns, (R, C, 4): sense-node voltages / Vdd, configurations A to D.
 
     Each cell is two circuits: Vdd - ref_top - row electrode i, column electrode j - ref_bottom -
     ground gives A and B; with Vdd and ground exchanged C (column electrode) and D (row electrode).
+    joints: pairs of electrodes, rows first, that 0.1 ohm joins.
     """
     rows, columns = skin.shape
     alone = skin_network(skin)
     top_end, bottom_end = alone.nodes, alone.nodes + 1
-    ohm = np.append(alone.branch_ohm, [skin.ref_top_ohm, skin.ref_bottom_ohm])
+    one, other = np.array(joints, dtype=np.intp).reshape(-1, 2).T
+    references = [skin.ref_top_ohm, skin.ref_bottom_ohm]
+    ohm = np.concatenate([alone.branch_ohm, [0.1] * len(joints), references])
     ratio = np.empty((rows, columns, READINGS_PER_CELL))
     for i in range(rows):
         for j in range(columns):
             sense = [i, rows + j]
             network = Network(
                 alone.nodes + 2,
-                np.append(alone.tail, [top_end, bottom_end]),
-                np.append(alone.head, sense),
+                np.concatenate([alone.tail, one, [top_end, bottom_end]]),
+                np.concatenate([alone.head, other, sense]),
                 ohm,
             )
             ratio[i, j, :2] = network.solve({top_end: 1.0, bottom_end: 0.0}).node_v[sense]

@@ -25,6 +25,7 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
 from stepped_link import SteppedLink
+from waiting import until
 
 SCENE = "scene=multi&seed=3"
 EXPECTED = Scene("multi", 8, 8, seed=3).ratio(0.0)
@@ -60,13 +61,6 @@ def fast() -> Iterator[ohmskin.Device]:
 
 def take(scans: Iterator[Scan], count: int) -> list[Scan]:
     return list(itertools.islice(scans, count))
-
-
-def until(ready: Callable[[], object], limit_s: float = 20.0) -> None:
-    end_s = time.monotonic() + limit_s
-    while not ready():
-        assert time.monotonic() < end_s, "it never came"
-        time.sleep(0.005)
 
 
 def assert_reads_the_scene(ratio: np.ndarray) -> None:

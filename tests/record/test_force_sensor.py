@@ -33,6 +33,7 @@ from ohmskin.record.force_sensor import QUEUE_SAMPLES, ForceLineDecoder, ForceSe
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import ForceSample, load_recording
 from scripted_skin import REST, ScriptedSkin
+from waiting import until
 
 tty = pytest.importorskip("tty")
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -226,9 +227,7 @@ def test_a_sensor_that_prints_no_numbers(
     monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.2)
     with ForceSensor(sketch.path, 9600) as sensor:
         sketch.print(b"\n" + b"weight: 12 g\n" * 7)
-        end_s = time.monotonic() + PATIENCE_S
-        while sensor.damaged < 7 and time.monotonic() < end_s:
-            time.sleep(0.01)
+        until(lambda: sensor.damaged == 7)
         with pytest.raises(DeviceLost, match=r"no numbers \(7 damaged lines\).*at 9600 baud"):
             sensor.wait()
 
@@ -252,9 +251,7 @@ def test_what_nobody_takes_is_bounded_and_counted(sketch: PtySensor) -> None:
         for block in range(0, QUEUE_SAMPLES + 500, 100):
             sketch.print(b"".join(b"%d\n" % number for number in range(block, block + 100)))
             time.sleep(0.002)
-        end_s = time.monotonic() + PATIENCE_S
-        while sensor.dropped < 500 and time.monotonic() < end_s:
-            time.sleep(0.01)
+        until(lambda: sensor.dropped == 500)
         samples = sensor.take()
     assert [sample.force_n for sample in samples] == list(range(500, QUEUE_SAMPLES + 500))
     assert sensor.dropped == 500

@@ -35,6 +35,7 @@ from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
+from waiting import until
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
@@ -196,10 +197,8 @@ def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello
     path = tmp_path / "a.mcap"
     with Recorder(path, hello) as recorder:
         recorder.add(scan(0))
-        end_s = time.monotonic() + LATE_S
-        while not (found := load_recording(path)).scans:
-            assert time.monotonic() < end_s
-            time.sleep(0.05)
+        until(lambda: load_recording(path).scans, LATE_S)
+        found = load_recording(path)
     assert found.cut_off
     assert_same(found.scans, [scan(0)])
 
@@ -210,10 +209,7 @@ def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello
 def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
     path = tmp_path / "a.mcap"
     process = command("record", URL, str(path))
-    end_s = time.monotonic() + 20
-    while not path.exists() or path.stat().st_size < 20_000:
-        assert time.monotonic() < end_s, "nothing is written"
-        time.sleep(0.01)
+    until(lambda: path.exists() and path.stat().st_size > 20_000)
     time.sleep(0.77)
     process.send_signal(signal.SIGKILL)
     killed_s = time.monotonic()
@@ -231,9 +227,7 @@ def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
 def test_signals_end_it_properly(tmp_path: Path, command: Command, number: signal.Signals) -> None:
     path = tmp_path / "a.mcap"
     process = command("record", URL, str(path))
-    while not path.exists() or path.stat().st_size < 10_000:
-        assert process.poll() is None
-        time.sleep(0.01)
+    until(lambda: path.exists() and path.stat().st_size > 10_000)
     process.send_signal(number)
     out, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (0, "")
@@ -597,14 +591,7 @@ def test_typed_lines_become_marks(tmp_path: Path) -> None:
     far, near = os.openpty()
     host = str(Path(ohmskin.__file__).parents[1])
     process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "ohmskin",
-            "record",
-            URL,
-            str(path),
-        ],
+        [sys.executable, "-m", "ohmskin", "record", URL, str(path)],
         stdin=near,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -612,16 +599,11 @@ def test_typed_lines_become_marks(tmp_path: Path) -> None:
     )
     os.close(near)
     with os.fdopen(far, "wb", buffering=0) as keyboard:
-        while not path.exists():
-            assert process.poll() is None
-            time.sleep(0.01)
+        until(path.exists)
         keyboard.write(b"left hand\nright")
         time.sleep(0.3)
         keyboard.write(b" hand\n")
-        end_s = time.monotonic() + 20
-        while len(load_recording(path).marks) < 2:
-            assert time.monotonic() < end_s
-            time.sleep(0.05)
+        until(lambda: len(load_recording(path).marks) == 2)
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=20)
     assert process.returncode == 0

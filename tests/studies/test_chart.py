@@ -28,6 +28,7 @@ from places import DATA, ROOT
 from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published
 from studies.__main__ import app
 from studies.chart import Plan, Row, Size, pareto_front
+from waiting import until
 
 TINY = Plan(
     skins=1,
@@ -322,9 +323,7 @@ def test_ctrl_c_is_not_lost_in_ipopt(
     """CasADi takes the signal; the frame once was just not converged, and the run went on."""
     folder = tmp_path / "new"
     process = command("chart", "--out", str(folder), module="studies")
-    while not folder.exists():
-        assert process.poll() is None
-        time.sleep(0.01)
+    until(folder.exists)
     time.sleep(1.5)  # by then nearly all time goes into Ipopt, and so for two minutes
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=20)

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ohmskin.arrays import Float
+from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
 from ohmskin.cli import main as cli
 from ohmskin.estimate.matrix import MatrixEstimator
@@ -27,6 +26,7 @@ from studies import conditions, stability, stability_figure
 from studies.__main__ import app
 from studies.conditions import SWEEPS, Case
 from studies.stability import Plan, Row, Task, Verdict, verdict
+from waiting import until
 
 TINY = Plan(skins=2, frames=2, paper_skins=0, paper_shape=(2, 2), shape=(3, 3))
 FAST = ("ohm", "matrix")
@@ -74,43 +74,6 @@ def test_verdict(cells_us: list[float], std_us: list[float], expected: str) -> N
 # ------------------------------------------------------------------------------------ the faults
 
 
-def readings_by_laplacian(skin: Skin, short: tuple[int, int] | None = None) -> Float:
-    """All readings by a Laplacian of R + C + 2RC nodes with its references, solved port by port."""
-    rows, columns = skin.shape
-    nodes = rows + columns + 2 * rows * columns
-    laplacian = np.zeros((nodes, nodes))
-
-    def join(first: int, second: int, siemens: float) -> None:
-        laplacian[[first, second], [first, second]] += siemens
-        laplacian[[first, second], [second, first]] -= siemens
-
-    def top(i: int, j: int) -> int:
-        return rows + columns + i * columns + j if j >= 0 else i
-
-    def bottom(i: int, j: int) -> int:
-        return top(i, j) + rows * columns if i >= 0 else rows + j
-
-    for i in range(rows):
-        for j in range(columns):
-            join(top(i, j), bottom(i, j), float(skin.cell_siemens[i, j]))
-            join(top(i, j), top(i, j - 1), 1 / float(skin.top_wire_ohm[i, j]))
-            join(bottom(i, j), bottom(i - 1, j), 1 / float(skin.bottom_wire_ohm[i, j]))
-    if short is not None:
-        join(*short, 1 / 0.1)
-    ratio = np.empty((rows, columns, 4))
-    for i in range(rows):
-        for j in range(columns):
-            port = [i, rows + j]
-            to_pins = np.array([1 / skin.ref_top_ohm, 1 / skin.ref_bottom_ohm])
-            driven = laplacian.copy()
-            driven[port, port] += to_pins
-            current = np.zeros((nodes, 2))
-            current[port, [0, 1]] = to_pins  # one pin high at a time
-            by_top, by_bottom = np.linalg.solve(driven, current)[port].T
-            ratio[i, j] = [*by_top, *by_bottom[::-1]]
-    return ratio
-
-
 @pytest.fixture
 def skin() -> Skin:
     random = np.random.default_rng(5)
@@ -130,8 +93,8 @@ def skin() -> Skin:
 )
 def test_shorted_electrodes(skin: Skin, fault: str, short: tuple[int, int]) -> None:
     found = conditions._with_line_fault(skin, fault, (1, 2))
-    assert np.abs(found - readings_by_laplacian(skin, short)).max() < 1e-8
-    assert np.abs(found - readings_by_laplacian(skin)).max() > 1e-2
+    assert np.abs(found - laplacian_readings(skin, [short])).max() < 1e-8
+    assert np.abs(found - laplacian_readings(skin)).max() > 1e-2
 
 
 @pytest.mark.parametrize(
@@ -146,7 +109,7 @@ def test_cut_lines(skin: Skin, fault: str, layer: str, segment: tuple[int, int])
     wires = getattr(skin, layer).copy()
     wires[segment] = 1e12
     found = conditions._with_line_fault(skin, fault, (1, 2))
-    expected = readings_by_laplacian(replace(skin, **{layer: wires}))
+    expected = laplacian_readings(replace(skin, **{layer: wires}))
     assert np.abs(found - expected).max() < 1e-6
     no_current = np.abs(found - [1, 0, 1, 0]).max(axis=2) < 1e-6
     dead = {"row open": np.s_[1, :], "column open": np.s_[:, 2], "row cut midway": np.s_[:0]}
@@ -334,27 +297,17 @@ def test_ctrl_c_leaves_the_old_files_and_no_process(
 ) -> None:
     (tmp_path / "stability.csv").write_text("old")
     process = command("stability", "--jobs", "2", "--out", str(tmp_path), module="studies")
-    workers: list[int] = []
-    while len(workers) < 2:
-        assert process.poll() is None
-        time.sleep(0.1)
-        workers = children(process.pid)
+    until(lambda: len(children(process.pid)) >= 2)
     # A worker that is stopped while it starts prints a traceback, joblib's: let them begin to work.
-    deadline_s = time.monotonic() + 30
-    while max(map(processor_s, workers)) < 1.5:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
-        workers = children(process.pid)
+    until(lambda: max(map(processor_s, children(process.pid))) > 1.5)
+    workers = children(process.pid)
     process.send_signal(signal.SIGINT)  # to it alone: the terminal would tell its workers as well
     out, err = process.communicate(timeout=20)
     assert process.returncode == 130, err
     assert "picture" not in out
     assert [path.name for path in tmp_path.iterdir()] == ["stability.csv"]
     assert (tmp_path / "stability.csv").read_text() == "old"
-    deadline_s = time.monotonic() + 10
-    while any(Path(f"/proc/{worker}").exists() for worker in workers):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
+    until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
 
 def children(parent: int) -> list[int]:

@@ -33,6 +33,7 @@ from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards, server
 from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
 from ohmskin.view.server import make_app
+from waiting import until
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?scene=rest&seed=1"
@@ -451,9 +452,7 @@ def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Pa
     with ViewedBoards([GHOST, "/dev/ttyACM99"], folder=tmp_path) as boards:
         board = boards.find(0)
         assert board is not None
-        end_s = time.monotonic() + LIMIT_S
-        while board.state()["status"] != "scanning" and time.monotonic() < end_s:
-            time.sleep(0.01)
+        until(lambda: board.state()["status"] == "scanning")
         assert board.shown is None  # nobody looks
         board.record()
         (path,) = tmp_path.iterdir()
