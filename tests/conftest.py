@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What several test files share: ports to open, the command line as a process, and what leaks."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages say is there: commands and their options, code, files, names, printed numbers."""
 
-from __future__ import annotations
-
 import importlib.util
 import pkgutil
 import re

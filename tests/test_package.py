@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as others get it: sdist, wheel made of it, a new environment, another folder."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names for the arrays that all rooms pass around; the docstrings say shapes and units."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong between a program and a board. Every text says what to do."""
 
-from __future__ import annotations
-
 
 class OhmskinError(Exception):
     """Any of the errors below. Bad arguments are `ValueError` instead.

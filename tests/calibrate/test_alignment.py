@@ -5,8 +5,6 @@ The simulation shares nothing with the alignment but time: presses are drawn by 
 cell's conductance is a power of the force, with play and creep, and both sensors have noise.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 

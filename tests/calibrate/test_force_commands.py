@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forces on the command line: ``stream --calibration`` and ``tare``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

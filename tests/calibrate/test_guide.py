@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The guide, in simulated scans: what counts as a press, and what is said of what does not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

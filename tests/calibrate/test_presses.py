@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Presses found in scans: which cell, which scans, which force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force logs and tables of presses: what is read is what stands there, all else is refused."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``calibrate weights``: a scripted person puts weights on a simulated skin."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The forward model against files of ngspice and hand arithmetic."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

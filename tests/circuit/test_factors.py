@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Factors against numpy, and matrices that rounding has made indefinite."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

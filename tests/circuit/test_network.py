@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node Laplacian against Qucs and hand arithmetic; the forward model against the Laplacian."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

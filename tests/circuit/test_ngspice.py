@@ -6,8 +6,6 @@ subcircuit. Electrodes that are not selected float. In no skin here does a part 
 path to the rest: ngspice may call that singular. The Laplacian does not (tests/test_network.py).
 """
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

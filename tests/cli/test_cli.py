@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: what it prints, its exit codes, and errors of exactly one line."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -4,8 +4,6 @@
 PlatformIO is a script that writes down its arguments; the board is emulated at a pseudo-terminal.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is loaded when: the package and its help are light, and methods load what they need."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -5,8 +5,6 @@ The boards run in simulated time. A finding is asked for by its fault's own opti
 else that is found besides is a failure, too.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the doctor tells of the wires: of an untouched skin, and of pressed corners."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated board, sans-IO, and that it and the firmware answer alike."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bad lines and boards: the host gets over it, or says so in one of the documented errors."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import threading

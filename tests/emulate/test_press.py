@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The press model, against analytic answers and its own claims about shape; the scene "press"."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

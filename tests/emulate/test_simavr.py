@@ -5,8 +5,6 @@ Assembler programs start at the reset vector, so that the cycle of each of their
 known: comments give the cycle at which an instruction takes effect.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import select

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults of simulated skins: what their readings become, node by node and reading by reading."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

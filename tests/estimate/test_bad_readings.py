@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames that no skin gives: no exception, and finite numbers where promised."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame is estimated with one BLAS thread, and the program keeps those it had."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimators' common interface, `ohm` and `matrix`, on networks whose truth is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`joint` on readings from ngspice, its derivatives by finite differences, and bad readings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

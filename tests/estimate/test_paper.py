@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods `lsq` and `regularized`: the paper's Algorithm 1 converges, and to circuits that hold."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What no touches can make of a skin is said, and nothing of the kind where touches are all."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

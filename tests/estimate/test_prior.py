@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is expected of cells, and how a deviation of a log becomes one of a conductance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`touch`, the networks behind it, and what the wires learn: against whole-circuit solutions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

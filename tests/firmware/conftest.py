@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board with the built firmware, in lock-step, for each kind of board."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands to the built firmware: every one answered, what is refused changes nothing."""
 
-from __future__ import annotations
-
 import pytest
 
 from firmware_helpers import (

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans of the built firmware: codes, order, time, settling; under load; after a hang."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 from typing import Any

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The self-test of the built firmware, on sound and broken boards."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of the built firmware in EEPROM."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calibration file: the same bits after a round trip, and whatever else it may hold refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

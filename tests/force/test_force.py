@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force curves against numpy and scipy's own regressions, known laws, and counted coverage."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any

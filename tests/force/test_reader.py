@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forces from a board: what open promises with a calibration, tare, and replay bit for bit."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from itertools import islice

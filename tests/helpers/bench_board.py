@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An emulated board in simulated time, with as much of a `Device` as the doctor needs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrations of simulated skins whose cells are all alike, for several test files."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ohmskin.arrays import Float

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run of the command line leaves, for several test files."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

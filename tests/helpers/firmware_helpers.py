@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tests of the built firmware share besides fixtures."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -5,8 +5,6 @@ For tests and benchmarks of the firmware: simulated time passes only in `Rig.run
 figure is exact and repeatable. In real time there is ``simavr://`` (`ohmskin.emulate.simavr`).
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass

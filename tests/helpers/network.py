@@ -30,8 +30,6 @@ in the diagonal of L: `circuit` is the one to compute with.
 IEEE Transactions on Circuits and Systems 22(6), 504-509.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

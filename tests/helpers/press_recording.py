@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording of the scene "press" in simulated time, with what a force sensor says of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

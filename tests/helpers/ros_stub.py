@@ -6,8 +6,6 @@ and are as strict as Python messages that rosidl generates: no other field, no v
 type, no NumPy scalar for a number, no NumPy array for a sequence. Not modelled: the rest of ROS.
 """
 
-from __future__ import annotations
-
 import time
 from array import array
 from collections.abc import Callable, Sequence

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A device whose time goes on when a scan is taken: minutes of scans within a second."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board would read of a skin, and what is told of the skin, for several test files."""
 
-from __future__ import annotations
-
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An emulated board whose time the test lets pass: nothing depends on how busy the machine is."""
 
-from __future__ import annotations
-
 import threading
 
 from ohmskin.errors import DeviceLost

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board's clock on the host's: against known clocks, and that of the simulated firmware."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Codes of the converter and the ratios that they stand for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

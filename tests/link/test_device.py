@@ -3,8 +3,6 @@
 pseudo-terminal that is opened like a serial port, and the firmware in the AVR simulator.
 """
 
-from __future__ import annotations
-
 import gc
 import itertools
 import threading

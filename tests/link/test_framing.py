@@ -5,8 +5,6 @@ Streams are made with a COBS and a CRC written here, so that encoder and decoder
 error.
 """
 
-from __future__ import annotations
-
 import itertools
 import struct
 import tracemalloc

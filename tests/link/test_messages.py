@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Board messages from bytes, and what is counted between them: gaps, wraps, restarts, strangers."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

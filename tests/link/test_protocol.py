@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The protocol definition and its golden vectors, which other code than the project's has made."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

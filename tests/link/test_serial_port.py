@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which ports there are, what is probably behind them, and how long a bridge holds back bytes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

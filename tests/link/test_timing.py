@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When readings are taken and when scans arrive: against the emulated and the simulated board."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

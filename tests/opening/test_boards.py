@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several boards at once: which are opened, what becomes of those that cannot be, every scan."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections import Counter

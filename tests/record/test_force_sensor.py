@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A force sensor: its lines, its port, and ``record --force-port``, which is then calibrated."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

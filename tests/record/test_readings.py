@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The readings file: what is read, what is refused and how it is said, what is written."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

@@ -4,8 +4,6 @@
 Files are read here by the `mcap` library's own readers as well, not by ours alone.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import itertools

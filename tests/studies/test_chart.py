@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make chart`: the front, the table, the picture, and what interrupts them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

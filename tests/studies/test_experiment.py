@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ohmskin experiment`: the simulated experiments with force, and what they print."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

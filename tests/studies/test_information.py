@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The information limit, against the dense formula with derivatives by finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

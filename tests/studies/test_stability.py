@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make stability`: the verdict, the faults, the sweep over processes, the files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

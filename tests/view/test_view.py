@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin view`` without a browser: what the server sends, takes, refuses and leaves behind."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

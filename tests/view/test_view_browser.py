@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin view`` in a browser: what somebody sees, hears and does at the page."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

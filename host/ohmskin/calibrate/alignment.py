@@ -30,8 +30,6 @@ gives the offset between grid points.
 the force sensor, such as that of its filter, is part of the offset.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

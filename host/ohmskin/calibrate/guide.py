@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Leads a person from press to press: which one is wanted next, and when it is read. Sans-IO."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence

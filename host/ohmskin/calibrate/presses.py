@@ -8,8 +8,6 @@ Two kinds of scans are left out: those of a run of less than `MIN_SCANS`, and th
 cell rises by more than `SECOND_SHARE` of the first, for nothing tells how two cells share a force.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise

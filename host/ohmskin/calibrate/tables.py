@@ -20,8 +20,6 @@ Nothing is guessed: a file that is not plainly so raises a ValueError of one lin
 file, the row (the header is row 1) and the column, and says what to do.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import io

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One BLAS thread while a circuit is solved: for matrices of a skin's size, more are slower."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import ContextDecorator
 from typing import Any

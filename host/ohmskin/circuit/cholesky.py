@@ -5,8 +5,6 @@ before it calls LAPACK takes as long again.
 Symmetric matrices and factors are lower triangles, in Fortran's order; what is above is anything.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import blas, lapack
 

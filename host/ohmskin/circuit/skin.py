@@ -30,8 +30,6 @@ unknowns of the node Laplacian, and open cells (g = 0) and wires of zero ohm nee
 Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g), has none.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Self
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin ports``, ``info`` and ``configure``: which boards there are, and how they scan."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Annotated, Any

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin demo``: the main job on an emulated skin, compared with the truth."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The words of ``ohmskin doctor``; those of each kind of finding are in ``doctor_words.toml``."""
 
-from __future__ import annotations
-
 import tomllib
 from functools import cache
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin emulate``: an emulated board at a pseudo-terminal, for any program."""
 
-from __future__ import annotations
-
 import signal
 from contextlib import ExitStack, suppress
 from pathlib import Path

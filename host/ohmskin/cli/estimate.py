@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin estimate``: every cell of every frame of a readings file."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Annotated

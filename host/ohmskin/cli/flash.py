@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin flash``: build the firmware, write it to a board, and hear that it runs there."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

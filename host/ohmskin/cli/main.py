@@ -4,8 +4,6 @@
 A command's module is imported when the command is run, or asked for its help.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from importlib import import_module

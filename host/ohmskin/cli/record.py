@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin record`` and ``ohmskin export``."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin stream``: the skin at a port, live in a terminal or as JSON."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin tare``: a tare that lasts, in the calibration file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

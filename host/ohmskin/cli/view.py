@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin view``: a live page of one or several boards."""
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -26,8 +26,6 @@ what A and D show over that of B and C. The readings are ratios: a factor common
 references included, changes none of them and cannot be known.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

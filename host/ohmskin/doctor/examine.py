@@ -8,8 +8,6 @@ A skin that is touched is not at fault: touched cells are told and left out, and
 is not judged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final

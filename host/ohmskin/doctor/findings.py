@@ -4,8 +4,6 @@
 Words are made of it elsewhere: `ohmskin.cli.doctor_words`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum

@@ -25,8 +25,6 @@ the right f their c(f) exp(-2 pi i f d) have one phase. Mains that are seen at a
 drift.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Self

@@ -14,8 +14,6 @@ Not modelled:
 ``simavr://`` has all these, for it runs the firmware itself.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An emulated board at a pseudo-terminal, which programs can open like a serial port."""
 
-from __future__ import annotations
-
 import os
 import select
 import time

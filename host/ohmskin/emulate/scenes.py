@@ -5,8 +5,6 @@ A scene is a skin, whose wires and cells at rest are drawn from a seed, and touc
 time alone. So a scene always gives the same answer for the same time.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import Final

@@ -8,8 +8,6 @@ firmware/sim/README.md lists what is not modelled. Above all these are noise, th
 and its sample-and-hold capacitor, crystal tolerance, and everything on the USB side of the UART.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import subprocess

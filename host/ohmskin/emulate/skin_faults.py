@@ -6,8 +6,6 @@ network (`joined_readings`). Hum and slow settling change each reading at its ow
 (`SkinFaults.sampled`). Faults of the serial line are in `ohmskin.emulate.line_faults`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate

@@ -6,8 +6,6 @@ derives from `Estimator` and writes `_solve`; checking the readings, timing, and
 cells are touched happen here, so that all methods do them alike.
 """
 
-from __future__ import annotations
-
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

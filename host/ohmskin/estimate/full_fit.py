@@ -22,8 +22,6 @@ eq. 3.51),
 and the posterior covariance is P - P J^T (J P J^T + 1)^-1 J P.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -19,8 +19,6 @@ fifth of the skin is touched, where wires hide how hard, or where a touch may hi
 for `joint`. Without rest readings no cell is known to be untouched, so every frame is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import ClassVar, Final
 

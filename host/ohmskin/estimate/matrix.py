@@ -34,8 +34,6 @@ Source: the network and its Jacobian are the resistance-matrix approach of Shu e
 Journal 15(1), 2015; the weights, bounds and standard deviations are ours.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimators by name. A method's module is imported when one is made."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Final
 

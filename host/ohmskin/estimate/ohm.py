@@ -12,8 +12,6 @@ fourth look pressed. `voltage` is the paper's baseline for forces: it reads a fo
 voltage over the reference resistors, and for all else it is `ohm`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -23,8 +23,6 @@ A touch alone reveals nothing, as its own resistance is in the same reading: N h
 cells as noise without limit. Between frames knowledge fades, U shrinks: a skin bends.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -35,8 +35,6 @@ rest is taken out. The last steps know that wires are known to P only, and weigh
 N^-1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -27,8 +27,6 @@ Numbers are written so that they are read back bit for bit. A file from elsewher
 its fields, their types, shapes and ranges are checked before anything is made of them.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass, fields

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contacts: touched cells that adjoin are one thing on the skin, followed from scan to scan."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -28,8 +28,6 @@ For a line d = a dx. For x^b with b < 1 the differential is infinite at rest, th
 `regression` learns the curves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Final

@@ -25,8 +25,6 @@ delay measurements", INFOCOM 1999. [Zhang2002]: L. Zhang, Z. Liu, C. H. Xia, "Cl
 algorithms for network measurements", INFOCOM 2002.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Collection

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the converter's codes to ratios of its supply, and back."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What gives scans, as programs see it: a board, or a recording that is played."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ encode   type, sequence, payload  ->  0x00 COBS(type sequence payload crc16) 0x0
 Decoder  bytes as they come       ->  whole, valid frames, and counts of what was not
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board says, as Python objects. They are decoded from bytes, without port or thread."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

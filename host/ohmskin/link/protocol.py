@@ -5,8 +5,6 @@
 value of an enum field is a name. Framing and ports are not known here.
 """
 
-from __future__ import annotations
-
 import binascii
 import json
 import math

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ways for bytes to and from a board: `Link`, and the serial ports of this machine."""
 
-from __future__ import annotations
-
 import errno
 import os
 from dataclasses import dataclass

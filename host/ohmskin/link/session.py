@@ -4,8 +4,6 @@
 Programs use `ohmskin.link.device.Device`, which has a session.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import suppress

@@ -5,8 +5,6 @@ A board takes one reading a slot, cell after cell, column by column; its `hello`
 slot is. The slots after the last reading, up to the start of the next scan, are idle.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Final
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a recording to other programs: a readings file (.npz) for `ohmskin estimate`, or CSV."""
 
-from __future__ import annotations
-
 import csv
 from io import TextIOWrapper
 from pathlib import Path

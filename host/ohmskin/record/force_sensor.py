@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A force sensor at a serial port, which prints one number a line, as sketches for the HX711 do."""
 
-from __future__ import annotations
-
 import math
 import re
 import threading

@@ -21,8 +21,6 @@ a frame is not converged, or what is wrong with its readings), chi2 (F, per read
 iterations (F), seconds (F).
 """
 
-from __future__ import annotations
-
 import os
 import zipfile
 import zlib

@@ -5,8 +5,6 @@ What is written reaches the file at least every `FLUSH_EVERY_S`, as whole chunks
 file of a recorder that was killed, or whose disk was full, can be read up to its last whole chunk.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import threading

@@ -21,8 +21,6 @@ other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were a
 that was cut off anywhere is read up to its last whole chunk.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

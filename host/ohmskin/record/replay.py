@@ -14,8 +14,6 @@ start and stop, which let the replay run and pause, raise `CommandRefused`.
 `ohmskin.record.recording.load_recording` has them.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

@@ -7,8 +7,6 @@ rebinding) is refused, and so is a foreign page. On other addresses than loopbac
 that nobody here can know; there the token in the address takes the place of the check of ``Host``.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import secrets
 from collections.abc import Collection

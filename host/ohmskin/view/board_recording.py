@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording that goes on beside the page: every scan, whatever the page shows of them."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The boards of the page: a thread opens and reads each, and opens it again if it goes away."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

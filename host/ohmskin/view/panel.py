@@ -7,8 +7,6 @@ however slow page or network are. From the page come texts, whose ``do`` is one 
 "ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the host's clock.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time

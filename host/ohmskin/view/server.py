@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The server of the page: a few files, the list of boards, a websocket for each panel."""
 
-from __future__ import annotations
-
 import json
 import secrets
 import socket

@@ -8,8 +8,6 @@ planes          those that the header names, each R x C float32, little-endian, 
 ==============  ======================================================================
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct
