@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stand-in for what examples/lsl_outlet.py uses of pylsl, where that or its library is absent."""
 
+from __future__ import annotations
+
 import time
 from dataclasses import dataclass, field
 from types import ModuleType
