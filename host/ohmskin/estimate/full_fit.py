@@ -33,7 +33,6 @@ from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
 from ohmskin.circuit.skin import port_sensitivity
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
-    DOUBT,
     HIDDEN,
     LOG_LIMITS,
     TOUCHED,
@@ -94,8 +93,7 @@ class _Slopes:
 class FullFit:
     """One frame's fit. cell (RC,), wires (2RC,): log resistances.
 
-    cell_std: standard deviation of the cells' log resistances. elsewhere: another start that may
-    lead to a better optimum, if there is one. cost: -2 log of the posterior, up to a constant.
+    cell_std: standard deviation of the cells' log resistances.
     """
 
     def __init__(
@@ -105,14 +103,16 @@ class FullFit:
         ref_ohm: float,
         current: Float,
         current_std: Float,
-        starts: list[Float],
+        start: Float,
     ) -> None:
-        """Minimise from the best of some starts; `message` says if that did not converge."""
+        """Minimise from these cells (RC,); `message` says if that did not converge."""
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
         self._current, self._weight = current, 1.0 / current_std
         self.iterations = 0
         self.message = ""
-        self._minimise(starts)
+        self.cell: Float = start
+        self.wires = belief.mean
+        self._minimise()
         self._conclude()
 
     def _evaluate(self) -> None:
@@ -132,27 +132,21 @@ class FullFit:
         by_wires *= slope[heavy, None]
         residual = (self._current - modelled) * self._weight
         self._here = _Slopes(modelled, residual, centre, cell_std, by_cell, heavy, by_wires)
-        self.cost = float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
+        self._cost = float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
 
-    def _minimise(self, starts: list[Float]) -> None:
-        self.wires = self._belief.mean
+    def _minimise(self) -> None:
         # a of wires - mean = P a, which saves an inverse of P in the cost
         self._wire_pull = np.zeros_like(self.wires)
         self._moved = 0.0
-        tried = []
-        for start in starts:
-            self.cell: Float = start
-            self._evaluate()
-            tried.append((self.cost, start, self._here))
-        self.cost, self.cell, self._here = min(tried, key=lambda each: each[0])
+        self._evaluate()
         for _ in range(MAX_ITERATIONS):
             self.iterations += 1
-            before, cost_before = (self.cell, self.wires, self._wire_pull), self.cost
+            before, cost_before = (self.cell, self.wires, self._wire_pull), self._cost
             if self._step():
                 return
             self._evaluate()
             for _ in range(MAX_HALVINGS):
-                if self.cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
+                if self._cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
                     break
                 # Too far: back half the way. What is lost is one factorisation.
                 self.cell = 0.5 * (self.cell + before[0])
@@ -220,7 +214,7 @@ class FullFit:
         return moved < CLOSE or (moved < NEARLY and next_one < CLOSE)
 
     def _conclude(self) -> None:
-        """cell_std and elsewhere, from the last factor that was made.
+        """cell_std, from the last factor that was made.
 
         A cell is called untouched when the readings ask for less than the prior asks against it.
         Where that may be a touch all the same, small for the readings but not for the cell, it is
@@ -235,7 +229,6 @@ class FullFit:
         rise = distance / share
         rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
         hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
-        self.elsewhere = self._with_the_likeliest(hidden, rise, rise_std)
         if self.is_crowded:
             hidden, rise = at_rest, np.maximum(rise, LIGHT_TOUCH)
         self._hidden = hidden
@@ -244,18 +237,6 @@ class FullFit:
             at = replace(at, cell_std=wider, by_cell=at.by_cell * (wider / at.cell_std))
             learned = at.learned(at.factor(self._belief))
         self.cell_std: Float = at.cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
-
-    def _with_the_likeliest(
-        self, hidden: NDArray[np.bool_], rise: Float, rise_std: Float
-    ) -> Float | None:
-        """The cells, the likeliest of the hidden touches among them, if any is worth a try."""
-        evidence = np.where(hidden, rise / rise_std, 0.0)
-        likeliest = int(np.argmax(evidence))
-        if evidence[likeliest] <= DOUBT:
-            return None
-        elsewhere: Float = self.cell.copy()
-        elsewhere[likeliest] = self._prior.expected[likeliest] - np.log1p(rise[likeliest])
-        return elsewhere
 
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings that wires matter to, for the belief."""

@@ -25,9 +25,9 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import MIN_CELL_SIEMENS, Estimator, SkinKnowledge, Solution
+from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.ohm import conductance_from_current
+from ohmskin.estimate.matrix import MatrixEstimator
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     REST_STD,
@@ -45,7 +45,6 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.sparse_fit import SparseFit, Touched
 
 LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
-MAX_DOUBTS: Final = 4  # other touches that are tried for a frame
 MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
@@ -68,25 +67,27 @@ class JointEstimator(Estimator):
         self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
+        self._without_wires = MatrixEstimator(knowledge)
         self._before: Float | None = None
         self._learned_from: Float | None = None
         self._bent = False
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
+        self._without_wires.reset()
         self._before = self._learned_from = None
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
 
-    def _solve(self, ports: PortReadings) -> Solution:
+    def solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
         self._bent = False
         prior = self._prior_of(current)
         found = self._finder.find(current, current_std) if self._finder is not None else None
         if found is not None and self.knowledge.rest_ratio is not None and self._is_enough(found):
             return self._simple_solution(prior, found, ports)
-        fit = self._best_fit(prior, current, current_std, self._starts(prior, current, found))
+        fit = self._best_fit(prior, current, current_std, self._start(prior, ports, found))
         usual = not (ports.fault or fit.message)
         self._before = fit.cell if usual else None
         if usual and not fit.is_crowded:
@@ -142,33 +143,21 @@ class JointEstimator(Estimator):
             bottom_wire_ohm=bottom,
         )
 
-    def _fit(
-        self, prior: CellPrior, current: Float, current_std: Float, starts: list[Float]
-    ) -> FullFit:
+    def _fit(self, prior: CellPrior, current: Float, current_std: Float, start: Float) -> FullFit:
         ref_ohm = self.knowledge.ref_ohm
-        return FullFit(prior, self._belief, ref_ohm, current, current_std, starts)
+        return FullFit(prior, self._belief, ref_ohm, current, current_std, start)
 
     def _best_fit(
-        self, prior: CellPrior, current: Float, current_std: Float, starts: list[Float]
+        self, prior: CellPrior, current: Float, current_std: Float, start: Float
     ) -> FullFit:
         """The best fit that can be found: other wires and other touched cells are tried if the
         first leaves a doubt.
         """
-        best = self._fit(prior, current, current_std, starts)
+        best = self._fit(prior, current, current_std, start)
         if best.wires_contradict and not self._belief.is_fresh:
             self._belief.forget()
             self._bent = True
-            best = self._fit(prior, current, current_std, [best.cell])
-        iterations = best.iterations
-        for _ in range(MAX_DOUBTS):
-            if best.elsewhere is None:
-                break
-            other = self._fit(prior, current, current_std, [best.elsewhere])
-            iterations += other.iterations
-            if other.cost >= best.cost:
-                break
-            best = other
-        best.iterations = iterations
+            best = self._fit(prior, current, current_std, best.cell)
         loss = best.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
         worst = int(loss.argmax())
         if best.message:
@@ -180,20 +169,28 @@ class JointEstimator(Estimator):
             best.message = f"cell ({row}, {column}): conducts less than at rest, is a line open?"
         return best
 
-    def _starts(self, prior: CellPrior, current: Float, found: Touched | None) -> list[Float]:
-        """Log resistances of the cells to start from: one, or two if it takes trying."""
-        if found is not None:
+    def _start(self, prior: CellPrior, ports: PortReadings, found: Touched | None) -> Float:
+        """Log resistances of the cells to start from, (RC,).
+
+        They are the touched cells that explain the frame. Where these do not, they are what
+        `matrix` finds: without wires, cells come out a little too soft, and from there a fit never
+        reaches the distant answer of one hard touch behind long wires.
+        """
+        if found is not None and self._explains(found):
             start = prior.expected.copy()
             if self._before is not None:
                 # Cells at rest are where rounding put them before.
                 near = np.abs(prior.rise(self._before)) < TOUCHED
                 start[near] = self._before[near]
             start[found.cells] = -found.log_siemens
-            return [start]
-        siemens = conductance_from_current(current, self.knowledge.ref_ohm)
-        log_ohm = -np.log(np.clip(siemens, MIN_CELL_SIEMENS, HIGHEST_START_SIEMENS))
-        afresh = np.minimum(log_ohm, prior.expected)
-        return [afresh] if self._before is None else [self._before, afresh]
+            return start
+        siemens = self._without_wires.solve(ports).cell_siemens.ravel()
+        return np.minimum(-np.log(np.minimum(siemens, HIGHEST_START_SIEMENS)), prior.expected)
+
+    @staticmethod
+    def _explains(found: Touched) -> bool:
+        """Whether few touched cells explain the frame."""
+        return not found.contradicted and found.cells.size <= MOST_TOUCHED * found.current.size
 
     def _learn(self, prior: CellPrior, cell: Float, lesson: Callable[[], Lesson]) -> None:
         """Let the wires learn from a plain frame that is not like the last one learned from."""
@@ -244,7 +241,7 @@ class JointEstimator(Estimator):
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
         expected = np.full(current.size, np.log(UNTOUCHED_OHM))
         wide = CellPrior(expected, np.full(current.size, UNTOUCHED_STD), np.inf)
-        fit = self._fit(wide, current, current_std, self._starts(wide, current, None))
+        fit = self._fit(wide, current, current_std, self._start(wide, ports, None))
         return fit.cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
 
 
@@ -254,6 +251,5 @@ class TouchEstimator(JointEstimator):
     name: ClassVar[str] = "touch"
 
     def _is_enough(self, found: Touched) -> bool:
-        few = found.cells.size <= MOST_TOUCHED * found.current.size
         known = found.log_std.max(initial=0.0) <= WIDEST_LOG_STD
-        return few and known and not (found.doubtful or found.contradicted)
+        return self._explains(found) and known and not found.doubtful

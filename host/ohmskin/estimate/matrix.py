@@ -108,7 +108,7 @@ class MatrixEstimator(Estimator):
         """Forget the previous frame: the next one starts from `ohm`."""
         self._previous = None
 
-    def _solve(self, ports: PortReadings) -> Solution:
+    def solve(self, ports: PortReadings) -> Solution:
         known = self.knowledge
         afresh = conductance_from_current(ports.current, known.ref_ohm)
         starts = [afresh] if self._previous is None else [self._previous, afresh]

@@ -50,7 +50,7 @@ HIDDEN: Final = 0.3  # a rise that must not go unnoticed
 DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
 
 UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
-UNKNOWN_LAYER_STD: Final = 1.5  # what all segments of such a layer share
+UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a factor of two
 LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
