@@ -29,11 +29,11 @@ class Waits(OhmEstimator):
         super().__init__(SkinKnowledge(2, 2))
         self.has_begun, self.may_end = Event(), Event()
 
-    def solve(self, ports):
+    def _solve(self, ports):
         self.has_begun.set()
         assert self.may_end.wait(10)
         assert blas_threads() == {1}
-        return super().solve(ports)
+        return super()._solve(ports)
 
 frame = np.tile([0.9, 0.1, 0.9, 0.1], (2, 2, 1))
 assert blas_threads() == {2}

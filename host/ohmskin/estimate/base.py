@@ -2,7 +2,7 @@
 """What every estimator is told, what it answers, and the steps they share.
 
 An estimator turns the readings of one frame, shape (R, C, 4), into cell conductances. A method
-derives from `Estimator` and writes `solve`; checking the readings, timing, and deciding which
+derives from `Estimator` and writes `_solve`; checking the readings, timing, and deciding which
 cells are touched happen here, so that all methods do them alike.
 """
 
@@ -175,7 +175,7 @@ class Estimator(ABC):
         self._rest: Solution | None = None
 
     @abstractmethod
-    def solve(self, ports: PortReadings) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
         """Answer for one frame, started from the previous frame if there is one.
 
         Must return finite values with an honest standard deviation (NaN: none is known), or set
@@ -190,7 +190,7 @@ class Estimator(ABC):
         """This method's own answer to the rest readings; None where they are not known."""
         if self._rest is None and self.knowledge.rest_ratio is not None:
             with one_blas_thread:
-                self._rest = self.solve(self._reader.read(self.knowledge.rest_ratio))
+                self._rest = self._solve(self._reader.read(self.knowledge.rest_ratio))
             self.reset()
         return self._rest
 
@@ -216,7 +216,7 @@ class Estimator(ABC):
         started = time.perf_counter()
         with one_blas_thread:
             ports = self._reader.read(readings)
-            found = self.solve(ports)
+            found = self._solve(ports)
         message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)
         level, level_std = self._level(readings, found)

@@ -27,7 +27,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.matrix import MatrixEstimator
+from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     REST_STD,
@@ -67,20 +67,19 @@ class JointEstimator(Estimator):
         self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
-        self._without_wires = MatrixEstimator(knowledge)
         self._before: Float | None = None
+        self._without_wires: Float | None = None
         self._learned_from: Float | None = None
         self._bent = False
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
-        self._without_wires.reset()
-        self._before = self._learned_from = None
+        self._before = self._learned_from = self._without_wires = None
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
 
-    def solve(self, ports: PortReadings) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
         self._bent = False
         prior = self._prior_of(current)
@@ -184,8 +183,10 @@ class JointEstimator(Estimator):
                 start[near] = self._before[near]
             start[found.cells] = -found.log_siemens
             return start
-        siemens = self._without_wires.solve(ports).cell_siemens.ravel()
-        return np.minimum(-np.log(np.minimum(siemens, HIGHEST_START_SIEMENS)), prior.expected)
+        fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires)
+        self._without_wires = None if fit.message else fit.cell
+        siemens = np.minimum(fit.cell.ravel(), HIGHEST_START_SIEMENS)
+        return np.minimum(-np.log(siemens), prior.expected)
 
     @staticmethod
     def _explains(found: Touched) -> bool:

@@ -108,43 +108,43 @@ class MatrixEstimator(Estimator):
         """Forget the previous frame: the next one starts from `ohm`."""
         self._previous = None
 
-    def solve(self, ports: PortReadings) -> Solution:
-        known = self.knowledge
-        afresh = conductance_from_current(ports.current, known.ref_ohm)
-        starts = [afresh] if self._previous is None else [self._previous, afresh]
-        fit = _Fit(ports.current.ravel(), ports.current_std.ravel(), known.ref_ohm, starts)
-        message = fit.run()
+    def _solve(self, ports: PortReadings) -> Solution:
+        fit = CellFit(ports, self.knowledge.ref_ohm, self._previous)
         # A frame that did not converge is a poor start for the next one.
-        self._previous = None if message else fit.cell
+        self._previous = None if fit.message else fit.cell
         return Solution(
             cell_siemens=fit.cell,
             cell_siemens_std=fit.cell_std(),
             chi2=self._chi2(ports.ratio, fit.current.reshape(fit.cell.shape)),
             iterations=fit.iterations,
-            message=message,
+            message=fit.message,
         )
 
 
-class _Fit:
-    """One frame's minimisation: holds the present cells and all that follows from them."""
+class CellFit:
+    """One frame's minimisation. cell (R, C) [S]; message: why it did not converge, or empty.
 
-    def __init__(
-        self, current: Float, current_std: Float, ref_ohm: float, starts: list[Float]
-    ) -> None:
-        self._target = current
-        self._current_std = current_std
+    It starts from the cells of the frame `before`, or from those of `ohm` if they are nearer.
+    """
+
+    def __init__(self, ports: PortReadings, ref_ohm: float, before: Float | None) -> None:
+        self._target = ports.current.ravel()
+        self._current_std = ports.current_std.ravel()
         self._ref_ohm = ref_ohm
         # 1 / (1 + G_read R), of a current that the most conductive cell allows.
-        feasible = np.minimum(current, port_current(MAX_CELL_SIEMENS, ref_ohm))
+        feasible = np.minimum(self._target, port_current(MAX_CELL_SIEMENS, ref_ohm))
         self._target_share = 1.0 - feasible * ref_ohm
         self.iterations = 0
-        cell, trial = starts[0], self._evaluate(starts[0])
+        afresh = conductance_from_current(ports.current, ref_ohm)
+        cell = afresh if before is None else before
+        trial = self._evaluate(cell)
         # A scene that jumped is nearer to the plain estimate than to the frame before it.
-        for other in starts[1:] if self._is_far(trial[-1]) else []:
-            other_trial = self._evaluate(other)
+        if before is not None and self._is_far(trial[-1]):
+            other_trial = self._evaluate(afresh)
             if other_trial[-1] < trial[-1]:
-                cell, trial = other, other_trial
+                cell, trial = afresh, other_trial
         self._move_to(cell, *trial)
+        self.message = self._run()
 
     def _is_far(self, cost: float) -> bool:
         return cost > _FAR_CHI2 * self._target.size
@@ -170,7 +170,7 @@ class _Fit:
         self.normal: Float = jacobian.T @ jacobian
         self.diagonal = np.diagonal(self.normal).copy()
 
-    def run(self) -> str:
+    def _run(self) -> str:
         """Minimise; returns why not converged, or an empty string."""
         damping = 0.0
         far = self._is_far(self.cost)

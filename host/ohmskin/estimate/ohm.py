@@ -43,7 +43,7 @@ class OhmEstimator(Estimator):
 
     name = "ohm"
 
-    def solve(self, ports: PortReadings) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
         ref_ohm = self.knowledge.ref_ohm
         current = ports.current
         cell = conductance_from_current(current, ref_ohm)

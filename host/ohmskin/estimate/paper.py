@@ -182,7 +182,7 @@ class PaperEstimator(Estimator):
         """Forget the previous frame: the next one starts from step 2."""
         self._previous = None
 
-    def solve(self, ports: PortReadings) -> Solution:
+    def _solve(self, ports: PortReadings) -> Solution:
         feasible, message = self._feasible(ports.ratio)
         before, answers = self._previous, []
         if before is not None and np.abs(feasible - before.ratio).max() < _JUMP_RATIO:
