@@ -35,6 +35,7 @@ from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIDDEN,
     LOG_LIMITS,
+    MOST_TOUCHED,
     TOUCHED,
     UNLIMITED_STD,
     CellPrior,
@@ -50,8 +51,6 @@ MAX_STEP: Final = 1.5  # of a log resistance
 CLOSE: Final = 0.3
 NEARLY: Final = 3.0
 HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
-BENT: Final = 9.0  # chi-square of the wires for each touched cell: above it they have changed
-CROWDED: Final = 0.3  # share of touched cells: above it no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
 LESSON: Final = 0.25  # share of the noise's variance: wires learn from what they move by more
 MAX_LESSON: Final = 32  # readings that wires learn from, the best
@@ -172,15 +171,9 @@ class FullFit:
         return float(self._wire_pull @ (self.wires - self._belief.mean))
 
     @property
-    def wires_contradict(self) -> bool:
-        """Whether the wires moved further than was believed possible."""
-        touches = int(np.sum(self._prior.rise(self.cell) > TOUCHED))
-        return self.wire_chi2 > BENT * (1 + touches)
-
-    @property
     def is_crowded(self) -> bool:
         """Whether so many cells are touched that rest is no more likely than a touch."""
-        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > CROWDED)
+        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > MOST_TOUCHED)
 
     def _step(self) -> bool:
         """One step; True when the next would not matter."""

@@ -9,14 +9,13 @@ standard deviation that says how much of it is prior:
 - a wire segment is near what is believed of it: at first the nominal value of its layer, later what
   the frames before have revealed.
 
-The maximum of the posterior is found from the simplest model that explains the frame
-(`sparse_fit`), in one or two steps (`full_fit`). Where the answer leaves a doubt, other
-explanations are tried: other wires than believed, a touch that hides.
+The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
+few touches that explain the frame (`sparse_fit`). If no few touches do, as under a fingertip, they
+begin at the cells that `matrix` finds.
 
-`touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is that
-simplest model, where it is enough. It is not where the touches contradict the readings, where a
-fifth of the skin is touched, where wires hide how hard, or where a touch may hide: such frames are
-for `joint`. Without rest readings no cell is known to be untouched, so every frame is.
+`touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
+few touches. Where they do not explain the frame, its answer is that of `joint`. Without rest
+readings no cell is known to be untouched, so every frame is for `joint`.
 """
 
 from collections.abc import Callable
@@ -30,6 +29,8 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
+    HIGHEST_TOUCH_SIEMENS,
+    MOST_TOUCHED,
     REST_STD,
     TAIL,
     TOUCHED,
@@ -50,10 +51,7 @@ LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at f
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
 CLEAR: Final = 12.0  # deviations of the prior: a cell beyond them is touched beyond doubt
-HIGHEST_START_SIEMENS: Final = 1e-2  # the hardest touch that a fit starts from
-MOST_TOUCHED: Final = 0.2  # share of the cells up to which `touch` is enough
 WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
-BENT_MESSAGE: Final = "the wires changed since they were learned: they are learned anew"
 
 
 class JointEstimator(Estimator):
@@ -67,29 +65,25 @@ class JointEstimator(Estimator):
         self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
-        self._before: Float | None = None
         self._without_wires: Float | None = None
         self._learned_from: Float | None = None
-        self._bent = False
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
-        self._before = self._learned_from = self._without_wires = None
+        self._learned_from = self._without_wires = None
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
 
     def _solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
-        self._bent = False
         prior = self._prior_of(current)
         found = self._finder.find(current, current_std) if self._finder is not None else None
         if found is not None and self.knowledge.rest_ratio is not None and self._is_enough(found):
             return self._simple_solution(prior, found, ports)
-        fit = self._best_fit(prior, current, current_std, self._start(prior, ports, found))
-        usual = not (ports.fault or fit.message)
-        self._before = fit.cell if usual else None
-        if usual and not fit.is_crowded:
+        fit = self._fit(prior, ports, self._start(prior, ports, found))
+        message = self._doubt(prior, fit)
+        if not (ports.fault or message or fit.is_crowded):
             self._learn(prior, fit.cell, fit.lesson)
         return self._solution(
             ports,
@@ -97,7 +91,7 @@ class JointEstimator(Estimator):
             fit.wires,
             fit.modelled,
             fit.iterations,
-            fit.message,
+            message,
             max(1.0, fit.misfit) ** 0.5,
         )
 
@@ -137,55 +131,43 @@ class JointEstimator(Estimator):
             cell_siemens_std_down=wider * std_down.reshape(self._shape),
             chi2=self._chi2(ports.ratio, current.reshape(self._shape)),
             iterations=iterations,
-            message=message or (BENT_MESSAGE if self._bent else ""),
+            message=message,
             top_wire_ohm=top,
             bottom_wire_ohm=bottom,
         )
 
-    def _fit(self, prior: CellPrior, current: Float, current_std: Float, start: Float) -> FullFit:
+    def _fit(self, prior: CellPrior, ports: PortReadings, start: Float) -> FullFit:
+        current, current_std = ports.current.ravel(), ports.current_std.ravel()
         ref_ohm = self.knowledge.ref_ohm
         return FullFit(prior, self._belief, ref_ohm, current, current_std, start)
 
-    def _best_fit(
-        self, prior: CellPrior, current: Float, current_std: Float, start: Float
-    ) -> FullFit:
-        """The best fit that can be found: other wires and other touched cells are tried if the
-        first leaves a doubt.
-        """
-        best = self._fit(prior, current, current_std, start)
-        if best.wires_contradict and not self._belief.is_fresh:
-            self._belief.forget()
-            self._bent = True
-            best = self._fit(prior, current, current_std, best.cell)
-        loss = best.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
+    def _doubt(self, prior: CellPrior, fit: FullFit) -> str:
+        """Why this fit cannot be the answer; empty if it can."""
+        if fit.message:
+            return fit.message
+        if fit.misfit > MISFIT:
+            return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
+        loss = fit.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
         worst = int(loss.argmax())
-        if best.message:
-            return best
-        if best.misfit > MISFIT:
-            best.message = f"no resistances explain the readings: chi-square {best.misfit:.1f}"
-        elif self.knowledge.rest_ratio is not None and loss[worst] > 0:
+        if self.knowledge.rest_ratio is not None and loss[worst] > 0:
             row, column = divmod(worst, self._shape[1])
-            best.message = f"cell ({row}, {column}): conducts less than at rest, is a line open?"
-        return best
+            return f"cell ({row}, {column}): conducts less than at rest, is a line open?"
+        return ""
 
     def _start(self, prior: CellPrior, ports: PortReadings, found: Touched | None) -> Float:
         """Log resistances of the cells to start from, (RC,).
 
         They are the touched cells that explain the frame. Where these do not, they are what
-        `matrix` finds: without wires, cells come out a little too soft, and from there a fit never
-        reaches the distant answer of one hard touch behind long wires.
+        `matrix` finds: without wires, cells come out a little too soft, and from there a fit does
+        not reach the distant answer of one hard touch behind long wires.
         """
         if found is not None and self._explains(found):
             start = prior.expected.copy()
-            if self._before is not None:
-                # Cells at rest are where rounding put them before.
-                near = np.abs(prior.rise(self._before)) < TOUCHED
-                start[near] = self._before[near]
             start[found.cells] = -found.log_siemens
             return start
         fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires)
         self._without_wires = None if fit.message else fit.cell
-        siemens = np.minimum(fit.cell.ravel(), HIGHEST_START_SIEMENS)
+        siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
 
     @staticmethod
@@ -201,7 +183,7 @@ class JointEstimator(Estimator):
         if before is not None and np.abs(cell - before).max() < NEWS:
             return
         self._learned_from = cell
-        self._bent |= self._belief.learn(*lesson())
+        self._belief.learn(*lesson())
 
     @staticmethod
     def _is_plain(rise: Float) -> bool:
@@ -239,10 +221,9 @@ class JointEstimator(Estimator):
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
         """Log resistances of the untouched cells, and how well they are known: the same fit."""
-        current, current_std = ports.current.ravel(), ports.current_std.ravel()
-        expected = np.full(current.size, np.log(UNTOUCHED_OHM))
-        wide = CellPrior(expected, np.full(current.size, UNTOUCHED_STD), np.inf)
-        fit = self._fit(wide, current, current_std, self._start(wide, ports, None))
+        expected = np.full(ports.current.size, np.log(UNTOUCHED_OHM))
+        wide = CellPrior(expected, np.full(expected.size, UNTOUCHED_STD), np.inf)
+        fit = self._fit(wide, ports, self._start(wide, ports, None))
         return fit.cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
 
 
@@ -253,4 +234,4 @@ class TouchEstimator(JointEstimator):
 
     def _is_enough(self, found: Touched) -> bool:
         known = found.log_std.max(initial=0.0) <= WIDEST_LOG_STD
-        return self._explains(found) and known and not found.doubtful
+        return self._explains(found) and known

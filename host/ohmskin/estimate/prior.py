@@ -41,23 +41,17 @@ REST_QUANTILE: Final = 0.2  # of the ports, taken for untouched ones where rest 
 REST_STD: Final = 0.05  # drift of a cell since the rest readings
 TAIL: Final = 1.0  # exponent of the density of touched cells
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
-HARDEST_LOG_OHM: Final = float(np.log(300.0))
-WALL_STD: Final = 0.3  # how far beyond the hardest touch a cell may be
 # A cell that the prior holds at rest may be touched all the same, where readings say little of it.
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
 UNLIMITED_STD: Final = 3.0  # what is not known of such a cell
 HIDDEN: Final = 0.3  # a rise that must not go unnoticed
-DOUBT: Final = 2.0  # evidence of such a rise, in its deviation, that is followed up
+MOST_TOUCHED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 
 UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
 UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a factor of two
 LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
-# Lessons, the last few together, that ask for a change of a layer by ALARM standard deviations say
-# that the skin has been bent. Each lesson counts by the share MEMORY of the next one.
-MEMORY: Final = 0.8
-ALARM: Final = 1.6  # three times what they scatter by: lessons state their noise on the safe side
 MAX_DIRECTIONS: Final = 32  # columns of U; the least informative are forgotten
 _LEAST_DIRECTION: Final = 1e-3  # of SEGMENT_STD^2: not worth a column
 LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
@@ -72,7 +66,7 @@ class CellPrior:
     With d the distance from `expected` over `std`, -2 log p is d^2 up to d^2 = `tail`, and goes on
     with the same slope as tail (1 + log(d^2 / tail)): the density falls as d^-tail. Cells at rest
     are a quadratic problem, which costs no iterations; being touched is unlikely, but how hard,
-    once a cell is, costs little, up to the hardest touch; beyond, it costs.
+    once a cell is, costs little.
     expected, std: (RC,) [log ohm]. tail: inf for a normal.
     """
 
@@ -90,9 +84,7 @@ class CellPrior:
         if self.tail == np.inf:
             return float(square.sum())
         beyond = np.maximum(square / self.tail, 1.0)
-        wall = np.maximum(HARDEST_LOG_OHM - log_ohm, 0.0) / WALL_STD
-        near_and_tail = np.minimum(square, self.tail) + self.tail * np.log(beyond)
-        return float((near_and_tail + wall * wall).sum())
+        return float((np.minimum(square, self.tail) + self.tail * np.log(beyond)).sum())
 
     def normal(
         self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
@@ -101,11 +93,6 @@ class CellPrior:
         expected = self.expected[cells]
         away = log_ohm - expected
         variance = np.maximum(self.std[cells] ** 2, away * away / self.tail)
-        if self.tail < np.inf and (log_ohm < HARDEST_LOG_OHM).any():
-            precision = 1.0 / variance
-            wall = np.where(log_ohm < HARDEST_LOG_OHM, WALL_STD**-2, 0.0)
-            variance = 1.0 / (precision + wall)
-            expected = (precision * expected + wall * HARDEST_LOG_OHM) * variance
         return expected, variance
 
 
@@ -129,17 +116,7 @@ class WireBelief:
     def reset(self) -> None:
         """Back to the nominal wires."""
         self.mean = self._nominal
-        self.forget()
-
-    @property
-    def is_fresh(self) -> bool:
-        """Whether nothing has been learned."""
-        return self._learned.shape[1] == 0
-
-    def forget(self) -> None:
-        """Back to the prior's covariance; the mean stays as the best guess there is."""
         self._learned = np.zeros((2 * self._cells, 0))
-        self._slope, self._curvature = np.zeros(2), np.full(2, 1e-9)
 
     def times(self, slopes: Float) -> Float:
         """P J^T, shape (2RC, m), or P a for a vector (2RC,)."""
@@ -184,35 +161,19 @@ class WireBelief:
         top, bottom = self.layers(log_wires)
         return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
 
-    def learn(self, slopes: Float, residual: Float, noise: Float) -> bool:
-        """One Kalman step; True if lessons say that the skin was bent: what was learned is dropped.
-
-        slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m).
-        """
+    def learn(self, slopes: Float, residual: Float, noise: Float) -> None:
+        """One Kalman step. slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m)."""
         if len(residual) < 2:
-            return False
+            return
         self._learned *= np.sqrt(1 - FADE)
         spread = self.times(slopes)
         factor = cholesky(noise + slopes @ spread)
-        # Slope and curvature of the likelihood along a change of a whole layer.
-        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
-        pulls = solve(factor, np.column_stack([residual, layers]))
-        self._slope = MEMORY * self._slope + layers.T @ pulls[:, 0]
-        self._curvature = MEMORY * self._curvature + np.sum(layers * pulls[:, 1:], axis=0)
-        bent = False
-        if np.any(self._slope**2 > ALARM**2 * self._curvature):
-            self.forget()
-            bent = True
-            spread = self.times(slopes)
-            factor = cholesky(noise + slopes @ spread)
-            pulls = solve(factor, residual[:, None])
-        self.mean = np.clip(self.mean + spread @ pulls[:, 0], *LOG_LIMITS)
+        self.mean = np.clip(self.mean + spread @ solve(factor, residual), *LOG_LIMITS)
         gain = solve_lower(factor, spread.T)
         learned = np.concatenate([self._learned, gain.T], axis=1)
         size, turn = scipy.linalg.eigh(learned.T @ learned, check_finite=False)
         kept = np.flatnonzero(size > _LEAST_DIRECTION * SEGMENT_STD**2)[-MAX_DIRECTIONS:]
         self._learned = learned @ turn[:, kept]
-        return bent
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

@@ -47,9 +47,8 @@ from ohmskin.circuit.cholesky import cholesky, solve, solve_lower
 from ohmskin.circuit.skin import admittance_of, by_wires, factorised, impedance_of, port_potential
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
-    DOUBT,
-    HIDDEN,
     HIGHEST_TOUCH_SIEMENS,
+    MOST_TOUCHED,
     UNLIMITED_STD,
     CellPrior,
     Lesson,
@@ -58,7 +57,6 @@ from ohmskin.estimate.prior import (
 
 Cells = NDArray[np.intp]
 
-MOST_PER_LINE: Final = 2  # touches a row and column; with more, the skin is not at rest any more
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
 LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
@@ -71,9 +69,6 @@ CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
 HEAVY: Final = 0.5
 LIGHT: Final = 0.03
 MAX_HEAVY: Final = 24
-HIDING: Final = (
-    0.1  # deviation of the wires to a cell at rest, over the cell: above it they hide it
-)
 REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
 CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
@@ -152,16 +147,15 @@ class TouchedNetwork:
 class Touched:
     """What was found: cells (k,), their log conductance and its standard deviation (k,).
 
-    current: what the model predicts, wires corrected (RC,) [S]. doubtful: a touch may hide at
-    another cell. contradicted: no touches explain the readings. lesson: what the wires can learn
-    from: Jw, r and N of the m ports, the touched cells in N as noise without limit.
+    current: what the model predicts, wires corrected (RC,) [S]. contradicted: no touches explain
+    the readings. lesson: what the wires can learn from: Jw, r and N of the m ports, the touched
+    cells in N as noise without limit.
     """
 
     cells: Cells
     log_siemens: Float
     log_std: Float
     current: Float
-    doubtful: bool
     contradicted: bool
     steps: int
     lesson: Lesson
@@ -189,8 +183,6 @@ class SparseFit:
         self.slack += belief.variance(wires * (self.current**2)[:, None])
         self.path_ohm = belief.path_ohm(belief.mean)
         self.wire_std = float(belief.std().max())
-        # Wires this uncertain are no small noise beside a cell at rest.
-        self.hides = bool(np.any(self.path_ohm * self.wire_std * net.cell_siemens > HIDING))
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
         """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
@@ -205,7 +197,8 @@ class SparseFit:
             if not asked.size:
                 return frame.finish()
             cells = np.concatenate([frame.cells, asked])
-            if cells.size > MOST_PER_LINE * sum(self.net.shape):
+            # Ghosts among them may leave again.
+            if cells.size > 2 * MOST_TOUCHED * self.current.size:
                 return None
             added = np.log(self.net.cell_siemens[asked] + rise)
             frame.settle(cells, np.concatenate([frame.log_siemens, added]))
@@ -305,7 +298,7 @@ class _Frame:
             none = np.zeros(0)
             lesson = np.zeros((0, 2 * skin.current.size)), none, np.zeros((0, 0))
             less = bool(self._residual.min() < -DEMAND)
-            return Touched(cells, none, none, self._current, False, less, 0, lesson)
+            return Touched(cells, none, none, self._current, less, 0, lesson)
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
@@ -333,13 +326,11 @@ class _Frame:
         of_touches = slopes[:, ports]
         noise = UNLIMITED_STD**2 * (of_touches.T @ of_touches)
         noise.ravel()[:: ports.size + 1] += 1.0
-        unit = np.sqrt(np.diagonal(covariance))
         return Touched(
             cells=cells,
             log_siemens=self.log_siemens,
             log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
             current=current,
-            doubtful=skin.hides or self._doubtful(ports, residual, unit),
             contradicted=bool(
                 residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1)
                 or self._residual[light].min(initial=0.0) < -DEMAND
@@ -373,19 +364,3 @@ class _Frame:
         wires = net.by_wires(currents)
         wires *= -(square / self._std[ports])[:, None]
         return wires
-
-    def _doubtful(self, ports: Cells, residual: Float, deviation: Float) -> bool:
-        """Whether a touch may hide at a cell that this model holds for untouched.
-
-        What its own reading says of it: rise of its conductance over rest, and deviation.
-        """
-        assert self._touched is not None
-        net = self._skin.net
-        volt, _ = self._touched.own_volt()
-        slope = (self._current * volt) ** 2 * net.cell_siemens / self._std
-        left, unit = self._residual.copy(), np.ones(volt.size)
-        left[ports], unit[ports] = residual, deviation
-        rise, rise_std = left / slope, unit / slope
-        hidden = (rise > DOUBT * rise_std) & (rise + 2 * rise_std > HIDDEN)
-        hidden[self.cells] = False
-        return bool(hidden.any())
