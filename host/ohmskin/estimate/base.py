@@ -182,9 +182,9 @@ class Estimator(ABC):
         `message`.
         """
 
-    # Not abstract: a method that keeps nothing from frame to frame has nothing to forget.
-    def reset(self) -> None:  # noqa: B027
+    def reset(self) -> None:
         """Forget the previous frame: the next one starts afresh. What is known of rest stays."""
+        self._reader.reset()
 
     def rest(self) -> Solution | None:
         """This method's own answer to the rest readings; None where they are not known."""

@@ -51,6 +51,7 @@ LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at f
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
 CLEAR: Final = 12.0  # deviations of the prior: a cell beyond them is touched beyond doubt
+FEW_TOUCHED: Final = 0.2  # share of the cells up to which `touch` is enough
 WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
 
 
@@ -70,6 +71,7 @@ class JointEstimator(Estimator):
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
+        super().reset()
         self._learned_from = self._without_wires = None
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
@@ -234,4 +236,5 @@ class TouchEstimator(JointEstimator):
 
     def _is_enough(self, found: Touched) -> bool:
         known = found.log_std.max(initial=0.0) <= WIDEST_LOG_STD
-        return self._explains(found) and known
+        few = found.cells.size <= FEW_TOUCHED * found.current.size
+        return few and known and self._explains(found)

@@ -106,6 +106,7 @@ class MatrixEstimator(Estimator):
 
     def reset(self) -> None:
         """Forget the previous frame: the next one starts from `ohm`."""
+        super().reset()
         self._previous = None
 
     def _solve(self, ports: PortReadings) -> Solution:

@@ -180,6 +180,7 @@ class PaperEstimator(Estimator):
 
     def reset(self) -> None:
         """Forget the previous frame: the next one starts from step 2."""
+        super().reset()
         self._previous = None
 
     def _solve(self, ports: PortReadings) -> Solution:

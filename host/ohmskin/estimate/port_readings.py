@@ -14,7 +14,9 @@ A frame is at fault, and its answer not to be relied on, where
 - a current is below that at rest: lowering resistances lowers the resistance between any two
   electrodes (Rayleigh's monotonicity law), so touches do not do that, but open lines do;
 - two lines that differed at rest draw the same current from every other, and all of it more than
-  at rest: shorted electrodes; or they did so at rest already, and more than the other lines;
+  at rest: shorted electrodes; or they did so at rest already, and more than the other lines. A
+  finger between two lines makes them alike for a moment: lines that frames have shown apart must
+  be alike for `ALIKE_FRAMES`;
 - a port has less resistance than it had if every cell were pressed as hard as can be, by the same
   law: a row shorted to a column;
 - a line showed no current at rest, though others did.
@@ -57,6 +59,7 @@ CLEAR_STDS: Final = 5.0  # deviations that are more than noise
 # code is 3.5 deviations of rounding.
 SAME_STDS: Final = 2.5
 RISE_SHARE: Final = 1.15  # of the current at rest: shorted lines draw more, all of them
+ALIKE_FRAMES: Final = 270  # three seconds at 90 Hz: a finger does not lie that evenly for longer
 PAIR_SHARE: Final = 1.15  # of the median line's current: lines that were shorted at rest draw more
 WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of it is pressed
 
@@ -85,10 +88,15 @@ class PortReader:
             self._highest_current = 1.0 / (port_resistance_ohm(pressed) + known.ref_ohm)
         self._rest: PortReadings | None = None
         self._rest_fault = ""
+        self.reset()
         if known.rest_ratio is not None:
             self._rest = rest = self.read(known.rest_ratio)
             self._rest_apart = [_apart(rest, axis) for axis in (0, 1)]
             self._rest_fault = self._fault_at_rest(rest)
+
+    def reset(self) -> None:
+        """Forget which lines the frames before have shown apart."""
+        self._alike_frames = [np.asarray(ALIKE_FRAMES), np.asarray(ALIKE_FRAMES)]
 
     def read(self, ratio: Float) -> PortReadings:
         """Currents of checked readings (R, C, 4), and what is wrong with them."""
@@ -165,9 +173,14 @@ class PortReader:
         for axis, line in enumerate(("row", "column")):
             up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
             if found.current.shape[1 - axis] < 3 or np.count_nonzero(up) < 2:
+                self._alike_frames[axis] = np.asarray(0)
                 continue
             differed = self._rest_apart[axis] > 2 * SAME_STDS
-            if pair := _alike(np.where(differed, _apart(found, axis), np.inf), up, line):
+            apart = np.where(differed & up & up[:, None], _apart(found, axis), np.inf)
+            frames = np.where(apart < SAME_STDS, self._alike_frames[axis] + 1, 0)
+            self._alike_frames[axis] = frames
+            apart[frames < ALIKE_FRAMES] = np.inf
+            if pair := _alike(apart, up, line):
                 return f"{pair} read alike as they did not at rest: shorted?"
         return ""
 
