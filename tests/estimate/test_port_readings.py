@@ -9,7 +9,7 @@ import pytest
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate.base import SkinKnowledge
-from ohmskin.estimate.port_readings import PortReader
+from ohmskin.estimate.port_readings import ALIKE_FRAMES, PortReader
 from skins import ten_bits, told
 from studies.conditions import shorted_readings
 from studies.trials import random_trial, skin_at_rest, touch
@@ -81,6 +81,19 @@ def test_shorted_lines_are_named(rest: Skin, touched: Skin, first: int, said: st
     assert said in reader_of(readings(rest)).read(shorted).fault
     at_rest = ten_bits(shorted_readings(rest, first, first + 1))
     assert said in reader_of(at_rest).read(at_rest).fault
+
+
+def test_lines_that_were_apart_are_shorted_if_they_stay_alike(rest: Skin, touched: Skin) -> None:
+    reader, apart = reader_of(readings(rest)), ten_bits(readings(touched))
+    alike = ten_bits(shorted_readings(touched, 4, 5))
+    for _ in range(3):
+        assert not reader.read(apart).fault
+        faults = [reader.read(alike).fault for _ in range(ALIKE_FRAMES)]
+        assert not any(faults[:-1])
+        assert "rows 4 and 5" in faults[-1]
+    assert not reader.read(apart).fault
+    reader.reset()
+    assert "rows 4 and 5" in reader.read(alike).fault
 
 
 def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:

@@ -21,12 +21,11 @@ def test_the_stand_in_normal_has_the_slope_of_the_prior(tail: float) -> None:
         assert slope == pytest.approx(float(2 * (at - mean)[0] / variance[0]), rel=1e-3, abs=1e-3)
 
 
-def test_the_further_from_rest_the_less_a_step_costs_up_to_the_hardest_touch() -> None:
+def test_the_further_from_rest_the_less_a_step_costs() -> None:
     prior = CellPrior(REST, np.full(1, 0.05), TAIL)
     steps = np.diff([prior.cost(REST - away) for away in (0.0, 2.0, 4.0, 6.0, 8.0)])
     assert np.all(steps > 0)
     assert np.all(np.diff(steps) < 0)
-    assert prior.cost(REST - 10.0) - prior.cost(REST - 8.0) > 10
 
 
 def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:

@@ -155,10 +155,9 @@ def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])
-def test_a_jump_of_the_wires_is_noticed_and_nothing_where_there_is_none(method: str) -> None:
+def test_a_jump_of_the_wires_is_followed(method: str) -> None:
     """Eight simulated skins, 40 frames each before and after all wires double."""
-    before = after = 0
-    away = []
+    away, errors = [], []
     for seed in range(8):
         random = np.random.default_rng(100 + seed)
         rest = skin_at_rest(8, 8, random)
@@ -169,32 +168,36 @@ def test_a_jump_of_the_wires_is_noticed_and_nothing_where_there_is_none(method: 
         frames += [touch(skin, int(random.integers(1, 9)), random) for skin in [longer] * 40]
         trial = trial_of(rest, frames)
         out = estimate_file(trial.rounded(10), method)
-        noticed = np.array(["wires changed" in message for message in out["message"]])
-        before += int(noticed[:40].sum())
-        after += bool(noticed[40:].any())
-        errors = np.abs(out["cell_siemens"] - trial.cell_siemens) / out["cell_siemens_std"]
-        away += errors[60:][trial.pressed[60:]].tolist()
-    assert before <= 1
-    assert after >= 6
+        error = np.abs(out["cell_siemens"] - trial.cell_siemens)
+        late = np.s_[60:], trial.pressed[60:]
+        away += (error / out["cell_siemens_std"])[late[0]][late[1]].tolist()
+        errors += (error / trial.cell_siemens)[late[0]][late[1]].tolist()
     assert np.mean(np.array(away) < 4) > 0.95
+    assert np.median(errors) < 0.04
 
 
-def test_lessons_that_contradict_the_belief_set_it_free() -> None:
-    """Told again and again of one layer, then of one twice as high: what was learned is dropped."""
-    random = np.random.default_rng(9)
-    belief = WireBelief(4, 4, 100.0, 200.0)
-    noise = np.eye(6)
-    for _ in range(20):
-        belief.learn(5 * random.normal(size=(6, 32)) ** 2, random.normal(size=6), noise)
-    learned = belief.std()
-    noticed = []
-    for _ in range(3):
-        slopes = 5 * random.normal(size=(6, 32)) ** 2
-        offset = np.log(2 * np.repeat([100.0, 200.0], 16)) - belief.mean
-        noticed.append(belief.learn(slopes, slopes @ offset + random.normal(size=6), noise))
-    assert any(noticed)
-    assert belief.std().mean() > 1.2 * learned.mean()
-    assert np.exp(belief.mean[:16]).mean() == pytest.approx(200.0, rel=0.1)
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_fingertip_on_a_skin_whose_wires_nobody_knows(method: str) -> None:
+    """ngspice's readings of a soft finger that moves: no frame shows a multiple of its force."""
+    exact = load_readings(DATA / "finger_8x8.npz")
+    assert exact.rest_ratio is not None
+    rounded = replace(
+        exact, ratio=ten_bits(exact.ratio), rest_ratio=ten_bits(exact.rest_ratio), adc_bits=10
+    )
+    out = estimate_file(rounded, method)
+    with np.load(DATA / "finger_8x8.npz", allow_pickle=False) as file:
+        rest, truth = 1 / file["rest_ohm"], 1 / file["cell_ohm"]
+    assert out["converged"].all()
+    touched = (truth - rest).sum(axis=(1, 2)) > 5e-6
+    rise = np.maximum(out["cell_siemens"] - rest, 0).sum(axis=(1, 2))[touched]
+    share = rise / (truth - rest).sum(axis=(1, 2))[touched]
+    assert 0.9 < np.quantile(share, 0.1) and np.quantile(share, 0.9) < 1.08
+    assert share.max() < 1.3
+    pressed = truth > 1.5 * rest
+    error = np.abs(out["cell_siemens"] - truth)[pressed]
+    assert np.median(error / truth[pressed]) < 0.025
+    assert np.quantile(error / truth[pressed], 0.9) < 0.07
+    assert np.mean(error < 4 * out["cell_siemens_std"][pressed]) > 0.99
 
 
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
