@@ -9,7 +9,7 @@ import pytest
 from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.prior import FADE, WireBelief
+from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
 from ohmskin.record.readings import estimate_file, load_readings
 from places import DATA
@@ -205,20 +205,21 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     """Against the textbook's covariance form, two lessons, with what fades between them."""
     random = np.random.default_rng(8)
     belief = WireBelief(2, 3, 100.0, 200.0)
-    mean = belief.mean.copy()
-    covariance = belief.times(np.eye(12))
+    layers, own = np.kron(np.eye(2), np.ones((6, 1))), SEGMENT_STD**2 * np.eye(12)
+    mean, covariance = np.log([100.0, 200.0]), LAYER_STD**2 * np.eye(2)
     for _ in range(2):
-        prior = WireBelief(2, 3, 100.0, 200.0).times(np.eye(12))
-        covariance += FADE * (prior - covariance)
+        covariance += FADE * (LAYER_STD**2 * np.eye(2) - covariance)
         slopes, residual = random.normal(size=(4, 12)), random.normal(size=4)
         noise = np.diag(random.uniform(1, 2, 4))
-        gain = covariance @ slopes.T @ np.linalg.inv(slopes @ covariance @ slopes.T + noise)
+        whole = layers @ covariance @ layers.T + own
+        gain = covariance @ layers.T @ slopes.T @ np.linalg.inv(slopes @ whole @ slopes.T + noise)
         mean = mean + gain @ residual
-        covariance = covariance - gain @ slopes @ covariance
+        covariance = covariance - gain @ slopes @ layers @ covariance
         belief.learn(slopes, residual, noise)
-    np.testing.assert_allclose(belief.mean, mean, rtol=1e-9)
-    np.testing.assert_allclose(belief.times(np.eye(12)), covariance, atol=1e-4)
-    np.testing.assert_allclose(belief.std(), np.sqrt(np.diagonal(covariance)), atol=1e-3)
+    whole = layers @ covariance @ layers.T + own
+    np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
+    np.testing.assert_allclose(belief.times(np.eye(12)), whole, atol=1e-12)
+    np.testing.assert_allclose(belief.std(), np.sqrt(np.diagonal(whole)), rtol=1e-9)
     some = random.normal(size=(3, 12))
     seen = some @ belief.times(some)
     np.testing.assert_allclose(np.tril(belief.seen(some)), np.tril(seen), rtol=1e-9)

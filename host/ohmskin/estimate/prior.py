@@ -1,37 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is expected of a skin's resistances before a frame is read: its cells, and its wires.
 
-RC readings do not determine 3RC resistances; these numbers are what decides the rest. Touches
-correct what is believed of the wires:
+RC readings do not determine 3RC resistances; these numbers decide the rest. Touches correct what is
+believed of the wires:
 
-====== =========== ============================================================== ==========
-symbol shape       meaning                                                        unit
-====== =========== ============================================================== ==========
-w      (2RC,)      log resistances of the segments, top layer, then bottom layer  log ohm
-P0     (2RC, 2RC)  prior covariance: own part of each segment, common part of each layer
-U      (2RC, n)    what was learned: P = P0 - U U^T
-J      (m, 2RC)    slope of m readings by w, over their noise                      1
-N      (m, m)      covariance of these readings' noise, cells of unknown force in it
-====== =========== ============================================================== ==========
+====== ========== =============================================================== ==========
+symbol shape      meaning                                                         unit
+====== ========== =============================================================== ==========
+m      (2,)       log of the mean segment of each layer: top, bottom              log ohm
+C      (2, 2)     its covariance; C0 before any frame
+s      scalar     deviation of a segment from its layer's mean, each by itself    log ohm
+L      (2, 2RC)   ones: which segments are of which layer
+P      (2RC, 2RC) covariance of the log segments, L^T C L + s^2
+J      (m, 2RC)   slope of m readings by the log segments, over their noise       1
+N      (m, m)     covariance of these readings' noise, cells of unknown force in it
+====== ========== =============================================================== ==========
 
 A frame is one step of a Kalman filter: with z the residual at the mean and S = N + J P J^T,
 
-    mean += P J^T S^-1 z ,     P -= P J^T S^-1 J P .
+    m += C L J^T S^-1 z ,     C -= C L J^T S^-1 J L^T C .
 
-The common part of a layer is most of P0, so it is what the first touches settle; segments follow.
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
-cells as noise without limit. Between frames knowledge fades, U shrinks: a skin bends.
+cells as noise without limit. Between frames C grows back towards C0: a skin bends. What single
+segments have of their own is not learned: frames say too little of it.
 """
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
+from ohmskin.circuit.cholesky import cholesky, gram, solve
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
@@ -52,8 +53,6 @@ UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a fac
 LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
-MAX_DIRECTIONS: Final = 32  # columns of U; the least informative are forgotten
-_LEAST_DIRECTION: Final = 1e-3  # of SEGMENT_STD^2: not worth a column
 LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 
 Lesson = tuple[Float, Float, Float]  # what wires learn from: J, z and N
@@ -105,51 +104,49 @@ class WireBelief:
         self.shape = (rows, columns)
         self._cells = rows * columns
         told = nominal_top is not None and nominal_bottom is not None
-        self._layer_std = LAYER_STD if told else UNKNOWN_LAYER_STD
+        self._prior_covariance = (LAYER_STD if told else UNKNOWN_LAYER_STD) ** 2 * np.eye(2)
         nominal = [
-            np.log(max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3))
+            max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3)
             for ohm in (nominal_top, nominal_bottom)
         ]
-        self._nominal = np.repeat(nominal, self._cells)
+        self._nominal: Float = np.log(nominal)
         self.reset()
 
     def reset(self) -> None:
         """Back to the nominal wires."""
-        self.mean = self._nominal
-        self._learned = np.zeros((2 * self._cells, 0))
+        self._layers, self._covariance = self._nominal, self._prior_covariance
+
+    @property
+    def mean(self) -> Float:
+        """Expected log resistances, (2RC,)."""
+        return np.repeat(self._layers, self._cells)
+
+    def _by_layer(self, slopes: Float) -> Float:
+        """J L^T, (m, 2), or L a (2,) for a vector (2RC,)."""
+        return np.asarray(slopes.reshape(*slopes.shape[:-1], 2, self._cells).sum(axis=-1))
 
     def times(self, slopes: Float) -> Float:
         """P J^T, shape (2RC, m), or P a for a vector (2RC,)."""
-        rows = slopes.reshape(*slopes.shape[:-1], 2, self._cells)
-        product = SEGMENT_STD**2 * rows
-        product += self._layer_std**2 * rows.sum(axis=-1, keepdims=True)
-        product = product.reshape(slopes.shape)
-        if self._learned.shape[1]:
-            product -= (slopes @ self._learned) @ self._learned.T
-        return np.asarray(product.T)
+        common = self._by_layer(slopes) @ self._covariance
+        return np.asarray((SEGMENT_STD**2 * slopes + np.repeat(common, self._cells, axis=-1)).T)
 
     def seen(self, slopes: Float, onto: Float | None = None) -> Float:
         """J P J^T, what the wires' uncertainty does to m readings: lower triangle (m, m).
 
         Added onto a matrix that is overwritten, if there is one.
         """
-        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
-        seen = gram(slopes, SEGMENT_STD**2, onto)
-        seen = gram(layers, self._layer_std**2, seen)
-        return gram(slopes @ self._learned, -1.0, seen) if self._learned.shape[1] else seen
+        common = self._by_layer(slopes) @ np.linalg.cholesky(self._covariance)
+        return gram(common, 1.0, gram(slopes, SEGMENT_STD**2, onto))
 
     def variance(self, slopes: Float) -> Float:
         """Diagonal of J P J^T, (m,)."""
-        layers = slopes.reshape(len(slopes), 2, self._cells).sum(axis=2)
-        learned = slopes @ self._learned
-        variance = SEGMENT_STD**2 * np.einsum("ij,ij->i", slopes, slopes)
-        variance += self._layer_std**2 * np.einsum("ij,ij->i", layers, layers)
-        return np.asarray(variance - np.einsum("ij,ij->i", learned, learned))
+        common = self._by_layer(slopes) @ np.linalg.cholesky(self._covariance)
+        own = SEGMENT_STD**2 * np.einsum("ij,ij->i", slopes, slopes)
+        return np.asarray(own + np.einsum("ij,ij->i", common, common))
 
     def std(self) -> Float:
         """Standard deviation of each log resistance, (2RC,)."""
-        variance = SEGMENT_STD**2 + self._layer_std**2 - np.sum(self._learned**2, axis=1)
-        return np.asarray(np.sqrt(np.maximum(variance, 1e-12)))
+        return np.repeat(np.sqrt(SEGMENT_STD**2 + np.diagonal(self._covariance)), self._cells)
 
     def layers(self, log_wires: Float) -> tuple[Float, Float]:
         """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
@@ -165,15 +162,11 @@ class WireBelief:
         """One Kalman step. slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m)."""
         if len(residual) < 2:
             return
-        self._learned *= np.sqrt(1 - FADE)
-        spread = self.times(slopes)
-        factor = cholesky(noise + slopes @ spread)
-        self.mean = np.clip(self.mean + spread @ solve(factor, residual), *LOG_LIMITS)
-        gain = solve_lower(factor, spread.T)
-        learned = np.concatenate([self._learned, gain.T], axis=1)
-        size, turn = scipy.linalg.eigh(learned.T @ learned, check_finite=False)
-        kept = np.flatnonzero(size > _LEAST_DIRECTION * SEGMENT_STD**2)[-MAX_DIRECTIONS:]
-        self._learned = learned @ turn[:, kept]
+        self._covariance = (1 - FADE) * self._covariance + FADE * self._prior_covariance
+        spread = self._by_layer(slopes) @ self._covariance
+        gain = solve(cholesky(noise + slopes @ self.times(slopes)), spread).T
+        self._layers = np.clip(self._layers + gain @ residual, *LOG_LIMITS)
+        self._covariance = self._covariance - gain @ spread
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:
