@@ -35,7 +35,6 @@ from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIDDEN,
     LOG_LIMITS,
-    MOST_TOUCHED,
     TOUCHED,
     UNLIMITED_STD,
     CellPrior,
@@ -51,6 +50,7 @@ MAX_STEP: Final = 1.5  # of a log resistance
 CLOSE: Final = 0.3
 NEARLY: Final = 3.0
 HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
+CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
 LESSON: Final = 0.25  # share of the noise's variance: wires learn from what they move by more
 MAX_LESSON: Final = 32  # readings that wires learn from, the best
@@ -173,7 +173,7 @@ class FullFit:
     @property
     def is_crowded(self) -> bool:
         """Whether so many cells are touched that rest is no more likely than a touch."""
-        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > MOST_TOUCHED)
+        return bool(np.mean(self._prior.rise(self.cell) > TOUCHED) > CROWDED)
 
     def _step(self) -> bool:
         """One step; True when the next would not matter."""

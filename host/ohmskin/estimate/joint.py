@@ -30,7 +30,6 @@ from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
-    MOST_TOUCHED,
     REST_STD,
     TAIL,
     TOUCHED,
@@ -43,7 +42,7 @@ from ohmskin.estimate.prior import (
     rest_level,
     siemens_std,
 )
-from ohmskin.estimate.sparse_fit import SparseFit, Touched
+from ohmskin.estimate.sparse_fit import MOST_PER_LINE, SparseFit, Touched
 
 LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
 MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
@@ -172,10 +171,9 @@ class JointEstimator(Estimator):
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
 
-    @staticmethod
-    def _explains(found: Touched) -> bool:
+    def _explains(self, found: Touched) -> bool:
         """Whether few touched cells explain the frame."""
-        return not found.contradicted and found.cells.size <= MOST_TOUCHED * found.current.size
+        return not found.contradicted and found.cells.size <= MOST_PER_LINE * sum(self._shape)
 
     def _learn(self, prior: CellPrior, cell: Float, lesson: Callable[[], Lesson]) -> None:
         """Let the wires learn from a plain frame that is not like the last one learned from."""

@@ -48,7 +48,6 @@ from ohmskin.circuit.skin import admittance_of, by_wires, factorised, impedance_
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
-    MOST_TOUCHED,
     UNLIMITED_STD,
     CellPrior,
     Lesson,
@@ -57,6 +56,7 @@ from ohmskin.estimate.prior import (
 
 Cells = NDArray[np.intp]
 
+MOST_PER_LINE: Final = 1.0  # touches a row and column, on average; with more, they are not few
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
 LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
@@ -198,7 +198,7 @@ class SparseFit:
                 return frame.finish()
             cells = np.concatenate([frame.cells, asked])
             # Ghosts among them may leave again.
-            if cells.size > 2 * MOST_TOUCHED * self.current.size:
+            if cells.size > 2 * MOST_PER_LINE * sum(self.net.shape):
                 return None
             added = np.log(self.net.cell_siemens[asked] + rise)
             frame.settle(cells, np.concatenate([frame.log_siemens, added]))
