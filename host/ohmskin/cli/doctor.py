@@ -25,6 +25,7 @@ from ohmskin.errors import (
     OhmskinError,
     PortError,
     ProtocolMismatch,
+    RecordingEnded,
 )
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
@@ -171,6 +172,8 @@ def gather(
         if ask is not None and presses is not None:
             evidence.presses = presses
             _scan_presses(device, presses, ask)
+    except RecordingEnded:
+        pass  # all of the recording was read
     except DeviceLost as exc:
         evidence.board, evidence.lost = device.info, str(exc)
     evidence.stats = device.stats
