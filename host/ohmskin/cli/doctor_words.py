@@ -111,20 +111,17 @@ def verdict(diagnosis: Diagnosis) -> str:
 
 def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:
     """The figures; and the wires of layers and lines in words, where they were judged."""
-    if not diagnosis.untouched:
+    if diagnosis.nominal_ohm is None:
         return diagnosis.measured
-    ohm = dict(zip(LAYERS, diagnosis.nominal_ohm, strict=True))
-    layers = [
-        f"{each.layers[0]} {_ohm(each, ohm)}" for each in diagnosis.untouched[:2] if each.known
-    ]
-    lines = [
-        f"{named(each.place)}: {each.share:.2f} +- {each.std:.2f}"
-        for each in diagnosis.untouched[2:]
-    ]
-    told = "; ".join(layers) or _UNTOUCHED
-    if diagnosis.pressed is not None:
-        told = _ohm(diagnosis.pressed[0], ohm) if diagnosis.pressed else _NOT_PRESSED
-        lines += [f"{named(each.place)}: {_times(each)}" for each in diagnosis.pressed[1:]]
+    ohm, pressed = dict(zip(LAYERS, diagnosis.nominal_ohm, strict=True)), diagnosis.pressed
+    if pressed is None:
+        layers = [
+            f"{each.layers[0]} {_ohm(each, ohm)}" for each in diagnosis.untouched if each.known
+        ]
+        told = "; ".join(layers) or _UNTOUCHED
+    else:
+        told = _ohm(pressed[0], ohm) if pressed else _NOT_PRESSED
+    lines = [f"{named(each.place)}: {_times(each)}" for each in (pressed or ())[1:]]
     return {**diagnosis.measured, "wires": told, "wires_of_lines": lines}
 
 

@@ -20,6 +20,7 @@ from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, found
 from ohmskin.doctor.signal import RestScans, examine_settling, examine_signal, mean_std_lsb
 from ohmskin.doctor.wires import CornerScans, measure_untouched
+from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
@@ -98,16 +99,18 @@ def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) ->
 def _examine_wires(
     evidence: Evidence, rest: RestScans, noise_lsb: float, diagnosis: Diagnosis
 ) -> None:
-    """Adds the wires. They are at fault only if nominal ones or an earlier rest were told."""
-    scans, earlier, told = len(rest.codes), evidence.rest_ratio, evidence.wire_ohm is not None
+    """Adds the wires. They are at fault only if an earlier rest or nominal wires were told."""
+    scans, board = len(rest.codes), evidence.board
     diagnosis.nominal_ohm = wire_ohm = evidence.wire_ohm or WIRE_OHM
-    mean_std = mean_std_lsb(noise_lsb, scans)
-    untouched = measure_untouched(rest.mean, mean_std, evidence.board, wire_ohm, earlier)
-    diagnosis.untouched = untouched if earlier is not None else untouched[:2]
+    if evidence.rest_ratio is not None:
+        ratio, std_lsb = ratio_from_codes(rest.mean, board.adc_bits), mean_std_lsb(noise_lsb, scans)
+        diagnosis.untouched = measure_untouched(
+            ratio, evidence.rest_ratio, std_lsb, board, wire_ohm
+        )
     if evidence.presses is not None:
         diagnosis.pressed = evidence.presses.measure(rest.mean, scans, noise_lsb, wire_ohm)
-    changed = [each for each in untouched if each.differs and (told or earlier is not None)]
-    if told and not changed:
+    changed = [each for each in diagnosis.untouched if each.differs]
+    if evidence.wire_ohm is not None and not changed:
         changed = [each for each in diagnosis.pressed or () if each.differs]
     for each in changed:
         finding = found(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)

@@ -14,18 +14,22 @@ n      (RC,)        deviations of what was read [ohm]
 B      (RC, RC)     slopes of the model by the cells' log resistances [ohm]
 W      (RC, 2RC)    slopes of the model by the segments' log resistances [ohm]
 s      ()           deviation of a cell's log resistance from the model's, to be found
-x      (2+R+C,)     what the wires have more than nominal, as a share: all top wires, all
-                    bottom ones, those of each row, those of each column
-A      (RC, 2+R+C)  slopes of the model by x: sums of W [ohm]
+x      (2,)         what the wires of each layer have more than nominal, as a share
+A      (RC, 2)      slopes of the model by x: sums of W [ohm]
+L      (RC, R+C)    slopes of the model by the wires of each row and column [ohm]
 y      ()           log of the wires over nominal
 u      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
 ====== ============ =====================================================================
 
-Untouched skin. The model is the nominal wires and the cells that an earlier rest shows; without
-one, equal cells. With z = A x + B (common + each) + noise, x is the generalised least squares
-answer under wide priors; s is chosen so that the residual has the size it should. Cells of 1 MOhm
-hide wires of 100 ohm behind their own scatter: without an earlier rest only gross changes show, and
-with one a factor of two shows on large skins alone.
+Untouched skin. The model is the nominal wires and the cells that an earlier rest shows, so
+
+    z = A x + L line + B (common + cell) + noise ,
+    S = n^2 + LAYER_STD^2 A A^T + LINE_STD^2 L L^T + B (COMMON_STD^2 1 1^T + s^2) B^T ,
+    x = LAYER_STD^2 A^T S^-1 z
+
+with s such that z^T S^-1 z is the number of readings. Cells of 1 MOhm hide wires of 100 ohm behind
+their own scatter: on large skins a factor of two shows, on others only gross changes. Without an
+earlier rest, and of single lines, an untouched skin shows nothing.
 
 Pressed corners. A pressed cell hides the wires behind it, too, because its own resistance is in the
 same reading. Three corners of a rectangle do not: with (a, b) the one between the other two,
@@ -58,9 +62,8 @@ from itertools import permutations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
 from ohmskin.doctor.signal import rounding_std_lsb
@@ -71,21 +74,18 @@ from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 
 Corners = tuple[Cell, Cell, Cell]
-Bool = NDArray[np.bool_]
 
 LAYERS: Final = ("top", "bottom")
 
 # What is told. Shares are over nominal; deviations of pressed ones are those of their logs.
 KNOWN: Final = 0.15  # [share] A deviation above this is too close to a change to tell the share.
 CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of a layer anyway.
-LINE_CHANGED: Final = 0.75  # [share] A line matters less than a layer: it moves fewer cells.
-CLEAR_STDS: Final = 5.0  # [deviations] By chance, none of up to 34 shares differs by this.
+CLEAR_STDS: Final = 5.0  # [deviations] By chance, no share of a layer differs by this.
 PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
 
 # Standard deviations before the readings, of an untouched skin.
 LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
 LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
-ODD_LINE_STD: Final = 30.0  # [share] The line that is asked about may have changed by any factor.
 COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
 LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
 # Standard deviations before the readings, of a pressed skin.
@@ -117,61 +117,35 @@ def _port_ohm(ratio: Float, noise_lsb: Float | float, board: Hello) -> tuple[Flo
 
 
 def measure_untouched(
-    mean_codes: Float,
-    mean_std: float,
-    board: Hello,
-    wire_ohm: tuple[float, float],
-    rest_ratio: Float | None,
+    ratio: Float, rest_ratio: Float, std_lsb: float, board: Hello, wire_ohm: tuple[float, float]
 ) -> list[WireShare]:
-    """Shares of both layers, of each row, and of each column.
+    """The share of each layer.
 
-    mean_codes: of rest, (R, C, 4), with the deviation mean_std [LSB]. wire_ohm: nominal ones of a
-    segment, top and bottom. rest_ratio: readings (R, C, 4) of an earlier rest.
+    ratio, rest_ratio: readings now and of an earlier rest, (R, C, 4), with the deviation std_lsb
+    [LSB]. wire_ohm: nominal ones of a segment, top and bottom.
     """
-    shape = rows, columns = mean_codes.shape[:2]
-    ratio = ratio_from_codes(mean_codes, board.adc_bits)
-    matrix = make_estimator("matrix", SkinKnowledge.of(board))
-    cell = matrix.estimate(ratio if rest_ratio is None else rest_ratio).cell_siemens
-    if rest_ratio is None:
-        cell = np.full(shape, float(np.exp(np.mean(np.log(cell)))))
-    else:
-        mean_std *= 2**0.5  # an earlier rest is a mean of such codes as well
-    model = port_sensitivity(cell, *(np.full(shape, ohm) for ohm in wire_ohm))
-    now_ohm, noise_ohm = _port_ohm(ratio, mean_std, board)
-    expected_ohm = model.port_ohm if rest_ratio is None else _port_ohm(rest_ratio, 0.0, board)[0]
-    z, by_cell = now_ohm - expected_ohm, model.by_cell
-    by_wire = model.by_wires().reshape(-1, 2, rows, columns)
-    slopes = np.concatenate(
-        [by_wire.sum(axis=(2, 3)), by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1
-    )
-    alike = np.array([LAYER_STD] * 2 + [LINE_STD] * (rows + columns))
-    common = COMMON_STD * by_cell.sum(axis=1)
+    now_ohm, noise_ohm = _port_ohm(ratio, 2**0.5 * std_lsb, board)
+    z = now_ohm - _port_ohm(rest_ratio, 0.0, board)[0]
+    cell = make_estimator("matrix", SkinKnowledge.of(board)).estimate(rest_ratio).cell_siemens
+    model = port_sensitivity(cell, *(np.full(cell.shape, ohm) for ohm in wire_ohm))
+    by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *cell.shape)
+    layers = by_wire.sum(axis=(2, 3))  # A
+    lines = np.concatenate([by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1)  # L
+    common = by_cell.sum(axis=1)
+    but_cells = np.diag(noise_ohm**2) + COMMON_STD**2 * np.outer(common, common)
+    but_cells += LAYER_STD**2 * layers @ layers.T + LINE_STD**2 * lines @ lines.T
     for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
         # The smallest scatter of cells that, with all else, explains the readings.
-        but_wires = np.outer(common, common) + np.diag(noise_ohm**2)
-        but_wires += float(cell_std) ** 2 * by_cell @ by_cell.T
-        if z @ np.linalg.solve(but_wires + (slopes * alike**2) @ slopes.T, z) < len(z):
+        covariance = but_cells + cell_std**2 * by_cell @ by_cell.T
+        weighed = np.linalg.solve(covariance, np.column_stack([z, layers]))
+        if z @ weighed[:, 0] < len(z):
             break
-
-    shares: list[WireShare] = []
-    for at in range(len(alike)):
-        line, layer = at - 2, at
-        place, prior, least = WHOLE_SKIN, alike, CHANGED
-        if line >= 0:
-            layer = int(line >= rows)
-            place = Place(columns=(line - rows,)) if layer else Place(rows=(line,))
-            # Each line in turn may be unlike the others of its layer.
-            prior = np.where(np.arange(len(alike)) == at, ODD_LINE_STD, alike)
-            least = np.inf if shares[layer].differs else LINE_CHANGED
-        spread = slopes * prior**2
-        gain = np.linalg.solve(but_wires + spread @ slopes.T, spread)
-        posterior = np.diag(prior**2) - spread.T @ gain
-        summed = sorted({layer, at})
-        more = float((gain.T @ z)[summed].sum())
-        std = max(float(posterior[np.ix_(summed, summed)].sum()), 0.0) ** 0.5
-        differs = abs(more) > max(least, CLEAR_STDS * std)
-        shares.append(WireShare((LAYERS[layer],), place, 1 + more, std, std < KNOWN, differs))
-    return shares
+    gain = LAYER_STD**2 * layers.T @ weighed
+    more, std = gain[:, 0], LAYER_STD * np.sqrt(np.maximum(1 - np.diagonal(gain[:, 1:]), 0.0))
+    known, differs = std < KNOWN, np.abs(more) > np.maximum(CHANGED, CLEAR_STDS * std)
+    columns = (each.tolist() for each in (1 + more, std, known, differs))
+    told = zip(LAYERS, *columns, strict=True)
+    return [WireShare((layer,), WHOLE_SKIN, *figures) for layer, *figures in told]
 
 
 # --------------------------------------------------------------------------- pressed corners
@@ -350,9 +324,11 @@ def _pressed_fit(
 
 def _free(shape: tuple[int, ...], corners: Corners) -> Bool:
     """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
-    cells = np.array([*corners, moved_across(corners)[0]])
-    rows, columns = np.indices(shape)[..., None]
-    near = np.maximum(np.abs(rows - cells[:, 0]), np.abs(columns - cells[:, 1])) <= 1
-    free = near[..., :3].any(axis=-1) & ~near[..., 3]
+    rows, columns = np.indices(shape)
+    *near, near_fourth = (
+        np.maximum(np.abs(rows - row), np.abs(columns - column)) <= 1
+        for row, column in (*corners, moved_across(corners)[0])
+    )
+    free = np.any(near, axis=0) & ~near_fourth
     free[tuple(np.transpose(corners))] = True
     return np.asarray(free)
