@@ -53,11 +53,8 @@ cells and their neighbours, since a fingertip may press these as well. What stay
 the deviation.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import permutations
 from typing import Final
 
@@ -67,11 +64,12 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
 from ohmskin.doctor.signal import rounding_std_lsb
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import ADC_BITS
 
 Corners = tuple[Cell, Cell, Cell]
 
@@ -102,15 +100,17 @@ LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
 CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
 
 
-def _port_ohm(ratio: Float, noise_lsb: Float | float, board: Hello) -> tuple[Float, Float]:
-    """Port resistances of readings (R, C, 4) and their deviations [ohm], each (RC,).
+def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Float, Float, Float]:
+    """Port resistances of readings (R, C, 4), their deviations, and log resistances of the cells.
 
-    noise_lsb: deviation of a port's reading, one for all or (R, C).
+    std_lsb: deviation of a port's reading, one for all or (R, C). All (RC,) [ohm].
     """
-    refs = (board.ref_top_ohm, board.ref_bottom_ohm)
+    known = matrix.knowledge
+    refs = (known.ref_top_ohm, known.ref_bottom_ohm)
     loop_ohm = (1 / np.maximum(current_from_ratio(ratio, *refs), 1e-9)).ravel()
-    std_siemens = current_std(2.0**-board.adc_bits, *refs) * np.ravel(noise_lsb)
-    return loop_ohm - sum(refs), std_siemens * loop_ohm**2
+    std_siemens = current_std(2.0**-ADC_BITS, *refs) * np.ravel(std_lsb)
+    log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
+    return loop_ohm - known.ref_ohm, std_siemens * loop_ohm**2, log_ohm
 
 
 # ------------------------------------------------------------------------- the untouched skin
@@ -124,15 +124,17 @@ def measure_untouched(
     ratio, rest_ratio: readings now and of an earlier rest, (R, C, 4), with the deviation std_lsb
     [LSB]. wire_ohm: nominal ones of a segment, top and bottom.
     """
-    now_ohm, noise_ohm = _port_ohm(ratio, 2**0.5 * std_lsb, board)
-    z = now_ohm - _port_ohm(rest_ratio, 0.0, board)[0]
-    cell = make_estimator("matrix", SkinKnowledge.of(board)).estimate(rest_ratio).cell_siemens
-    model = port_sensitivity(cell, *(np.full(cell.shape, ohm) for ohm in wire_ohm))
-    by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *cell.shape)
+    shape, matrix = ratio.shape[:2], make_estimator("matrix", SkinKnowledge.of(board))
+    rest_ohm, _, log_ohm = _ports(rest_ratio, std_lsb, matrix)
+    port_ohm, port_std, _ = _ports(ratio, std_lsb, matrix)
+    z, variance = port_ohm - rest_ohm, 2 * port_std**2  # the rest is a mean of such codes as well
+    siemens = np.exp(-log_ohm).reshape(shape)
+    model = port_sensitivity(siemens, *(np.full(shape, ohm) for ohm in wire_ohm))
+    by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *shape)
     layers = by_wire.sum(axis=(2, 3))  # A
     lines = np.concatenate([by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1)  # L
     common = by_cell.sum(axis=1)
-    but_cells = np.diag(noise_ohm**2) + COMMON_STD**2 * np.outer(common, common)
+    but_cells = np.diag(variance) + COMMON_STD**2 * np.outer(common, common)
     but_cells += LAYER_STD**2 * layers @ layers.T + LINE_STD**2 * lines @ lines.T
     for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
         # The smallest scatter of cells that, with all else, explains the readings.
@@ -242,15 +244,25 @@ class CornerScans:
             # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
             scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
             pressed = self._ports(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
-            free = _free(rest.log_ohm.shape, corners)
-            found.append((corners[0], *_pressed_fit(rest, pressed, free, wire_ohm)))
+            found.append((corners[0], *_pressed_fit(rest, pressed, self._free(corners), wire_ohm)))
         return shares_of(found)
 
-    def _ports(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Ports:
-        ratio = ratio_from_codes(mean, self._board.adc_bits)
+    def _ports(
+        self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int
+    ) -> tuple[Float, Float, Float]:
         variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1) + noise_lsb**2 / scans
-        port_ohm, std_ohm = _port_ohm(ratio, np.sqrt(variance), self._board)
-        return _Ports(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
+        return _ports(ratio_from_codes(mean, ADC_BITS), np.sqrt(variance), self._matrix)
+
+    def _free(self, corners: Corners) -> Bool:
+        """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
+        rows, columns = np.indices((self._board.rows, self._board.columns))
+        *near, near_fourth = (
+            np.maximum(np.abs(rows - row), np.abs(columns - column)) <= 1
+            for row, column in (*corners, moved_across(corners)[0])
+        )
+        free = np.any(near, axis=0) & ~near_fourth
+        free[tuple(np.transpose(corners))] = True
+        return np.asarray(free)
 
 
 def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
@@ -274,24 +286,15 @@ def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
     return [share(mean, mean_std, alike), *each]
 
 
-@dataclass(frozen=True, eq=False)
-class _Ports:
-    """Port resistances and deviations (RC,) [ohm]; log resistances of the cells by `matrix`."""
-
-    port_ohm: Float
-    std_ohm: Float
-    log_ohm: Float
-
-
 def _pressed_fit(
-    rest: _Ports, pressed: _Ports, free: Bool, wire_ohm: tuple[float, float]
+    rest: tuple[Float, ...], pressed: tuple[Float, ...], free: Bool, wire_ohm: tuple[float, float]
 ) -> tuple[float, float]:
-    """y and its deviation."""
-    shape = free.shape
+    """y and its deviation. rest, pressed: what `_ports` gives."""
+    shape, free = free.shape, free.ravel()
+    (rest_ohm, rest_std, untouched), (port_ohm, port_std, touched) = rest, pressed
     log_share = 0.0
-    untouched = rest.log_ohm.ravel()
-    lift = np.where(free, pressed.log_ohm - rest.log_ohm, 0.0).ravel()
-    variance = np.where(free, UNLIMITED_STD, DRIFT_STD).ravel() ** 2
+    lift = np.where(free, touched - untouched, 0.0)
+    variance = np.where(free, UNLIMITED_STD, DRIFT_STD) ** 2
     for _ in range(MOST_STEPS):
         top, bottom = (np.full(shape, ohm * np.exp(log_share)) for ohm in wire_ohm)
         before, now = (
@@ -301,13 +304,13 @@ def _pressed_fit(
         at_rest = np.linalg.inv(before.by_cell)
         through = now.by_cell @ at_rest  # B1 B0^-1
         by_rest_wires = before.by_wires()
-        off_rest = rest.port_ohm - before.port_ohm
-        residual = pressed.port_ohm - now.port_ohm - through @ off_rest  # r
+        off_rest = rest_ohm - before.port_ohm
+        residual = port_ohm - now.port_ohm - through @ off_rest  # r
         by_segment = now.by_wires() - through @ by_rest_wires  # W
         slopes = by_segment.sum(axis=1)  # w
         spread = now.by_cell * variance
         covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
-        covariance += (through * rest.std_ohm**2) @ through.T + np.diag(pressed.std_ohm**2)
+        covariance += (through * rest_std**2) @ through.T + np.diag(port_std**2)
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
         known = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
         pull = float(slopes @ weighed[:, 1]) - log_share * BEFORE_STD**-2
@@ -315,20 +318,8 @@ def _pressed_fit(
         log_share += step
         untouched = untouched + at_rest @ (off_rest - step * by_rest_wires.sum(axis=1))
         more = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
-        lift += np.where(free.ravel(), np.clip(more, -LONGEST_STEP, LONGEST_STEP), 0.0)
+        lift += np.where(free, np.clip(more, -LONGEST_STEP, LONGEST_STEP), 0.0)
         if abs(step) < CLOSE:
             break
     misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
     return log_share, (max(misfit, 1.0) / known) ** 0.5
-
-
-def _free(shape: tuple[int, ...], corners: Corners) -> Bool:
-    """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
-    rows, columns = np.indices(shape)
-    *near, near_fourth = (
-        np.maximum(np.abs(rows - row), np.abs(columns - column)) <= 1
-        for row, column in (*corners, moved_across(corners)[0])
-    )
-    free = np.any(near, axis=0) & ~near_fourth
-    free[tuple(np.transpose(corners))] = True
-    return np.asarray(free)
