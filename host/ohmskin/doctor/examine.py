@@ -20,7 +20,6 @@ from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, found
 from ohmskin.doctor.signal import RestScans, examine_settling, examine_signal, mean_std_lsb
 from ohmskin.doctor.wires import CornerScans, measure_untouched
-from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
@@ -100,13 +99,11 @@ def _examine_wires(
     evidence: Evidence, rest: RestScans, noise_lsb: float, diagnosis: Diagnosis
 ) -> None:
     """Adds the wires. They are at fault only if an earlier rest or nominal wires were told."""
-    scans, board = len(rest.codes), evidence.board
+    scans, board, earlier = len(rest.codes), evidence.board, evidence.rest_ratio
     diagnosis.nominal_ohm = wire_ohm = evidence.wire_ohm or WIRE_OHM
-    if evidence.rest_ratio is not None:
-        ratio, std_lsb = ratio_from_codes(rest.mean, board.adc_bits), mean_std_lsb(noise_lsb, scans)
-        diagnosis.untouched = measure_untouched(
-            ratio, evidence.rest_ratio, std_lsb, board, wire_ohm
-        )
+    if earlier is not None:
+        std_lsb = mean_std_lsb(noise_lsb, scans)
+        diagnosis.untouched = measure_untouched(rest.mean, earlier, std_lsb, board, wire_ohm)
     if evidence.presses is not None:
         diagnosis.pressed = evidence.presses.measure(rest.mean, scans, noise_lsb, wire_ohm)
     changed = [each for each in diagnosis.untouched if each.differs]

@@ -32,13 +32,12 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
 from ohmskin.link.timing import reading_offsets_s, slot_s
 
-Bool = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
 
 REST_S: Final = 2.5  # [s] The first look takes this long: with all else, less than 10 s pass.
@@ -174,68 +173,56 @@ class _Spectrum:
     """c(f) and P(f) of scans, and the power that noise alone would have."""
 
     def __init__(self, scans: RestScans) -> None:
-        rest = scans.codes - scans.mean
-        window = np.hanning(len(rest) + 2)[1:-1]
+        window = np.hanning(len(scans.codes) + 2)[1:-1]
         self._window = window / window.sum()
-        self._weighted = self._window[:, None] * rest.reshape(len(rest), -1)
-        self._time_s = scans.time_s
+        self._rest, self._time_s = scans.codes - scans.mean, scans.time_s
         self.seconds = float(np.ptp(scans.time_s))
-        self._shape = rest.shape[1:]
-        self.noise = 4 * float((rest**2).mean()) * float(np.sum(self._window**2))
+        self.noise = 4 * float((self._rest**2).mean()) * float(np.sum(self._window**2))
 
     def amplitude(self, frequency_hz: float) -> Complex:
         """c (R, C, 4)."""
         turn = np.exp(-2j * np.pi * frequency_hz * self._time_s)
-        return np.asarray(2 * (turn @ self._weighted).reshape(self._shape))
+        return 2 * np.tensordot(self._window * turn, self._rest, axes=1)
 
     def power(self, frequency_hz: float) -> float:
         """P."""
         return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
 
-    def sine(self, frequency_hz: float) -> tuple[float, Complex]:
-        """What share of P a sine at f has, and its complex amplitude (R, C, 4).
+    def hum(self, mains_hz: float) -> Hum | None:
+        """Hum near one of the mains, if it matters and stands out.
 
         A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image
         overlap by m. At half the rate only a part of it is seen, half of its power on average.
         """
-        amplitude = self.amplitude(frequency_hz)
-        mirror = complex(self._window @ np.exp(-4j * np.pi * frequency_hz * self._time_s))
+        at_hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=self.power)
+        power, sine = self.power(at_hz), self.amplitude(at_hz)
+        mirror = complex(self._window @ np.exp(-4j * np.pi * at_hz * self._time_s))
         if abs(mirror) ** 2 >= OVERLAP:
-            return 0.5, amplitude / 2
-        sine = (amplitude - mirror * np.conj(amplitude)) / (1 - abs(mirror) ** 2)
-        return float(np.mean(np.abs(sine) ** 2)) / self.power(frequency_hz), sine
+            share, sine = 0.5, sine / 2
+        else:
+            sine = (sine - mirror * np.conj(sine)) / (1 - abs(mirror) ** 2)
+            share = float(np.mean(np.abs(sine) ** 2)) / power
+        lsb = max(share * (power - self.noise), 0.0) ** 0.5
+        beside = np.median([self.power(at_hz + far / self.seconds) for far in BESIDE])
+        over_noise = power > self.noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
+        if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
+            return Hum((mains_hz,), at_hz, sine, lsb)
+        return None
 
 
 def find_hum(scans: RestScans) -> Hum | None:
-    """The mains hum in the scans; None if there is none, or none can be seen."""
+    """The mains hum in the scans; None if there is none, or none can be seen.
+
+    Of two mains that are found, the stronger one, or else the one with one phase, or both.
+    """
     if not np.ptp(scans.codes, axis=0).any():
         return None
-    spectrum = _Spectrum(scans)
-    heard = [
-        _hum_at(mains_hz, spectrum) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz
-    ]
-    match [hum for hum in heard if hum is not None]:
-        case [one, other]:
-            return _the_right_one(one, other, spectrum, reading_offsets_s(scans.board))
-        case some:
-            return some[0] if some else None
+    spectrum, offsets_s = _Spectrum(scans), reading_offsets_s(scans.board)
+    seen = [spectrum.hum(mains_hz) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
+    hums = [hum for hum in seen if hum is not None]
 
-
-def _hum_at(mains_hz: float, spectrum: _Spectrum) -> Hum | None:
-    """Hum near one of the mains, if it matters and stands out."""
-    frequency_hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=spectrum.power)
-    power = spectrum.power(frequency_hz)
-    share, sine = spectrum.sine(frequency_hz)
-    lsb = max(share * (power - spectrum.noise), 0.0) ** 0.5
-    beside = np.median([spectrum.power(frequency_hz + far / spectrum.seconds) for far in BESIDE])
-    over_noise = power > spectrum.noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
-    if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
-        return Hum((mains_hz,), frequency_hz, sine, lsb)
-    return None
-
-
-def _the_right_one(one: Hum, other: Hum, spectrum: _Spectrum, offsets_s: Float) -> Hum:
-    """Of two mains that were found: the stronger one, or else the one with one phase, or both."""
+    def power(hum: Hum) -> float:
+        return spectrum.power(hum.frequency_hz)
 
     def agreement(hum: Hum) -> float:
         """1 if all readings have one phase, less if they have not."""
@@ -243,13 +230,13 @@ def _the_right_one(one: Hum, other: Hum, spectrum: _Spectrum, offsets_s: Float) 
         at_reading = amplitude * np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
         return float(np.abs(at_reading.mean()) / np.abs(at_reading).mean())
 
-    power, other_power = (spectrum.power(each.frequency_hz) for each in (one, other))
-    if max(power, other_power) > ALIKE_POWER * min(power, other_power):
-        return one if power > other_power else other
-    agree, other_agree = agreement(one), agreement(other)
-    if max(agree, other_agree) > IN_PHASE * min(agree, other_agree):
-        return one if agree > other_agree else other
-    return replace(one, mains_hz=one.mains_hz + other.mains_hz)
+    if len(hums) < 2:
+        return hums[0] if hums else None
+    for measure, clear in ((power, ALIKE_POWER), (agreement, IN_PHASE)):
+        less, more = sorted(hums, key=measure)
+        if measure(more) > clear * measure(less):
+            return more
+    return replace(hums[0], mains_hz=MAINS_HZ)
 
 
 def _seen_hz(mains_hz: float, rate_hz: float) -> float:
@@ -320,7 +307,7 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
     most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
     longer_us = min(max(LONGER * board.settle_us, LEAST_LONGER_US), most_us)
-    if not _is_longer(longer_us, board.settle_us) and not _hidden_hz(board.rate_hz, REST_S):
+    if longer_us <= NOT_LONGER * board.settle_us and not _hidden_hz(board.rate_hz, REST_S):
         return None
     slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
@@ -329,15 +316,11 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     return longer_us, max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
 
 
-def _is_longer(settle_us: int, than_us: int) -> bool:
-    return settle_us > NOT_LONGER * than_us
-
-
 def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis) -> bool:
     """Adds to a diagnosis how means change with a longer settle time. Returns whether they do."""
     settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
     diagnosis.measured["settling_lsb"] = 0.0
-    if not _is_longer(longer_us, settle_us):
+    if longer_us <= NOT_LONGER * settle_us:
         return False
     change = np.abs(usual.mean - settled.mean)
     scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))

@@ -117,24 +117,24 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
 
 
 def measure_untouched(
-    ratio: Float, rest_ratio: Float, std_lsb: float, board: Hello, wire_ohm: tuple[float, float]
+    codes: Float, rest_ratio: Float, std_lsb: float, board: Hello, wire_ohm: tuple[float, float]
 ) -> list[WireShare]:
     """The share of each layer.
 
-    ratio, rest_ratio: readings now and of an earlier rest, (R, C, 4), with the deviation std_lsb
-    [LSB]. wire_ohm: nominal ones of a segment, top and bottom.
+    codes: mean codes (R, C, 4) of the untouched skin. rest_ratio: readings (R, C, 4) of an earlier
+    rest. Both have the deviation std_lsb [LSB]. wire_ohm: nominal ones of a segment, top and bottom.
     """
-    shape, matrix = ratio.shape[:2], make_estimator("matrix", SkinKnowledge.of(board))
+    shape, matrix = codes.shape[:2], make_estimator("matrix", SkinKnowledge.of(board))
     rest_ohm, _, log_ohm = _ports(rest_ratio, std_lsb, matrix)
-    port_ohm, port_std, _ = _ports(ratio, std_lsb, matrix)
-    z, variance = port_ohm - rest_ohm, 2 * port_std**2  # the rest is a mean of such codes as well
+    port_ohm, port_std, _ = _ports(ratio_from_codes(codes, ADC_BITS), std_lsb, matrix)
+    z = port_ohm - rest_ohm
     siemens = np.exp(-log_ohm).reshape(shape)
     model = port_sensitivity(siemens, *(np.full(shape, ohm) for ohm in wire_ohm))
     by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *shape)
     layers = by_wire.sum(axis=(2, 3))  # A
     lines = np.concatenate([by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1)  # L
     common = by_cell.sum(axis=1)
-    but_cells = np.diag(variance) + COMMON_STD**2 * np.outer(common, common)
+    but_cells = np.diag(2 * port_std**2) + COMMON_STD**2 * np.outer(common, common)
     but_cells += LAYER_STD**2 * layers @ layers.T + LINE_STD**2 * lines @ lines.T
     for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
         # The smallest scatter of cells that, with all else, explains the readings.
