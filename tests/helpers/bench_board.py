@@ -4,7 +4,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ohmskin.cli.doctor import Ask, gather
+from ohmskin.cli.doctor import gather
 from ohmskin.doctor.examine import Evidence
 from ohmskin.emulate.line_faults import Faults
 from ohmskin.files import Closing
@@ -72,10 +72,10 @@ class Bench(Closing):
     def close(self) -> None:
         pass
 
-    def evidence(self, ask: Ask | None = None) -> Evidence:
-        """All that the doctor reads."""
+    def evidence(self) -> Evidence:
+        """All that the doctor reads of an untouched skin."""
         read = Evidence(self.info)
-        gather(self, read, ask=ask)
+        gather(self, read)
         return read
 
 

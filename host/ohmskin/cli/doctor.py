@@ -13,20 +13,12 @@ import typer
 from rich.console import Console
 
 import ohmskin
+from ohmskin import errors
 from ohmskin.cli import doctor_words as words
 from ohmskin.doctor.examine import Evidence, examine
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Severity, found
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
-from ohmskin.errors import (
-    CommandRefused,
-    DeviceLost,
-    DeviceSilent,
-    OhmskinError,
-    PortError,
-    ProtocolMismatch,
-    RecordingEnded,
-)
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -35,10 +27,16 @@ from ohmskin.link.serial_port import latency_ms, latency_timer_file
 WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
 LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
+_UNANSWERED: Final = {
+    errors.DeviceLost: Kind.LOST,
+    errors.DeviceSilent: Kind.NOTHING_ANSWERS,
+    errors.PortError: Kind.PORT_UNUSABLE,
+    errors.ProtocolMismatch: Kind.PROTOCOL_MISMATCH,
+}
 
 _out = Console(soft_wrap=True)
-Progress = Callable[[str], None]
-Ask = Callable[[CornerScans], None]
+# Says what is being done, and before it what a person is asked to press, if anything.
+Tell = Callable[..., None]
 
 
 def doctor(
@@ -65,8 +63,8 @@ def doctor(
     wire_ohm = None if told is None else told.nominal_wire_ohm.both
     if wires:
         wire_ohm = _wires(wires)
-    with _terminal() as (progress, ask):
-        diagnosis = diagnose(port, told, wire_ohm, progress, ask if press else None)
+    with _terminal() as tell:
+        diagnosis = diagnose(port, told, wire_ohm, tell, press=press)
     page = as_object(port, diagnosis)
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201
@@ -87,27 +85,20 @@ def _wires(text: str) -> tuple[float, float]:
 
 
 @contextmanager
-def _terminal() -> Iterator[tuple[Progress, Ask]]:
-    """Ways to say what is done, and what to press.
+def _terminal() -> Iterator[Tell]:
+    """On a terminal, one line changes. Elsewhere each request is printed once, and no progress."""
+    console, said = Console(stderr=True), {""}
 
-    On a terminal, one line changes. Elsewhere the progress is not told, and each request once.
-    """
-    errors = Console(stderr=True)
-    if errors.is_terminal:
-        with errors.status("connecting") as status:
-            yield (
-                status.update,
-                lambda presses: status.update(f"{words.request(presses)}; {words.answer(presses)}"),
-            )
+    def print_once(doing: str, request: str = "") -> None:
+        if request not in said:
+            said.add(request)
+            console.print(request, markup=False, highlight=False)
+
+    if not console.is_terminal:
+        yield print_once
         return
-    said: list[str] = []
-
-    def ask(presses: CornerScans) -> None:
-        if words.request(presses) not in said:
-            said.append(words.request(presses))
-            errors.print(said[-1], markup=False, highlight=False)
-
-    yield lambda text: None, ask
+    with console.status("connecting") as status:
+        yield lambda doing, request="": status.update(f"{request}; {doing}" if request else doing)
 
 
 # ------------------------------------------------------------------------------- the examination
@@ -115,14 +106,13 @@ def _terminal() -> Iterator[tuple[Progress, Ask]]:
 
 def diagnose(
     port: str,
-    calibration: Calibration | None = None,
-    wire_ohm: tuple[float, float] | None = None,
-    progress: Progress = lambda text: None,
-    ask: Ask | None = None,
+    calibration: Calibration | None,
+    wire_ohm: tuple[float, float] | None,
+    tell: Tell,
+    *,
+    press: bool,
 ) -> Diagnosis:
     """Examine the board at `port`. A port at which there is nothing to examine is a finding, too.
-
-    ask: tells a person where to press; without, nobody is asked.
 
     :raises PortError: the URL is wrong.
     :raises ValueError: the calibration is of another unit or geometry, or somebody would be asked
@@ -130,8 +120,14 @@ def diagnose(
     """
     try:
         device = ohmskin.open(port, start=False)
-    except (DeviceSilent, DeviceLost, ProtocolMismatch, PortError) as exc:
-        return Diagnosis([_unanswered(port, exc)])
+    except errors.OhmskinError as exc:
+        kind = _UNANSWERED.get(type(exc))
+        wrong_url = kind is Kind.PORT_UNUSABLE and ("://" in port or exc.__cause__ is None)
+        if kind is None or wrong_url:
+            raise
+        told = {"port": port, "problem": exc.problem, "remedy": exc.remedy}
+        values = {name: told[name] for name in kind.names}
+        return Diagnosis([Finding(kind, WHOLE_SKIN, values)])
     with device:
         board = device.info
         evidence = Evidence(board, host_version=ohmskin.__version__)
@@ -144,37 +140,34 @@ def diagnose(
         timer_ms = None if "://" in port else latency_ms(path)
         if timer_ms is not None:
             evidence.latency = timer_ms, str(latency_timer_file(path))
-        gather(device, evidence, progress, ask)
+        gather(device, evidence, tell, press=press)
     return examine(evidence)
 
 
 def gather(
-    device: Device,
-    evidence: Evidence,
-    progress: Progress = lambda text: None,
-    ask: Ask | None = None,
+    device: Device, evidence: Evidence, tell: Tell = lambda *told: None, *, press: bool = False
 ) -> None:
     """Read into `evidence` what `examine` goes by, as far as the board lets. Leave it as it was.
 
     :raises ValueError: somebody would be asked to press a skin of one row or column.
     """
-    presses = None if ask is None else CornerScans(device.info)
+    presses = CornerScans(device.info) if press else None
     try:
-        progress("self-test")
-        with suppress(CommandRefused):  # a recording has none
+        tell("self-test")
+        with suppress(errors.CommandRefused):  # a recording has none
             evidence.report = device.self_test()
-        progress(f"scanning the untouched skin for {REST_S} s")
+        tell(f"scanning the untouched skin for {REST_S} s")
         _scan(device, evidence.scans, REST_S)
         evidence.board = device.info
-        progress("scanning with a longer settle time")
-        with suppress(CommandRefused):
+        tell("scanning with a longer settle time")
+        with suppress(errors.CommandRefused):
             _scan_settled(device, evidence)
-        if ask is not None and presses is not None:
+        if presses is not None:
             evidence.presses = presses
-            _scan_presses(device, presses, ask)
-    except RecordingEnded:
+            _scan_presses(device, presses, tell)
+    except errors.RecordingEnded:
         pass  # all of the recording was read
-    except DeviceLost as exc:
+    except errors.DeviceLost as exc:
         evidence.board, evidence.lost = device.info, str(exc)
     evidence.stats = device.stats
 
@@ -200,7 +193,7 @@ def _scan_settled(device: Device, evidence: Evidence) -> None:
         device.configure(rate_hz=board.rate_asked_mhz / 1000, settle_us=board.settle_asked_us)
 
 
-def _scan_presses(device: Device, presses: CornerScans, ask: Ask) -> None:
+def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
     """Until three corners and then three others were pressed, or it has taken too long."""
     begin_s = None
     for scan in device:
@@ -208,36 +201,24 @@ def _scan_presses(device: Device, presses: CornerScans, ask: Ask) -> None:
         presses.take(scan)
         if presses.done or scan.host_time_s - begin_s >= WAIT_S:
             return
-        ask(presses)
-
-
-def _unanswered(port: str, error: OhmskinError) -> Finding:
-    """Why there is nothing to examine. Raises what is a wrong use instead."""
-    if isinstance(error, DeviceLost):
-        return found(Kind.LOST, problem=error.problem)
-    kinds = {ProtocolMismatch: Kind.PROTOCOL_MISMATCH, DeviceSilent: Kind.NOTHING_ANSWERS}
-    kind = kinds.get(type(error), Kind.PORT_UNUSABLE)
-    if kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None):
-        raise error  # no serial port has refused: the URL is wrong
-    return found(kind, port=port, problem=error.problem, remedy=error.remedy)
+        tell(words.pressed(presses), words.request(presses))
 
 
 # ----------------------------------------------------------------------------------- the page
 
 
 def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
-    """What ``--json`` prints."""
-    findings = []
-    for finding in diagnosis.findings:
-        kind, data = finding.kind, {"place": asdict(finding.place), "values": finding.values}
-        findings.append(
-            {"id": kind.id, "severity": kind.severity, **words.words_of(finding), **data}
-        )
+    """What ``--json`` prints, with places and shares that `asdict` takes apart."""
     return {
         "port": port,
         "sound": not diagnosis.worse,
         "verdict": words.verdict(diagnosis),
-        "findings": findings,
+        "findings": [
+            {"id": each.kind.id, "severity": each.kind.severity}
+            | words.words_of(each)
+            | {"place": each.place, "values": each.values}
+            for each in diagnosis.findings
+        ],
         "measured": words.measured_in_words(diagnosis),
     }
 

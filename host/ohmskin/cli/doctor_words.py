@@ -25,59 +25,54 @@ def _table() -> dict[str, Any]:
 
 def words_of(finding: Finding) -> dict[str, str]:
     """What is told of a finding, by the names in `FIELDS`."""
-    name, cases, more = _case(finding, finding.values)
-    told = _table()[name]
-    for case in cases:
-        told = told | told.get(case, {})
-    words = {"where": named(finding.place), **finding.values, **more}
+    kind, place, values = finding.kind, finding.place, finding.values
+    words = {"where": named(place), "one_place": place != WHOLE_SKIN, **values, **_words(finding)}
+    table = _table()[words.get("table", kind.id)]
+    told = {name: text for name, text in table.items() if isinstance(text, str)}
+    for case in table.keys() - told.keys():
+        if words.get(case) or case in words.values():
+            told |= table[case]
     return {field: told[field].format(**words) for field in FIELDS}
 
 
-def _case(finding: Finding, values: Any) -> tuple[str, list[str], dict[str, Any]]:
-    """The table of a finding, the cases in it that apply, and words besides the values."""
-    name, cases, words = finding.kind.id, [], {}
-    place = finding.place
-    what, lines = ("row", place.rows) if place.rows else ("column", place.columns)
-    if place != WHOLE_SKIN:
-        cases.append("one_place")
+def _words(finding: Finding) -> dict[str, Any]:
+    """Words and cases of a finding that its values do not have."""
+    values = finding.values
+    line, lines = "row", finding.place.rows
+    if not lines:
+        line, lines = "column", finding.place.columns
     match finding.kind:
         case Kind.PORT_UNUSABLE:
-            cases += [] if values["remedy"] else ["unknown"]
+            return {"unknown": not values["remedy"]}
         case Kind.SELF_TEST:
             side, _, fault = values["name"].partition("_")
             doc = ENUMS["finding"].docs.get(values["name"], "a finding of a newer firmware")
-            cases, words = [fault], {"side": side, "doc": doc}
-        case Kind.NOTHING_CONDUCTS if values["cell_count"] == 1:
-            cases.append("one_cell")
+            return {"side": side, "fault": fault, "doc": doc}
+        case Kind.NOTHING_CONDUCTS:
+            return {"one_cell": values["cell_count"] == 1}
         case Kind.OPEN_ROW | Kind.OPEN_COLUMN:
-            name, words = "open", {"line": what, "first": lines[0]}
-            cases += ["one_cell"] if values["cells_per_line"] == 1 else []
             # Lines beyond the skin look open, too.
             beyond = lines == tuple(range(lines[0], values["line_count"]))
-            cases += ["last_lines"] if beyond else []
+            cases = {"one_cell": values["cells_per_line"] == 1, "last_lines": beyond}
+            return {"table": "open", "line": line, "first": lines[0], **cases}
         case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS:
-            name, words = "short", {"line": what, "joined": " and ".join(map(str, lines))}
+            return {"table": "short", "line": line, "joined": " and ".join(map(str, lines))}
         case Kind.REFERENCE_RATIO:
-            nominal = values["ref_top_ohm"] / values["ref_bottom_ohm"]
-            words = {"percent": abs(values["off_percent"]), "nominal_ratio": nominal}
-            cases += ["low"] if values["off_percent"] < 0 else []
-        case Kind.RESET_CAUSE:
-            cases.append(values["cause"])
+            nominal, off = values["ref_top_ohm"] / values["ref_bottom_ohm"], values["off_percent"]
+            return {"nominal_ratio": nominal, "percent": abs(off), "low": off < 0}
         case Kind.RESTARTED:
-            words = {"last": ", ".join(values["causes"]) or "unknown"}
-        case Kind.LOSS if values["dropped_by_board"] or not values["missed"]:
-            cases.append("dropped" if values["missed"] else "few")
+            return {"last": ", ".join(values["causes"]) or "unknown"}
+        case Kind.LOSS:
+            missed = values["missed"]
+            return {"dropped": missed and values["dropped_by_board"], "few": not missed}
         case Kind.HUM:
-            words = {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
+            return {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
         case Kind.WIRES:
             share, ohm = values["share"], dict(zip(LAYERS, values["nominal_ohm"], strict=True))
-            words = {"told": _ohm(share, ohm), "nominal": ohm[share.layers[0]], **ohm}
-            words["times"] = share.share
-            cases += ["both"] if len(share.layers) > 1 else []
-            cases += [] if lines else [f"all_{'_'.join(share.layers)}"]
-        case Kind.TOUCHED if values["moves"]:
-            cases.append("moves")
-    return name, cases, words
+            cases = {"both": len(share.layers) > 1, f"all_{'_'.join(share.layers)}": not lines}
+            told = {"told": _ohm(share, ohm), "times": share.share, **ohm}
+            return {"nominal": ohm[share.layers[0]], **told, **cases}
+    return {}
 
 
 def named(place: Place) -> str:
@@ -146,7 +141,7 @@ def request(presses: CornerScans) -> str:
     return f"{'now' if presses.again else 'press firmly, at once:'} {cells}"
 
 
-def answer(presses: CornerScans) -> str:
+def pressed(presses: CornerScans) -> str:
     """What is pressed meanwhile."""
     if presses.hold:
         return "hold still"

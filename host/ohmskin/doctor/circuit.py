@@ -30,18 +30,15 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
+from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.signal import RestScans, mean_std_lsb
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello
-
-Bool = NDArray[np.bool_]
 
 WIRE_OHM: Final = (100.0, 200.0)  # [ohm] Top and bottom segments are so unless told otherwise.
 
@@ -92,7 +89,7 @@ def examine_circuit(
     touches the skin and moves; then shorted lines and dead cells are not judged, because the means
     are of no one skin.
     """
-    board, mean_codes, findings = rest.board, rest.mean, diagnosis.findings
+    board, mean_codes = rest.board, rest.mean
     full = (1 << board.adc_bits) - 1
     shown = np.where(READING_SIGN > 0, mean_codes, full - mean_codes)
     current = shown.mean(axis=2)
@@ -100,40 +97,35 @@ def examine_circuit(
     usual = float(np.median(current))
     least = max(DARK_LSB + DARK_NOISE * noise_lsb, min(OFFSET_LSB, DARK_SHARE * usual))
     dark = current < least
-    nothing = np.zeros(current.shape, dtype=np.bool_)
+    shorted = np.zeros(current.shape, dtype=np.bool_)
     if dark.all():
-        findings.append(found(Kind.NOTHING_CONDUCTS, cell_count=dark.size))
+        diagnosis.add(Kind.NOTHING_CONDUCTS, cell_count=dark.size)
         diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
-        return nothing, ~nothing
+        return shorted, dark
     no_row, no_column = dark.all(axis=1), dark.all(axis=0)
-    for kind, place, count, cells in (
-        (Kind.OPEN_ROW, Place(rows=lines_of(no_row)), rows, columns),
-        (Kind.OPEN_COLUMN, Place(columns=lines_of(no_column)), columns, rows),
-    ):
-        if place != WHOLE_SKIN:
-            findings.append(found(kind, place, line_count=count, cells_per_line=cells))
+    if no_row.any():
+        place = Place(rows=lines_of(no_row))
+        diagnosis.add(Kind.OPEN_ROW, place, line_count=rows, cells_per_line=columns)
+    if no_column.any():
+        place = Place(columns=lines_of(no_column))
+        diagnosis.add(Kind.OPEN_COLUMN, place, line_count=columns, cells_per_line=rows)
     out = no_row[:, None] | no_column
     siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
-    shorted = nothing.copy()
     if not moved:
         std = noise_lsb / (4 * len(rest.codes)) ** 0.5
-        row_groups = _shorted(current, siemens, std, out)
-        column_groups = _shorted(current.T, siemens.T, std, out.T)
-        for group in row_groups:
-            findings.append(found(Kind.SHORT_ROWS, Place(rows=tuple(group))))
-            shorted[group] = True
-            no_row[group[1:]] = True
-        for group in column_groups:
-            findings.append(found(Kind.SHORT_COLUMNS, Place(columns=tuple(group))))
-            shorted[:, group] = True
-            no_column[group[1:]] = True
+        for group in _shorted(current, siemens, std, out):
+            diagnosis.add(Kind.SHORT_ROWS, Place(rows=tuple(group)))
+            shorted[group] = no_row[group[1:]] = True
+        for group in _shorted(current.T, siemens.T, std, out.T):
+            diagnosis.add(Kind.SHORT_COLUMNS, Place(columns=tuple(group)))
+            shorted[:, group] = no_column[group[1:]] = True
         if shorted.any():
             # Shorted lines are one: the network without the others is right for all other cells.
             siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
     wrong = out | shorted
-    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, wire_ohm, findings, moved=moved)
+    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, wire_ohm, diagnosis, moved=moved)
     mean_std = mean_std_lsb(noise_lsb, len(rest.codes))
-    ratio = _reference_ratio(shown[~dark], mean_std, board, findings)
+    ratio = _reference_ratio(shown[~dark], mean_std, board, diagnosis)
     cell_ohm = 1 / np.nanmedian(siemens)
     diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
     return touched, wrong | bad
@@ -156,18 +148,14 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
     current, siemens = current[np.ix_(lines, ports)], siemens[np.ix_(lines, ports)]
     apart = np.abs(current[:, None] - current[None, :]).max(axis=2)
     alike = apart < ALIKE_LSB + ALIKE_STDS * std * 2**0.5
-    np.fill_diagonal(alike, False)
-    level = np.median(siemens, axis=1)
+    level, few = np.median(siemens, axis=1), len(ports) < ALIKE_PORTS
     groups: list[list[int]] = []
     for line in range(len(lines)):
         members = [line, *np.flatnonzero(alike[line, line + 1 :]) + line + 1]
         if len(members) < 2 or any(int(lines[line]) in group for group in groups):
             continue
-        others = np.log(np.delete(level, members))
-        few = len(ports) < ALIKE_PORTS
-        if not len(others):
-            is_short = not few
-        else:
+        is_short, others = not few, np.log(np.delete(level, members))
+        if len(others):
             rise = float(np.log(level[members].min()) - np.median(others))
             is_short = rise > max(np.log(DOUBLED), RISE_STDS * few * float(np.std(others)))
         if is_short:
@@ -180,11 +168,11 @@ def _judge_cells(
     std: Float,
     judged: Bool,
     wire_ohm: tuple[float, float],
-    findings: list[Finding],
+    diagnosis: Diagnosis,
     *,
     moved: bool,
 ) -> tuple[Bool, Bool]:
-    """Adds dead and saturated cells to findings. Returns touched cells, and these."""
+    """Adds dead and saturated cells. Returns touched cells, and these."""
     dead: Bool = np.zeros(siemens.shape, dtype=np.bool_)
     if not judged.any():
         return dead, dead
@@ -198,14 +186,14 @@ def _judge_cells(
         dead = np.asarray(judged & ~hidden & (siemens + doubt < DEAD_SHARE * usual))
     if dead.any():
         percent = 100 * float(np.max(siemens[dead] / usual))
-        findings.append(found(Kind.DEAD_CELL, Place.of_cells(dead), percent_of_usual=percent))
+        diagnosis.add(Kind.DEAD_CELL, Place.of_cells(dead), percent_of_usual=percent)
     rows, columns = siemens.shape
     top, bottom = wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
     saturated = high & (siemens * (WIRE_SPREAD * path_ohm + SHORTED_OHM) > 1)
     if saturated.any():
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
-        findings.append(found(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest))
+        diagnosis.add(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest)
     return high & ~saturated, dead | saturated
 
 
@@ -218,8 +206,8 @@ def _touched_share(siemens: Float) -> float:
     return max(TOUCHED_SHARE, float(np.exp(TOUCHED_STDS * spread)))
 
 
-def _reference_ratio(lit: Float, mean_std: float, board: Hello, findings: list[Finding]) -> float:
-    """R_top / R_bottom. Adds to findings if it is far from what the board says.
+def _reference_ratio(lit: Float, mean_std: float, board: Hello, diagnosis: Diagnosis) -> float:
+    """R_top / R_bottom. Adds a finding if it is far from what the board says.
 
     lit: what the ports (P, 4) with a current show of it, with the deviation mean_std [LSB].
     """
@@ -229,8 +217,11 @@ def _reference_ratio(lit: Float, mean_std: float, board: Hello, findings: list[F
     top, bottom = board.ref_top_ohm, board.ref_bottom_ohm
     off = ratio * bottom / top - 1
     if abs(off) >= RATIO_TOLERANCE + RATIO_STDS * ratio_std:
-        refs = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
-        findings.append(
-            found(Kind.REFERENCE_RATIO, WHOLE_SKIN, ratio=ratio, off_percent=100 * off, **refs)
+        diagnosis.add(
+            Kind.REFERENCE_RATIO,
+            ratio=ratio,
+            off_percent=100 * off,
+            ref_top_ohm=top,
+            ref_bottom_ohm=bottom,
         )
     return ratio

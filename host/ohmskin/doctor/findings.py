@@ -101,11 +101,6 @@ class Finding:
             raise ValueError(f"{self.kind.id} has {set(self.kind.names)}, not {set(self.values)}")
 
 
-def found(kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> Finding:
-    """A finding with these values."""
-    return Finding(kind, place, values)
-
-
 @dataclass(frozen=True)
 class WireShare:
     """Wire resistance over the nominal one, and its deviation.
@@ -138,6 +133,10 @@ class Diagnosis:
     nominal_ohm: tuple[float, float] | None = None
     untouched: list[WireShare] = field(default_factory=list)
     pressed: list[WireShare] | None = None
+
+    def add(self, kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> None:
+        """Add a finding with these values."""
+        self.findings.append(Finding(kind, place, values))
 
     @property
     def worse(self) -> list[Finding]:

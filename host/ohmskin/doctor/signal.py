@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
 from ohmskin.link.timing import reading_offsets_s, slot_s
@@ -139,9 +139,20 @@ def examine_signal(
         hum = find_hum(other)
         hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
     if hum is not None:
-        diagnosis.findings.append(_hum_finding(hum, scans.board))
+        by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
+        # The worst cell is named if it has twice as much as others.
+        worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
+        diagnosis.add(
+            Kind.HUM,
+            Place.of_cells(worst),
+            mains_hz=hum.mains_hz,
+            amplitude_lsb=hum.lsb,
+            most_lsb=HUM_LSB,
+            rate_hz=scans.board.rate_hz,
+            seen_hz=_seen_hz(hum.frequency_hz, scans.board.rate_hz),
+        )
     if len(scans.codes) >= LEAST_SCANS and not moved.any():
-        diagnosis.findings += _noise(np.sqrt(variance.mean(axis=2)))
+        _examine_noise(np.sqrt(variance.mean(axis=2)), diagnosis)
     diagnosis.measured |= {
         "noise_lsb": round(noise_lsb, 3),
         "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
@@ -250,21 +261,6 @@ def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
     return tuple(each for each in MAINS_HZ if _seen_hz(each, rate_hz) < least_hz)
 
 
-def _hum_finding(hum: Hum, board: Hello) -> Finding:
-    """Hum of a board; cells: the worst one, if it has twice as much as others."""
-    by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
-    worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
-    return found(
-        Kind.HUM,
-        Place.of_cells(worst),
-        mains_hz=hum.mains_hz,
-        amplitude_lsb=hum.lsb,
-        most_lsb=HUM_LSB,
-        rate_hz=board.rate_hz,
-        seen_hz=_seen_hz(hum.frequency_hz, board.rate_hz),
-    )
-
-
 # --------------------------------------------------------------------------- noise, what moves
 
 
@@ -277,22 +273,20 @@ def _moved(rest: Float, variance: Float) -> Bool:
     return np.asarray((np.ptp(means, axis=0) > MOVED_LSB + CLEAR_STDS * of_noise).any(axis=2))
 
 
-def _noise(cell_lsb: Float) -> list[Finding]:
-    """Noise of each cell [LSB], (R, C), against that of a sound board: lines, or else cells."""
+def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
+    """Adds noisy lines, or else cells, or else the skin. cell_lsb: noise of each cell, (R, C)."""
     usual = float(np.median(cell_lsb))
     limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
-    rows, columns = lines_of(row_lsb > limit), lines_of(column_lsb > limit)
-    cells = () if rows or columns else Place.of_cells(cell_lsb > limit).cells
-    lsb = usual
-    if rows or columns:
-        lsb = float(max(row_lsb.max(), column_lsb.max()))
-    elif cells:
-        lsb = float(cell_lsb.max())
-    elif usual <= NOISY_LSB:
-        return []
-    place, sound = Place(rows, columns, cells), SOUND_NOISE_LSB
-    return [found(Kind.NOISE, place, noise_lsb=lsb, sound_lsb=sound, adc_lsb=ADC_NOISE_LSB)]
+    place = Place(lines_of(row_lsb > limit), lines_of(column_lsb > limit))
+    lsb = float(max(row_lsb.max(), column_lsb.max()))
+    if place == WHOLE_SKIN:
+        place, lsb = Place.of_cells(cell_lsb > limit), float(cell_lsb.max())
+    if place == WHOLE_SKIN:
+        lsb = usual
+    if place != WHOLE_SKIN or usual > NOISY_LSB:
+        sound = {"sound_lsb": SOUND_NOISE_LSB, "adc_lsb": ADC_NOISE_LSB}
+        diagnosis.add(Kind.NOISE, place, noise_lsb=lsb, **sound)
 
 
 # ------------------------------------------------------------------------------------ settling
@@ -334,7 +328,7 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(float(change.max()), 0.9 * swing)
     needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
-    finding = found(
+    diagnosis.add(
         Kind.SETTLING,
         WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
         change_lsb=float(change.max()),
@@ -343,5 +337,4 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
         longer_us=longer_us,
         needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
     )
-    diagnosis.findings.append(finding)
     return True

@@ -122,7 +122,7 @@ def measure_untouched(
     """The share of each layer.
 
     codes: mean codes (R, C, 4) of the untouched skin. rest_ratio: readings (R, C, 4) of an earlier
-    rest. Both have the deviation std_lsb [LSB]. wire_ohm: nominal ones of a segment, top and bottom.
+    rest. Both have the deviation std_lsb [LSB]. wire_ohm: nominal segments, top and bottom.
     """
     shape, matrix = codes.shape[:2], make_estimator("matrix", SkinKnowledge.of(board))
     rest_ohm, _, log_ohm = _ports(rest_ratio, std_lsb, matrix)
