@@ -177,7 +177,12 @@ def _judge_cells(
     if not judged.any():
         return dead, dead
     rest = min(float(np.quantile(siemens[judged], REST_QUANTILE)), MOST_AT_REST_SIEMENS)
-    high: Bool = judged & (siemens > _touched_share(siemens[judged]) * rest)
+    share = TOUCHED_SHARE
+    if judged.sum() >= MANY_CELLS:  # cells at rest differ
+        lower, middle = np.quantile(siemens[judged], (0.16, 0.5))  # one deviation apart
+        spread = min(float(np.log(middle / lower)), MOST_SPREAD)
+        share = max(share, float(np.exp(TOUCHED_STDS * spread)))
+    high: Bool = judged & (siemens > share * rest)
     if not moved and high.sum() < judged.sum() > 1:
         usual = float(np.median(siemens[judged & ~high]))
         hidden = np.logical_and.outer(high.any(axis=1), high.any(axis=0))
@@ -195,15 +200,6 @@ def _judge_cells(
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
         diagnosis.add(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest)
     return high & ~saturated, dead | saturated
-
-
-def _touched_share(siemens: Float) -> float:
-    """From where on a cell counts as touched, over the level at rest: cells at rest differ."""
-    if siemens.size < MANY_CELLS:
-        return TOUCHED_SHARE
-    lower, middle = np.quantile(siemens, (0.16, 0.5))  # one deviation apart
-    spread = min(float(np.log(middle / lower)), MOST_SPREAD)
-    return max(TOUCHED_SHARE, float(np.exp(TOUCHED_STDS * spread)))
 
 
 def _reference_ratio(lit: Float, mean_std: float, board: Hello, diagnosis: Diagnosis) -> float:

@@ -27,6 +27,7 @@ drift.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
@@ -92,17 +93,31 @@ class RestScans:
         codes = np.stack([scan.codes for scan in fit]).astype(np.float64)
         return cls(board, codes, np.array([1e-6 * scan.time_us for scan in fit]))
 
-    @property
+    @cached_property
     def mean(self) -> Float:
         """Mean codes (R, C, 4)."""
         return np.asarray(self.codes.mean(axis=0))
 
+    @cached_property
+    def window(self) -> Float:
+        """w (N,)."""
+        window = np.hanning(len(self.codes) + 2)[1:-1]
+        return np.asarray(window / window.sum())
+
+    def amplitude(self, frequency_hz: float) -> Complex:
+        """c (R, C, 4)."""
+        turn = np.exp(-2j * np.pi * frequency_hz * self.time_s)
+        return 2 * np.tensordot(self.window * turn, self.codes - self.mean, axes=1)
+
+    def power(self, frequency_hz: float) -> float:
+        """P."""
+        return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
+
     @property
     def hidden_hz(self) -> tuple[float, ...]:
         """Mains that these scans cannot show [Hz]."""
-        if len(self.codes) < LEAST_SCANS:
-            return MAINS_HZ
-        return _hidden_hz(self.board.rate_hz, float(np.ptp(self.time_s)))
+        seconds = float(np.ptp(self.time_s)) if len(self.codes) >= LEAST_SCANS else 0.0
+        return _hidden_hz(self.board.rate_hz, seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,47 +195,6 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 # ----------------------------------------------------------------------------------------- hum
 
 
-class _Spectrum:
-    """c(f) and P(f) of scans, and the power that noise alone would have."""
-
-    def __init__(self, scans: RestScans) -> None:
-        window = np.hanning(len(scans.codes) + 2)[1:-1]
-        self._window = window / window.sum()
-        self._rest, self._time_s = scans.codes - scans.mean, scans.time_s
-        self.seconds = float(np.ptp(scans.time_s))
-        self.noise = 4 * float((self._rest**2).mean()) * float(np.sum(self._window**2))
-
-    def amplitude(self, frequency_hz: float) -> Complex:
-        """c (R, C, 4)."""
-        turn = np.exp(-2j * np.pi * frequency_hz * self._time_s)
-        return 2 * np.tensordot(self._window * turn, self._rest, axes=1)
-
-    def power(self, frequency_hz: float) -> float:
-        """P."""
-        return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
-
-    def hum(self, mains_hz: float) -> Hum | None:
-        """Hum near one of the mains, if it matters and stands out.
-
-        A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image
-        overlap by m. At half the rate only a part of it is seen, half of its power on average.
-        """
-        at_hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=self.power)
-        power, sine = self.power(at_hz), self.amplitude(at_hz)
-        mirror = complex(self._window @ np.exp(-4j * np.pi * at_hz * self._time_s))
-        if abs(mirror) ** 2 >= OVERLAP:
-            share, sine = 0.5, sine / 2
-        else:
-            sine = (sine - mirror * np.conj(sine)) / (1 - abs(mirror) ** 2)
-            share = float(np.mean(np.abs(sine) ** 2)) / power
-        lsb = max(share * (power - self.noise), 0.0) ** 0.5
-        beside = np.median([self.power(at_hz + far / self.seconds) for far in BESIDE])
-        over_noise = power > self.noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
-        if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
-            return Hum((mains_hz,), at_hz, sine, lsb)
-        return None
-
-
 def find_hum(scans: RestScans) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen.
 
@@ -228,26 +202,50 @@ def find_hum(scans: RestScans) -> Hum | None:
     """
     if not np.ptp(scans.codes, axis=0).any():
         return None
-    spectrum, offsets_s = _Spectrum(scans), reading_offsets_s(scans.board)
-    seen = [spectrum.hum(mains_hz) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
+    seen = [_hum_at(mains_hz, scans) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
     hums = [hum for hum in seen if hum is not None]
+    if len(hums) < 2:
+        return hums[0] if hums else None
+    offsets_s = reading_offsets_s(scans.board)
 
     def power(hum: Hum) -> float:
-        return spectrum.power(hum.frequency_hz)
+        return scans.power(hum.frequency_hz)
 
     def agreement(hum: Hum) -> float:
         """1 if all readings have one phase, less if they have not."""
-        amplitude = spectrum.amplitude(hum.frequency_hz)
-        at_reading = amplitude * np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
+        turn = np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
+        at_reading = scans.amplitude(hum.frequency_hz) * turn
         return float(np.abs(at_reading.mean()) / np.abs(at_reading).mean())
 
-    if len(hums) < 2:
-        return hums[0] if hums else None
     for measure, clear in ((power, ALIKE_POWER), (agreement, IN_PHASE)):
         less, more = sorted(hums, key=measure)
         if measure(more) > clear * measure(less):
             return more
     return replace(hums[0], mains_hz=MAINS_HZ)
+
+
+def _hum_at(mains_hz: float, scans: RestScans) -> Hum | None:
+    """Hum near one of the mains, if it matters and stands out.
+
+    A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image overlap
+    by m. At half the rate only a part of it is seen, half of its power on average.
+    """
+    hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=scans.power)
+    power, sine = scans.power(hz), scans.amplitude(hz)
+    mirror = complex(scans.window @ np.exp(-4j * np.pi * hz * scans.time_s))
+    if abs(mirror) ** 2 >= OVERLAP:
+        share, sine = 0.5, sine / 2
+    else:
+        sine = (sine - mirror * np.conj(sine)) / (1 - abs(mirror) ** 2)
+        share = float(np.mean(np.abs(sine) ** 2)) / power
+    of_noise = 4 * float(np.mean((scans.codes - scans.mean) ** 2) * np.sum(scans.window**2))
+    lsb = max(share * (power - of_noise), 0.0) ** 0.5
+    seconds = np.ptp(scans.time_s)
+    beside = np.median([scans.power(hz + far / seconds) for far in BESIDE])
+    over_noise = power > of_noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
+    if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
+        return Hum((mains_hz,), hz, sine, lsb)
+    return None
 
 
 def _seen_hz(mains_hz: float, rate_hz: float) -> float:
@@ -278,12 +276,11 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
     usual = float(np.median(cell_lsb))
     limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
-    place = Place(lines_of(row_lsb > limit), lines_of(column_lsb > limit))
-    lsb = float(max(row_lsb.max(), column_lsb.max()))
-    if place == WHOLE_SKIN:
+    place, lsb = Place(lines_of(row_lsb > limit), lines_of(column_lsb > limit)), usual
+    if place != WHOLE_SKIN:
+        lsb = float(max(row_lsb.max(), column_lsb.max()))
+    elif (cell_lsb > limit).any():
         place, lsb = Place.of_cells(cell_lsb > limit), float(cell_lsb.max())
-    if place == WHOLE_SKIN:
-        lsb = usual
     if place != WHOLE_SKIN or usual > NOISY_LSB:
         sound = {"sound_lsb": SOUND_NOISE_LSB, "adc_lsb": ADC_NOISE_LSB}
         diagnosis.add(Kind.NOISE, place, noise_lsb=lsb, **sound)
