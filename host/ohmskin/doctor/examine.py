@@ -17,7 +17,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Kind, Place
-from ohmskin.doctor.signal import RestScans, examine_settling, examine_signal, mean_std_lsb
+from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans, measure_untouched
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
@@ -87,22 +87,22 @@ def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) ->
     """
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
-    moves, rest = bool(moved.any()), usual
+    moves, scans = bool(moved.any()), usual
     if settled is not None and not moves and examine_settling(usual, settled, diagnosis):
-        rest = settled
+        scans = settled
     wire_ohm, presses = evidence.wire_ohm or WIRE_OHM, evidence.presses
-    touched, wrong = examine_circuit(rest, noise_lsb, wire_ohm, diagnosis, moved=moves)
+    rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
+    touched, wrong = examine_circuit(rest, diagnosis)
     touched = touched if touched.any() else moved
     if touched.any():
         diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
     if touched.any() or wrong.any():
         return
-    scans, diagnosis.nominal_ohm = len(rest.codes), wire_ohm
+    diagnosis.nominal_ohm = wire_ohm
     if evidence.rest_ratio is not None:
-        of_rest = (evidence.rest_ratio, mean_std_lsb(noise_lsb, scans))
-        diagnosis.untouched = measure_untouched(rest.mean, *of_rest, rest.board, wire_ohm)
+        diagnosis.untouched = measure_untouched(rest, evidence.rest_ratio)
     if presses is not None:
-        diagnosis.pressed = presses.measure(rest.mean, scans, noise_lsb, wire_ohm)
+        diagnosis.pressed = presses.measure(rest)
     changed = [each for each in diagnosis.untouched if each.differs]
     if evidence.wire_ohm is not None and not changed:
         changed = [each for each in diagnosis.pressed or () if each.differs]

@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
+from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
 from ohmskin.link.timing import reading_offsets_s, slot_s
@@ -121,6 +122,33 @@ class RestScans:
 
 
 @dataclass(frozen=True, eq=False)
+class Rest:
+    """The skin at rest, by the means of scans.
+
+    codes: means (R, C, 4) of so many scans. noise_lsb: of a reading, without hum. wire_ohm: nominal
+    ones of a segment, top and bottom. moves: something touches the skin and moves, so that the
+    means are of no one skin.
+    """
+
+    board: Hello
+    codes: Float
+    scans: int
+    noise_lsb: float
+    wire_ohm: tuple[float, float]
+    moves: bool = False
+
+    @property
+    def ratio(self) -> Float:
+        """The same as ratios to Vdd."""
+        return ratio_from_codes(self.codes, self.board.adc_bits)
+
+    @property
+    def std_lsb(self) -> float:
+        """Deviation of these means, rounding included."""
+        return float(np.hypot(rounding_std_lsb(self.noise_lsb), self.noise_lsb / self.scans**0.5))
+
+
+@dataclass(frozen=True, eq=False)
 class Hum:
     """Mains hum. mains_hz: which mains, or both where they cannot be told apart [Hz].
 
@@ -175,11 +203,6 @@ def examine_signal(
         "hum_not_visible": list(hidden_hz),
     }
     return noise_lsb, moved
-
-
-def mean_std_lsb(noise_lsb: float, scans: int) -> float:
-    """Deviation of the mean of so many codes [LSB], each with this noise, rounding included."""
-    return float(np.hypot(rounding_std_lsb(noise_lsb), noise_lsb / scans**0.5))
 
 
 def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:

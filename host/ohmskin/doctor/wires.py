@@ -63,7 +63,7 @@ import numpy as np
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
-from ohmskin.doctor.signal import rounding_std_lsb
+from ohmskin.doctor.signal import Rest, rounding_std_lsb
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
@@ -116,20 +116,14 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
 # ------------------------------------------------------------------------- the untouched skin
 
 
-def measure_untouched(
-    codes: Float, rest_ratio: Float, std_lsb: float, board: Hello, wire_ohm: tuple[float, float]
-) -> list[WireShare]:
-    """The share of each layer.
-
-    codes: mean codes (R, C, 4) of the untouched skin. rest_ratio: readings (R, C, 4) of an earlier
-    rest. Both have the deviation std_lsb [LSB]. wire_ohm: nominal segments, top and bottom.
-    """
-    shape, matrix = codes.shape[:2], make_estimator("matrix", SkinKnowledge.of(board))
-    rest_ohm, _, log_ohm = _ports(rest_ratio, std_lsb, matrix)
-    port_ohm, port_std, _ = _ports(ratio_from_codes(codes, ADC_BITS), std_lsb, matrix)
+def measure_untouched(rest: Rest, earlier_ratio: Float) -> list[WireShare]:
+    """The share of each layer. earlier_ratio: readings (R, C, 4) of an earlier rest."""
+    shape, matrix = rest.codes.shape[:2], make_estimator("matrix", SkinKnowledge.of(rest.board))
+    rest_ohm, _, log_ohm = _ports(earlier_ratio, rest.std_lsb, matrix)
+    port_ohm, port_std, _ = _ports(rest.ratio, rest.std_lsb, matrix)
     z = port_ohm - rest_ohm
     siemens = np.exp(-log_ohm).reshape(shape)
-    model = port_sensitivity(siemens, *(np.full(shape, ohm) for ohm in wire_ohm))
+    model = port_sensitivity(siemens, *(np.full(shape, ohm) for ohm in rest.wire_ohm))
     by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *shape)
     layers = by_wire.sum(axis=(2, 3))  # A
     lines = np.concatenate([by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1)  # L
@@ -223,35 +217,22 @@ class CornerScans:
             self.hold, self.again, self.done = False, True, self.again
             self._first, self.wanted = corners, moved_across(corners)
 
-    def measure(
-        self,
-        rest_codes: Float,
-        rest_scans: int,
-        noise_lsb: float,
-        wire_ohm: tuple[float, float],
-    ) -> list[WireShare]:
-        """The share of both layers, then that of each row and column; none if none was pressed.
-
-        rest_codes: mean codes (R, C, 4) of so many scans of the untouched skin, each reading with
-        this noise. wire_ohm: nominal ones of a segment, top and bottom.
-        """
-        rest = self._ports(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
+    def measure(self, rest: Rest) -> list[WireShare]:
+        """The share of both layers, then that of each row and column; none if none was pressed."""
+        at_rest = _ports(rest.ratio, rest.std_lsb, self._matrix)
         most = max(map(len, self._codes.values()), default=0)
         found = []
         for corners, codes in self._codes.items():
             if len(codes) < HELD_SHARE * most:
                 continue
             # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
-            scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
-            pressed = self._ports(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
-            found.append((corners[0], *_pressed_fit(rest, pressed, self._free(corners), wire_ohm)))
+            scatter_lsb = np.maximum(np.std(codes, axis=0), rest.noise_lsb)
+            variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1)
+            std_lsb = np.sqrt(variance + rest.noise_lsb**2 / len(codes))
+            ratio = ratio_from_codes(np.mean(codes, axis=0), self._board.adc_bits)
+            pressed, free = _ports(ratio, std_lsb, self._matrix), self._free(corners)
+            found.append((corners[0], *_pressed_fit(at_rest, pressed, free, rest.wire_ohm)))
         return shares_of(found)
-
-    def _ports(
-        self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int
-    ) -> tuple[Float, Float, Float]:
-        variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1) + noise_lsb**2 / scans
-        return _ports(ratio_from_codes(mean, ADC_BITS), np.sqrt(variance), self._matrix)
 
     def _free(self, corners: Corners) -> Bool:
         """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
