@@ -17,6 +17,7 @@ from bench_board import Bench
 from calibrations import calibration
 from command_line import Done, assert_one_line
 from ohmskin.cli import doctor as doctor_command
+from ohmskin.cli.doctor import gather
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link import session
@@ -156,7 +157,7 @@ def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
     bench = Watched("emulator://3x4")
     before = bench.configure(rate_hz=77.5, settle_us=120, adc_prescaler="clock_250khz")
     with nullcontext() if end is None else pytest.raises(end):
-        bench.evidence()
+        gather(bench)
     assert looks_us[1] > 3 * looks_us[0]
     assert bench.info == before
 

@@ -72,13 +72,7 @@ class Bench(Closing):
     def close(self) -> None:
         pass
 
-    def evidence(self) -> Evidence:
-        """All that the doctor reads of an untouched skin."""
-        read = Evidence(self.info)
-        gather(self, read)
-        return read
-
 
 def evidence(url: str, **told: object) -> Evidence:
     """What the doctor reads of the board at an `emulator://` URL, and what it is told besides."""
-    return replace(Bench(url).evidence(), **told)
+    return replace(gather(Bench(url)), **told)

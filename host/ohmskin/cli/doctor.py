@@ -64,7 +64,14 @@ def doctor(
     if wires:
         wire_ohm = _wires(wires)
     with _terminal() as tell:
-        diagnosis = diagnose(port, told, wire_ohm, tell, press=press)
+        try:
+            device = ohmskin.open(port, start=False)
+        except errors.OhmskinError as exc:
+            diagnosis = Diagnosis([_unanswered(port, exc)])
+        else:
+            with device:
+                evidence = gather(device, tell, told, wire_ohm, press=press)
+            diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201
@@ -82,6 +89,16 @@ def _wires(text: str) -> tuple[float, float]:
     if not (0 < top < float("inf") and 0 < bottom < float("inf")):
         raise ValueError(f"--wires must be above 0 ohm, not '{text}'")
     return top, bottom
+
+
+def _unanswered(port: str, error: errors.OhmskinError) -> Finding:
+    """Why there is nothing to examine. Raises what is a wrong use instead."""
+    kind = _UNANSWERED.get(type(error))
+    wrong_url = kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None)
+    if kind is None or wrong_url:
+        raise error
+    told = {"port": port, "problem": error.problem, "remedy": error.remedy}
+    return Finding(kind, WHOLE_SKIN, {name: told[name] for name in kind.names})
 
 
 @contextmanager
@@ -104,54 +121,30 @@ def _terminal() -> Iterator[Tell]:
 # ------------------------------------------------------------------------------- the examination
 
 
-def diagnose(
-    port: str,
-    calibration: Calibration | None,
-    wire_ohm: tuple[float, float] | None,
-    tell: Tell,
+def gather(
+    device: Device,
+    tell: Tell = lambda *told: None,
+    calibration: Calibration | None = None,
+    wire_ohm: tuple[float, float] | None = None,
     *,
-    press: bool,
-) -> Diagnosis:
-    """Examine the board at `port`. A port at which there is nothing to examine is a finding, too.
+    press: bool = False,
+) -> Evidence:
+    """What `examine` goes by, as far as the board lets. Leaves the board as it was.
 
-    :raises PortError: the URL is wrong.
     :raises ValueError: the calibration is of another unit or geometry, or somebody would be asked
         to press a skin of one row or column.
     """
-    try:
-        device = ohmskin.open(port, start=False)
-    except errors.OhmskinError as exc:
-        kind = _UNANSWERED.get(type(exc))
-        wrong_url = kind is Kind.PORT_UNUSABLE and ("://" in port or exc.__cause__ is None)
-        if kind is None or wrong_url:
-            raise
-        told = {"port": port, "problem": exc.problem, "remedy": exc.remedy}
-        values = {name: told[name] for name in kind.names}
-        return Diagnosis([Finding(kind, WHOLE_SKIN, values)])
-    with device:
-        board = device.info
-        evidence = Evidence(board, host_version=ohmskin.__version__)
-        # Wires of no resistance are none that could have changed.
-        evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
-        if calibration is not None:
-            calibration.check(board.unit_id, board.rows, board.columns)
-            evidence.rest_ratio = calibration.rest.ratio
-        path = port.partition("?")[0]
-        timer_ms = None if "://" in port else latency_ms(path)
-        if timer_ms is not None:
-            evidence.latency = timer_ms, str(latency_timer_file(path))
-        gather(device, evidence, tell, press=press)
-    return examine(evidence)
-
-
-def gather(
-    device: Device, evidence: Evidence, tell: Tell = lambda *told: None, *, press: bool = False
-) -> None:
-    """Read into `evidence` what `examine` goes by, as far as the board lets. Leave it as it was.
-
-    :raises ValueError: somebody would be asked to press a skin of one row or column.
-    """
-    presses = CornerScans(device.info) if press else None
+    board, path = device.info, device.name.partition("?")[0]
+    evidence = Evidence(board, host_version=ohmskin.__version__)
+    # Wires of no resistance are none that could have changed.
+    evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
+    if calibration is not None:
+        calibration.check(board.unit_id, board.rows, board.columns)
+        evidence.rest_ratio = calibration.rest.ratio
+    timer_ms = None if "://" in path else latency_ms(path)
+    if timer_ms is not None:
+        evidence.latency = timer_ms, str(latency_timer_file(path))
+    presses = CornerScans(board) if press else None
     try:
         tell("self-test")
         with suppress(errors.CommandRefused):  # a recording has none
@@ -170,6 +163,7 @@ def gather(
     except errors.DeviceLost as exc:
         evidence.board, evidence.lost = device.info, str(exc)
     evidence.stats = device.stats
+    return evidence
 
 
 def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
