@@ -5,7 +5,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -34,7 +33,7 @@ _UNANSWERED: Final = {
     errors.ProtocolMismatch: Kind.PROTOCOL_MISMATCH,
 }
 
-_out = Console(soft_wrap=True)
+_out = Console(soft_wrap=True, markup=False, highlight=False)
 # Says what is being done, and before it what a person is asked to press, if anything.
 Tell = Callable[..., None]
 
@@ -104,12 +103,12 @@ def _unanswered(port: str, error: errors.OhmskinError) -> Finding:
 @contextmanager
 def _terminal() -> Iterator[Tell]:
     """On a terminal, one line changes. Elsewhere each request is printed once, and no progress."""
-    console, said = Console(stderr=True), {""}
+    console, said = Console(stderr=True, markup=False, highlight=False), {""}
 
     def print_once(doing: str, request: str = "") -> None:
         if request not in said:
             said.add(request)
-            console.print(request, markup=False, highlight=False)
+            console.print(request)
 
     if not console.is_terminal:
         yield print_once
@@ -195,7 +194,7 @@ def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
         presses.take(scan)
         if presses.done or scan.host_time_s - begin_s >= WAIT_S:
             return
-        tell(words.pressed(presses), words.request(presses))
+        tell(*words.guidance(presses))
 
 
 # ----------------------------------------------------------------------------------- the page
@@ -219,7 +218,7 @@ def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
 
 def _print(page: dict[str, Any]) -> None:
     """What `as_object` has, for people."""
-    show = partial(_out.print, markup=False, highlight=False)
+    show = _out.print
     show(f"{page['port']}: {page['verdict']}")
     for number, finding in enumerate(page["findings"], start=1):
         severity, name = finding["severity"], finding["id"].replace("_", " ")

@@ -2,7 +2,6 @@
 """The words of ``ohmskin doctor``; those of each kind of finding are in ``doctor_words.toml``."""
 
 import tomllib
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,23 +12,19 @@ from ohmskin.link.protocol import ENUMS
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
 MOST_CELLS: Final = 6  # [cells] More are not named one by one.
 
+_TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
 _WIDE: Final = "not known: press with something smaller than a cell, further apart"
-
-
-@cache
-def _table() -> dict[str, Any]:
-    return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def words_of(finding: Finding) -> dict[str, str]:
     """What is told of a finding, by the names in `FIELDS`."""
     kind, place, values = finding.kind, finding.place, finding.values
     words = {"where": named(place), "one_place": place != WHOLE_SKIN, **values, **_words(finding)}
-    table = _table()[words.get("table", kind.id)]
-    told = {name: text for name, text in table.items() if isinstance(text, str)}
-    for case in table.keys() - told.keys():
+    table = _TABLES[words.get("table", kind.id)]
+    told = dict(table)
+    for case in table.keys() - FIELDS:
         if words.get(case) or case in words.values():
             told |= table[case]
     return {field: told[field].format(**words) for field in FIELDS}
@@ -135,14 +130,10 @@ def _ohm(share: WireShare, nominal_ohm: dict[str, float]) -> str:
     return f"{_times(share)}: top {top}, bottom {bottom} ohm a segment, if both changed alike"
 
 
-def request(presses: CornerScans) -> str:
-    """Where to press next."""
+def guidance(presses: CornerScans) -> tuple[str, str]:
+    """What is pressed meanwhile, and where to press next."""
     cells = " ".join(map(str, sorted(presses.wanted)))
-    return f"{'now' if presses.again else 'press firmly, at once:'} {cells}"
-
-
-def pressed(presses: CornerScans) -> str:
-    """What is pressed meanwhile."""
+    request = f"{'now' if presses.again else 'press firmly, at once:'} {cells}"
     if presses.hold:
-        return "hold still"
-    return f"pressed: {' '.join(map(str, presses.pressed)) or 'nothing'}"
+        return "hold still", request
+    return f"pressed: {' '.join(map(str, presses.pressed)) or 'nothing'}", request
