@@ -185,7 +185,7 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
     table = tmp_path / "skin.presses.csv"
     good = {"--grams": "50,100,200", "--indenter-mm2": "100"}
     for options, words in (
-        ({"--method": "voltage"}, ["presses are kept as conductances, which 'voltage'"]),
+        ({"--method": "voltage"}, ["a table has conductances, which 'voltage'"]),
         ({"--method": "magic"}, ["no method 'magic'", "joint"]),
         ({"--grams": "50,no"}, ["--grams '50,no': give weights above 0"]),
         ({"--grams": "50,-1"}, ["give weights above 0"]),
