@@ -36,6 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.files import naming, read_bounded, whole_file
+from ohmskin.force.curve import require_rows
 from ohmskin.record.readings import MAX_CELLS
 
 # An hour of a sensor at 1 kHz, with columns of other things.
@@ -64,20 +65,6 @@ _COLUMNS: Final = (*_NEEDED, "conductance_std")
 PRESS: Final = np.dtype([(name, np.int64 if name in _CELL else np.float64) for name in _COLUMNS])
 # Presses (n,), each of the type `PRESS`.
 PressTable = NDArray[np.void]
-# The largest value of each column, and what a message says of a value that is no such.
-_INDEX: Final = (MAX_CELLS - 1, f"it must be a whole number from 0 to {MAX_CELLS - 1}")
-_SIEMENS: Final = (
-    MAX_CONDUCTANCE,
-    "it must be 0 to 1 S: of microsiemens, write 1e-6 times as much",
-)
-_LIMITS: Final = {
-    "row": _INDEX,
-    "column": _INDEX,
-    "force_n": (MAX_NUMBER, "it must be 0 or more: zero the force sensor, or leave the row out"),
-    "conductance": _SIEMENS,
-    "conductance_std": _SIEMENS,
-}
-
 # What to do with a column of another unit, by the column that is missing.
 _UNITS: Final = {
     "time_s": " (seconds: 0.001 times milliseconds)",
@@ -108,15 +95,15 @@ class ForceLog:
         if time_s.size < MIN_SAMPLES:
             raise ValueError(f"too few samples: {time_s.size}, {MIN_SAMPLES} are needed")
         later = np.diff(time_s, prepend=-np.inf) > 0
-        _require(later, "time_s", time_s, "it must be later than the one before", rows)
+        require_rows("time_s", time_s, later, "later than the one before", rows)
         if np.ptp(force_n) == 0:
             raise ValueError(f"force_n is {force_n[0]:g} throughout: does the sensor measure?")
         limit = max(NEGATIVE_N, NEGATIVE_SHARE * float(force_n.max()))
         if np.count_nonzero(force_n < -limit) > np.count_nonzero(force_n > limit):
             least = float(force_n.min())
             raise ValueError(f"forces go down to {least:g} N, a press is negative: turn the sign")
-        must = f"below -{limit:.2g} N: zero the sensor"
-        _require(force_n >= -limit, "force_n", force_n, must, rows)
+        must = f"-{limit:.2g} N or more: zero the sensor"
+        require_rows("force_n", force_n, force_n >= -limit, must, rows)
 
     def at(self, time_s: ArrayLike) -> Float:
         """Force [N] at these times of the sensor's clock, of any shape: linear between samples.
@@ -158,11 +145,14 @@ def load_press_table(path: str | os.PathLike[str]) -> PressTable:
             raise ValueError("no press is in it")
         table = np.zeros(rows.size, PRESS)
         for name, values in columns.items():
-            most, must = _LIMITS[name]
-            good = (values >= 0) & (values <= most)
+            most, must = MAX_CONDUCTANCE, "0 to 1 S: of microsiemens, write 1e-6 times as much"
             if name in _CELL:
-                good &= values == np.floor(values)
-            _require(good, name, values, must, rows)
+                most, must = MAX_CELLS - 1, f"a whole number from 0 to {MAX_CELLS - 1}"
+            elif name == "force_n":
+                most, must = MAX_NUMBER, "0 or more: zero the force sensor, or leave the row out"
+            good = (values >= 0) & (values <= most)
+            good &= (name not in _CELL) | (values == np.floor(values))
+            require_rows(name, values, good, must, rows)
             table[name] = values
         return table
 
@@ -175,16 +165,6 @@ def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
     lines = [",".join(map(str, row)) for row in (_COLUMNS, *table.tolist())]
     with whole_file(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
-
-
-def _require(
-    good: NDArray[np.bool_], name: str, values: Float, must: str, rows: NDArray[np.int64] | None
-) -> None:
-    """Raise ValueError, naming the first value that is not good, and its row in the file if any."""
-    if not good.all():
-        at = int(np.argmin(good))
-        place = f"sample {at}" if rows is None else f"row {rows[at]}"
-        raise ValueError(f"{place}: {name} is {values[at]:.12g}, {must}")
 
 
 # ------------------------------------------------------------------------------------ CSV files

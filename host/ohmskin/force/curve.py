@@ -29,7 +29,7 @@ For a line d = a dx. For x^b with b < 1 the differential is infinite at rest, th
 """
 
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -162,3 +162,20 @@ def require(name: str, good: NDArray[np.bool_], what: str) -> None:
     if not good.all():
         row, column = (int(index) for index in np.argwhere(~good)[0])
         raise ValueError(f"{name} of cell ({row}, {column}) is {what}")
+
+
+def require_rows(
+    name: str,
+    values: NDArray[Any],
+    good: NDArray[np.bool_],
+    must: str,
+    rows: NDArray[np.int64] | None = None,
+) -> None:
+    """Raise ValueError, naming the first row where it is not so, by its number in `rows`, if told.
+
+    values, good, rows: (n,). must: what the value has to be.
+    """
+    if not good.all():
+        at = int(np.argmin(good))
+        row = at if rows is None else rows[at]
+        raise ValueError(f"row {row}: {name} is {values[at]:.12g}, it must be {must}")

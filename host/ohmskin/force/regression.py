@@ -57,6 +57,7 @@ from ohmskin.force.curve import (
     Curve,
     ForceModel,
     force_by,
+    require_rows,
     spread,
 )
 
@@ -365,10 +366,10 @@ def _checked(
         press=_array("press", np.arange(size) if press is None else press, size, np.intp),
     )
     hint = "0 or more: zero the force sensor, or leave the row out"
-    _require("force_n", rows.force, rows.force >= 0, hint)
-    _require("rise_std", rows.dx, rows.dx >= 0, "0 or more")
+    require_rows("force_n", rows.force, rows.force >= 0, hint)
+    require_rows("rise_std", rows.dx, rows.dx >= 0, "0 or more")
     on_skin = (rows.cell >= 0) & (rows.cell < shape[0] * shape[1])
-    _require("cells", rows.cell, on_skin, f"one of a {shape[0]}x{shape[1]} skin")
+    require_rows("cells", rows.cell, on_skin, f"one of a {shape[0]}x{shape[1]} skin")
     number = np.unique(rows.press).size
     if number < MIN_PRESSES:
         raise ValueError(f"too few presses: {number}, {MIN_PRESSES} are needed")
@@ -384,11 +385,5 @@ def _array(name: str, values: ArrayLike, size: int, dtype: Any = np.float64) -> 
     kinds, what = ("iu", "integers") if dtype is np.intp else ("iuf", "numbers")
     if array.dtype.kind not in kinds:
         raise ValueError(f"{name} holds {array.dtype}, it must hold {what}")
-    _require(name, array, np.isfinite(array), "finite")
+    require_rows(name, array, np.isfinite(array), "finite")
     return array.astype(dtype)
-
-
-def _require(name: str, values: NDArray[Any], good: NDArray[np.bool_], must: str) -> None:
-    if not good.all():
-        row = int(np.argmin(good))
-        raise ValueError(f"row {row}: {name} is {values[row]:g}, it must be {must}")
