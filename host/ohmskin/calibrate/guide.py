@@ -41,7 +41,7 @@ class State(Enum):
     """What a `Guide` waits for."""
 
     PUT = "put"
-    HOLD = "hold"
+    HOLD = "reading"
     WRONG = "wrong"
     TAKE_OFF = "take off"
     DONE = "done"

@@ -70,7 +70,7 @@ def weights(
     out: Out,
     grams: Annotated[str, typer.Option(help="the weights you have, in gram, such as 50,100")],
     indenter_mm2: Indenter,
-    repeats: Annotated[int, typer.Option(help="times each weight is put on each cell")] = 2,
+    repeats: Annotated[int, typer.Option(min=1, help="times each weight is put on each cell")] = 2,
     cells: Annotated[str, typer.Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
     redo: Annotated[
         list[str] | None, typer.Option(help="row,column: drop this cell's presses first")
@@ -88,8 +88,6 @@ def weights(
     """
     calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm, table=True)
     forces_n = [1e-3 * mass_g * GRAVITY for mass_g in _grams(grams)]
-    if repeats < 1:
-        raise ValueError(f"--repeats is {repeats}, it must be 1 or more")
     kept = _KeptPresses(table or out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         shape = skin.info.rows, skin.info.columns
@@ -335,64 +333,53 @@ class _KeptPresses:
 def _guided(
     skin: Device, calibrator: Calibrator, kept: _KeptPresses, missing: list[Press], total: int
 ) -> int:
-    """Ask for what is missing. Returns how much still is, after an interruption."""
-    guide, voice, left = Guide(missing), _Voice(total), len(missing)
-    rest = calibrator.rest_level
-    with until_stopped() as watched, voice.bar:
+    """Ask for what is missing. Returns how much still is, after an interruption.
+
+    Lines say what to do next. A terminal also gets a bar, and a bell for each press.
+    """
+    guide, rest = Guide(missing), calibrator.rest_level
+    done, said = total - len(missing), ""
+    columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
+    bar = Progress(*columns, console=_out, transient=True, disable=not _out.is_terminal)
+    task = bar.add_task("", total=total)
+    with until_stopped() as watched, bar:
         for scan in watched(iter(skin.latest, None)):
             found = calibrator.estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
             if step.wanted is not None and step.rise is not None:
                 kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
-                left -= 1
-            voice.say(step, total - left)
+                done += 1
+                _out.bell()
+            line, now = _said_of(step)
+            if line and line != said:
+                counted = f"{done} of {total}: " if step.rise is not None else ""
+                _out.print(counted + line, markup=False, highlight=False)
+                said = line
+            bar.update(task, completed=done, description=now)
             if step.state is State.DONE:
                 break
-    return left
+    return total - done
 
 
-class _Voice:
-    """Says what to do next, by lines; in a terminal also by a bar, and a bell for each press."""
-
-    def __init__(self, total: int) -> None:
-        self._total = total
-        self._said = ""
-        self.bar = Progress(
-            BarColumn(20),
-            MofNCompleteColumn(),
-            TextColumn("{task.description}", markup=False),
-            console=_out,
-            transient=True,
-            disable=not _out.is_terminal,
-        )
-        self._task = self.bar.add_task("", total=total)
-
-    def say(self, step: Step, done: int) -> None:
-        """Say what a scan has led to; nothing twice."""
-        line, press = "", step.wanted
-        if step.rise is not None:
-            _out.bell()
-            line = (
-                f"{done} of {self._total}: {1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} "
-                "microsiemens above rest: take it off"
-            )
-        elif press is not None and step.state is State.PUT:
-            weight = f"{1e3 * press.force_n / GRAVITY:.6g} g ({press.force_n:.3f} N)"
-            row, column = press.cell
-            line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
-        elif press is not None and step.state is State.WRONG:
-            cells = ", ".join(map(str, step.cells))
-            pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"
-            line = f"{pressed} pressed: put the weight on {press.cell} alone"
-        if line and line != self._said:
-            _out.print(line, markup=False, highlight=False)
-            self._said = line
-        now = "" if step.state is State.DONE else step.state.value
-        if step.state is State.HOLD:
-            now = "reading"
-            if step.change is not None:
-                now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
-        self.bar.update(self._task, completed=done, description=now)
+def _said_of(step: Step) -> tuple[str, str]:
+    """What to do next, empty where nothing changes, and what goes on meanwhile."""
+    press, line, now = step.wanted, "", step.state.value
+    if press is None:
+        return "", ""
+    if step.rise is not None:
+        rise = f"{1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} microsiemens above rest"
+        line = f"{rise}: take it off"
+    elif step.state is State.PUT:
+        weight = f"{1e3 * press.force_n / GRAVITY:.6g} g ({press.force_n:.3f} N)"
+        row, column = press.cell
+        line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
+    elif step.state is State.WRONG:
+        cells = ", ".join(map(str, step.cells))
+        pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"
+        line = f"{pressed} pressed: put the weight on {press.cell} alone"
+    elif step.change is not None:
+        now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
+    return line, now
 
 
 def _grams(text: str) -> list[float]:
