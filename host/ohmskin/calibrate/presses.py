@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.tables import ForceLog, PressTable
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.reader import now
 from ohmskin.force.regression import ForceRegression
 from ohmskin.link.clock import scan_times_s
-from ohmskin.link.messages import Scan
+from ohmskin.link.messages import Hello, Scan
 
 # So many scans without touch may interrupt a press: a light touch flickers about its threshold.
 FLICKER_SCANS: Final = 3
@@ -183,20 +184,21 @@ def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]
 class Calibrator:
     """Makes the calibration of one skin.
 
-    knowledge: of that skin, with the readings of the untouched skin and the nominal wires. method:
-    what its cells are estimated by. indenter_area_m2: area that it is pressed with [m^2]. unit_id:
-    the board's. date: of the calibration, ISO 8601. estimator: by that method. rest_level (R, C):
-    what it shows of the untouched skin [S, or 1 for `voltage`].
+    board: that scans it. rest_ratio: readings (R, C, 4) of the untouched skin. method: what its
+    cells are estimated by. indenter_area_m2: area that it is pressed with [m^2]. nominal_wire_ohm:
+    as far as it is known. estimator: by that method. rest_level (R, C): what it shows of the
+    untouched skin [S, or 1 for `voltage`].
     """
 
-    knowledge: SkinKnowledge
+    board: Hello
+    rest_ratio: Float
     method: str
     indenter_area_m2: float
-    unit_id: int
-    date: str
+    nominal_wire_ohm: WireOhm = NO_WIRES
 
     def __post_init__(self) -> None:
-        self.estimator = make_estimator(self.method, self.knowledge)
+        self._knowledge = SkinKnowledge.of(self.board, self.rest_ratio, self.nominal_wire_ohm)
+        self.estimator = make_estimator(self.method, self._knowledge)
         self.rest_level = self.estimator.rest_level()
 
     def measure(
@@ -219,7 +221,7 @@ class Calibrator:
 
         Raises ValueError, naming the row, for a cell that is not on the skin.
         """
-        rows, columns = self.knowledge.rows, self.knowledge.columns
+        rows, columns = self.board.rows, self.board.columns
         for number, (row, column) in enumerate(table[["row", "column"]].tolist(), start=2):
             with naming(f"row {number}"):
                 check_cell(row, column, (rows, columns))
@@ -251,13 +253,14 @@ class Calibrator:
                 f"all presses are on cell {tuple(pressed[0])}: press at least one more, which "
                 "tells how much cells differ"
             )
+        date = now()
         calibration = Calibration(
-            unit_id=self.unit_id,
-            date=self.date,
+            unit_id=self.board.unit_id,
+            date=date,
             method=self.method,
-            rest=Rest.of(self.method, self.knowledge, self.date),
+            rest=Rest.of(self.method, self._knowledge, date),
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
-            nominal_wire_ohm=self.knowledge.nominal_wire_ohm,
+            nominal_wire_ohm=self.nominal_wire_ohm,
         )
         return calibration, found.message_

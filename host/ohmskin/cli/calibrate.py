@@ -26,10 +26,10 @@ from ohmskin.calibrate.tables import (
 )
 from ohmskin.cli.record import cell_table, until_stopped
 from ohmskin.errors import RecordingError
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import naming
-from ohmskin.force.reader import DEFAULT_METHOD, TARE_S, now
+from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.force.regression import MIN_PRESSES
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
@@ -145,7 +145,11 @@ def recording(
         raise RecordingError(f"{recording}: no scan in it")
     log = None if forces is None else load_force_log(forces)
     with naming(recording):
-        log = log or _force_log(given)
+        if log is None and not given.forces:
+            raise ValueError("no force in it: say --forces LOG.csv")
+        if log is None:  # the scans have the same clock
+            samples = np.array([(each.host_time_s, each.force_n) for each in given.forces])
+            log = ForceLog(*samples.T)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s))
         history = calibrator.measure(given.scans, _with_progress)
         alignment = align(history.time_s, history.of_skin, log)
@@ -237,20 +241,8 @@ def _options(
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     if out.is_dir() or not out.parent.is_dir():
         raise ValueError(f"{out}: cannot be written: say a file in a directory there is")
-
-    def calibrator_of(board: Hello, rest_ratio: Float) -> Calibrator:
-        knowledge = SkinKnowledge.of(board, rest_ratio, wires)
-        return Calibrator(knowledge, method, 1e-6 * indenter_mm2, board.unit_id, now())
-
-    return calibrator_of
-
-
-def _force_log(given: Recording) -> ForceLog:
-    """The forces of a recording, whose scans have the same clock."""
-    if not given.forces:
-        raise ValueError("no force in it: say --forces LOG.csv")
-    time_s, force_n = np.array([(each.host_time_s, each.force_n) for each in given.forces]).T
-    return ForceLog(time_s, force_n)
+    area_m2 = 1e-6 * indenter_mm2
+    return lambda board, rest: Calibrator(board, rest, method, area_m2, wires)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
