@@ -78,22 +78,22 @@ class ForceModel:
                 raise ValueError(f"{field.name} has shape {array.shape}, kind {shape}")
         power = self.kind == POWER
         require("kind", power | (self.kind == LINEAR), f"neither {LINEAR} nor {POWER}")
-        for name in ("slope", "exponent", "intercept", "correlation"):
-            require(name, np.isfinite(getattr(self, name)), "not finite")
+        require("slope", (self.slope > 0) & np.isfinite(self.slope), "not above 0")
+        require("intercept", np.isfinite(self.intercept), "not finite")
+        require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
+        inside = (self.exponent >= MIN_EXPONENT) & (self.exponent <= MAX_EXPONENT)
+        require("exponent", inside, f"not in {MIN_EXPONENT:g}..{MAX_EXPONENT:g}")
         for name in ("slope_std", "exponent_std", "intercept_std"):
             std = getattr(self, name)
             require(name, np.isfinite(std) & (std >= 0), "not finite and >= 0")
         for name in ("residual_std", "residual_share", "held_out_rmse"):
             known = getattr(self, name)
             require(name, np.isnan(known) | (np.isfinite(known) & (known >= 0)), "negative or inf")
-        require("slope", self.slope > 0, "not above 0")
-        require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
-        inside = (self.exponent >= MIN_EXPONENT) & (self.exponent <= MAX_EXPONENT)
-        require("exponent", inside, f"not in {MIN_EXPONENT:g}..{MAX_EXPONENT:g}")
-        require("exponent", power | (self.exponent == 1), "not 1, as of a linear cell")
-        require("exponent_std", power | (self.exponent_std == 0), "not 0, as of a linear cell")
-        require("intercept", ~power | (self.intercept == 0), "not 0, as of a power law")
-        require("intercept_std", ~power | (self.intercept_std == 0), "not 0, as of a power law")
+        for name, fixed in (("exponent", 1), ("exponent_std", 0)):
+            good = power | (getattr(self, name) == fixed)
+            require(name, good, f"not {fixed}, as of a linear cell")
+        for name in ("intercept", "intercept_std"):
+            require(name, ~power | (getattr(self, name) == 0), "not 0, as of a power law")
 
     def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
         """Force and its standard deviation [N], each (R, C), of rises above rest (R, C).

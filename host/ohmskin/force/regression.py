@@ -229,12 +229,12 @@ def fit_power(
     covariance = to_si @ np.linalg.pinv(jacobian.T @ jacobian) @ to_si.T
     covariance *= _square(force - a * z**b, weight, 2)
     a_std, b_std = np.sqrt(np.diag(covariance)).tolist()
-    product = a_std * b_std
+    both_std = a_std * b_std
     return Curve(
         *(POWER, a * unit**-b, a_std),
         exponent=b,
         exponent_std=b_std,
-        correlation=float(np.clip(covariance[0, 1] / product, -1, 1)) if product > 0 else 0.0,
+        correlation=float(np.clip(covariance[0, 1] / both_std, -1, 1)) if both_std else 0.0,
     )
 
 
