@@ -24,7 +24,7 @@ _COMMANDS: Final = {
     "flash.flash": "Build the firmware, write it to a board, and check that it answers.",
     "stream.stream": "Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it.",
     "view.view": "Show skins live on a page in the browser: heat map, contacts, tare, recording.",
-    "tare.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
+    "calibrate.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
     "touch it.",
     "doctor.doctor": "Say what is wrong with the skin board at PORT, and what to do. Touch "
     "nothing meanwhile.",
