@@ -2,6 +2,7 @@
 """An emulated board in simulated time, with as much of a `Device` as the doctor needs."""
 
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 
 from ohmskin.cli.doctor import Ask, gather
@@ -54,7 +55,7 @@ class Bench(Closing):
 
     @property
     def stats(self) -> BoardStats:
-        return self._decoder.snapshot()
+        return deepcopy(self._decoder.stats)
 
     def self_test(self) -> SelfTestReport:
         self.ask("self_test")

@@ -18,7 +18,7 @@ import ohmskin
 from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
-from ohmskin.link import device, feed, framing, protocol
+from ohmskin.link import device, framing, protocol, source
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
@@ -346,7 +346,7 @@ def test_a_moving_scene_moves_in_the_simulator_too() -> None:
 
 @pytest.mark.parametrize("fault", ["", "&drop=0.2"])
 def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(source, "QUEUE_SCANS", 16)
     link = SteppedLink(f"emulator://1x1?rate=1000{fault}")
     with Device(Session(link)) as skin:
         slow, quick = iter(skin), iter(skin)
@@ -370,7 +370,7 @@ def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.Mo
 def test_an_iterator_never_used_costs_nothing(
     fast: ohmskin.Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(source, "QUEUE_SCANS", 16)
     unused = iter(fast)
     until(lambda: fast.stats.overflowed > 0)  # while somebody may still use it
     del unused
@@ -378,6 +378,7 @@ def test_an_iterator_never_used_costs_nothing(
     before = fast.stats
     until(lambda: fast.stats.scans > before.scans + 100)
     assert fast.stats.overflowed <= before.overflowed + 1
+    assert fast.stats.line.frames > before.line.frames + 100  # `before` is a copy
 
 
 def test_latest_after_close_is_no_old_scan(fast: ohmskin.Device) -> None:

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What gives scans, as programs see it: a board, or a recording that is played."""
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 import numpy as np
 
@@ -12,42 +10,12 @@ from ohmskin.arrays import Float
 from ohmskin.errors import DeviceLost
 from ohmskin.files import Closing
 from ohmskin.link import protocol
-from ohmskin.link.feed import ScanFeed
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 from ohmskin.link.session import COMMAND_TRIES, configuration
+from ohmskin.link.source import Source
 
 # A device that should scan and is silent for so long counts as lost [s].
 SILENCE_TIMEOUT_S = 5.0
-
-
-class Source(Protocol):
-    """What a `Device` is made of: a board's `Session`, or a recording.
-
-    feed: its scans. report: of the last self-test. want_scans: it is to scan. commands: held for
-    as long as one command, or a few that belong together, take.
-    """
-
-    feed: ScanFeed
-    commands: threading.RLock
-    report: SelfTestReport | None
-    want_scans: bool
-
-    @property
-    def hello(self) -> Hello:
-        """What it has last said of itself."""
-
-    @property
-    def stats(self) -> BoardStats:
-        """Counts since the connection was made, as a copy."""
-
-    def command(self, name: str, **values: protocol.Value) -> None:
-        """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
-
-    def refresh(self) -> Hello:
-        """Ask for `hello` anew."""
-
-    def close(self) -> None:
-        """Give the port or file back. May be called again."""
 
 
 class Device(Closing):
@@ -60,7 +28,6 @@ class Device(Closing):
 
     def __init__(self, source: Source, *, start: bool = True) -> None:
         self._source = source
-        self._feed = source.feed
         self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
         if start:
             try:
@@ -84,18 +51,18 @@ class Device(Closing):
     @property
     def name(self) -> str:
         """The port's name."""
-        return self._feed.name
+        return self._source.name
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan from now on; ``missed`` of each counts what was lost before it.
 
-        An iterator that falls behind by more than `feed.QUEUE_SCANS` loses the oldest scans, which
-        are counted too. It ends with the recording at a ``replay://`` port.
+        An iterator that falls behind by more than `source.QUEUE_SCANS` loses the oldest scans,
+        which are counted too. It ends with the recording at a ``replay://`` port.
 
         :raises DeviceLost: the board went away, or said nothing for `SILENCE_TIMEOUT_S`.
         """
         self.start()
-        return self._feed.scans(self._silence_s)
+        return self._source.scans(self._silence_s)
 
     def latest(self, timeout_s: float | None = None) -> Scan:
         """The newest scan. Each is given once: waits for the next if this one was given already.
@@ -105,7 +72,7 @@ class Device(Closing):
         :raises DeviceLost: the board went away, or no scan came in time.
         """
         self.start()
-        return self._feed.latest(self._silence_s() if timeout_s is None else timeout_s)
+        return self._source.latest(self._silence_s() if timeout_s is None else timeout_s)
 
     def mean_ratio(self, seconds: float) -> Float:
         """Mean readings of the coming scans, shape (R, C, 4): of so many seconds, at least one.
@@ -138,7 +105,7 @@ class Device(Closing):
                 return
             for _ in range(COMMAND_TRIES):
                 self._restore()
-                self._feed.forget_newest()
+                self._source.forget_newest()
                 source.command("start")
                 # The hello of a reset that came in between was read before this ack.
                 if self._is_as_wanted():
@@ -228,7 +195,7 @@ class Device(Closing):
             try:
                 yield
             finally:
-                if was_scanning and self._feed.failure is None:
+                if was_scanning and self._source.failure is None:
                     self.start()
 
     def _is_as_wanted(self) -> bool:

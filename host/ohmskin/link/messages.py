@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board says, as Python objects. They are decoded from bytes, without port or thread."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -230,7 +230,3 @@ class BoardDecoder:
         time_us = counter_us + _COUNTER_SPAN * round((expected_us - counter_us) / _COUNTER_SPAN)
         near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + _RATE_ERROR * elapsed_us
         return time_us if near else counter_us
-
-    def snapshot(self) -> BoardStats:
-        """The counts now, as a copy."""
-        return replace(self.stats, line=replace(self.stats.line))
