@@ -53,15 +53,11 @@ _INTEGER: Final = {"type": "integer"}
 _TEXT: Final = {"type": "string"}
 _HOST_TIME: Final = {"type": "number", "description": "host's monotonic clock [s]"}
 _SIZE: Final = {"rows": _INTEGER, "columns": _INTEGER}
+_OF_TYPE: Final[dict[object, dict[str, Any]]] = {str: _TEXT, int: _INTEGER}
 SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     "hello": {
         "host_time_s": _HOST_TIME,
-        **{
-            f.name: {"str": _TEXT, "int": _INTEGER}.get(
-                str(f.type), {"type": "array", "items": _TEXT}
-            )
-            for f in fields(Hello)
-        },
+        **{f.name: _OF_TYPE.get(f.type, {"type": "array", "items": _TEXT}) for f in fields(Hello)},
     },
     "scan": {
         "number": {"type": "integer", "description": "of the scan since the board was started"},
@@ -283,9 +279,9 @@ def _hello(content: dict[str, Any]) -> Hello:
             # 60,000 cycles, unless a settle time was asked for.
             readings = values["rows"] * values["columns"] * values["readings_per_cell"]
             values[each.name] = min(values["scan_cycles"] // max(readings, 1), 60_000)
-        elif each.type == "int":
+        elif each.type is int:
             values[each.name] = _integer(content, each.name)
-        elif each.type == "str":
+        elif each.type is str:
             values[each.name] = str(content[each.name])
         else:
             values[each.name] = tuple(map(str, content[each.name]))
