@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.files import naming, read_bounded, whole_file
+from ohmskin.files import naming, read_bounded, save_table
 from ohmskin.record.readings import MAX_CELLS
 
 # An hour of a sensor at 1 kHz, with columns of other things.
@@ -174,12 +174,7 @@ def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
 
     Raises ValueError if it cannot be written.
     """
-    with whole_file(path) as file:
-        text = io.TextIOWrapper(file, encoding="ascii", newline="", write_through=True)
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows(table.tolist())
-        text.detach()
+    save_table(path, _COLUMNS, table.tolist())
 
 
 def _require(

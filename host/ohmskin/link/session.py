@@ -8,7 +8,6 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
-from itertools import count
 
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import framing, protocol
@@ -70,15 +69,16 @@ class Session(Source):
 
     def _connect(self) -> None:
         deadline = time.monotonic() + CONNECT_TIMEOUT_S
-        for tries in count(1):
+        tries = 0
+        while self._hello is None:
+            tries += 1
             # A board that was left at the other speed answers there; most never were.
             speed = "baud_fast" if tries % 5 == 0 else "baud_default"
             self._link.set_baud(protocol.CONSTANTS[speed])
             self._send("get_hello")
             with self.changed:
-                if self.wait(lambda: self._hello is not None, _HELLO_EVERY_S):
-                    return
-            if time.monotonic() > deadline:
+                greeted = self.wait(lambda: self._hello is not None, _HELLO_EVERY_S)
+            if not greeted and time.monotonic() > deadline:
                 speaks = self._decoder.stats.line.octets > 0
                 raise DeviceSilent(
                     f"{self.name} {'sends bytes that are no frames' if speaks else 'is silent'}: "
