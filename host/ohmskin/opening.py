@@ -29,12 +29,11 @@ from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import protocol
-from ohmskin.link.clock import BoardClock
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import Link, SerialLink, serial_ports
 from ohmskin.link.session import Session
-from ohmskin.link.timing import line_delay_s, scan_s
 
 if TYPE_CHECKING:
     from ohmskin.emulate.board import EmulatedBoard

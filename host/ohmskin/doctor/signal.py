@@ -34,9 +34,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
+from ohmskin.link.clock import reading_offsets_s, slot_s
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
-from ohmskin.link.timing import reading_offsets_s, slot_s
 
 Bool = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
