@@ -115,10 +115,18 @@ def open_device(url: str, *, start: bool = True) -> Device:
 
         options = _options(url, query, ("speed",))
         try:
-            return Device(Replay(place, float(options.get("speed", "1")), url), start=start)
+            device: Device = Replay(place, float(options.get("speed", "1")), url)
         except ValueError as exc:
             raise PortError(f"{url}: {exc}") from exc
-    return Device(Session(*open_link(url)), start=start)
+    else:
+        device = Session(*open_link(url))
+    try:
+        if start:
+            device.start()
+    except BaseException:
+        device.close()
+        raise
+    return device
 
 
 def open_link(url: str) -> tuple[Link, int | None]:

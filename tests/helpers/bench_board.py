@@ -10,8 +10,8 @@ from ohmskin.doctor.examine import Evidence
 from ohmskin.emulate.line_faults import Faults
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
+from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, BoardStats, Hello, Message, Scan, SelfTestReport
-from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The conversation with a board: one thread reads, and commands wait for their answers.
-
-Programs use `ohmskin.link.device.Device`, which has a session.
-"""
+"""The conversation with a board: one thread reads, and commands wait for their answers."""
 
 import threading
 import time
@@ -11,6 +8,7 @@ from dataclasses import replace
 
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import framing, protocol
+from ohmskin.link.device import COMMAND_TRIES, Device, configuration
 from ohmskin.link.messages import (
     Ack,
     BoardDecoder,
@@ -21,7 +19,6 @@ from ohmskin.link.messages import (
     SelfTestReport,
 )
 from ohmskin.link.serial_port import Link
-from ohmskin.link.source import Source
 
 # Opening a port resets some boards, which are then silent for up to 3 s.
 CONNECT_TIMEOUT_S = 4.0
@@ -29,13 +26,11 @@ CONNECT_TIMEOUT_S = 4.0
 _HELLO_EVERY_S = 0.3
 # Time that a board has for its answer, besides the rest of a scan [s].
 _COMMAND_TIMEOUT_S = 1.0
-# Times that a command is sent before the board counts as lost.
-COMMAND_TRIES = 3
 # A scanning board that sends no valid frame for so long is asked who it is [s].
 _SPEED_LOST_S = 2.5
 
 
-class Session(Source):
+class Session(Device):
     """A board at a `Link` that has said hello. One that is reset while it scans is started again.
 
     baud: speed of the line to change to.
@@ -56,13 +51,13 @@ class Session(Source):
         self._thread.start()
         try:
             self._connect()
-            if self.hello.scanning:
-                self.command("stop")
-                self.refresh()
-            if baud is not None and baud != self.hello.baud:
-                self.command("set_baud", baud=baud)
+            if self.info.scanning:
+                self._command("stop")
+                self._refresh()
+            if baud is not None and baud != self.info.baud:
+                self._command("set_baud", baud=baud)
                 link.set_baud(baud)
-                self.refresh()
+                self._refresh()
         except BaseException:
             self.close()
             raise
@@ -76,8 +71,8 @@ class Session(Source):
             speed = "baud_fast" if tries % 5 == 0 else "baud_default"
             self._link.set_baud(protocol.CONSTANTS[speed])
             self._send("get_hello")
-            with self.changed:
-                greeted = self.wait(lambda: self._hello is not None, _HELLO_EVERY_S)
+            with self._changed:
+                greeted = self._wait(lambda: self._hello is not None, _HELLO_EVERY_S)
             if not greeted and time.monotonic() > deadline:
                 speaks = self._decoder.stats.line.octets > 0
                 raise DeviceSilent(
@@ -90,13 +85,13 @@ class Session(Source):
         """Stop the board and give the port back. May be called again."""
         if self._closing:
             return
-        if self.want_scans and self.failure is None:
+        if self._want_scans and self._failure is None:
             with suppress(OhmskinError):  # it may be gone already
                 self._send("stop")
         self._closing = True
         self._thread.join()
         self._link.close()
-        self.want_scans = False
+        self._want_scans = False
         super().close()
 
     # ------------------------------------------------------------------------------ commands
@@ -105,25 +100,25 @@ class Session(Source):
         """Send a command and return its sequence number; nothing waits for the answer."""
         frame = protocol.FRAMES[name]
         payload = frame.pack(**values)
-        with self.changed:
+        with self._changed:
             self._sequence = (self._sequence + 1) & 0xFF
             sequence = self._sequence
             self._acks.pop(sequence, None)
         self._link.write(framing.encode(frame.id, sequence, payload))
         return sequence
 
-    def command(self, name: str, **values: protocol.Value) -> None:
+    def _command(self, name: str, **values: protocol.Value) -> None:
         """Send until it is answered: every command may be repeated without harm.
 
         :raises CommandRefused: the board's answer is not ok.
         :raises DeviceLost: there is none.
         """
-        with self.commands:
-            limit_s = _COMMAND_TIMEOUT_S + 1 / self.hello.rate_hz  # it waits for the scan's end
+        with self._commands:
+            limit_s = _COMMAND_TIMEOUT_S + 1 / self.info.rate_hz  # it waits for the scan's end
             for _ in range(COMMAND_TRIES):
                 sequence = self._send(name, **values)
-                with self.changed:
-                    if self.wait(lambda: sequence in self._acks, limit_s):  # noqa: B023
+                with self._changed:
+                    if self._wait(lambda: sequence in self._acks, limit_s):  # noqa: B023
                         ack = self._acks.pop(sequence)
                         break
             else:
@@ -141,40 +136,40 @@ class Session(Source):
                 chunk = self._link.read()
                 if chunk and self._take(chunk):
                     heard_s = time.monotonic()
-                elif self.want_scans and time.monotonic() - heard_s > _SPEED_LOST_S:
+                elif self._want_scans and time.monotonic() - heard_s > _SPEED_LOST_S:
                     # A board that was reset is back at its default speed.
                     heard_s = time.monotonic()
                     self._link.set_baud(protocol.CONSTANTS["baud_default"])
                     self._send("get_hello")
         except OhmskinError as exc:
-            self.fail(exc)
+            self._fail(exc)
 
     def _take(self, chunk: bytes) -> bool:
         host_time_s = time.monotonic()
-        with self.changed:
+        with self._changed:
             messages = self._decoder.feed(chunk, host_time_s)
             for message in messages:
                 self._keep(message)
             if messages:
-                self.changed.notify_all()
+                self._changed.notify_all()
         return bool(messages)
 
     def _keep(self, message: Message) -> None:
         match message:
             case Scan():
-                self.publish(message)
+                self._publish(message)
             case Ack():
                 self._acks[message.command_sequence] = message
             case SelfTestReport():
-                self.report = message
-            case Hello() if self.want_scans and not message.scanning:
+                self._report = message
+            case Hello() if self._want_scans and not message.scanning:
                 # It was reset: bring it back to where it was.
                 self._stats.restarts += 1
                 self._resume(message)
             case Hello():
                 self._hello = message
             case ForeignHello():
-                self.fail(
+                self._fail(
                     ProtocolMismatch(
                         f"{self.name}: board speaks layout 0x{message.layout_crc:04X}, this host "
                         f"0x{protocol.LAYOUT_CRC:04X}",
@@ -183,7 +178,7 @@ class Session(Source):
                 )
 
     def _resume(self, restarted: Hello) -> None:
-        before = self.hello
+        before = self.info
         self._send("configure", **configuration(before))
         self._hello = replace(
             before,
@@ -193,14 +188,3 @@ class Session(Source):
             reset_cause=restarted.reset_cause,
         )
         self._send("start")
-
-
-def configuration(board: Hello) -> dict[str, protocol.Value]:
-    """What `configure` would have to say for a board to scan as this one does."""
-    return {
-        "rows": board.rows,
-        "columns": board.columns,
-        "rate_mhz": board.rate_asked_mhz,
-        "settle_us": board.settle_asked_us,
-        "adc_prescaler": board.adc_prescaler,
-    }

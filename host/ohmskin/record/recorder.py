@@ -98,10 +98,10 @@ class Recorder(Closing):
         """
         name = next(name for name, kind in KINDS.items() if isinstance(message, kind))
         content = {"host_time_s": time.monotonic(), **vars(message)}
-        for key, value in vars(message).items():
-            if isinstance(value, np.ndarray):  # codes or ratios (R, C, 4)
-                rows, columns, _ = value.shape
-                content |= {"rows": rows, "columns": columns, key: value.reshape(-1).tolist()}
+        for array in {"codes", "rest_ratio"} & SCHEMAS[name].keys():
+            readings = content[array]
+            rows, columns, _ = readings.shape
+            content |= {"rows": rows, "columns": columns, array: readings.reshape(-1).tolist()}
         number = content.get("number", 0) & 0xFFFFFFFF
         content = {key: content[key] for key in SCHEMAS[name]}
         octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()

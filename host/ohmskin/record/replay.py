@@ -27,8 +27,8 @@ from ohmskin.errors import (
     RecordingError,
 )
 from ohmskin.link import protocol
+from ohmskin.link.device import QUEUE_SCANS, Device
 from ohmskin.link.messages import BoardStats, Hello, Scan
-from ohmskin.link.source import Source
 from ohmskin.record.recording import Tare, messages
 
 # Longest time between two scans of a replay [s]: shorter than the silence of a lost board.
@@ -37,10 +37,10 @@ LONGEST_PAUSE_S: Final = 2.0
 _LOOK_EVERY_S: Final = 0.2
 
 
-class Replay(Source):
+class Replay(Device):
     """Plays the recording `path`, `speed` times as fast as it came; 0: as fast as it is taken.
 
-    name: as it was opened. hello: what the board had said when the last scan came.
+    name: as it was opened. info: what the board had said when the last scan came.
 
     :raises RecordingError: it cannot be read.
     :raises PortError: it was made with another converter than this protocol knows.
@@ -68,7 +68,7 @@ class Replay(Source):
         self._thread = threading.Thread(target=self._play, name=f"play {path}", daemon=True)
         self._thread.start()
 
-    def command(self, name: str, **values: protocol.Value) -> None:
+    def _command(self, name: str, **values: protocol.Value) -> None:
         """Start or stop.
 
         :raises CommandRefused: a recording can do nothing else.
@@ -76,17 +76,17 @@ class Replay(Source):
         if name not in ("start", "stop"):
             reason = f"{self.name} is a recording, which stays as it is"
             raise CommandRefused(name, "recorded", reason)
-        with self.changed:
-            if self.failure is not None:
-                raise self.failure
+        with self._changed:
+            if self._failure is not None:
+                raise self._failure
             self._running, self._last = name == "start", None
-            self.changed.notify_all()
+            self._changed.notify_all()
 
     def close(self) -> None:
         """End the replay. May be called again."""
-        with self.changed:
+        with self._changed:
             self._closing = True
-            self.changed.notify_all()
+            self._changed.notify_all()
         self._thread.join()
         self._messages.close()
         super().close()
@@ -111,23 +111,23 @@ class Replay(Source):
                         error = RecordingEnded(f"{self.name} has been played to its end")
         except RecordingError as exc:
             error = exc
-        self.fail(error)
+        self._fail(error)
 
     def _play_scan(self, scan: Scan) -> None:
         if int(scan.codes.max()) >> protocol.ADC_BITS:
             raise RecordingError(f"{self.name}: scan {scan.number} has a code beyond the converter")
-        with self.changed:
+        with self._changed:
             self._stats.scans += 1
             self._stats.missed += scan.missed
-            self.publish(replace(scan, host_time_s=time.monotonic()))
+            self._publish(replace(scan, host_time_s=time.monotonic()))
 
     def _wait_for(self, message: Hello | Scan) -> bool:
         """Wait until somebody reads, and until a scan is due: False if the replay was closed."""
-        with self.changed:
+        with self._changed:
             while not self._closing:
                 now_s = due_s = time.monotonic()
-                waits = self._speed == 0 and self.is_behind
-                if waits or not (self._running and self.asked):
+                waits = self._speed == 0 and self._readers_are_behind()
+                if waits or not (self._running and self._asked):
                     due_s = float("inf")
                 elif isinstance(message, Scan) and self._speed and self._last is not None:
                     pause_s = (message.host_time_s - self._last[1]) / self._speed
@@ -136,5 +136,11 @@ class Replay(Source):
                     if isinstance(message, Scan):
                         self._last = (due_s, message.host_time_s)
                     return True
-                self.changed.wait(min(due_s - now_s, _LOOK_EVERY_S))
+                self._changed.wait(min(due_s - now_s, _LOOK_EVERY_S))
         return False
+
+    def _readers_are_behind(self) -> bool:
+        """Whether they have not yet taken what was published."""
+        if self._queues:
+            return any(len(queue) >= QUEUE_SCANS // 2 for queue in self._queues.values())
+        return self._newest is not None
