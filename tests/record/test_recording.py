@@ -29,10 +29,17 @@ from command_line import Done, assert_one_line
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
-from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
-from ohmskin.record.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
+from ohmskin.record.recording import (
+    ForceSample,
+    Mark,
+    Recording,
+    Tare,
+    export,
+    load_recording,
+    messages,
+)
 from waiting import until
 
 pytestmark = pytest.mark.usefixtures("nothing_left")

@@ -38,7 +38,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.link import protocol
-from ohmskin.link.framing import cobs_encode
+from ohmskin.link.framing import MAX_BLOCK, cobs_encode
 from ohmskin.link.messages import Hello, Scan
 
 # Board time of the points that a line is fitted to [s]. A ceramic resonator that warms drifts by up
@@ -59,8 +59,6 @@ _JITTER_PERCENT: Final = 95
 _JITTER_SCANS: Final = 2048
 # A byte takes ten bits on a line of 8N1: a start bit, eight data bits and a stop bit.
 _BITS_PER_BYTE: Final = 10
-# Length byte of a COBS block that is full: no zero stands for its end.
-_FULL_BLOCK: Final = 0xFF
 # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
 _UNKNOWN_CRC: Final = b"\x01\x01"
 # The last conversion and the pass of the main loop that packs its cell [s]: 0.1 ms fits the built
@@ -109,7 +107,7 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     known_byte_s = scan_s(board) / len(codes)
     delay_s, at, unknown = 0.0, 0, len(header) + len(codes)
     while at < len(wire):
-        unknown -= wire[at] - (wire[at] == _FULL_BLOCK)
+        unknown -= wire[at] - (wire[at] == MAX_BLOCK)  # no zero stands for the end of a full block
         line_s = (len(wire) + 1 - at) * byte_s
         delay_s = max(delay_s, line_s - max(unknown, 0) * known_byte_s)
         at += wire[at]

@@ -260,8 +260,7 @@ class Device(Closing):
         with self._changed:
             self._newest = None
             if self._failure is None or isinstance(self._failure, RecordingEnded):
-                self._failure = DeviceLost(f"{self.name} was closed")
-            self._changed.notify_all()
+                self._fail(DeviceLost(f"{self.name} was closed"))
 
     # ----------------------------------------------------------------------- for a board's thread
 

@@ -163,13 +163,9 @@ class BoardDecoder:
 
     def feed(self, chunk: bytes, host_time_s: float) -> list[Message]:
         """The messages that `chunk`, read at `host_time_s`, completes."""
-        messages: list[Message] = []
-        for frame in self._frames.feed(chunk):
-            message = self._message(frame, host_time_s)
-            if message is None:
-                self.stats.unknown += 1
-            else:
-                messages.append(message)
+        found = [self._message(frame, host_time_s) for frame in self._frames.feed(chunk)]
+        messages = [message for message in found if message is not None]
+        self.stats.unknown += len(found) - len(messages)
         return messages
 
     def _message(self, raw: RawFrame, host_time_s: float) -> Message | None:

@@ -90,14 +90,14 @@ class Enum:
 class Frame:
     """A frame type: its id, direction and payload fields."""
 
-    def __init__(self, entry: Mapping[str, Any], constants: Mapping[str, int]) -> None:
+    def __init__(self, entry: Mapping[str, Any]) -> None:
         self.name: str = entry["name"]
         self.id: int = entry["id"]
         self.sender: str = entry["from"]
         self.doc: str = entry["doc"]
         self.tail: Mapping[str, str] | None = entry.get("tail")
         self.fields = tuple(
-            Field(**{**field, "count": constants[field["count"]] if "count" in field else 1})
+            Field(**{**field, "count": CONSTANTS[field["count"]] if "count" in field else 1})
             for field in entry["fields"]
         )
         codes = (f"{f.count if f.count > 1 else ''}{_STRUCT_CODES[f.type]}" for f in self.fields)
@@ -131,15 +131,6 @@ def crc16(octets: bytes) -> int:
     return binascii.crc_hqx(octets, _CRC_INITIAL)
 
 
-def _without_docs(node: Any) -> Any:
-    """The definition as far as it decides what bytes mean."""
-    if isinstance(node, dict):
-        return {k: _without_docs(v) for k, v in node.items() if k not in ("doc", "unit")}
-    if isinstance(node, list):
-        return [_without_docs(v) for v in node]
-    return node
-
-
 _PLACE = _IN_PACKAGE if _IN_PACKAGE.is_file() else _IN_CHECKOUT
 DEFINITION: dict[str, Any] = tomllib.loads(_PLACE.read_text(encoding="utf-8"))
 _CRC_INITIAL: int = DEFINITION["framing"]["crc_initial"]
@@ -153,11 +144,14 @@ ENUMS: dict[str, Enum] = {
     )
     for name, e in DEFINITION["enums"].items()
 }
-FRAMES: dict[str, Frame] = {e["name"]: Frame(e, CONSTANTS) for e in DEFINITION["frames"]}
+FRAMES: dict[str, Frame] = {e["name"]: Frame(e) for e in DEFINITION["frames"]}
 FRAMES_BY_ID: dict[int, Frame] = {f.id: f for f in FRAMES.values()}
-LAYOUT_CRC = crc16(
-    json.dumps(_without_docs(DEFINITION), sort_keys=True, separators=(",", ":")).encode()
+# The definition as far as it decides what bytes mean.
+_LAYOUT = json.loads(
+    json.dumps(DEFINITION),
+    object_hook=lambda node: {k: v for k, v in node.items() if k not in ("doc", "unit")},
 )
+LAYOUT_CRC = crc16(json.dumps(_LAYOUT, sort_keys=True, separators=(",", ":")).encode())
 
 READINGS_PER_CELL = CONSTANTS["readings_per_cell"]
 ADC_BITS = CONSTANTS["adc_bits"]

@@ -101,8 +101,7 @@ class Session(Device):
         frame = protocol.FRAMES[name]
         payload = frame.pack(**values)
         with self._changed:
-            self._sequence = (self._sequence + 1) & 0xFF
-            sequence = self._sequence
+            sequence = self._sequence = (self._sequence + 1) & 0xFF
             self._acks.pop(sequence, None)
         self._link.write(framing.encode(frame.id, sequence, payload))
         return sequence
@@ -134,25 +133,21 @@ class Session(Device):
         try:
             while not self._closing:
                 chunk = self._link.read()
-                if chunk and self._take(chunk):
-                    heard_s = time.monotonic()
-                elif self._want_scans and time.monotonic() - heard_s > _SPEED_LOST_S:
+                now_s = time.monotonic()
+                with self._changed:
+                    messages = self._decoder.feed(chunk, now_s)
+                    for message in messages:
+                        self._keep(message)
+                    if messages:
+                        heard_s = now_s
+                        self._changed.notify_all()
+                if self._want_scans and now_s - heard_s > _SPEED_LOST_S:
                     # A board that was reset is back at its default speed.
-                    heard_s = time.monotonic()
+                    heard_s = now_s
                     self._link.set_baud(protocol.CONSTANTS["baud_default"])
                     self._send("get_hello")
         except OhmskinError as exc:
             self._fail(exc)
-
-    def _take(self, chunk: bytes) -> bool:
-        host_time_s = time.monotonic()
-        with self._changed:
-            messages = self._decoder.feed(chunk, host_time_s)
-            for message in messages:
-                self._keep(message)
-            if messages:
-                self._changed.notify_all()
-        return bool(messages)
 
     def _keep(self, message: Message) -> None:
         match message:
@@ -165,7 +160,16 @@ class Session(Device):
             case Hello() if self._want_scans and not message.scanning:
                 # It was reset: bring it back to where it was.
                 self._stats.restarts += 1
-                self._resume(message)
+                before = self.info
+                self._send("configure", **configuration(before))
+                self._hello = replace(
+                    before,
+                    unit_id=message.unit_id,
+                    baud=message.baud,
+                    settings=message.settings,
+                    reset_cause=message.reset_cause,
+                )
+                self._send("start")
             case Hello():
                 self._hello = message
             case ForeignHello():
@@ -176,15 +180,3 @@ class Session(Device):
                         "flash it with 'ohmskin flash'",
                     )
                 )
-
-    def _resume(self, restarted: Hello) -> None:
-        before = self.info
-        self._send("configure", **configuration(before))
-        self._hello = replace(
-            before,
-            unit_id=restarted.unit_id,
-            baud=restarted.baud,
-            settings=restarted.settings,
-            reset_cause=restarted.reset_cause,
-        )
-        self._send("start")

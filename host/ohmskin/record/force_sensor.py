@@ -84,9 +84,8 @@ class ForceSensor(Closing):
         self._octets = 0  # since the last force
         self._changed = threading.Condition()
         self._waiting: deque[ForceSample] = deque()
-        self._failure: DeviceLost | None = None
         self._last_s = time.monotonic()
-        self._closing = False
+        self._closing = self._is_gone = False
         self._thread = threading.Thread(target=self._read, name=f"read {path}", daemon=True)
         self._thread.start()
 
@@ -118,8 +117,8 @@ class ForceSensor(Closing):
                 self._changed.wait(0.1)
 
     def _check(self) -> None:
-        if self._failure is not None:
-            raise self._failure
+        if self._is_gone:
+            raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_S:
             return
         if not self._octets:
@@ -141,11 +140,7 @@ class ForceSensor(Closing):
                 if octets:
                     self._keep(octets, time.monotonic())
         except DeviceLost:
-            with self._changed:
-                self._failure = DeviceLost(
-                    f"{self.path} is gone: is the force sensor still plugged in?"
-                )
-                self._changed.notify_all()
+            self._is_gone = True
 
     def _keep(self, octets: bytes, now_s: float) -> None:
         with self._changed:

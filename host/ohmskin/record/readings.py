@@ -90,8 +90,8 @@ class Readings:
     def one_skin_per_frame(self) -> bool:
         """Whether rest or wires are given per frame: then frames are not one skin in time."""
         wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
-        per_frame_rest = self.rest_ratio is not None and self.rest_ratio.ndim == 4
-        return per_frame_rest or any(wire is not None and wire.ndim == 1 for wire in wires)
+        given = [(self.rest_ratio, 3), *((wire_ohm, 0) for wire_ohm in wires)]
+        return any(array is not None and array.ndim > ndim for array, ndim in given)
 
     def knowledge(self, frame: int) -> SkinKnowledge:
         """What an estimator is told before it reads `frame`."""

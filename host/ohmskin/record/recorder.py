@@ -198,10 +198,12 @@ def record(
                 recorder.add(skin.info)
             recorder.add(scan)
             if tare_s and elapsed_s <= tare_s:
+                if untouched and untouched[0].shape != scan.ratio.shape:
+                    untouched.clear()  # somebody has configured the board
                 untouched.append(scan.ratio)
             elif untouched:
-                recorder.add(_tare(untouched))
-                untouched = []
+                recorder.add(Tare(np.mean(untouched, axis=0), time.monotonic()))
+                untouched.clear()
             for sample in sensor.take() if sensor is not None else ():
                 recorder.add(sample)
             if beside is not None:
@@ -210,10 +212,4 @@ def record(
                 return
     finally:
         if untouched:
-            recorder.add(_tare(untouched))
-
-
-def _tare(untouched: list[Float]) -> Tare:
-    newest = untouched[-1].shape  # somebody may have configured the board meanwhile
-    of_size = [ratio for ratio in untouched if ratio.shape == newest]
-    return Tare(np.mean(of_size, axis=0), time.monotonic())
+            recorder.add(Tare(np.mean(untouched, axis=0), time.monotonic()))

@@ -18,7 +18,8 @@ other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were a
 ``host_time_s`` is that of `Scan`; log times are the same instants since 1970.
 
 `recorder` writes them; `messages` reads one by one, `load_recording` all at once. A file
-that was cut off anywhere is read up to its last whole chunk.
+that was cut off anywhere is read up to its last whole chunk. `export` writes readings files (.npz),
+for `ohmskin estimate`, and tables (.csv).
 """
 
 import json
@@ -27,6 +28,8 @@ import os
 import struct
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
+from pathlib import Path
 from typing import IO, Any, Final, TypeVar, cast
 
 import lz4.frame
@@ -41,13 +44,24 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
+from ohmskin.files import save_table
+from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
 # A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
 LARGEST_RECORD: Final = 16_000_000
-_LARGEST_CELLS: Final = 4096
 _LARGEST_CODE: Final = 0xFFFF
 _LARGEST_COUNTER: Final = (1 << 63) - 1
+# What `export` writes.
+FORMATS: Final = (".npz", ".csv")
+# What both formats have of each scan, besides its readings.
+_OF_SCAN: Final = ("number", "time_us", "host_time_s", "missed")
+# What mcap and its packers raise for bytes that are no MCAP file.
+_DAMAGE: Final = (
+    *(CRCValidationError, McapError, struct.error, UnicodeDecodeError),
+    *(zstandard.ZstdError, RuntimeError, MemoryError),
+)
 _T = TypeVar("_T")
 
 
@@ -212,7 +226,7 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
             if first:
                 raise ValueError("the file is cut off before its first record") from None
             return
-        except (McapError, struct.error, UnicodeDecodeError) as exc:
+        except _DAMAGE as exc:
             raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
         first = False
         if not isinstance(record, Chunk):
@@ -223,13 +237,9 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
         try:
             if _unpacked_size(record) > LARGEST_RECORD:
                 raise ValueError("damaged: a chunk larger than any recorder writes")
-            inside = breakup_chunk(record, validate_crc=True)
-        except (
-            *(CRCValidationError, McapError, struct.error, UnicodeDecodeError),
-            *(zstandard.ZstdError, RuntimeError, MemoryError),
-        ) as exc:
+            yield from breakup_chunk(record, validate_crc=True)
+        except _DAMAGE as exc:
             raise ValueError(f"damaged: {exc}") from exc
-        yield from inside
 
 
 def _unpacked_size(chunk: Chunk) -> int:
@@ -272,7 +282,7 @@ def _hello(values: dict[str, Any]) -> Hello:
 
 def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
     rows, columns, _ = shape
-    if rows * columns > _LARGEST_CELLS:
+    if rows * columns > MAX_CELLS:
         raise ValueError(f"{name}: no {rows}x{columns} cells")
     readings = np.array(values) if name == "codes" else np.array(values, np.float64)
     if readings.size != math.prod(shape):
@@ -295,3 +305,76 @@ def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
             raise ValueError(f"{name} is {value!r:.40}, not a number")
         return float(value)
     return str(value) if form["type"] == "string" else value
+
+
+# ------------------------------------------------------------------------- to other programs
+
+
+def export(recording: Recording, out: Path, begin_s: float = 0.0, end_s: float = 0.0) -> int:
+    """Write the scans from `begin_s` to `end_s` [s after the first; 0: to the last] to `out`.
+
+    The file is complete or not there. Returns the number of scans.
+
+    :raises RecordingError: there are none, or they have not all the same size.
+    :raises ValueError: an unknown format, or `out` cannot be written.
+    """
+    if out.suffix not in FORMATS:
+        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
+    scans = _between(recording.scans, begin_s, end_s)
+    if out.suffix == ".csv":
+        _save_csv(scans, out)
+        return len(scans)
+    arrays = _arrays(recording, scans)
+    if arrays["ratio"].nbytes > MAX_ARRAY_BYTES:
+        raise RecordingError(
+            f"{len(scans)} scans are more than a readings file holds: export a part of them, "
+            "--begin and --end"
+        )
+    save_arrays(out, arrays)
+    return len(scans)
+
+
+def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
+    first_s = scans[0].host_time_s if scans else 0.0
+    last_s = first_s + end_s if end_s else float("inf")
+    scans = [scan for scan in scans if first_s + begin_s <= scan.host_time_s <= last_s]
+    if not scans:
+        raise RecordingError("no scans: neither in the recording nor in this part of it")
+    size = scans[0].codes.shape
+    for scan in scans:
+        if scan.codes.shape != size:
+            at_s = scan.host_time_s - first_s
+            raise RecordingError(
+                f"{size[0]}x{size[1]} cells become {scan.rows}x{scan.columns} after {at_s:.3f} s: "
+                "export each part by itself, --begin and --end"
+            )
+    return scans
+
+
+def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
+    """The arrays of a readings file, and besides those of `_OF_SCAN`.
+
+    `rest_ratio` is the last tare of this size. `ratio` in single precision is exact.
+    """
+    board = recording.hellos[0]
+    codes = np.array([scan.codes for scan in scans])
+    arrays: dict[str, Any] = {
+        "ratio": ratio_from_codes(codes, board.adc_bits).astype(np.float32),
+        "ref_top_ohm": float(board.ref_top_ohm),
+        "ref_bottom_ohm": float(board.ref_bottom_ohm),
+        "adc_bits": board.adc_bits,
+        **{name: [getattr(scan, name) for scan in scans] for name in _OF_SCAN},
+    }
+    for tare in recording.tares:
+        if tare.rest_ratio.shape == codes.shape[1:]:
+            arrays["rest_ratio"] = tare.rest_ratio
+    return {name: np.array(each) for name, each in arrays.items()}
+
+
+def _save_csv(scans: list[Scan], out: Path) -> None:
+    """A row a scan: its times, then the codes of each cell, named by row, column and reading."""
+    cells = np.ndindex(*scans[0].codes.shape)
+    names = [f"r{row}c{column}{'abcd'[reading]}" for row, column, reading in cells]
+    times = attrgetter(*_OF_SCAN)
+    rows = ([*times(scan), *scan.codes.reshape(-1).tolist()] for scan in scans)
+    save_table(out, [*_OF_SCAN, *names], rows)
