@@ -29,12 +29,11 @@ from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import protocol
-from ohmskin.link.clock import BoardClock
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import Link, SerialLink, serial_ports
 from ohmskin.link.session import Session
-from ohmskin.link.timing import line_delay_s, scan_s
 
 if TYPE_CHECKING:
     from ohmskin.emulate.board import EmulatedBoard
@@ -116,10 +115,18 @@ def open_device(url: str, *, start: bool = True) -> Device:
 
         options = _options(url, query, ("speed",))
         try:
-            return Device(Replay(place, float(options.get("speed", "1")), url), start=start)
+            device: Device = Replay(place, float(options.get("speed", "1")), url)
         except ValueError as exc:
             raise PortError(f"{url}: {exc}") from exc
-    return Device(Session(*open_link(url)), start=start)
+    else:
+        device = Session(*open_link(url))
+    try:
+        if start:
+            device.start()
+    except BaseException:
+        device.close()
+        raise
+    return device
 
 
 def open_link(url: str) -> tuple[Link, int | None]:

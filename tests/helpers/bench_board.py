@@ -2,6 +2,7 @@
 """An emulated board in simulated time, with as much of a `Device` as the doctor needs."""
 
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 
 from ohmskin.cli.doctor import gather
@@ -9,8 +10,8 @@ from ohmskin.doctor.examine import Evidence
 from ohmskin.emulate.line_faults import Faults
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
+from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, BoardStats, Hello, Message, Scan, SelfTestReport
-from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 
 
@@ -54,7 +55,7 @@ class Bench(Closing):
 
     @property
     def stats(self) -> BoardStats:
-        return self._decoder.snapshot()
+        return deepcopy(self._decoder.stats)
 
     def self_test(self) -> SelfTestReport:
         self.ask("self_test")

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.files import naming, read_bounded, whole_file
+from ohmskin.files import naming, read_bounded, save_table
 from ohmskin.force.curve import require_rows
 from ohmskin.record.readings import MAX_CELLS
 
@@ -162,9 +162,7 @@ def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
 
     Raises ValueError if it cannot be written.
     """
-    lines = [",".join(map(str, row)) for row in (_COLUMNS, *table.tolist())]
-    with whole_file(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    save_table(path, _COLUMNS, table.tolist())
 
 
 # ------------------------------------------------------------------------------------ CSV files

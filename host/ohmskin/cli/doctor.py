@@ -21,7 +21,7 @@ from ohmskin.doctor.wires import CornerScans
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
-from ohmskin.link.serial_port import latency_ms, latency_timer_file
+from ohmskin.link.serial_port import latency_timer
 
 WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
 LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
@@ -140,9 +140,7 @@ def gather(
     if calibration is not None:
         calibration.check(board.unit_id, board.rows, board.columns)
         evidence.rest_ratio = calibration.rest.ratio
-    timer_ms = None if "://" in path else latency_ms(path)
-    if timer_ms is not None:
-        evidence.latency = timer_ms, str(latency_timer_file(path))
+    evidence.latency = None if "://" in path else latency_timer(path)
     presses = CornerScans(board) if press else None
     try:
         tell("self-test")

@@ -26,11 +26,10 @@ from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
-from ohmskin.record.export import FORMATS
-from ohmskin.record.export import export as export_recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import Mark, load_recording
+from ohmskin.record.recording import FORMATS, Mark, load_recording
+from ohmskin.record.recording import export as export_recording
 
 # With a force sensor the first scans are a tare of so many seconds, unless told.
 FORCE_TARE_S: Final = 2.0

@@ -35,10 +35,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
+from ohmskin.link.clock import reading_offsets_s, slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
-from ohmskin.link.timing import reading_offsets_s, slot_s
 
 Complex = NDArray[np.complex128]
 
