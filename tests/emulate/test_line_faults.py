@@ -25,7 +25,7 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
-from ohmskin.opening import emulated, open_link
+from ohmskin.opening import emulated
 from stepped_link import SteppedLink
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -130,7 +130,7 @@ def test_a_reset_board_goes_on_as_it_was_configured() -> None:
 def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its line speed is that of the start again, too; the simulated line follows the board's."""
     monkeypatch.setattr(simavr, "SkinSim", LockstepSim)
-    link, _ = open_link("simavr://uno")
+    link = simavr.SimavrLink("uno", Scene())
     with ohmskin.Device(Session(link, baud)) as skin:
         kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
         scans = iter(skin)

@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from ohmskin import opening
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
@@ -21,7 +22,6 @@ from ohmskin.force.contacts import MEMORY_US
 from ohmskin.force.reader import TARE_S, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.opening import open_device
 from ohmskin.record.recording import Mark, Tare
 from ohmskin.view.board_recording import BoardRecording
 from ohmskin.view.shown import Shown
@@ -231,7 +231,7 @@ class ViewedBoard(Closing):
         self._changed()
 
     def _follow(self) -> None:
-        with open_device(self.port) as skin:
+        with opening.open(self.port) as skin:
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
             raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
