@@ -660,7 +660,7 @@ def test_program_errors(build: Build, tmp_path: Path, monkeypatch: pytest.Monkey
         patched.setattr(simavr, "PROGRAM", tmp_path / "none")
         with pytest.raises(FileNotFoundError, match="none is missing: run 'make sim'"):
             LockstepSim("uno", elf)
-    with pytest.raises(FileNotFoundError, match="none.elf is missing: run 'make firmware'"):
+    with pytest.raises(FileNotFoundError, match=r"none\.elf is missing: run 'make firm"):
         LockstepSim("uno", tmp_path / "none.elf")
     with pytest.raises(SimulationError, match="usage"):
         LockstepSim("due", elf)

@@ -448,7 +448,7 @@ def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> No
 
 def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Path) -> None:
     with ViewedBoards([GHOST, "/dev/ttyACM99"], folder=tmp_path) as boards:
-        board = boards.find(0)
+        board = boards.get(0)
         assert board is not None
         until(lambda: board.state()["status"] == "scanning")
         assert board.shown is None  # nobody looks

@@ -2,7 +2,7 @@
 """The live page of ``ohmskin view``: boards read in threads, shown by a server on loopback.
 
 Takes ports and calibrations, gives a page: `server`, `access` and `panel` serve it, `boards` reads
-the boards, `board_recording` records beside it, `shown` makes the bytes of a scan.
+and records the boards, `shown` makes the bytes of a scan.
 
 May import: `ohmskin.opening` and what is below it. `server`, `access` and `panel` need the extra
 ``ohmskin[view]``: nothing imports them before a page is wanted.

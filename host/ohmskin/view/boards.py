@@ -3,12 +3,13 @@
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
+from itertools import count, takewhile
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,9 +22,8 @@ from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import MEMORY_US
 from ohmskin.force.reader import TARE_S, SkinReader
 from ohmskin.link.device import Device
-from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
-from ohmskin.view.board_recording import BoardRecording
 from ohmskin.view.shown import Shown
 
 # The paper's programmes take minutes for a frame of 8x8.
@@ -32,12 +32,54 @@ LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "reg
 MOST_BOARDS: Final = 16
 # Time until a port that is not there is tried again [s].
 AGAIN_S: Final = 1.0
-# The scan rate that is shown is a mean over so long [s].
-_RATE_OVER_S: Final = 2.0
 # `close` waits so long for the thread: a port that never answers must not hold it up [s].
 _CLOSE_S: Final = 1.0
 # Characters of a mark at most.
 _LONGEST_MARK: Final = 1000
+# What the page says of a board.
+_OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
+# What makes boards the same skin: methods, rest and tare of one are good for the other.
+_skin_of: Final = attrgetter(
+    *("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+)
+
+
+class _Recording(Closing):
+    """Records `skin` to `path` in a thread of its own, until it is closed or the board is gone.
+
+    tare: the one in force. ended: is called, from that thread, when the file is whole. text: then
+    says how it went.
+
+    :raises RecordingError: the file cannot be written.
+    """
+
+    def __init__(
+        self, skin: Device, path: Path, tare: Tare | None, ended: Callable[[], None]
+    ) -> None:
+        self.text = ""
+        self.recorder = Recorder(path, skin.info)
+        self._until_s = float("inf")
+        self._thread = threading.Thread(target=self._work, args=(skin, tare, ended))
+        self._thread.start()
+
+    def _work(self, skin: Device, tare: Tare | None, ended: Callable[[], None]) -> None:
+        trouble = ""
+        try:
+            with self.recorder as recorder:
+                if tare is not None:
+                    recorder.add(tare)
+                in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, skin)
+                record(skin, recorder, in_time)
+        except OhmskinError as exc:
+            trouble = f"; {exc}"
+        counts = f"{recorder.scans} scans, missed {recorder.missed}"
+        self.text = f"{recorder.path}: {counts}{trouble}"
+        ended()
+
+    def close(self) -> None:
+        """End with the scans that have come until now. Returns when the file is whole."""
+        self._until_s = min(self._until_s, time.monotonic())
+        self._thread.join()
 
 
 class ViewedBoard(Closing):
@@ -58,7 +100,7 @@ class ViewedBoard(Closing):
         self._status, self._text, self._note = "opening", "", ""
         self._skin: Device | None = None
         self._reader: SkinReader | None = None
-        self._recording: BoardRecording | None = None
+        self._recording: _Recording | None = None
         self._watchers: set[Callable[[], None]] = set()
         self._commands = threading.Lock()
         self._closing = threading.Event()
@@ -84,7 +126,7 @@ class ViewedBoard(Closing):
 
     def state(self) -> dict[str, Any]:
         """What the page says beside the scans, as JSON has it."""
-        reader, recording = self._reader, self._recording
+        reader, recording, running = self._reader, self._recording, self._running()
         board = None if reader is None else reader.board
         rest = None if reader is None else reader.rest
         return {
@@ -92,21 +134,13 @@ class ViewedBoard(Closing):
             "status": self._status,
             "text": self._text,
             "note": self._note,
-            "board": board
-            and {
-                "name": board.board,
-                "unit_id": board.unit_id,
-                "version": board.version,
-                "rows": board.rows,
-                "columns": board.columns,
-                "rate_hz": board.rate_hz,
-            },
+            "board": board and {name: getattr(board, name) for name in _OF_BOARD},
             "methods": [] if reader is None else _methods(reader),
             "method": "" if reader is None else reader.method,
             "force_method": None if reader is None else _force_method(reader),
             "rest_date": rest and rest.date,
             "tared": reader is not None and reader.is_tared,
-            "recording": "" if recording is None or recording.text else str(recording.path),
+            "recording": "" if running is None else str(running.recorder.path),
             "recorded": "" if recording is None else recording.text,
         }
 
@@ -151,12 +185,12 @@ class ViewedBoard(Closing):
         with self._one_at_a_time():
             skin, reader = self._there()
             if (running := self._running()) is not None:
-                raise OhmskinError(f"{running.path} is being recorded already")
+                raise OhmskinError(f"{running.recorder.path} is being recorded already")
             tare = None
             if reader.is_tared and reader.rest is not None:
                 tare = Tare(reader.rest.ratio, time.monotonic())
             path = self._new_file(reader.board.unit_id)
-            self._recording = BoardRecording(skin, path, tare, self._changed)
+            self._recording = _Recording(skin, path, tare, self._changed)
         self._changed()
         return "recording: every scan, whatever is shown"
 
@@ -175,7 +209,7 @@ class ViewedBoard(Closing):
             raise OhmskinError("a mark goes into a recording: start one first")
         if not 0 < len(text) <= _LONGEST_MARK:
             raise OhmskinError(f"a mark is a text of 1 to {_LONGEST_MARK} characters")
-        recording.add(Mark(text, time.monotonic()))
+        recording.recorder.add(Mark(text, time.monotonic()))
         return f"marked: {text}"
 
     def _there(self) -> tuple[Device, SkinReader]:
@@ -194,13 +228,13 @@ class ViewedBoard(Closing):
             self._commands.release()
             self._changed()
 
-    def _running(self) -> BoardRecording | None:
+    def _running(self) -> _Recording | None:
         recording = self._recording
         return None if recording is None or recording.text else recording
 
     def _record_rest(self, rest: Tare) -> None:
         if (recording := self._running()) is not None:
-            recording.add(rest)
+            recording.recorder.add(rest)
 
     def _new_file(self, unit_id: int) -> Path:
         stem = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
@@ -235,22 +269,25 @@ class ViewedBoard(Closing):
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
             raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
+            seen_us = newest_us = 0
             try:
-                rate, seen = _Rate(), _SeenTime()
                 while not self._closing.is_set():
-                    scan = skin.latest()
-                    rate_hz, running = rate.of(scan), self._running()
+                    scan, running = skin.latest(), self._running()
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
                     if self._watchers:
+                        # Contacts that nobody looked at meanwhile have not gone.
+                        step_us = max(scan.time_us - newest_us, 0)
+                        seen_us += min(step_us, MEMORY_US // 2)
+                        newest_us = scan.time_us
                         self.shown = Shown(
-                            reader.read(seen.at(scan)),
+                            reader.read(replace(scan, time_us=seen_us)),
                             raw.estimate(scan.ratio),
                             reader.method,
                             reader.has_forces,
                             skin.stats,
-                            rate_hz,
-                            0 if running is None else running.scans,
+                            skin.info.rate_hz,
+                            0 if running is None else running.recorder.scans,
                         )
                     if self._status != "scanning":
                         self._status, self._text = "scanning", ""
@@ -264,7 +301,7 @@ class ViewedBoard(Closing):
     def _reader_of(self, skin: Device) -> SkinReader:
         """A board that is there again is read as before, with method and tare."""
         board, before = skin.info, self._reader
-        if before is not None and _same(before.board, board):
+        if before is not None and _skin_of(before.board) == _skin_of(board):
             return before
         self._note = ""
         for calibration in self._calibrations:
@@ -290,40 +327,6 @@ class ViewedBoard(Closing):
         self._changed()
 
 
-class _Rate:
-    """The board's scan rate over the last `_RATE_OVER_S`, those that were missed included."""
-
-    def __init__(self) -> None:
-        self._scans: deque[tuple[int, int]] = deque()
-
-    def of(self, scan: Scan) -> float:
-        scans = self._scans
-        if scans and scan.time_us <= scans[-1][1]:
-            scans.clear()  # the board has restarted
-        scans.append((scan.number, scan.time_us))
-        while scan.time_us - scans[0][1] > 1e6 * _RATE_OVER_S:
-            scans.popleft()
-        if len(scans) < 2:
-            return 0.0
-        return 1e6 * (scan.number - scans[0][0]) / (scan.time_us - scans[0][1])
-
-
-class _SeenTime:
-    """Board time without gaps: contacts that nobody looked at meanwhile have not gone."""
-
-    def __init__(self) -> None:
-        self._newest_us: int | None = None
-        self._time_us = 0
-
-    def at(self, scan: Scan) -> Scan:
-        """The scan at the time that was looked at until it."""
-        if self._newest_us is not None:
-            step_us = max(scan.time_us - self._newest_us, 0)
-            self._time_us += min(step_us, MEMORY_US // 2)
-        self._newest_us = scan.time_us
-        return replace(scan, time_us=self._time_us)
-
-
 def _force_method(reader: SkinReader) -> str | None:
     """The method that gives newtons, if there is one."""
     return None if reader.calibration is None else reader.calibration.method
@@ -335,12 +338,7 @@ def _methods(reader: SkinReader) -> tuple[str, ...]:
     return LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
 
 
-def _same(one: Hello, other: Hello) -> bool:
-    names = ("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
-    return all(getattr(one, name) == getattr(other, name) for name in names)
-
-
-class ViewedBoards(Closing):
+class ViewedBoards(Closing, dict[int, ViewedBoard]):
     """The boards of one page, by number, from 0. `ViewedBoard` says what the arguments are."""
 
     def __init__(
@@ -351,9 +349,8 @@ class ViewedBoards(Closing):
         *,
         force: bool = False,
     ) -> None:
-        self._calibrations, self._folder, self._force = calibrations, folder, force
-        self._boards: dict[int, ViewedBoard] = {}
-        self._last = -1
+        self._calibrations, self._folder, self._force = calibrations, folder.resolve(), force
+        self._numbers = count()
         for port in ports:
             self.add(port)
 
@@ -362,31 +359,21 @@ class ViewedBoards(Closing):
 
         :raises ValueError: there are `MOST_BOARDS` already.
         """
-        for number, board in self._boards.items():
+        for number, board in self.items():
             if board.port == port:
                 return number
-        if len(self._boards) >= MOST_BOARDS:
+        if len(self) >= MOST_BOARDS:
             raise ValueError(f"there are {MOST_BOARDS} boards: close one first")
-        self._last += 1
-        folder = self._folder.resolve()
-        self._boards[self._last] = ViewedBoard(port, self._calibrations, folder, force=self._force)
-        return self._last
-
-    def find(self, number: int) -> ViewedBoard | None:
-        """The board of that number, if there is one."""
-        return self._boards.get(number)
-
-    def ports(self) -> dict[int, str]:
-        """The port of each board, by number."""
-        return {number: board.port for number, board in self._boards.items()}
+        number = next(self._numbers)
+        self[number] = ViewedBoard(port, self._calibrations, self._folder, force=self._force)
+        return number
 
     def remove(self, number: int) -> None:
         """Close a board; nothing happens if there is none of that number."""
-        board = self._boards.pop(number, None)
-        if board is not None:
+        if (board := self.pop(number, None)) is not None:
             board.close()
 
     def close(self) -> None:
         """Close all. May be called again."""
         with ThreadPoolExecutor(MOST_BOARDS) as pool:  # some may have to be waited for
-            list(pool.map(self.remove, tuple(self._boards)))
+            list(pool.map(self.remove, tuple(self)))

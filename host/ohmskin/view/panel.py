@@ -132,12 +132,9 @@ class Panel:
 
     async def _run(self, name: str, command: _Command) -> None:
         try:
-            done = await anyio.to_thread.run_sync(command)
-        except TareRefused as exc:
-            answer = {"text": str(exc), "good": False, "refused": name}
+            answer = {"text": await anyio.to_thread.run_sync(command), "good": True, "refused": ""}
         except (OhmskinError, ValueError, OSError) as exc:
-            answer = {"text": str(exc), "good": False, "refused": ""}
-        else:
-            answer = {"text": done, "good": True, "refused": ""}
+            refused = name if isinstance(exc, TareRefused) else ""
+            answer = {"text": str(exc), "good": False, "refused": refused}
         self._is_busy = False
         await self._say("notice", **answer)
