@@ -25,7 +25,8 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli.record import cell_table, until_stopped
+from ohmskin.cli.record import until_stopped
+from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
@@ -318,8 +319,8 @@ def _guided(
     guide, estimator, left = Guide(missing), calibrator.estimator(), len(missing)
     rest = estimator.rest_level()
     voice = _Voice(total)
-    with until_stopped() as watched, voice.bar:
-        for scan in watched(iter(skin.latest, None)):
+    with voice.bar:
+        for scan in until_stopped(iter(skin.latest, None)):
             found = estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
             if step.wanted is not None and step.rise is not None:

@@ -28,12 +28,12 @@ _COMMANDS: Final = {
     "touch it.",
     "doctor.doctor": "Say what is wrong with the skin board at PORT, and what to do. Touch "
     "nothing meanwhile.",
-    "estimate.estimate": "Estimate every cell of every frame of a readings file.",
+    "record.estimate": "Estimate every cell of every frame of a readings file.",
     "record.record": "Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a "
     "mark.",
     "record.export": "Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as "
     "a table (.csv).",
-    "emulate.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
+    "demo.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
     "ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
     "calibrate.calibrate": "Learn each cell's force from presses of single cells: a calibration "
@@ -49,14 +49,15 @@ class _Command(TyperCommand):
         super().__init__(name, help=help_)
 
     def load(self) -> Any:
-        """The command itself, or the group of them. Its module may have an EPILOG for its help."""
+        """The command itself, or the group of them. Its module may have EPILOGS for their help."""
         assert self.name is not None
         module = import_module(f"ohmskin.cli.{self._module}")
         found, made = getattr(module, self.name), typer.Typer(add_completion=False)
         if isinstance(found, typer.Typer):
             made.add_typer(found, name=self.name)
         else:
-            made.command(self.name, epilog=getattr(module, "EPILOG", None))(found)
+            epilog = getattr(module, "EPILOGS", {}).get(self.name)
+            made.command(self.name, epilog=epilog)(found)
         return typer.main.get_group(made).commands[self.name]
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
