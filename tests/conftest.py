@@ -17,7 +17,7 @@ from hypothesis import settings
 import ohmskin
 from command_line import Done
 from ohmskin.cli import main as cli
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.opening import emulated
 from places import ROOT

@@ -3,8 +3,8 @@
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -50,15 +50,6 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             partial.unlink(missing_ok=True)
     except OSError as error:
         raise ValueError(f"{target}: cannot be written: {error.strerror or error}") from error
-
-
-def save_whole(contents: Mapping[Path, bytes]) -> None:
-    """Write all of these files, or none."""
-    with ExitStack() as stack:
-        for path, content in contents.items():
-            file = stack.enter_context(whole_file(path))
-            file.write(content)
-            file.flush()
 
 
 class Closing(ABC):

@@ -16,13 +16,12 @@ from __future__ import annotations
 import heapq
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 from urllib.parse import parse_qsl
 
-from ohmskin.arrays import Float
 from ohmskin.errors import DeviceSilent, PortError
 from ohmskin.files import Closing, naming
 from ohmskin.force.calibration import Calibration, load_calibration
@@ -37,9 +36,8 @@ from ohmskin.link.timing import line_delay_s, scan_s
 
 if TYPE_CHECKING:
     from ohmskin.emulate.board import EmulatedBoard
-    from ohmskin.emulate.line_faults import Faults
+    from ohmskin.emulate.faults import LineFaults, SkinFaults
     from ohmskin.emulate.scenes import Scene
-    from ohmskin.emulate.skin_faults import SkinFaults
 
 CalibrationLike = Calibration | str | os.PathLike[str]
 SkinT = TypeVar("SkinT", bound=Device | CalibratedSkin)
@@ -161,76 +159,48 @@ def _wrong(url: str) -> Iterator[None]:
 # ----------------------------------------------------------------------------- without a board
 
 
-def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
+def emulated(url: str) -> tuple[EmulatedBoard, str, LineFaults]:
     """The emulated board of an ``emulator://`` URL, its name, and the faults of its line.
 
     :raises PortError: the URL is wrong.
     """
     from ohmskin.emulate.board import EmulatedBoard
-    from ohmskin.emulate.line_faults import FAULTS, Faults
-    from ohmskin.emulate.skin_faults import SkinFaults
+    from ohmskin.emulate.faults import LineFaults, faults_of
 
-    place, options = _emulator_options(url)
+    scene, options = _emulated(url)
     with _wrong(url):
         seed = int(options.get("seed", 0))
-        skin_faults = SkinFaults.from_texts(options)
-        of_line = {name: float(options[name]) for name in FAULTS if name in options}
-        if "readings" in options:
-            skin = _readings(options, skin_faults)
-        else:
-            scene = _scene(place, options, skin_faults)
-            skin = scene.ratio, scene.rows, scene.columns
         board = EmulatedBoard(
-            *skin,
+            *(scene.ratio, scene.rows, scene.columns),
             rate_hz=float(options["rate"]) if "rate" in options else None,
             noise_lsb=float(options.get("noise", _DEFAULT_NOISE_LSB)),
             seed=seed,
             unit_id=int(options.get("unit", 0)),
             layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
-            sampled=skin_faults.sampled if skin_faults.of_sampling else None,
+            sampled=scene.faults.sampled if scene.faults.of_sampling else None,
         )
-        return board, url, Faults(seed=seed, **of_line)
+        return board, url, faults_of(LineFaults, options, seed=seed)
 
 
 def scene_of(url: str) -> Scene:
     """What the board of an ``emulator://`` URL reads: the truth.
 
-    :raises PortError: the URL is wrong, or it plays the readings of a file.
+    :raises PortError: the URL is wrong.
     """
-    from ohmskin.emulate.skin_faults import SkinFaults
-
-    place, options = _emulator_options(url)
-    with _wrong(url):
-        if "readings" in options:
-            raise ValueError("the truth behind a file's readings is not known: say a scene")
-        return _scene(place, options, SkinFaults.from_texts(options))
+    return _emulated(url)[0]
 
 
-def _emulator_options(url: str) -> tuple[str, dict[str, str]]:
-    from ohmskin.emulate.line_faults import FAULTS
-    from ohmskin.emulate.skin_faults import SKIN_FAULTS
+def _emulated(url: str) -> tuple[Scene, dict[str, str]]:
+    """The scene of the URL, and its options."""
+    from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, SkinFaults, faults_of
 
     scheme, place, query = _parts(url)
     if scheme != "emulator":
         raise PortError(f"{url} is not emulated: write emulator://8x8")
-    of_board = ("readings", "rate", "noise", "unit", "foreign")
-    return place, _options(url, query, "scene", "seed", *of_board, *SKIN_FAULTS, *FAULTS)
-
-
-def _readings(
-    options: dict[str, str], faults: SkinFaults
-) -> tuple[Callable[[float], Float], int, int]:
-    from ohmskin.emulate.board import DEFAULT_RATE_HZ
-    from ohmskin.record.readings import load_readings
-
-    if "scene" in options:
-        raise ValueError("say either scene or readings")
-    if faults.of_resistances:
-        raise ValueError("readings of a file have no resistances that could be at fault")
-    ratio = load_readings(options["readings"]).ratio
-    rate_hz = float(options.setdefault("rate", str(DEFAULT_RATE_HZ)))
-    # Half a scan on, because a scan begins a rounding error before its frame's time.
-    return lambda time_s: ratio[int(time_s * rate_hz + 0.5) % len(ratio)], *ratio.shape[1:3]
+    known = ("scene", "seed", "rate", "noise", "unit", "foreign", *SKIN_FAULTS, *LINE_FAULTS)
+    options = _options(url, query, *known)
+    with _wrong(url):
+        return _scene(place, options, faults_of(SkinFaults, options)), options
 
 
 def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None) -> Scene:

@@ -15,8 +15,7 @@ import pytest
 import ohmskin
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
-from ohmskin.emulate.board import EmulatorLink
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import EmulatorLink, PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import device, framing, protocol, session

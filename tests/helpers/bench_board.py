@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from ohmskin.cli.doctor import Ask, gather
 from ohmskin.doctor.examine import Evidence
-from ohmskin.emulate.line_faults import Faults
+from ohmskin.emulate.faults import LineFaults
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import BoardDecoder, BoardStats, Hello, Message, Scan, SelfTestReport
@@ -26,14 +26,14 @@ class Bench(Closing):
         self.now_s = now_s
         self.board.advance(now_s)
 
-    def _take(self, faults: Faults) -> None:
+    def _take(self, faults: LineFaults) -> None:
         octets = self.board.heard(faults, self.now_s)
         self._messages += self._decoder.feed(octets, self.now_s)
 
     def ask(self, name: str, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
         self.board.receive(framing.encode(frame.id, 1, frame.pack(**values)))
-        self._take(Faults())  # commands are repeated until they are answered
+        self._take(LineFaults())  # commands are repeated until they are answered
 
     def __iter__(self) -> Iterator[Scan]:
         self._messages = [self.info]

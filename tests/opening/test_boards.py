@@ -14,8 +14,7 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from ohmskin import opening
-from ohmskin.emulate.board import CLOCK_HZ
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import CLOCK_HZ, PtyServer
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import framing, protocol, session

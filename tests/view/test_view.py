@@ -23,7 +23,7 @@ from starlette.websockets import WebSocketDisconnect
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Done, assert_one_line
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.record.recorder import Recorder

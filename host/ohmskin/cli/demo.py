@@ -16,10 +16,9 @@ from rich.console import Console
 import ohmskin
 from ohmskin.arrays import Bool, Float
 from ohmskin.cli.stream import FULL_SCALE_US, conductances
-from ohmskin.emulate.line_faults import FAULTS
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
-from ohmskin.emulate.skin_faults import SKIN_FAULTS
 from ohmskin.errors import OhmskinError
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -36,7 +35,7 @@ _View = tuple[str, Float, Bool]
 
 EPILOGS: Final = {
     "emulate": f"Scenes: {'; '.join(f'{k}: {v}' for k, v in SCENES.items())}. "
-    f"Faults of the line: {'; '.join(f'{k}: {v}' for k, v in FAULTS.items())}. "
+    f"Faults of the line: {'; '.join(f'{k}: {v}' for k, v in LINE_FAULTS.items())}. "
     f"Faults of the skin: {'; '.join(f'{k}: {v}' for k, v in SKIN_FAULTS.items())}."
 }
 
@@ -103,25 +102,13 @@ def _save_picture(path: Path, views: Sequence[_View], title: str) -> None:
     all_axes = figure.subplots(1, len(views), squeeze=False)[0]
     image = None
     for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
-        image = axes.imshow(
-            np.maximum(1e6 * cell_siemens, 0.1), norm="log", vmin=0.5, vmax=FULL_SCALE_US
-        )
-        image.set_cmap("viridis")
+        seen_us = np.maximum(1e6 * cell_siemens, 0.1)
+        image = axes.imshow(seen_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
         for row, column in np.argwhere(touched):
-            axes.text(
-                column,
-                row,
-                f"{1e6 * cell_siemens[row, column]:.0f}",
-                ha="center",
-                va="center",
-                color="white" if cell_siemens[row, column] < 5e-5 else "black",
-                fontsize=8,
-            )
-        axes.set_title(name, fontsize=10)
-        axes.set_xlabel("column")
-        axes.set_ylabel("row")
-        axes.set_xticks(range(cell_siemens.shape[1]))
-        axes.set_yticks(range(cell_siemens.shape[0]))
+            text, colour = f"{seen_us[row, column]:.0f}", "wk"[seen_us[row, column] > 50]
+            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
+        rows, columns = map(range, cell_siemens.shape)
+        axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
     assert image is not None
     figure.colorbar(image, ax=all_axes, label="cell conductance [µS]", shrink=0.9)
     figure.savefig(path, dpi=120)

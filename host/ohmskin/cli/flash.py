@@ -69,15 +69,12 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
     other = next((each for each in meant if each.board), None)
     if port and other is not None:
         raise PortError(f"{port} is a {other.board}, not a {board}: say which you mean")
-    if not board:
-        where = f"at {port}: its USB id is no Uno's or Mega's" if port else "is found"
+    if not (board and port):
+        listed = ", ".join(each.path for each in meant) or "there is none"
         raise PortError(
-            f"no known board {where}: say which board to flash: ohmskin flash "
-            f"{' | '.join(BOARDS)} --port PORT"
+            f"no {board or 'known board'} is found by its USB id: say which board is where: "
+            f"ohmskin flash {' | '.join(BOARDS)} --port PORT: {listed}"
         )
-    if not port:
-        listed = ", ".join(each.path for each in attached) or "there is none"
-        raise PortError(f"no {board} is found by its USB id: say --port: {listed}")
     return board, port
 
 

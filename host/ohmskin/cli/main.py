@@ -90,12 +90,8 @@ def run(commands: Callable[..., Any], program: str) -> None:
             sys.exit(code)
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(program, str(exc))
-    except typer.Abort:
-        sys.exit(130)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except Exception as exc:
-        if _is_ctrl_c(exc):
+    except (Exception, KeyboardInterrupt) as exc:
+        if isinstance(exc, typer.Abort) or _is_ctrl_c(exc):
             sys.exit(130)
         if not hasattr(exc, "format_message"):
             raise

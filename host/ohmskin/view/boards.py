@@ -103,17 +103,13 @@ class ViewedBoard(Closing):
         self._recording: _Recording | None = None
         self._watchers: set[Callable[[], None]] = set()
         self._commands = threading.Lock()
-        self._closing = threading.Event()
+        self.closing = threading.Event()
+        """Is set when `close` is called."""
         # A port that never answers does not hold up the end of the program.
         self._thread = threading.Thread(target=self._work, name=f"view {port}", daemon=True)
         self._thread.start()
 
     # ----------------------------------------------------------------------------- for the page
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether `close` was called."""
-        return self._closing.is_set()
 
     @contextmanager
     def watched(self, changed: Callable[[], None]) -> Iterator[None]:
@@ -174,10 +170,8 @@ class ViewedBoard(Closing):
     def undo_tare(self) -> str:
         """Return to the rest before the last tare."""
         with self._one_at_a_time():
-            rest = self._there()[1].undo_tare()
-            if rest is None:
-                return "the tare is undone: rest is not known"
-            self._record_rest(rest)
+            if (rest := self._there()[1].undo_tare()) is not None:
+                self._record_rest(rest)
         return "the tare is undone: rest is as it was before"
 
     def record(self) -> str:
@@ -191,7 +185,6 @@ class ViewedBoard(Closing):
                 tare = Tare(reader.rest.ratio, time.monotonic())
             path = self._new_file(reader.board.unit_id)
             self._recording = _Recording(skin, path, tare, self._changed)
-        self._changed()
         return "recording: every scan, whatever is shown"
 
     def stop_recording(self) -> str:
@@ -247,7 +240,7 @@ class ViewedBoard(Closing):
     # ----------------------------------------------------------------------------------- thread
 
     def _work(self) -> None:
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             try:
                 self._follow()
             except RecordingEnded as exc:
@@ -258,7 +251,7 @@ class ViewedBoard(Closing):
             except Exception as exc:
                 self._say("ended", f"a defect of this program: {exc!r}")
                 raise
-            self._closing.wait(AGAIN_S)
+            self.closing.wait(AGAIN_S)
 
     def _say(self, status: str, text: str = "") -> None:
         self._status, self._text = status, text
@@ -271,7 +264,7 @@ class ViewedBoard(Closing):
             raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
             seen_us = newest_us = 0
             try:
-                while not self._closing.is_set():
+                while not self.closing.is_set():
                     scan, running = skin.latest(), self._running()
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
@@ -317,7 +310,7 @@ class ViewedBoard(Closing):
 
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""
-        self._closing.set()
+        self.closing.set()
         skin, recording = self._skin, self._recording
         if skin is not None:
             skin.close()

@@ -63,7 +63,7 @@ class Panel:
         while True:
             await self._news.wait()
             self._news.clear()
-            if self._board.is_closed:
+            if self._board.closing.is_set():
                 await self._socket.close(_GONE)
                 raise WebSocketDisconnect(_GONE)
             state, shown = self._board.state(), self._board.shown
