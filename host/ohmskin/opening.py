@@ -19,7 +19,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 from urllib.parse import parse_qsl
 
 from ohmskin.errors import DeviceSilent, PortError
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ohmskin.emulate.scenes import Scene
 
 CalibrationLike = Calibration | str | os.PathLike[str]
-SkinT = TypeVar("SkinT", bound=Device | CalibratedSkin)
 
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
@@ -102,7 +101,8 @@ def _source(url: str) -> Source:
     if scheme == "emulator":
         from ohmskin.emulate.board import EmulatorLink
 
-        return Session(EmulatorLink(*emulated(url)))
+        board, _, faults = emulated(url)
+        return Session(EmulatorLink(board, url, faults))
     if scheme == "simavr":
         from ohmskin.emulate.simavr import SimavrLink
 
@@ -159,40 +159,13 @@ def _wrong(url: str) -> Iterator[None]:
 # ----------------------------------------------------------------------------- without a board
 
 
-def emulated(url: str) -> tuple[EmulatedBoard, str, LineFaults]:
-    """The emulated board of an ``emulator://`` URL, its name, and the faults of its line.
+def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
+    """The emulated board of an ``emulator://`` URL, what it reads, and the faults of its line.
 
     :raises PortError: the URL is wrong.
     """
     from ohmskin.emulate.board import EmulatedBoard
-    from ohmskin.emulate.faults import LineFaults, faults_of
-
-    scene, options = _emulated(url)
-    with _wrong(url):
-        seed = int(options.get("seed", 0))
-        board = EmulatedBoard(
-            *(scene.ratio, scene.rows, scene.columns),
-            rate_hz=float(options["rate"]) if "rate" in options else None,
-            noise_lsb=float(options.get("noise", _DEFAULT_NOISE_LSB)),
-            seed=seed,
-            unit_id=int(options.get("unit", 0)),
-            layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
-            sampled=scene.faults.sampled if scene.faults.of_sampling else None,
-        )
-        return board, url, faults_of(LineFaults, options, seed=seed)
-
-
-def scene_of(url: str) -> Scene:
-    """What the board of an ``emulator://`` URL reads: the truth.
-
-    :raises PortError: the URL is wrong.
-    """
-    return _emulated(url)[0]
-
-
-def _emulated(url: str) -> tuple[Scene, dict[str, str]]:
-    """The scene of the URL, and its options."""
-    from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, SkinFaults, faults_of
+    from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
 
     scheme, place, query = _parts(url)
     if scheme != "emulator":
@@ -200,7 +173,19 @@ def _emulated(url: str) -> tuple[Scene, dict[str, str]]:
     known = ("scene", "seed", "rate", "noise", "unit", "foreign", *SKIN_FAULTS, *LINE_FAULTS)
     options = _options(url, query, *known)
     with _wrong(url):
-        return _scene(place, options, faults_of(SkinFaults, options)), options
+        seed = int(options.get("seed", 0))
+        faults = faults_of(SkinFaults, options)
+        scene = _scene(place, options, faults)
+        board = EmulatedBoard(
+            *(scene.ratio, scene.rows, scene.columns),
+            rate_hz=float(options["rate"]) if "rate" in options else None,
+            noise_lsb=float(options.get("noise", _DEFAULT_NOISE_LSB)),
+            seed=seed,
+            unit_id=int(options.get("unit", 0)),
+            layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
+            sampled=faults.sampled if faults.of_sampling else None,
+        )
+        return board, scene, faults_of(LineFaults, options, seed=seed)
 
 
 def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None) -> Scene:
@@ -234,13 +219,15 @@ class BoardScan(NamedTuple):
     jitter_s: float
 
 
-class Boards(Closing, dict[int, SkinT]):
-    """Open boards by unit id. Made by `open_all`; closes all with ``with`` or `close`.
+class Boards(Closing, dict[int, Any]):
+    """Open boards by unit id: each a `Device`, or a `CalibratedSkin` if calibrations were given.
+
+    Made by `open_all`. ``with`` closes all, and so does `close`.
 
     :raises PortError: two have the same unit id.
     """
 
-    def __init__(self, devices: Sequence[SkinT]) -> None:
+    def __init__(self, devices: Sequence[Device | CalibratedSkin]) -> None:
         taken = {device.info.unit_id for device in devices}
         for device in devices:
             unit_id = device.info.unit_id
@@ -282,27 +269,12 @@ def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[B
         yield BoardScan(unit_id, scan, time_s, clock.jitter_s)
 
 
-@overload
-def open_all(
-    urls: Iterable[str] | None = None, *, calibrations: None = None, start: bool = True
-) -> Boards[Device]: ...
-
-
-@overload
-def open_all(
-    urls: Iterable[str] | None = None,
-    *,
-    calibrations: Iterable[CalibrationLike],
-    start: bool = True,
-) -> Boards[CalibratedSkin]: ...
-
-
 def open_all(
     urls: Iterable[str] | None = None,
     *,
     calibrations: Iterable[CalibrationLike] | None = None,
     start: bool = True,
-) -> Boards[Any]:
+) -> Boards:
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
 
     urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a

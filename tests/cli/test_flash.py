@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from command_line import Done, assert_one_line
-from ohmskin.cli import flash as flash_command
+from ohmskin.cli import board as flash_command
 from ohmskin.emulate.board import EmulatedBoard, PtyServer
 from ohmskin.link import session
 from ohmskin.link.serial_port import SerialPort

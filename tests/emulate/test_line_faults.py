@@ -177,7 +177,7 @@ class ResetAfterConfigure(EmulatorLink):
 
 
 def test_a_reset_right_after_configure_does_not_undo_it() -> None:
-    link = ResetAfterConfigure(*emulated("emulator://4x4"))
+    link = ResetAfterConfigure(emulated("emulator://4x4")[0], "a board")
     with ohmskin.Device(Session(link)) as skin:
         assert skin.configure(rows=2, rate_hz=77).rows == 2
         assert link.resets_due == 0
@@ -186,8 +186,8 @@ def test_a_reset_right_after_configure_does_not_undo_it() -> None:
 
 
 def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
-    board, name, _ = emulated("emulator://4x4")
-    with Device(Session(EmulatorLink(board, name)), start=False) as skin:
+    board, _, _ = emulated("emulator://4x4")
+    with Device(Session(EmulatorLink(board, "a board")), start=False) as skin:
         skin.configure(rows=2, columns=3, rate_hz=77)
         board.reset()
         skin.start()

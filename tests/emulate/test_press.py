@@ -151,6 +151,5 @@ def test_the_board_reads_the_forces() -> None:
 
 
 def test_scenes_without_forces_say_so() -> None:
-    assert not Scene("rest", 2, 2).force_n(1.0).any()
     with pytest.raises(ValueError, match="scene 'ghost': take 'press'"):
         Scene("ghost", 2, 2).force_n(1.0)

@@ -18,7 +18,8 @@ class Bench(Closing):
     """An `emulator://` URL's board. Time passes only while its scans are taken: `now_s`."""
 
     def __init__(self, url: str, now_s: float = 0.0) -> None:
-        self.board, self.name, self.faults = emulated(url)
+        self.board, _, self.faults = emulated(url)
+        self.name = url
         self.now_s = 0.0
         self._decoder = BoardDecoder()
         self._messages: list[Message] = []

@@ -99,7 +99,7 @@ class Page:
 
 
 def decode(octets: bytes) -> Message:
-    """As the page does it: see `ohmskin.view.shown`."""
+    """As the page does it: see `ohmskin.view.boards.Shown`."""
     (length,) = struct.unpack_from("<I", octets)
     scan: Message = json.loads(octets[4 : 4 + length])
     shape = (len(scan["planes"]), scan["rows"], scan["columns"])

@@ -23,8 +23,9 @@ from ohmskin.errors import OhmskinError
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.opening import emulated, scene_of
+from ohmskin.opening import emulated
 
+_URL: Final = "emulator://8x8?scene=ghost&seed=1"
 _METHODS: Final = ("ohm", "joint")
 # Where nothing says how wide the output is, three tables stand side by side [characters].
 _WIDTH: Final = 160
@@ -42,13 +43,11 @@ EPILOGS: Final = {
 
 def demo(
     seconds: Annotated[float, typer.Option(help="how long to scan")] = 3.0,
-    port: Annotated[
-        str, typer.Option(help="an emulator:// URL")
-    ] = "emulator://8x8?scene=ghost&seed=1",
+    port: Annotated[str, typer.Option(help="an emulator:// URL")] = _URL,
     picture: Annotated[Path, typer.Option(help="PNG to write")] = Path("ohmskin-demo.png"),
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
-    scene = scene_of(port)
+    _, scene, _ = emulated(port)
     with ohmskin.open(port) as skin:
         board = skin.info
         rest_ratio = ratio_from_codes(quantise(scene.rest_ratio))
@@ -105,7 +104,8 @@ def _save_picture(path: Path, views: Sequence[_View], title: str) -> None:
         seen_us = np.maximum(1e6 * cell_siemens, 0.1)
         image = axes.imshow(seen_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
         for row, column in np.argwhere(touched):
-            text, colour = f"{seen_us[row, column]:.0f}", "wk"[seen_us[row, column] > 50]
+            text = f"{seen_us[row, column]:.0f}"
+            colour = "white" if seen_us[row, column] < 50 else "black"
             axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
         rows, columns = map(range, cell_siemens.shape)
         axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
@@ -115,9 +115,7 @@ def _save_picture(path: Path, views: Sequence[_View], title: str) -> None:
 
 
 def emulate(
-    url: Annotated[str, typer.Argument(help="emulator://8x8?scene=ghost&seed=1")] = (
-        "emulator://8x8?scene=ghost"
-    ),
+    url: Annotated[str, typer.Argument(help="an emulator:// URL")] = _URL,
     link: Annotated[
         Path | None, typer.Option(help="also make this symbolic link to the pseudo-terminal")
     ] = None,

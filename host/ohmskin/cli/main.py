@@ -21,7 +21,7 @@ _COMMANDS: Final = {
     "board.info": "Say what board is at PORT and how it scans.",
     "board.configure": "Change how the board scans; what is not given stays. Lasts until its "
     "reset, or --save.",
-    "flash.flash": "Build the firmware, write it to a board, and check that it answers.",
+    "board.flash": "Build the firmware, write it to a board, and check that it answers.",
     "stream.stream": "Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it.",
     "view.view": "Show skins live on a page in the browser: heat map, contacts, tare, recording.",
     "tare.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
@@ -93,9 +93,10 @@ def run(commands: Callable[..., Any], program: str) -> None:
     except (Exception, KeyboardInterrupt) as exc:
         if isinstance(exc, typer.Abort) or _is_ctrl_c(exc):
             sys.exit(130)
-        if not hasattr(exc, "format_message"):
+        said = getattr(exc, "format_message", None)
+        if said is None:
             raise
-        if text := exc.format_message():  # a wrong use of the command line
+        if text := said():  # a wrong use of the command line
             _fail(program, text)
         sys.exit(2)  # no command at all: the help is the answer
 

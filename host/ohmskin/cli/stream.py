@@ -34,6 +34,8 @@ FULL_SCALE_N: Final = 10.0
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 # Time between two pictures in a terminal [s]; every scan is counted all the same.
 _DISPLAY_EVERY_S: Final = 0.1
+# What is printed of a contact.
+_OF_CONTACT: Final = ("identity", "row", "column", "force_n", "force_n_std")
 
 
 def stream(
@@ -48,9 +50,7 @@ def stream(
     calibration: Annotated[
         Path | None, typer.Option(help="calibration file (.json): show forces")
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="take a calibration of another unit")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     tare_s: Annotated[
         float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its rest")
     ] = 0.0,
@@ -110,27 +110,17 @@ def _print_scans(skin: Device, reader: SkinReader | None, count: int, seconds: f
             line["converged"] = found.estimate.converged
             line["message"] = found.estimate.message
             if reader.has_forces:
-                line |= forces_as_json(found)
+                line["force_n"] = _numbers(found.force_n)
+                line["force_n_std"] = _numbers(found.force_n_std)
+                line["contacts"] = [
+                    {name: _numbers(getattr(contact, name)) for name in _OF_CONTACT}
+                    for contact in found.contacts
+                ]
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
         except BrokenPipeError:
             sys.stderr.close()  # the reader, such as `head`, has had enough
             return
-
-
-def forces_as_json(scan: ForceScan) -> dict[str, Any]:
-    """Forces and contacts of a scan."""
-    return {
-        "force_n": _numbers(scan.force_n),
-        "force_n_std": _numbers(scan.force_n_std),
-        "contacts": [
-            {
-                name: _numbers(getattr(contact, name))
-                for name in ("identity", "row", "column", "force_n", "force_n_std")
-            }
-            for contact in scan.contacts
-        ],
-    }
 
 
 def _numbers(values: ArrayLike) -> Any:

@@ -113,11 +113,9 @@ class Scene:
 
         :raises ValueError: other scenes press with conductances, and no force is known.
         """
-        if self._robot is not None:
-            return self._robot.touch(time_s)[1]
-        if self.name == "rest":
-            return np.zeros((self.rows, self.columns))
-        raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
+        if self._robot is None:
+            raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
+        return self._robot.touch(time_s)[1]
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
         """Cells whose conductance a touch raises by 1 uS or more, shape (rows, columns)."""

@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """The boards of the page: a thread opens and reads each, and opens it again if it goes away."""
 
+import json
+import math
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 from itertools import count, takewhile
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ohmskin import opening
+from ohmskin.arrays import Bool, Float
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import Estimate, SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import MEMORY_US
-from ohmskin.force.reader import TARE_S, SkinReader
+from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
-from ohmskin.view.shown import Shown
 
 # The paper's programmes take minutes for a frame of 8x8.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
@@ -38,10 +44,75 @@ _CLOSE_S: Final = 1.0
 _LONGEST_MARK: Final = 1000
 # What the page says of a board.
 _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
+# What it says of a contact.
+_numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
 # What makes boards the same skin: methods, rest and tare of one are good for the other.
 _skin_of: Final = attrgetter(
     *("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One scan of a page. raw: by the method `ohm`, what the electrodes read, ghosts included.
+
+    method: that of `found`. has_forces: there are newtons. missed: scans, since the connection was
+    made. rate_hz: the board's scan rate [Hz]. recorded: scans in the recording that goes on, if one
+    does.
+    """
+
+    found: ForceScan
+    raw: Estimate
+    method: str
+    has_forces: bool
+    missed: int
+    rate_hz: float
+    recorded: int
+
+    @cached_property
+    def message(self) -> bytes:
+        """The bytes of it.
+
+        ==============  ==================================================================
+        4 bytes         length of the header, little-endian
+        header          JSON, padded with spaces to a multiple of 4 bytes
+        planes          those that the header names, each R x C float32, little-endian, by row
+        ==============  ==================================================================
+        """
+        planes: dict[str, Float | Bool] = {
+            "raw": self.raw.cell_siemens,
+            "raw_touched": self.raw.touched,
+            "siemens": self.found.estimate.cell_siemens,
+            "siemens_std": self.found.estimate.cell_siemens_std,
+            "touched": self.found.estimate.touched,
+        }
+        if self.has_forces:
+            planes |= {"force": self.found.force_n, "force_std": self.found.force_n_std}
+        scan, estimate = self.found, self.found.estimate
+        content = {
+            "scan": scan.number,
+            "host_time_s": scan.host_time_s,
+            "rows": scan.rows,
+            "columns": scan.columns,
+            "planes": list(planes),
+            "method": self.method,
+            "chi2": _number(estimate.chi2),
+            "estimate_s": estimate.seconds,
+            "text": estimate.message,
+            "rate_hz": self.rate_hz,
+            "missed": self.missed,
+            "recorded": self.recorded,
+            "contacts": [list(map(_number, _numbers_of(each))) for each in scan.contacts],
+        }
+        header = json.dumps(content, allow_nan=False).encode()
+        header += b" " * (-len(header) % 4)
+        values = np.stack(list(planes.values())).astype("<f4")
+        return struct.pack("<I", len(header)) + header + values.tobytes()
+
+
+def _number(value: float) -> float | None:
+    """As JSON has it, which knows no NaN."""
+    return value if math.isfinite(value) else None
 
 
 class _Recording(Closing):
@@ -278,7 +349,7 @@ class ViewedBoard(Closing):
                             raw.estimate(scan.ratio),
                             reader.method,
                             reader.has_forces,
-                            skin.stats,
+                            skin.stats.missed,
                             skin.info.rate_hz,
                             0 if running is None else running.recorder.scans,
                         )
@@ -296,16 +367,14 @@ class ViewedBoard(Closing):
         board, before = skin.info, self._reader
         if before is not None and _skin_of(before.board) == _skin_of(board):
             return before
-        self._note = ""
+        self._note = note = ""
         for calibration in self._calibrations:
             try:
                 calibration.check(board.unit_id, board.rows, board.columns, force=self._force)
-                reader = SkinReader(board, calibration)
+                return SkinReader(board, calibration)
             except ValueError as exc:
-                self._note = f"no forces: {exc}"
-            else:
-                self._note = ""
-                return reader
+                note = f"no forces: {exc}"
+        self._note = note
         return SkinReader(board)
 
     def close(self) -> None:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One panel of a page: a websocket over which a board is shown and commanded.
 
-To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes, `shown`): the
-newest one, and no other before the page has acknowledged it. So nothing queues up on the way,
-however slow page or network are. From the page come texts, whose ``do`` is one of `_COMMANDS`,
-"ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the host's clock.
+To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes: `Shown.message`).
+The newest scan is sent, and no other before the page has acknowledged it. So nothing queues up on
+the way, however slow page or network are. From the page come texts, whose ``do`` is a command of
+`Panel._asked`, "ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the
+host's clock.
 """
 
 import asyncio
@@ -20,8 +21,7 @@ from anyio.abc import TaskGroup
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ohmskin.errors import OhmskinError, TareRefused
-from ohmskin.view.boards import ViewedBoard
-from ohmskin.view.shown import Shown
+from ohmskin.view.boards import Shown, ViewedBoard
 
 _GONE: Final = 4001  # close code: the board was closed, by this page or another
 _Command = Callable[[], str]
