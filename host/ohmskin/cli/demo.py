@@ -99,18 +99,16 @@ def _save_picture(path: Path, views: Sequence[_View], title: str) -> None:
     figure = Figure(figsize=(3.4 * len(views) + 0.8, 3.9), layout="constrained")
     figure.suptitle(title)
     all_axes = figure.subplots(1, len(views), squeeze=False)[0]
-    image = None
     for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
         seen_us = np.maximum(1e6 * cell_siemens, 0.1)
-        image = axes.imshow(seen_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
+        axes.imshow(seen_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
         for row, column in np.argwhere(touched):
             text = f"{seen_us[row, column]:.0f}"
             colour = "white" if seen_us[row, column] < 50 else "black"
             axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
         rows, columns = map(range, cell_siemens.shape)
         axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
-    assert image is not None
-    figure.colorbar(image, ax=all_axes, label="cell conductance [µS]", shrink=0.9)
+    figure.colorbar(all_axes[0].images[0], ax=all_axes, label="cell conductance [µS]", shrink=0.9)
     figure.savefig(path, dpi=120)
 
 

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
@@ -119,7 +118,7 @@ def until_stopped(scans: Iterable[_T]) -> Iterator[_T]:
     """
     is_stopped = waits = False
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def handle(*_: object) -> None:
         nonlocal is_stopped
         is_stopped = True
         if waits:
@@ -230,11 +229,9 @@ def estimate(
     errors = Console(stderr=True)
     with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task(method, total=len(given.ratio))
-
-        def show(done: int, _: int) -> None:
-            progress.update(task, completed=done)
-
-        answers = estimate_file(given, method, cold=cold, progress=show)
+        answers = estimate_file(
+            given, method, cold=cold, progress=lambda done, _: progress.update(task, completed=done)
+        )
     save_arrays(out, answers)
     frames = len(answers["converged"])
     _out.print(

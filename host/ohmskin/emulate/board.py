@@ -154,8 +154,7 @@ class EmulatedBoard:
     def codes_at(self, time_s: float) -> NDArray[np.uint16]:
         """Codes of a scan, shape (rows, columns, 4); lines beyond the skin are open."""
         rows, columns = self._settings["rows"], self._settings["columns"]
-        ratio = np.empty((rows, columns, protocol.READINGS_PER_CELL))
-        ratio[:] = READING_OFFSET  # no current flows
+        ratio = np.tile(READING_OFFSET, (rows, columns, 1))  # no current flows
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s)[: have[0], : have[1]]
         if self._sampled is not None:

@@ -56,10 +56,8 @@ modelled are a force below which the layers do not touch, and pressure that spre
 [Findley] Findley, Lai and Onaran, "Creep and Relaxation of Nonlinear Viscoelastic Materials", 1976.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -97,10 +95,6 @@ class PressModel:
     gain_spread: float = 0.2
     exponent_spread: float = 0.03
     seed: int = 0
-
-    def without_memory(self) -> PressModel:
-        """The same cells and the same noise, without hysteresis and creep."""
-        return replace(self, play_n=0.0, creep=0.0)
 
     def rise(self, time_s: Float, force_n: Float) -> Float:
         """Conductance above rest G [S] over a history of forces [N], both (n,) or (n, R, C).

@@ -172,7 +172,8 @@ class ViewedBoard(Closing):
         self._skin: Device | None = None
         self._reader: SkinReader | None = None
         self._recording: _Recording | None = None
-        self._watchers: set[Callable[[], None]] = set()
+        self.watchers: set[Callable[[], None]] = set()
+        """They are called, from any thread, when `shown` or `state` may be new."""
         self._commands = threading.Lock()
         self.closing = threading.Event()
         """Is set when `close` is called."""
@@ -181,15 +182,6 @@ class ViewedBoard(Closing):
         self._thread.start()
 
     # ----------------------------------------------------------------------------- for the page
-
-    @contextmanager
-    def watched(self, changed: Callable[[], None]) -> Iterator[None]:
-        """Meanwhile `changed` is called, from any thread, when `shown` or `state` may be new."""
-        self._watchers.add(changed)
-        try:
-            yield
-        finally:
-            self._watchers.discard(changed)
 
     def state(self) -> dict[str, Any]:
         """What the page says beside the scans, as JSON has it."""
@@ -212,7 +204,7 @@ class ViewedBoard(Closing):
         }
 
     def _changed(self) -> None:
-        for watcher in tuple(self._watchers):
+        for watcher in tuple(self.watchers):
             watcher()
 
     # --------------------------------------------------------------------------------- commands
@@ -339,7 +331,7 @@ class ViewedBoard(Closing):
                     scan, running = skin.latest(), self._running()
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
-                    if self._watchers:
+                    if self.watchers:
                         # Contacts that nobody looked at meanwhile have not gone.
                         step_us = max(scan.time_us - newest_us, 0)
                         seen_us += min(step_us, MEMORY_US // 2)
@@ -353,9 +345,7 @@ class ViewedBoard(Closing):
                             skin.info.rate_hz,
                             0 if running is None else running.recorder.scans,
                         )
-                    if self._status != "scanning":
-                        self._status, self._text = "scanning", ""
-                    self._changed()
+                    self._say("scanning")
             finally:
                 self._skin = None
                 skin.close()  # its scans end, and so does the recording

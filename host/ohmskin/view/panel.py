@@ -47,13 +47,15 @@ class Panel:
             with suppress(RuntimeError):  # the loop has just ended
                 loop.call_soon_threadsafe(self._news.set)
 
-        with self._board.watched(wake):
-            try:
-                async with anyio.create_task_group() as tasks:
-                    tasks.start_soon(self._send)
-                    tasks.start_soon(self._receive, tasks)
-            except* WebSocketDisconnect:
-                pass
+        self._board.watchers.add(wake)
+        try:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._send)
+                tasks.start_soon(self._receive, tasks)
+        except* WebSocketDisconnect:
+            pass
+        finally:
+            self._board.watchers.discard(wake)
 
     # ------------------------------------------------------------------------------ to the page
 

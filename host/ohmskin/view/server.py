@@ -118,9 +118,7 @@ async def _body(request: Request) -> bytes:
     return octets
 
 
-def serve(
-    boards: ViewedBoards, host: str, port: int, started: Callable[[str], None] = lambda url: None
-) -> None:
+def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], None]) -> None:
     """Serve until SIGINT or SIGTERM; then the boards are closed. SIGINT raises KeyboardInterrupt.
 
     port: 0: any that is free. started: is called with the page's address when it can be opened.
@@ -184,15 +182,9 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer 403 to a stranger, and let everybody else through."""
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-            return
-        refusal = self._refusal(scope)
-        if scope["type"] == "websocket":
-            if refusal:
-                await send({"type": "websocket.close", "code": 1008, "reason": refusal})
-            else:
-                await self._app(scope, receive, send)
+        refusal = "" if scope["type"] == "lifespan" else self._refusal(scope)
+        if refusal and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal})
             return
 
         async def send_with_headers(message: Message) -> None:
@@ -209,17 +201,14 @@ class Guard:
         if self._token is None:
             if _name(host) not in self._names:
                 return "this page is at 127.0.0.1, and by no other name"
-        elif scope["path"] not in self._public and not self._is_known(scope):
-            return "open the address that 'ohmskin view' has printed, with its token"
+        elif scope["path"] not in self._public:
+            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            if not secrets.compare_digest(given.encode(), self._token.encode()):
+                return "open the address that 'ohmskin view' has printed, with its token"
         changes = scope["type"] == "websocket" or scope["method"] not in _READS
         if (changes or origin is not None) and origin != f"http://{host}":
             return "only this page itself may ask that"
         return ""
-
-    def _is_known(self, scope: Scope) -> bool:
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        assert self._token is not None
-        return secrets.compare_digest(given.encode(), self._token.encode())
 
 
 def _name(host: str) -> str | None:
