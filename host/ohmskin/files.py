@@ -4,8 +4,8 @@
 import csv
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO, Self
@@ -64,15 +64,6 @@ def save_table(
         table.writerow(names)
         table.writerows(rows)
         text.detach()
-
-
-def save_whole(contents: Mapping[Path, bytes]) -> None:
-    """Write all of these files, or none."""
-    with ExitStack() as stack:
-        for path, content in contents.items():
-            file = stack.enter_context(whole_file(path))
-            file.write(content)
-            file.flush()
 
 
 class Closing(ABC):

@@ -18,7 +18,7 @@ from calibrations import calibration
 from command_line import Done, assert_one_line
 from ohmskin.cli import doctor as doctor_command
 from ohmskin.cli.doctor import gather
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link import session
 from ohmskin.record.recorder import Recorder

@@ -15,8 +15,7 @@ import pytest
 import ohmskin
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
-from ohmskin.emulate.board import EmulatorLink
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import EmulatorLink, PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import device, framing, protocol, session
@@ -24,7 +23,7 @@ from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
-from ohmskin.opening import emulated, open_link
+from ohmskin.opening import emulated
 from stepped_link import SteppedLink
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -129,7 +128,7 @@ def test_a_reset_board_goes_on_as_it_was_configured() -> None:
 def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its line speed is that of the start again, too; the simulated line follows the board's."""
     monkeypatch.setattr(simavr, "SkinSim", LockstepSim)
-    link, _ = open_link("simavr://uno")
+    link = simavr.SimavrLink("uno", Scene())
     with Session(link, baud) as skin:
         skin.start()
         kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
@@ -178,7 +177,7 @@ class ResetAfterConfigure(EmulatorLink):
 
 
 def test_a_reset_right_after_configure_does_not_undo_it() -> None:
-    link = ResetAfterConfigure(*emulated("emulator://4x4"))
+    link = ResetAfterConfigure(emulated("emulator://4x4")[0], "a board")
     with Session(link) as skin:
         skin.start()
         assert skin.configure(rows=2, rate_hz=77).rows == 2
@@ -188,8 +187,8 @@ def test_a_reset_right_after_configure_does_not_undo_it() -> None:
 
 
 def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
-    board, name, _ = emulated("emulator://4x4")
-    with Session(EmulatorLink(board, name)) as skin:
+    board, _, _ = emulated("emulator://4x4")
+    with Session(EmulatorLink(board, "a board")) as skin:
         skin.configure(rows=2, columns=3, rate_hz=77)
         board.reset()
         skin.start()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ohmskin.cli.doctor import gather
 from ohmskin.doctor.examine import Evidence
-from ohmskin.emulate.line_faults import Faults
+from ohmskin.emulate.faults import LineFaults
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.device import configuration
@@ -19,7 +19,8 @@ class Bench(Closing):
     """An `emulator://` URL's board. Time passes only while its scans are taken: `now_s`."""
 
     def __init__(self, url: str, now_s: float = 0.0) -> None:
-        self.board, self.name, self.faults = emulated(url)
+        self.board, _, self.faults = emulated(url)
+        self.name = url
         self.now_s = 0.0
         self._decoder = BoardDecoder()
         self._messages: list[Message] = []
@@ -27,14 +28,14 @@ class Bench(Closing):
         self.now_s = now_s
         self.board.advance(now_s)
 
-    def _take(self, faults: Faults) -> None:
+    def _take(self, faults: LineFaults) -> None:
         octets = self.board.heard(faults, self.now_s)
         self._messages += self._decoder.feed(octets, self.now_s)
 
     def ask(self, name: str, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
         self.board.receive(framing.encode(frame.id, 1, frame.pack(**values)))
-        self._take(Faults())  # commands are repeated until they are answered
+        self._take(LineFaults())  # commands are repeated until they are answered
 
     def __iter__(self) -> Iterator[Scan]:
         self._messages = [self.info]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
 from ohmskin.link import device, framing, protocol

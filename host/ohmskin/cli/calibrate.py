@@ -24,7 +24,8 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli.record import cell_table, until_stopped
+from ohmskin.cli.record import until_stopped
+from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.base import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
@@ -334,8 +335,8 @@ def _guided(
     columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
     bar = Progress(*columns, console=_out, transient=True, disable=not _out.is_terminal)
     task = bar.add_task("", total=total)
-    with until_stopped() as watched, bar:
-        for scan in watched(iter(skin.latest, None)):
+    with bar:
+        for scan in until_stopped(iter(skin.latest, None)):
             found = calibrator.estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
             if step.wanted is not None and step.rise is not None:
