@@ -40,7 +40,7 @@ import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.presses import Calibrator, Presses
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -58,8 +58,8 @@ SIEMENS_PER_NEWTON = 20e-6
 
 def calibration(board: Hello, rest_ratio: Float, method: str) -> Calibration:
     """Of a skin of which every cell answers alike: what a force costs does not depend on it."""
-    knowledge = SkinKnowledge.of(board, rest_ratio, WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM))
-    calibrator = Calibrator(knowledge, method, 1e-4, board.unit_id, "2025-01-01")
+    wires = WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    calibrator = Calibrator(board, rest_ratio, method, 1e-4, wires)
     cells = np.repeat(np.arange(64), 6)
     force_n = np.tile(np.arange(1.0, 7.0), 64)
     presses = Presses(

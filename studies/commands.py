@@ -6,7 +6,8 @@ from __future__ import annotations
 import json
 import platform
 import time
-from contextlib import suppress
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +15,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from ohmskin.files import save_whole
+from ohmskin.files import whole_file
 from studies import chart as speed_accuracy
 from studies import chart_figure, chart_table, stability_figure
 from studies import stability as verdicts
@@ -33,6 +34,15 @@ def default_folder() -> Path:
     """Where pictures go: docs of a checkout, or here."""
     root = Path(__file__).parents[1]
     return root / "docs" if (root / "platformio.ini").is_file() else Path()
+
+
+def save_whole(contents: Mapping[Path, bytes]) -> None:
+    """Write all of these files, or none."""
+    with ExitStack() as stack:
+        for path, content in contents.items():
+            file = stack.enter_context(whole_file(path))
+            file.write(content)
+            file.flush()
 
 
 def chart(

@@ -26,7 +26,7 @@ from ohmskin.circuit.skin import (
     Skin,
     readings,
 )
-from ohmskin.emulate.skin_faults import cut, joined_readings
+from ohmskin.emulate.faults import cut, joined_readings
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link.codes import DEFAULT_ADC_BITS, quantise, ratio_from_codes
 from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest, touch

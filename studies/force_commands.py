@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from ohmskin.files import save_whole
 from studies import chart_figure, force_experiment, force_figure, force_limits, force_table
 from studies.commands import default_folder as default_folder
+from studies.commands import save_whole
 
 experiment = typer.Typer(
     help="The paper's experiments with force, on simulated skins.", no_args_is_help=True

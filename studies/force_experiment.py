@@ -20,7 +20,7 @@ the cells' memory and their noise leave to the best readout there can be.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -49,8 +49,8 @@ ALL: Final = (VOLTAGE, *METHODS, TRUTH)
 OURS: Final = ("joint", "touch")
 CELLS: Final = {
     "whole": PressModel(),
-    "no memory": PressModel().without_memory(),
-    "ideal": replace(PressModel().without_memory(), noise=0.0, drift=0.0),
+    "no memory": PressModel(play_n=0.0, creep=0.0),
+    "ideal": PressModel(play_n=0.0, creep=0.0, noise=0.0, drift=0.0),
 }
 
 

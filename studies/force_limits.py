@@ -190,7 +190,7 @@ def _levels(plan: Detection, forces_n: Float, seed: int, scene: str, cell: int) 
         for other in others:
             force_n[free != other, other] = TOUCH_N
     # A second apart, so that no frame repeats the noise of another.
-    model = replace(PressModel().without_memory(), seed=seed)
+    model = PressModel(play_n=0.0, creep=0.0, seed=seed)
     rise = model.rise(np.arange(len(target_n), dtype=float), force_n.reshape(-1, *SHAPE))
     board = OneFrameBoard(SHAPE, int(random.integers(1 << 32)))
     rest_ratio = np.mean(

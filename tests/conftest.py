@@ -17,8 +17,8 @@ from hypothesis import settings
 import ohmskin
 from command_line import Done
 from ohmskin.cli import main as cli
-from ohmskin.emulate.pty_server import PtyServer
-from ohmskin.emulate.simavr import default_program
+from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.opening import emulated
 from places import ROOT
 
@@ -35,7 +35,7 @@ settings.load_profile("repeatable")
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("simavr") and not (
-        default_program().exists() and (ROOT / ".pio/build/uno/firmware.elf").exists()
+        PROGRAM.exists() and (ROOT / ".pio/build/uno/firmware.elf").exists()
     ):
         pytest.skip("needs 'make firmware sim'")
     if item.get_closest_marker("ngspice") and not shutil.which("ngspice"):

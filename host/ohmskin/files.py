@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that are read within bounds and written whole or not at all; what a ``with`` closes."""
 
+import csv
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO, Self
 
@@ -52,13 +54,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise ValueError(f"{target}: cannot be written: {error.strerror or error}") from error
 
 
-def save_whole(contents: Mapping[Path, bytes]) -> None:
-    """Write all of these files, or none."""
-    with ExitStack() as stack:
-        for path, content in contents.items():
-            file = stack.enter_context(whole_file(path))
-            file.write(content)
-            file.flush()
+def save_table(
+    path: str | os.PathLike[str], names: Iterable[str], rows: Iterable[Iterable[object]]
+) -> None:
+    """Write a CSV file with these column names, as `whole_file`. Numbers are kept bit for bit."""
+    with whole_file(path) as file:
+        text = TextIOWrapper(file, encoding="ascii", newline="", write_through=True)
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(names)
+        table.writerows(rows)
+        text.detach()
 
 
 class Closing(ABC):

@@ -16,38 +16,30 @@ from __future__ import annotations
 import heapq
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, overload
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 from urllib.parse import parse_qsl
 
-from ohmskin.arrays import Float
 from ohmskin.errors import DeviceSilent, PortError
-from ohmskin.files import Closing
+from ohmskin.files import Closing, naming
 from ohmskin.force.calibration import Calibration, load_calibration
-from ohmskin.force.reader import CalibratedSkin, ForceScan
+from ohmskin.force.reader import CalibratedSkin
 from ohmskin.link import protocol
-from ohmskin.link.clock import BoardClock
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
-from ohmskin.link.serial_port import Link, SerialLink, serial_ports
+from ohmskin.link.serial_port import SerialLink, serial_ports
 from ohmskin.link.session import Session
-from ohmskin.link.timing import line_delay_s, scan_s
 
 if TYPE_CHECKING:
     from ohmskin.emulate.board import EmulatedBoard
-    from ohmskin.emulate.line_faults import Faults
+    from ohmskin.emulate.faults import LineFaults, SkinFaults
     from ohmskin.emulate.scenes import Scene
-    from ohmskin.emulate.skin_faults import SkinFaults
 
 CalibrationLike = Calibration | str | os.PathLike[str]
-SkinT = TypeVar("SkinT", bound=Device | CalibratedSkin)
-ScanT = TypeVar("ScanT", bound=Scan)
 
-_SCENE_KEYS = ("scene", "seed")
-_BOARD_KEYS = ("readings", "rate", "noise", "unit", "foreign")
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
 
@@ -84,161 +76,67 @@ def open(
     :raises RecordingError: the recording of a ``replay://`` port cannot be read.
     :raises ValueError: the calibration cannot be read, or is of another unit or geometry.
     """
-    if calibration is None:
-        return open_device(url, start=start)
-    if not isinstance(calibration, Calibration):
-        calibration = load_calibration(calibration)
-    return _calibrated(open_device(url, start=False), calibration, start=start, force=force)
-
-
-def _calibrated(
-    device: Device, calibration: Calibration, *, start: bool, force: bool = False
-) -> CalibratedSkin:
-    try:
-        skin = CalibratedSkin(device, calibration, force=force)
+    told = None if calibration is None else _loaded(calibration)
+    with ExitStack() as opened:
+        device = opened.enter_context(_device(url))
+        skin = device if told is None else CalibratedSkin(device, told, force=force)
         if start:
             device.start()
-    except BaseException:
-        device.close()
-        raise
-    return skin
+        opened.pop_all()
+        return skin
 
 
-def open_device(url: str, *, start: bool = True) -> Device:
-    """The device of a URL.
-
-    :raises PortError: as `open`, and so are the other errors.
-    """
-    scheme, separator, rest = url.partition("://")
-    place, _, query = rest.partition("?")
-    if scheme == "replay" and separator:
-        from ohmskin.record.replay import Replay
-
-        options = _options(url, query, ("speed",))
-        try:
-            return Device(Replay(place, float(options.get("speed", "1")), url), start=start)
-        except ValueError as exc:
-            raise PortError(f"{url}: {exc}") from exc
-    return Device(Session(*open_link(url)), start=start)
+def _loaded(calibration: CalibrationLike) -> Calibration:
+    return calibration if isinstance(calibration, Calibration) else load_calibration(calibration)
 
 
-def open_link(url: str) -> tuple[Link, int | None]:
-    """The link of the board at a URL, and the line speed that the URL asks for, if any.
-
-    :raises PortError: as `open`.
-    """
-    scheme, separator, rest = url.partition("://")
-    if not separator:
-        path, _, query = url.partition("?")
-        baud = _baud(_options(url, query, ("baud",)))
-        return SerialLink(path), baud
-    place, _, query = rest.partition("?")
+def _device(url: str) -> Device:
+    """The device of a URL, not started."""
+    scheme, place, query = _parts(url)
+    if scheme is None:
+        baud = _baud(_options(url, query, "baud"))
+        return Session(SerialLink(place), baud)
     if scheme == "emulator":
         from ohmskin.emulate.board import EmulatorLink
 
-        return EmulatorLink(*emulated(url)), None
+        board, _, faults = emulated(url)
+        return Session(EmulatorLink(board, url, faults))
     if scheme == "simavr":
-        return _simavr(url, place, query)
+        from ohmskin.emulate.simavr import SimavrLink
+
+        options = _options(url, query, "scene", "seed", "rows", "columns", "baud")
+        size, baud = f"{options.get('rows', 8)}x{options.get('columns', 8)}", _baud(options)
+        with _wrong(url):
+            return Session(SimavrLink(place, _scene(size, options), url), baud)
+    if scheme == "replay":
+        from ohmskin.record.replay import Replay
+
+        options = _options(url, query, "speed")
+        with _wrong(url):
+            return Replay(place, float(options.get("speed", "1")), url)
     raise PortError(
         f"no kind of port '{scheme}://': there are serial ports by name, emulator://, simavr:// "
         "and replay://"
     )
 
 
-# ----------------------------------------------------------------------------- without a board
+def _parts(url: str) -> tuple[str | None, str, str]:
+    """Scheme (None: a serial port), place and options of a URL."""
+    scheme, separator, rest = url.partition("://")
+    place, _, query = (rest if separator else url).partition("?")
+    return scheme if separator else None, place, query
 
 
-def emulated(url: str) -> tuple[EmulatedBoard, str, Faults]:
-    """The emulated board of an ``emulator://`` URL, its name, and the faults of its line.
-
-    :raises PortError: the URL is wrong.
-    """
-    from ohmskin.emulate.board import EmulatedBoard
-    from ohmskin.emulate.line_faults import FAULTS, Faults
-    from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
-
-    scheme, _, rest = url.partition("://")
-    place, _, query = rest.partition("?")
-    if scheme != "emulator":
-        raise PortError(f"{url} is not emulated: write emulator://8x8")
-    options = _options(url, query, (*_SCENE_KEYS, *_BOARD_KEYS, *SKIN_FAULTS, *FAULTS))
-    try:
-        seed = int(options.pop("seed", "0"))
-        skin_faults = SkinFaults.from_texts(options)
-        for name in SKIN_FAULTS:
-            options.pop(name, None)
-        ratio_at, rows, columns = _skin(place, options, seed, skin_faults)
-        board = EmulatedBoard(
-            ratio_at,
-            rows,
-            columns,
-            rate_hz=float(options.pop("rate")) if "rate" in options else None,
-            noise_lsb=float(options.pop("noise", str(_DEFAULT_NOISE_LSB))),
-            seed=seed,
-            unit_id=int(options.pop("unit", "0")),
-            layout_crc=protocol.LAYOUT_CRC ^ int(options.pop("foreign", "0")),
-            sampled=skin_faults.sampled if skin_faults.of_sampling else None,
-        )
-        faults = Faults(seed=seed, **{name: float(value) for name, value in options.items()})
-    except (ValueError, OSError) as exc:
-        raise PortError(f"{url}: {exc}") from exc
-    return board, url, faults
-
-
-def _skin(
-    place: str, options: dict[str, str], seed: int, faults: SkinFaults
-) -> tuple[Callable[[float], Float], int, int]:
-    path = options.pop("readings", None)
-    if path is None:
-        scene = _scene(place, options, seed, faults)
-        return scene.ratio, scene.rows, scene.columns
-    if "scene" in options:
-        raise ValueError("say either scene or readings")
-    if faults.of_resistances:
-        raise ValueError("readings of a file have no resistances that could be at fault")
-    from ohmskin.emulate.board import DEFAULT_RATE_HZ
-    from ohmskin.record.readings import load_readings
-
-    ratio = load_readings(path).ratio
-    rate_hz = float(options.setdefault("rate", str(DEFAULT_RATE_HZ)))
-    # Half a scan on, because a scan begins a rounding error before its frame's time.
-    return lambda time_s: ratio[int(time_s * rate_hz + 0.5) % len(ratio)], *ratio.shape[1:3]
-
-
-def _scene(
-    place: str, options: dict[str, str], seed: int, faults: SkinFaults | None = None
-) -> Scene:
-    from ohmskin.emulate.scenes import Scene
-
-    size = re.fullmatch(r"(\d{1,2})x(\d{1,2})", place)
-    if size is None:
-        raise ValueError(f"the size '{place}' is not of the form 8x8")
-    rows, columns = int(size[1]), int(size[2])
-    most = (protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
-    if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
-        raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not {place}")
-    return Scene(options.pop("scene", "rest"), rows, columns, seed=seed, faults=faults)
-
-
-def _simavr(url: str, place: str, query: str) -> tuple[Link, int | None]:
-    from ohmskin.emulate.simavr import SimavrLink
-
-    options = _options(url, query, (*_SCENE_KEYS, "rows", "columns", "elf", "baud", "tau_us"))
-    try:
-        seed = int(options.pop("seed", "0"))
-        size = f"{options.pop('rows', '8')}x{options.pop('columns', '8')}"
-        scene = _scene(size, options, seed)
-        elf = options.pop("elf", None)
-        baud = _baud(options)
-        tau_us = float(options.pop("tau_us", "0"))
-        link = SimavrLink(place, scene, None if elf is None else Path(elf), tau_us, url)
-    except (ValueError, OSError) as exc:
-        raise PortError(f"{url}: {exc}") from exc
-    return link, baud
+def _options(url: str, query: str, *known: str) -> dict[str, str]:
+    options = dict(parse_qsl(query, keep_blank_values=True))
+    for key in options:
+        if key not in known:
+            raise PortError(f"{url}: no option '{key}': there are {', '.join(known)}")
+    return options
 
 
 def _baud(options: dict[str, str]) -> int | None:
-    text = options.pop("baud", None)
+    text = options.get("baud")
     known = (protocol.CONSTANTS["baud_default"], protocol.CONSTANTS["baud_fast"])
     if text is None:
         return None
@@ -247,53 +145,99 @@ def _baud(options: dict[str, str]) -> int | None:
     return int(text)
 
 
-def _options(url: str, query: str, known: Iterable[str]) -> dict[str, str]:
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    for key in options:
-        if key not in known:
-            raise PortError(f"{url}: no option '{key}': there are {', '.join(known)}")
-    return options
+@contextmanager
+def _wrong(url: str) -> Iterator[None]:
+    """A value that cannot be, or a file that cannot be read, is a wrong URL."""
+    try:
+        yield
+    except (ValueError, OSError) as exc:
+        raise PortError(f"{url}: {exc}") from exc
+
+
+# ----------------------------------------------------------------------------- without a board
+
+
+def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
+    """The emulated board of an ``emulator://`` URL, what it reads, and the faults of its line.
+
+    :raises PortError: the URL is wrong.
+    """
+    from ohmskin.emulate.board import EmulatedBoard
+    from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
+
+    scheme, place, query = _parts(url)
+    if scheme != "emulator":
+        raise PortError(f"{url} is not emulated: write emulator://8x8")
+    known = ("scene", "seed", "rate", "noise", "unit", "foreign", *SKIN_FAULTS, *LINE_FAULTS)
+    options = _options(url, query, *known)
+    with _wrong(url):
+        seed = int(options.get("seed", 0))
+        faults = faults_of(SkinFaults, options)
+        scene = _scene(place, options, faults)
+        board = EmulatedBoard(
+            *(scene.ratio, scene.rows, scene.columns),
+            rate_hz=float(options["rate"]) if "rate" in options else None,
+            noise_lsb=float(options.get("noise", _DEFAULT_NOISE_LSB)),
+            seed=seed,
+            unit_id=int(options.get("unit", 0)),
+            layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
+            sampled=faults.sampled if faults.of_sampling else None,
+        )
+        return board, scene, faults_of(LineFaults, options, seed=seed)
+
+
+def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None) -> Scene:
+    from ohmskin.emulate.scenes import Scene
+
+    match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", size)
+    if match is None:
+        raise ValueError(f"the size '{size}' is not of the form 8x8")
+    rows, columns = int(match[1]), int(match[2])
+    most = (protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
+    if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
+        raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not {size}")
+    seed = int(options.get("seed", 0))
+    return Scene(options.get("scene", "rest"), rows, columns, seed=seed, faults=faults)
 
 
 # ------------------------------------------------------------------------------ several boards
 
 
-class BoardScan(NamedTuple, Generic[ScanT]):
+class BoardScan(NamedTuple):
     """A scan of one of several boards.
 
-    time_s: when its middle was, on `time.monotonic()` [s]; late by what USB delays all scans alike.
-    jitter_s: `BoardClock.jitter_s`.
+    scan: a `Scan`; a `ForceScan` if the boards were opened with calibrations. time_s: when its
+    middle was, on `time.monotonic()` [s]; late by what USB delays all scans alike. jitter_s:
+    `BoardClock.jitter_s`.
     """
 
     unit_id: int
-    scan: ScanT
+    scan: Any
     time_s: float
     jitter_s: float
 
 
-class Boards(Closing, Mapping[int, SkinT]):
-    """Open boards by unit id. Made by `open_all`; closes all with ``with`` or `close`."""
+class Boards(Closing, dict[int, Any]):
+    """Open boards by unit id: each a `Device`, or a `CalibratedSkin` if calibrations were given.
 
-    def __init__(self, devices: Iterable[SkinT], closing: ExitStack) -> None:
-        self._devices = {device.info.unit_id: device for device in devices}
-        self._closing = closing
+    Made by `open_all`. ``with`` closes all, and so does `close`.
 
-    def __getitem__(self, unit_id: int) -> SkinT:
-        return self._devices[unit_id]
+    :raises PortError: two have the same unit id.
+    """
 
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._devices)
+    def __init__(self, devices: Sequence[Device | CalibratedSkin]) -> None:
+        taken = {device.info.unit_id for device in devices}
+        for device in devices:
+            unit_id = device.info.unit_id
+            first = self.setdefault(unit_id, device)
+            if first is not device:
+                free = next(number for number in range(1, len(taken) + 2) if number not in taken)
+                raise PortError(
+                    f"{first.name} and {device.name} are both unit {unit_id}: rename one: "
+                    f"ohmskin configure {device.name} --unit-id {free} --save"
+                )
 
-    def __len__(self) -> int:
-        return len(self._devices)
-
-    @overload
-    def scans(self: Boards[CalibratedSkin]) -> Iterator[BoardScan[ForceScan]]: ...
-
-    @overload
-    def scans(self: Boards[Device]) -> Iterator[BoardScan[Scan]]: ...
-
-    def scans(self: Boards[SkinT]) -> Iterator[BoardScan[Scan]]:  # type: ignore[misc]
+    def scans(self) -> Iterator[BoardScan]:
         """Every scan of every board from now on, in order of their times.
 
         A scan comes when every other board has sent a later one: about a period of the slowest
@@ -302,19 +246,19 @@ class Boards(Closing, Mapping[int, SkinT]):
         :raises DeviceLost: one of the boards went away; its text names the port.
         """
         # All boards begin now: the merge below takes from one after the other.
-        begun = [(unit_id, device, iter(device)) for unit_id, device in self.items()]
-        each = [_timed(unit_id, device, scans) for unit_id, device, scans in begun]
+        begun = [(device, iter(device)) for device in self.values()]
+        each = [_timed(device, scans) for device, scans in begun]
         return heapq.merge(*each, key=lambda board_scan: board_scan.time_s)
 
     def close(self) -> None:
         """Stop all boards and give their ports back. May be called again."""
-        self._closing.close()
+        with ExitStack() as closing:
+            for device in self.values():
+                closing.push(device)
 
 
-def _timed(
-    unit_id: int, device: Device | CalibratedSkin, scans: Iterator[Scan]
-) -> Iterator[BoardScan[Scan]]:
-    clock = BoardClock()
+def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[BoardScan]:
+    clock, unit_id = BoardClock(), device.info.unit_id
     for scan in scans:
         board = device.info
         took_us = 1e6 * scan_s(board)
@@ -323,27 +267,12 @@ def _timed(
         yield BoardScan(unit_id, scan, time_s, clock.jitter_s)
 
 
-@overload
-def open_all(
-    urls: Iterable[str] | None = None, *, calibrations: None = None, start: bool = True
-) -> Boards[Device]: ...
-
-
-@overload
 def open_all(
     urls: Iterable[str] | None = None,
     *,
-    calibrations: Sequence[CalibrationLike],
+    calibrations: Iterable[CalibrationLike] | None = None,
     start: bool = True,
-) -> Boards[CalibratedSkin]: ...
-
-
-def open_all(
-    urls: Iterable[str] | None = None,
-    *,
-    calibrations: Sequence[CalibrationLike] | None = None,
-    start: bool = True,
-) -> Boards[Any]:
+) -> Boards:
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
 
     urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a
@@ -372,67 +301,41 @@ def open_all(
 
         def connect(url: str) -> Device | CalibratedSkin | None:
             try:
-                device = _open(url, by_unit)
+                device = opened.enter_context(open(url, start=False))
             except DeviceSilent:
                 if searched:
                     return None
                 raise
-            opened.callback(device.close)
-            return device
+            return device if by_unit is None else _calibrated(device, by_unit)
 
         # At once, because each takes as long as its board to boot.
         with ThreadPoolExecutor(len(named)) as pool:
             found = [device for device in pool.map(connect, named) if device is not None]
         if not found:
             raise PortError(f"no skin board answers at {', '.join(named)}: are they flashed?")
-        _check_units(found)
+        boards = Boards(found)
         if start:
             for device in found:
                 device.start()
-        return Boards(found, opened.pop_all())
+        opened.pop_all()
+        return boards
 
 
-def _open(url: str, by_unit: Mapping[int, Calibration] | None) -> Device | CalibratedSkin:
-    device = open_device(url, start=False)
-    if by_unit is None:
-        return device
+def _calibrated(device: Device, by_unit: dict[int, Calibration]) -> CalibratedSkin:
     unit_id = device.info.unit_id
     if unit_id not in by_unit:
-        device.close()
         known = ", ".join(map(str, sorted(by_unit))) or "none"
         raise ValueError(
-            f"{url} is unit {unit_id}, of which there is no calibration (there are of units: "
-            f"{known}): calibrate this skin"
+            f"{device.name} is unit {unit_id}, of which there is no calibration (there are of "
+            f"units: {known}): calibrate this skin"
         )
-    try:
-        return _calibrated(device, by_unit[unit_id], start=False)
-    except ValueError as exc:
-        raise ValueError(f"{url}: {exc}") from exc
+    with naming(device.name):
+        return CalibratedSkin(device, by_unit[unit_id])
 
 
-def _by_unit(calibrations: Sequence[CalibrationLike]) -> dict[int, Calibration]:
+def _by_unit(calibrations: Iterable[CalibrationLike]) -> dict[int, Calibration]:
     by_unit: dict[int, Calibration] = {}
-    names: dict[int, str] = {}
-    for index, given in enumerate(calibrations):
-        if isinstance(given, Calibration):
-            calibration, name = given, f"calibration {index}"
-        else:
-            calibration, name = load_calibration(given), os.fspath(given)
-        unit_id = calibration.unit_id
-        if unit_id in by_unit:
-            raise ValueError(f"{names[unit_id]} and {name} are both of unit {unit_id}: give one")
-        by_unit[unit_id], names[unit_id] = calibration, name
+    for calibration in map(_loaded, calibrations):
+        if by_unit.setdefault(calibration.unit_id, calibration) is not calibration:
+            raise ValueError(f"two calibrations are of unit {calibration.unit_id}: give one")
     return by_unit
-
-
-def _check_units(devices: Sequence[Device | CalibratedSkin]) -> None:
-    by_unit: dict[int, Device | CalibratedSkin] = {}
-    taken = {device.info.unit_id for device in devices}
-    for device in devices:
-        first = by_unit.setdefault(device.info.unit_id, device)
-        if first is not device:
-            free = next(number for number in range(1, len(taken) + 2) if number not in taken)
-            raise PortError(
-                f"{first.name} and {device.name} are both unit {device.info.unit_id}: rename one: "
-                f"ohmskin configure {device.name} --unit-id {free} --save"
-            )

@@ -108,7 +108,7 @@ def test_scans_without_a_force_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("rise", "offset_s", "reason"),
     [
-        (pressed_in_turn()[0], 0.0, "never overlap"),
+        (pressed_in_turn()[0], 0.0, "no cell is pressed alone while the force is known"),
         (np.zeros((400, 2, 3)), OFFSET_S, "no cell is pressed alone while the force is known"),
         (np.full((400, 2, 3), 1e-5), OFFSET_S, "no cell is pressed alone"),
     ],

@@ -80,7 +80,7 @@ BAD_LOGS: list[tuple[str | bytes, str]] = [
     (log_text(ROWS[:9]), "too few samples: 9, 10 are needed"),
     (log_text([f"{k},2.5" for k in range(12)]), "force_n is 2.5 throughout"),
     (log_text([f"{k},{-(k % 5)}" for k in range(12)]), "a press is negative: turn the sign"),
-    (log_text([*ROWS, "1.3,-0.5"]), "row 14: force_n is -0.5, below -0.08 N: zero the sensor"),
+    (log_text([*ROWS, "1.3,-0.5"]), "row 14: force_n is -0.5, it must be -0.08 N or more: zero"),
     (log_text([*ROWS, '1.3,"2']), "row 14 is damaged: unexpected end of data"),
     (log_text([*ROWS, "1.3," + 200_000 * "1"]), "row 14 is damaged: field larger than"),
 ]
@@ -192,7 +192,7 @@ def test_noise_about_zero_is_no_fault() -> None:
     force_n[3] = -0.02 * force_n.max()
     ForceLog(time_s, force_n)
     force_n[3] *= 1.01
-    with pytest.raises(ValueError, match=r"sample 3: force_n is .*: zero the sensor"):
+    with pytest.raises(ValueError, match=r"row 3: force_n is .*: zero the sensor"):
         ForceLog(time_s, force_n)
     weak = 0.01 * np.arange(20)
     weak[0] = -0.05

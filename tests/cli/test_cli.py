@@ -19,9 +19,9 @@ import serial
 import ohmskin
 from command_line import Done, assert_one_line
 from ohmskin.cli.main import app
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.faults import SKIN_FAULTS
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.skin_faults import SKIN_FAULTS
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link import session
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -367,7 +367,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
         ["estimate", READINGS, "--method", "ohm", "--out", "/no/such/place.npz"],
         ["/no/such/place.npz"],
     ),
-    "demo of a real port": (["demo", "--port", "/dev/ttyACM99"], ["truth", "emulator://"]),
+    "demo of a real port": (["demo", "--port", "/dev/ttyACM99"], ["emulator://8x8"]),
     "emulation of a real port": (["emulate", "/dev/ttyACM99"], ["emulator://8x8"]),
     "unknown command": (["skin"], ["skin"]),
     "unknown option": (["info", EMULATED, "--fast"], ["--fast"]),

@@ -16,9 +16,8 @@ from typing import Any
 import pytest
 
 from command_line import Done, assert_one_line
-from ohmskin.cli import flash as flash_command
-from ohmskin.emulate.board import EmulatedBoard
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.cli import board as flash_command
+from ohmskin.emulate.board import EmulatedBoard, PtyServer
 from ohmskin.link import session
 from ohmskin.link.serial_port import SerialPort
 from ohmskin.opening import emulated
@@ -210,7 +209,7 @@ UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {
     "an unknown bridge, no board": (
         ["--port", "/dev/ttyUSB0"],
         [("/dev/ttyUSB0", "")],
-        ["/dev/ttyUSB0", "say which board", "uno | megaatmega2560"],
+        ["/dev/ttyUSB0", "say which board is", "uno | megaatmega2560"],
     ),
 }
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from bench_board import Bench, evidence
+from ohmskin.cli.doctor import gather
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.examine import Evidence, examine
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, Severity, found
-from ohmskin.doctor.signal import RestScans, comparison, examine_signal, find_hum, mean_std_lsb
+from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, Severity
+from ohmskin.doctor.signal import Rest, RestScans, comparison, examine_signal, find_hum
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
 
@@ -62,7 +63,7 @@ def test_a_touch_is_said_and_is_no_fault(scene: str) -> None:
     for seed, size in enumerate(("2x3", "8x8" if scene != "press" else "3x3")):
         bench = Bench(f"emulator://{size}?scene={scene}&seed={seed}", now_s=5.0)
         # At 5 s the robot of "press" is on the skin.
-        diagnosis = examine(bench.evidence())
+        diagnosis = examine(gather(bench))
         assert [each.kind for each in diagnosis.findings] == [Kind.TOUCHED], (scene, size)
         assert diagnosis.worse == []
         assert "something touches the skin" in verdict(diagnosis)
@@ -137,7 +138,7 @@ def test_faults_are_found_beside_a_touch() -> None:
 def test_lines_that_are_not_there_are_one_finding() -> None:
     bench = Bench("emulator://4x6")
     bench.configure(rows=7, rate_hz=0)
-    [finding] = examine(bench.evidence()).findings
+    [finding] = examine(gather(bench)).findings
     assert (finding.kind, finding.place) == (Kind.OPEN_ROW, Place(rows=(4, 5, 6)))
     assert "'ohmskin configure PORT --rows 4'" in words_of(finding)["what_to_do"]
 
@@ -209,7 +210,7 @@ def test_noise_is_measured_beside_hum_and_drift() -> None:
     assert hum.lsb == pytest.approx(3.0, rel=0.05)
 
 
-def test_deviation_of_a_mean_of_codes() -> None:
+def test_deviation_of_a_mean_of_codes(sound: Evidence) -> None:
     """Against means of simulated codes over all places within a code."""
     random = np.random.default_rng(2)
     for before in (0.0, 0.2, 0.4, 1.0):
@@ -217,18 +218,19 @@ def test_deviation_of_a_mean_of_codes() -> None:
         exact = places[:, None] + before * random.standard_normal((400, 50))
         errors = np.floor(exact).mean(axis=1) + 0.5 - places
         noise = (before**2 + 1 / 12) ** 0.5
-        assert mean_std_lsb(noise, 50) == pytest.approx(errors.std(), rel=0.35)
+        rest = Rest(sound.board, exact, 50, noise, (100.0, 200.0))
+        assert rest.std_lsb == pytest.approx(errors.std(), rel=0.35)
 
 
 def test_settling_says_how_long_is_enough() -> None:
     for tau_us in (10, 15, 20):
         bench = Bench(f"emulator://8x8?tau_us={tau_us}")
-        [finding] = examine(bench.evidence()).findings
+        [finding] = examine(gather(bench)).findings
         enough_us = finding.values["needed_us"]
         assert f"--settle {enough_us} " in words_of(finding)["what_to_do"]
         assert enough_us < 12 * tau_us
         bench.configure(rate_hz=0, settle_us=enough_us)
-        assert examine(bench.evidence()).findings == []
+        assert examine(gather(bench)).findings == []
 
 
 def test_second_look_is_what_a_board_takes() -> None:
@@ -314,11 +316,13 @@ def test_latency_timer(sound: Evidence) -> None:
 def test_order_and_verdict() -> None:
     severities = [kind.severity for kind in Kind]
     assert severities == sorted(severities, key=list(Severity).index)
-    note, fault = found(Kind.TOUCHED, moves=True), found(Kind.LOST, problem="gone")
-    assert Diagnosis([note]).worse == []
-    assert verdict(Diagnosis([fault, note])) == "not sound: 1 finding, first lost (board)"
+    diagnosis = Diagnosis()
+    diagnosis.add(Kind.TOUCHED, moves=True)
+    assert diagnosis.worse == []
+    diagnosis.add(Kind.LOST, problem="gone")
+    assert verdict(diagnosis) == "not sound: 1 finding, first lost (board)"
     with pytest.raises(ValueError, match="lost has"):
-        found(Kind.LOST)
+        diagnosis.add(Kind.LOST)
 
 
 def test_places_are_named() -> None:

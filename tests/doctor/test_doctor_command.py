@@ -4,6 +4,7 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,11 @@ from bench_board import Bench
 from calibrations import calibration
 from command_line import Done, assert_one_line
 from ohmskin.cli import doctor as doctor_command
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.cli.doctor import gather
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.link import session
+from ohmskin.record.recorder import Recorder
 
 Run = Callable[..., Done]
 
@@ -154,7 +157,7 @@ def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
     bench = Watched("emulator://3x4")
     before = bench.configure(rate_hz=77.5, settle_us=120, adc_prescaler="clock_250khz")
     with nullcontext() if end is None else pytest.raises(end):
-        bench.evidence()
+        gather(bench)
     assert looks_us[1] > 3 * looks_us[0]
     assert bench.info == before
 
@@ -185,6 +188,19 @@ def test_ports_that_do_not_answer_are_findings(
         assert word in answer["findings"][0]["measured"]
         assert answer["findings"][0]["what_to_do"]
         assert "not sound" in answer["verdict"]
+
+
+@pytest.mark.parametrize("speed", [0, 1])
+def test_the_end_of_a_recording_is_no_loss(run: Run, tmp_path: Path, speed: int) -> None:
+    bench, path = Bench("emulator://3x4"), tmp_path / "skin.mcap"
+    with Recorder(path, bench.info) as recorder:
+        for scan in islice(bench, 60):
+            recorder.add(scan)
+    for more in ((), ("--press",)):
+        answer = json.loads(run("doctor", f"replay://{path}?speed={speed}", "--json", *more).out)
+        assert answer["verdict"].startswith("sound: ")
+        assert {each["id"] for each in answer["findings"]} <= {"slow_host"}
+        assert answer["measured"]["scans"] == 60
 
 
 @pytest.mark.usefixtures("hasty")

@@ -13,6 +13,7 @@ from ohmskin.circuit.skin import Skin, readings
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, WireShare
+from ohmskin.doctor.signal import Rest
 from ohmskin.doctor.wires import (
     CornerScans,
     moved_across,
@@ -86,8 +87,10 @@ def read_of(skin: Skin, noise_lsb: float = 0.0, seed: int = 0) -> Evidence:
     return replace(read, scans=scans, presses=presses)
 
 
-def rest_of(skin: Skin) -> Float:
-    return quantise(readings(skin)).astype(np.float64)
+def rest_of(skin: Skin) -> Rest:
+    """Of one scan without noise."""
+    board, codes = sound(*skin.shape).board, quantise(readings(skin)).astype(np.float64)
+    return Rest(board, codes, 1, EXACT_LSB, NOMINAL)
 
 
 # ------------------------------------------------------------------------- the untouched skin
@@ -99,11 +102,7 @@ def test_wires_show_against_an_earlier_rest() -> None:
         url = f"emulator://{rows}x{rows}?seed=3&wires={factor}"
         diagnosis = examine(evidence(url, wire_ohm=NOMINAL, rest_ratio=rest))
         assert {each.kind for each in diagnosis.findings} == {Kind.WIRES}
-        lines = measured_in_words(diagnosis)["wires_of_lines"]
-        assert len(lines) == 2 * rows
-        assert lines[rows].startswith("column 0: ")
-        last = diagnosis.untouched[-1]
-        assert abs(last.share - factor) < 4 * last.std
+        assert [each.layers for each in diagnosis.untouched] == [("top",), ("bottom",)]
         for finding in diagnosis.findings:
             share: WireShare = finding.values["share"]
             nominal = NOMINAL[share.layers == ("bottom",)]
@@ -153,12 +152,14 @@ def test_wires_of_circuits_solved_by_ngspice(told: float) -> None:
     with np.load(DATA / "wire_sweep_3x3.npz") as reference:
         ratios, rests = reference["ratio"][:3], reference["rest_ratio"][:3]
         wire_ohm = reference["top_wire_ohm"][:3, 0, 0]
-    for ratio, rest, ohm in zip(ratios, rests, wire_ohm, strict=True):
+    for ratio, untouched, ohm in zip(ratios, rests, wire_ohm, strict=True):
         of_rest, of_press = (
-            exact + 0.3 / 1024 * random.standard_normal((90, 3, 3, 4)) for exact in (rest, ratio)
+            exact + 0.3 / 1024 * random.standard_normal((90, 3, 3, 4))
+            for exact in (untouched, ratio)
         )
-        codes = quantise(of_rest).mean(axis=0)
-        _, wires = taken(*of_press).measure(codes, 90, 0.42, (told * ohm, told * ohm))
+        nominal = (told * ohm, told * ohm)
+        rest = Rest(sound(3, 3).board, quantise(of_rest).mean(axis=0), 90, 0.42, nominal)
+        _, wires = taken(*of_press).measure(rest)
         assert wires.place == Place(rows=(0,), columns=(0,))
         off = np.log(wires.share * told)
         assert off == pytest.approx(0, abs=0.1)
@@ -167,7 +168,7 @@ def test_wires_of_circuits_solved_by_ngspice(told: float) -> None:
 
 def test_what_a_finger_presses_beside_does_not_disturb() -> None:
     skin = worn("8x8", 1.0, seed=1)
-    wires = taken(*both_pressed(skin, 3e-5)).measure(rest_of(skin), 1, EXACT_LSB, NOMINAL)[0]
+    wires = taken(*both_pressed(skin, 3e-5)).measure(rest_of(skin))[0]
     assert abs(np.log(wires.share)) < 3 * wires.std / wires.share < 0.3
 
 
@@ -181,7 +182,7 @@ def test_one_line_that_is_worn_is_named(layer: str, where: str) -> None:
     top[4] *= 4 if layer == "top" else 1
     bottom[:, 7] *= 4 if layer == "bottom" else 1
     skin = replace(skin, top_wire_ohm=top, bottom_wire_ohm=bottom)
-    _, *each = taken(*both_pressed(skin)).measure(rest_of(skin), 1, EXACT_LSB, NOMINAL)
+    _, *each = taken(*both_pressed(skin)).measure(rest_of(skin))
     assert [named(share.place) for share in each] == ["row 4, column 4", "row 7, column 7"]
     [finding] = examine(read_of(skin)).findings
     assert words_of(finding)["where"] == where
@@ -194,13 +195,13 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
     for cell in suggested_corners(3, 3):
         siemens[cell] += 2e-4
     scans = taken(readings(replace(skin, cell_siemens=siemens)))
-    shares = scans.measure(rest_of(skin), 1, EXACT_LSB, NOMINAL)
+    shares = scans.measure(rest_of(skin))
     assert not any(each.differs or each.known for each in shares)
-    said = measured_in_words(Diagnosis(untouched=shares, pressed=shares))
+    said = measured_in_words(Diagnosis(nominal_ohm=NOMINAL, pressed=shares))
     assert said["wires"].startswith("not known: press with something smaller")
     nothing = taken(readings(skin))
     assert nothing.pressed == ()
-    assert nothing.measure(rest_of(skin), 1, EXACT_LSB, NOMINAL) == []
+    assert nothing.measure(rest_of(skin)) == []
 
 
 def test_what_is_hardly_known_is_no_finding() -> None:
@@ -216,7 +217,7 @@ def test_what_is_pressed_in_passing_is_left_out() -> None:
     scans = taken(*[held] * 5, passing)
     other = readings(worn("4x4", 1.0, seed=0))  # of a board that was reset
     scans.take(Scan(quantise(other), 0, 0, 0.0, 0))
-    _, *each = scans.measure(rest_of(skin), 1, EXACT_LSB, NOMINAL)
+    _, *each = scans.measure(rest_of(skin))
     assert [named(share.place) for share in each] == ["row 4, column 4"]
 
 

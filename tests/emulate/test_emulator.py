@@ -16,7 +16,6 @@ from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
 from ohmskin.opening import emulated
-from places import ROOT
 
 DEFAULT = {
     "rows": 8,
@@ -203,27 +202,11 @@ def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
         ("emulator://0x4", "1x1 to 16x16"),
         ("emulator://17x4", "1x1 to 16x16"),
         ("emulator://", "of the form"),
-        ("emulator://8x8?readings=/no/such.npz", "such.npz"),
-        ("emulator://4x6?readings=tests/data/random_4x6.npz&scene=rest", "either"),
     ],
 )
 def test_wrong_urls(url: str, reason: str) -> None:
     with pytest.raises(PortError, match=reason):
         emulated(url)
-
-
-def test_readings_of_a_file_come_in_order_one_a_scan() -> None:
-    path = ROOT / "tests" / "data" / "random_4x6.npz"
-    board, _, _ = emulated(f"emulator://4x6?readings={path}&noise=0&rate=90")
-    with np.load(path) as archive:
-        expected = quantise(archive["ratio"])
-    decoder = BoardDecoder()
-    board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
-    messages = decoder.feed(board.advance((len(expected) + 3.5) / 90), 0.0)
-    codes = [m.codes for m in messages if isinstance(m, Scan)]
-    assert len(codes) >= len(expected) + 3
-    for n, found in enumerate(codes):
-        np.testing.assert_array_equal(found, expected[n % len(expected)])
 
 
 # ---------------------------------------------------------------------- emulator and firmware

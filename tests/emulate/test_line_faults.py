@@ -15,17 +15,15 @@ import pytest
 import ohmskin
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
-from ohmskin.emulate.board import EmulatorLink
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import EmulatorLink, PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import device, framing, protocol, session
 from ohmskin.link.codes import quantise
-from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
-from ohmskin.opening import emulated, open_link
+from ohmskin.opening import emulated
 from stepped_link import SteppedLink
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -130,8 +128,9 @@ def test_a_reset_board_goes_on_as_it_was_configured() -> None:
 def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its line speed is that of the start again, too; the simulated line follows the board's."""
     monkeypatch.setattr(simavr, "SkinSim", LockstepSim)
-    link, _ = open_link("simavr://uno")
-    with ohmskin.Device(Session(link, baud)) as skin:
+    link = simavr.SimavrLink("uno", Scene())
+    with Session(link, baud) as skin:
+        skin.start()
         kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
         scans = iter(skin)
         for _ in range(20):
@@ -178,8 +177,9 @@ class ResetAfterConfigure(EmulatorLink):
 
 
 def test_a_reset_right_after_configure_does_not_undo_it() -> None:
-    link = ResetAfterConfigure(*emulated("emulator://4x4"))
-    with ohmskin.Device(Session(link)) as skin:
+    link = ResetAfterConfigure(emulated("emulator://4x4")[0], "a board")
+    with Session(link) as skin:
+        skin.start()
         assert skin.configure(rows=2, rate_hz=77).rows == 2
         assert link.resets_due == 0
         assert skin.info.rate_asked_mhz == 77_000
@@ -187,8 +187,8 @@ def test_a_reset_right_after_configure_does_not_undo_it() -> None:
 
 
 def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
-    board, name, _ = emulated("emulator://4x4")
-    with Device(Session(EmulatorLink(board, name)), start=False) as skin:
+    board, _, _ = emulated("emulator://4x4")
+    with Session(EmulatorLink(board, "a board")) as skin:
         skin.configure(rows=2, columns=3, rate_hz=77)
         board.reset()
         skin.start()
@@ -198,7 +198,8 @@ def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
 
 def test_a_stall_of_two_seconds() -> None:
     link = SteppedLink("emulator://2x2?rate=200&stall=2")
-    with Device(Session(link)) as skin:
+    with Session(link) as skin:
+        skin.start()
         scans = iter(skin)
         link.run(5.0)
         found = list(itertools.islice(scans, skin.stats.scans))
@@ -242,7 +243,8 @@ def test_a_board_that_stops_talking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.3)
     monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.1)
     link = SteppedLink("emulator://2x2?stall=600")
-    with Device(Session(link)) as skin:
+    with Session(link) as skin:
+        skin.start()
         link.run(2.0)
         with pytest.raises(DeviceLost, match=r"said nothing for 0\.3 s"):
             list(skin)
@@ -319,7 +321,8 @@ def test_a_board_that_is_reset_by_the_opening_of_its_port() -> None:
         def close(self) -> None:
             pass
 
-    with ohmskin.Device(Session(Bootloader())) as skin:
+    with Session(Bootloader()) as skin:
+        skin.start()
         assert skin.latest().codes.shape == (3, 3, 4)
         assert skin.stats.restarts == 0
 

@@ -6,8 +6,8 @@ import pytest
 
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
+from ohmskin.emulate.faults import SKIN_FAULTS, SkinFaults, faults_of
 from ohmskin.emulate.scenes import Scene
-from ohmskin.emulate.skin_faults import SKIN_FAULTS, SkinFaults
 from ohmskin.errors import PortError
 from ohmskin.opening import emulated
 
@@ -115,9 +115,8 @@ def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
     for name in SKIN_FAULTS:
         board, _, _ = emulated(f"emulator://{R}x{C}?{name}={values.get(name, '2')}&noise=0")
         assert board.codes_at(0.0).shape == (R, C, 4)
-    assert SkinFaults.from_texts({"short_rows": "0,2", "noise": "3"}) == SkinFaults(
-        short_rows=(0, 2)
-    )
+    found = faults_of(SkinFaults, {"short_rows": "0,2", "noise": "3"})
+    assert found == SkinFaults(short_rows=(0, 2))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +126,7 @@ def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
         ("open_column=-1", "no column -1"),
         ("short_rows=1,4", "no row 4"),
         ("short_rows=1,1", "two different"),
-        ("short_columns=3", "two numbers, as 1,2"),
+        ("short_columns=3", "two different numbers, as 1,2"),
         ("dead=0,5", "no column 5"),
         ("dead=a,b", "two numbers"),
         ("open_row=x", "a number, not 'x'"),
@@ -140,8 +139,3 @@ def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
 def test_wrong_faults_are_refused(option: str, reason: str) -> None:
     with pytest.raises(PortError, match=reason):
         emulated(f"emulator://{R}x{C}?{option}")
-
-
-def test_readings_of_a_file_have_no_resistances() -> None:
-    with pytest.raises(PortError, match="no resistances"):
-        emulated("emulator://4x6?readings=tests/data/random_4x6.npz&dead=1,2")

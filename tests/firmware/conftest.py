@@ -8,13 +8,13 @@ import pytest
 
 from firmware_helpers import BOOT_S
 from lockstep import BOARDS, Rig, elf_of
-from ohmskin.emulate.simavr import default_program
+from ohmskin.emulate.simavr import PROGRAM
 
 
 @pytest.fixture(params=BOARDS)
 def board(request: pytest.FixtureRequest) -> str:
     name: str = request.param
-    if not default_program().exists():
+    if not PROGRAM.exists():
         pytest.skip("skinsim is not built: make sim")
     if not elf_of(name).exists():
         pytest.skip(f"the firmware for {name} is not built: make firmware")

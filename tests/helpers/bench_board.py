@@ -2,15 +2,16 @@
 """An emulated board in simulated time, with as much of a `Device` as the doctor needs."""
 
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 
-from ohmskin.cli.doctor import Ask, gather
+from ohmskin.cli.doctor import gather
 from ohmskin.doctor.examine import Evidence
-from ohmskin.emulate.line_faults import Faults
+from ohmskin.emulate.faults import LineFaults
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
+from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, BoardStats, Hello, Message, Scan, SelfTestReport
-from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 
 
@@ -18,7 +19,8 @@ class Bench(Closing):
     """An `emulator://` URL's board. Time passes only while its scans are taken: `now_s`."""
 
     def __init__(self, url: str, now_s: float = 0.0) -> None:
-        self.board, self.name, self.faults = emulated(url)
+        self.board, _, self.faults = emulated(url)
+        self.name = url
         self.now_s = 0.0
         self._decoder = BoardDecoder()
         self._messages: list[Message] = []
@@ -26,14 +28,14 @@ class Bench(Closing):
         self.now_s = now_s
         self.board.advance(now_s)
 
-    def _take(self, faults: Faults) -> None:
+    def _take(self, faults: LineFaults) -> None:
         octets = self.board.heard(faults, self.now_s)
         self._messages += self._decoder.feed(octets, self.now_s)
 
     def ask(self, name: str, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
         self.board.receive(framing.encode(frame.id, 1, frame.pack(**values)))
-        self._take(Faults())  # commands are repeated until they are answered
+        self._take(LineFaults())  # commands are repeated until they are answered
 
     def __iter__(self) -> Iterator[Scan]:
         self._messages = [self.info]
@@ -54,7 +56,7 @@ class Bench(Closing):
 
     @property
     def stats(self) -> BoardStats:
-        return self._decoder.snapshot()
+        return deepcopy(self._decoder.stats)
 
     def self_test(self) -> SelfTestReport:
         self.ask("self_test")
@@ -72,13 +74,7 @@ class Bench(Closing):
     def close(self) -> None:
         pass
 
-    def evidence(self, ask: Ask | None = None) -> Evidence:
-        """All that the doctor reads."""
-        read = Evidence(self.info)
-        gather(self, read, ask=ask)
-        return read
-
 
 def evidence(url: str, **told: object) -> Evidence:
     """What the doctor reads of the board at an `emulator://` URL, and what it is told besides."""
-    return replace(Bench(url).evidence(), **told)
+    return replace(gather(Bench(url)), **told)

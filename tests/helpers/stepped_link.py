@@ -12,7 +12,8 @@ class SteppedLink:
     """The board of an ``emulator://`` URL, as a `Link`. Its time passes in `run` alone."""
 
     def __init__(self, url: str) -> None:
-        self._board, self.name, self._faults = emulated(url)
+        self._board, _, self._faults = emulated(url)
+        self.name = url
         self._now_s = 0.0
         self._octets = bytearray()
         self._changed = threading.Condition()

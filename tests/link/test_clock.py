@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from lockstep import CPU_HZ, Rig, first_holds
 from ohmskin.arrays import Float
-from ohmskin.link.clock import BoardClock, scan_times_s
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s, scan_times_s
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.timing import line_delay_s, scan_s
 
 HZ = 90.0
 START_S = 5000.0  # of the board's clock, on the host's

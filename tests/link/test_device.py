@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
-from ohmskin.link import device, feed, framing, protocol
-from ohmskin.link.device import Device
+from ohmskin.link import device, framing, protocol
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
 from stepped_link import SteppedLink
@@ -346,9 +345,10 @@ def test_a_moving_scene_moves_in_the_simulator_too() -> None:
 
 @pytest.mark.parametrize("fault", ["", "&drop=0.2"])
 def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(device, "QUEUE_SCANS", 16)
     link = SteppedLink(f"emulator://1x1?rate=1000{fault}")
-    with Device(Session(link)) as skin:
+    with Session(link) as skin:
+        skin.start()
         slow, quick = iter(skin), iter(skin)
         link.run(0.01)
         before = next(slow)
@@ -370,7 +370,7 @@ def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.Mo
 def test_an_iterator_never_used_costs_nothing(
     fast: ohmskin.Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed, "QUEUE_SCANS", 16)
+    monkeypatch.setattr(device, "QUEUE_SCANS", 16)
     unused = iter(fast)
     until(lambda: fast.stats.overflowed > 0)  # while somebody may still use it
     del unused
@@ -378,6 +378,7 @@ def test_an_iterator_never_used_costs_nothing(
     before = fast.stats
     until(lambda: fast.stats.scans > before.scans + 100)
     assert fast.stats.overflowed <= before.overflowed + 1
+    assert fast.stats.line.frames > before.line.frames + 100  # `before` is a copy
 
 
 def test_latest_after_close_is_no_old_scan(fast: ohmskin.Device) -> None:
@@ -389,7 +390,8 @@ def test_latest_after_close_is_no_old_scan(fast: ohmskin.Device) -> None:
 
 def test_latest_waits_as_long_as_told() -> None:
     link = SteppedLink("emulator://1x1?rate=1")
-    with Device(Session(link)) as skin:
+    with Session(link) as skin:
+        skin.start()
         link.run(0.9)
         with pytest.raises(DeviceLost, match=r"0\.1 s"):
             skin.latest(timeout_s=0.1)

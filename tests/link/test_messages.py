@@ -216,16 +216,6 @@ def test_reset_causes_are_named() -> None:
     assert hello.reset_cause == ("power_on", "watchdog")
 
 
-def test_a_snapshot_does_not_change_later() -> None:
-    decoder = BoardDecoder()
-    decoder.feed(scan_wire(0), 0.0)
-    before = decoder.snapshot()
-    decoder.feed(scan_wire(3) + b"\x05\x05\0", 0.0)
-    assert (before.scans, before.missed, before.line.frames, before.line.damaged) == (1, 0, 1, 0)
-    after = decoder.snapshot()
-    assert (after.scans, after.missed, after.line.frames, after.line.damaged) == (2, 2, 2, 1)
-
-
 def test_codes_and_ratio_of_a_scan() -> None:
     (scan,) = scans(BoardDecoder(), scan_wire(0))
     assert (scan.rows, scan.columns) == (1, 2)

@@ -7,7 +7,7 @@ import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ohmskin.link.serial_port import SerialPort, latency_ms, latency_timer_file, serial_ports
+from ohmskin.link.serial_port import SerialPort, latency_timer, serial_ports
 
 
 def test_boards_are_told_by_their_usb_ids(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,16 +35,16 @@ def test_boards_are_told_by_their_usb_ids(monkeypatch: pytest.MonkeyPatch) -> No
     assert found[-1].description == ""
 
 
-def test_the_latency_timer_of_a_bridge(tmp_path: Path) -> None:
+def test_the_latency_timer_of_a_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     devices = tmp_path / "devices"
+    monkeypatch.setattr("ohmskin.link.serial_port.USB_SERIAL", devices)
     (devices / "ttyUSB3").mkdir(parents=True)
     timer = devices / "ttyUSB3" / "latency_timer"
     timer.write_text("16\n")
     by_id = tmp_path / "by-id"
     by_id.symlink_to("/dev/ttyUSB3")
     for port in ("/dev/ttyUSB3", str(by_id)):
-        assert latency_timer_file(port, devices) == timer
-        assert latency_ms(port, devices) == 16
-    assert latency_ms("/dev/ttyACM0", devices) is None
+        assert latency_timer(port) == (16, str(timer))
+    assert latency_timer("/dev/ttyACM0") is None
     timer.write_text("no number")
-    assert latency_ms("/dev/ttyUSB3", devices) is None
+    assert latency_timer("/dev/ttyUSB3") is None

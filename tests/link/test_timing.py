@@ -7,8 +7,8 @@ import pytest
 from lockstep import CPU_HZ, Rig, first_holds
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.link.clock import line_delay_s, reading_offsets_s, scan_s, slot_s
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
-from ohmskin.link.timing import line_delay_s, reading_offsets_s, scan_s, slot_s
 
 
 @pytest.mark.parametrize(

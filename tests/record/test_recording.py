@@ -29,10 +29,17 @@ from command_line import Done, assert_one_line
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
-from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
-from ohmskin.record.recording import ForceSample, Mark, Recording, Tare, load_recording, messages
+from ohmskin.record.recording import (
+    ForceSample,
+    Mark,
+    Recording,
+    Tare,
+    export,
+    load_recording,
+    messages,
+)
 from waiting import until
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -324,14 +331,15 @@ def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
         load_recording(tmp_path / "none.mcap")
     with pytest.raises(RecordingError, match="directory"):
         load_recording(tmp_path)
+    head = {"number": 1, "time_us": 1, "host_time_s": 1, "missed": 0}
     for topic, content, reason in (
         ("/camera", {}, "no recording of a skin"),
         ("/skin/mark", {"host_time_s": 1.0, "text": ""}, "no board says hello"),
-        ("/skin/hello", {}, "layout_crc"),
+        ("/skin/hello", {"host_time_s": 1}, "layout_crc"),
         ("/skin/hello", [1], "no JSON object"),
-        ("/skin/scan", {"host_time_s": 1, "rows": 1, "columns": 1, "codes": [1] * 5}, "5 codes"),
-        ("/skin/scan", {"host_time_s": 1, "rows": 1, "columns": 1, "codes": [-1] * 4}, "range"),
-        ("/skin/scan", {"host_time_s": 1, "rows": 10**9, "columns": 9, "codes": []}, "no 10000"),
+        ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [1] * 5}, "5 codes"),
+        ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [-1] * 4}, "range"),
+        ("/skin/scan", {**head, "rows": 10**9, "columns": 9, "codes": []}, "no 10000"),
     ):
         foreign(path, topic, content)
         with pytest.raises(RecordingError, match=reason) as refusal:
@@ -352,13 +360,16 @@ class FullDisk(io.FileIO):
         return super().write(view[:fits])
 
 
-def test_a_full_disk_ends_the_recording(tmp_path: Path, hello: Hello) -> None:
+def test_a_full_disk_ends_the_recording(
+    tmp_path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.mcap"
     file = FullDisk(path, "wb")
     file.room = 20_000
+    monkeypatch.setattr(Path, "open", lambda path, mode: io.BufferedWriter(file))
 
     def fill() -> None:
-        with Recorder(path, hello, file=file) as recorder:
+        with Recorder(path, hello) as recorder:
             for number in range(10_000):
                 recorder.add(scan(number))
                 if number % 20 == 0:

@@ -21,11 +21,11 @@ from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.cli import main as cli
 from ohmskin.estimate.methods import METHODS
-from ohmskin.files import save_whole
 from places import DATA, ROOT
 from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published
 from studies.__main__ import app
 from studies.chart import Plan, Row, Size, pareto_front
+from studies.commands import save_whole
 from waiting import until
 
 TINY = Plan(

@@ -100,7 +100,8 @@ def test_the_baseline_is_a_line_through_raw_readings(flat: ForceTrial) -> None:
 
 
 def test_true_conductances_of_perfect_cells_give_the_forces() -> None:
-    perfect = replace(PressModel().without_memory(), noise=0.0, drift=0.0, full_contact_siemens=1e6)
+    ideal = PressModel(play_n=0.0, creep=0.0, noise=0.0, drift=0.0)
+    perfect = replace(ideal, full_contact_siemens=1e6)
     trial = surface_trial(2, 2, 0, SMALL, perfect, curved=True)
     rise = rises("truth", trial)
     np.testing.assert_allclose(learn(trial, rise, CHOICE)(rise), trial.force_n, atol=1e-4)

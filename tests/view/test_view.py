@@ -23,7 +23,7 @@ from starlette.websockets import WebSocketDisconnect
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Done, assert_one_line
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.record.recorder import Recorder
@@ -99,7 +99,7 @@ class Page:
 
 
 def decode(octets: bytes) -> Message:
-    """As the page does it: see `ohmskin.view.shown`."""
+    """As the page does it: see `ohmskin.view.boards.Shown`."""
     (length,) = struct.unpack_from("<I", octets)
     scan: Message = json.loads(octets[4 : 4 + length])
     shape = (len(scan["planes"]), scan["rows"], scan["columns"])
@@ -448,7 +448,7 @@ def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> No
 
 def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Path) -> None:
     with ViewedBoards([GHOST, "/dev/ttyACM99"], folder=tmp_path) as boards:
-        board = boards.find(0)
+        board = boards.get(0)
         assert board is not None
         until(lambda: board.state()["status"] == "scanning")
         assert board.shown is None  # nobody looks

@@ -19,7 +19,7 @@ import uvicorn
 
 import ohmskin
 from calibrations import of_scene
-from ohmskin.emulate.pty_server import PtyServer
+from ohmskin.emulate.board import PtyServer
 from ohmskin.record.recording import load_recording
 from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.server import make_app

@@ -115,7 +115,7 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
 
 def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, NDArray[np.bool_]]:
     """Edges on a grid that begins with `time_s`, 0 in gaps; and where there is no gap."""
-    from scipy.ndimage import gaussian_filter1d
+    from scipy.ndimage import binary_erosion, gaussian_filter1d
 
     span_s = float(time_s[-1] - time_s[0])
     if span_s < MIN_OVERLAP_S:
@@ -136,10 +136,7 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, NDArray[np.b
         for each in (np.where(known, level, 0.0), known.astype(np.float64))
     )
     smooth = weighted / np.where(known, weight, 1.0)
-    inside = known.copy()
-    inside[1:] &= known[:-1]
-    inside[:-1] &= known[1:]
-    inside[[0, -1]] = False
+    inside = binary_erosion(known, np.ones(3))
     return np.where(inside, np.gradient(smooth, STEP_S), 0.0), inside
 
 
@@ -174,12 +171,10 @@ def correlations(
 
 def _check_unique(r: Float, score: Float, best: int) -> None:
     """Raise ValueError if there is a peak as good beside the best one, which ends at half its r."""
-    low = np.flatnonzero(r < 0.5 * r[best])
-    end = int(np.searchsorted(low, best))
-    first = int(low[end - 1]) if end else 0
-    last = int(low[end]) if end < low.size else r.size
+    ends = np.concatenate([[0], np.flatnonzero(r < 0.5 * r[best]), [r.size]])
+    after = int(np.searchsorted(ends, best, side="right"))
     others = score.copy()
-    others[first:last] = 0.0
+    others[ends[after - 1] : ends[after]] = 0.0
     second = int(np.argmax(others))
     if others[second] > MAX_SECOND * score[best]:
         raise ValueError(

@@ -41,7 +41,7 @@ class State(Enum):
     """What a `Guide` waits for."""
 
     PUT = "put"
-    HOLD = "hold"
+    HOLD = "reading"
     WRONG = "wrong"
     TAKE_OFF = "take off"
     DONE = "done"
@@ -160,26 +160,23 @@ class Guide:
             return Step(State.WRONG if cells else State.PUT, press, cells)
         if pressed == cells:
             self._window.append((time_s, float(rise[press.cell])))
-        change, is_steady, rises = self._judge()
-        if not is_steady:
-            return Step(State.HOLD, press, cells, change)
-        self._is_read = True
-        std = float(rises.std(ddof=1)) / math.sqrt(rises.size)
-        return Step(State.TAKE_OFF, press, cells, change, float(rises.mean()), std)
+        return self._held(press)
 
-    def _judge(self) -> tuple[float | None, bool, Float]:
-        """How much the rises change over the window, whether they are steady, and they (n,)."""
-        window = self._window
+    def _held(self, press: Press) -> Step:
+        """What the window says of the press: that it is steady, and so read, or not yet."""
+        window, step = self._window, Step(State.HOLD, press, (press.cell,))
         while len(window) > MIN_SCANS and window[-1][0] - window[1][0] >= WINDOW_S:
             window.popleft()
+        if len(window) < MIN_SCANS or window[-1][0] - window[0][0] < WINDOW_S:
+            return step
         x = np.array([rise for _, rise in window])
-        if x.size < MIN_SCANS or window[-1][0] - window[0][0] < WINDOW_S:
-            return None, False, x
         mean, half = float(x.mean()), x.size // 2
         noise = float(np.mean(np.diff(x) ** 2)) / 2
         change = abs(float(x[half:].mean() - x[:half].mean()))
-        is_steady = (
-            change <= MAX_CHANGE * mean + 2 * math.sqrt(4 * noise / x.size)
-            and float(x.var()) - noise <= (MAX_SCATTER * mean) ** 2
-        )
-        return change / mean, is_steady, x
+        step = step._replace(change=change / mean)
+        still_changes = change > MAX_CHANGE * mean + 2 * math.sqrt(4 * noise / x.size)
+        if still_changes or float(x.var()) - noise > (MAX_SCATTER * mean) ** 2:
+            return step
+        self._is_read = True
+        std = float(x.std(ddof=1)) / math.sqrt(x.size)
+        return step._replace(state=State.TAKE_OFF, rise=mean, rise_std=std)

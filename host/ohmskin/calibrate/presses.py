@@ -8,7 +8,7 @@ Two kinds of scans are left out: those of a run of less than `MIN_SCANS`, and th
 cell rises by more than `SECOND_SHARE` of the first, for nothing tells how two cells share a force.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.tables import ForceLog, PressTable
-from ohmskin.estimate.base import Estimator, SkinKnowledge
-from ohmskin.estimate.methods import VOLTAGE, make_estimator
+from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.reader import now
 from ohmskin.force.regression import ForceRegression
 from ohmskin.link.clock import scan_times_s
-from ohmskin.link.messages import Scan
+from ohmskin.link.messages import Hello, Scan
 
 # So many scans without touch may interrupt a press: a light touch flickers about its threshold.
 FLICKER_SCANS: Final = 3
@@ -97,8 +99,6 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     scans, rows, columns = history.rise.shape
     force_n = log.at(history.time_s - offset_s)
     known = np.isfinite(force_n)
-    if not known.any():
-        raise ValueError("scans and force log never overlap: are they of the same session?")
     untouched = known & ~history.touched.any(axis=(1, 2))
     # The median of many scans, because the force begins before a touch is certain.
     enough = np.count_nonzero(untouched) >= MIN_ZERO_SCANS
@@ -168,61 +168,65 @@ def _valleys(rise: Float) -> list[int]:
     return [int(before + height[before:after].argmin()) for before, after in pairwise(peaks)]
 
 
-@dataclass(frozen=True, eq=False)
+def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]:
+    """The cell. Raises ValueError if it is not on a skin of this shape."""
+    if row >= shape[0] or column >= shape[1]:
+        raise ValueError(
+            f"cell ({row}, {column}) is not on this {shape[0]}x{shape[1]} skin, whose first is "
+            "(0, 0)"
+        )
+    return row, column
+
+
+@dataclass(eq=False)
 class Calibrator:
     """Makes the calibration of one skin.
 
-    knowledge: of that skin, with the readings of the untouched skin and the nominal wires. method:
-    what its cells are estimated by. indenter_area_m2: area that it is pressed with [m^2]. unit_id:
-    the board's. date: of the calibration, ISO 8601.
+    board: that scans it. rest_ratio: readings (R, C, 4) of the untouched skin. method: what its
+    cells are estimated by. indenter_area_m2: area that it is pressed with [m^2]. nominal_wire_ohm:
+    as far as it is known. estimator: by that method. rest_level (R, C): what it shows of the
+    untouched skin [S, or 1 for `voltage`].
     """
 
-    knowledge: SkinKnowledge
+    board: Hello
+    rest_ratio: Float
     method: str
     indenter_area_m2: float
-    unit_id: int
-    date: str
+    nominal_wire_ohm: WireOhm = NO_WIRES
 
-    def estimator(self) -> Estimator:
-        """A new estimator of this skin. Raises ValueError if there is no such method."""
-        return make_estimator(self.method, self.knowledge)
+    def __post_init__(self) -> None:
+        self._knowledge = SkinKnowledge.of(self.board, self.rest_ratio, self.nominal_wire_ohm)
+        self.estimator = make_estimator(self.method, self._knowledge)
+        self.rest_level = self.estimator.rest_level()
 
     def measure(
-        self, scans: list[Scan], progress: Callable[[int], None] = lambda done: None
+        self,
+        scans: list[Scan],
+        progress: Callable[[Iterable[Scan]], Iterable[Scan]] = iter,
     ) -> LevelHistory:
-        """What all scans show above rest, in order. progress: is told how many are done.
+        """What all scans show above rest. progress: passes them on, one after another.
 
         Raises ValueError for scans of another size than the untouched skin.
         """
-        estimator = self.estimator()
-        rest = estimator.rest_level()
         levels = []
-        for scan in scans:
-            found = estimator.estimate(scan.ratio)
-            levels.append((found.level - rest, found.level_std, found.touched))
-            progress(len(levels))
+        for scan in progress(scans):
+            found = self.estimator.estimate(scan.ratio)
+            levels.append((found.level - self.rest_level, found.level_std, found.touched))
         return LevelHistory(scan_times_s(scans), *map(np.array, zip(*levels, strict=True)))
 
     def presses_in_table(self, table: PressTable) -> Presses:
         """The presses of a table, each of its rows one.
 
-        Raises ValueError, naming the row, for a cell that is not on the skin; and for the method
-        `voltage`, whose levels are no conductances.
+        Raises ValueError, naming the row, for a cell that is not on the skin.
         """
-        if self.method == VOLTAGE:
-            raise ValueError(f"a table has conductances, which '{VOLTAGE}' knows nothing of")
-        rows, columns = self.knowledge.rows, self.knowledge.columns
-        outside = (table["row"] >= rows) | (table["column"] >= columns)
-        if outside.any():
-            at = int(np.argmax(outside))
-            raise ValueError(
-                f"row {at + 2}: cell ({table['row'][at]}, {table['column'][at]}) is not on this "
-                f"{rows}x{columns} skin, whose first is (0, 0)"
-            )
+        rows, columns = self.board.rows, self.board.columns
+        for number, (row, column) in enumerate(table[["row", "column"]].tolist(), start=2):
+            with naming(f"row {number}"):
+                check_cell(row, column, (rows, columns))
         cells = table["row"] * columns + table["column"]
         return Presses(
             cells=cells,
-            rise=table["conductance"] - self.estimator().rest_level().flat[cells],
+            rise=table["conductance"] - self.rest_level.flat[cells],
             rise_std=table["conductance_std"],
             force_n=table["force_n"],
             press=np.arange(cells.size),
@@ -236,9 +240,7 @@ class Calibrator:
         force, or such that the force does not grow with what the skin shows.
         """
         found = ForceRegression().fit(
-            presses.cells,
-            presses.rise,
-            presses.force_n,
+            *(presses.cells, presses.rise, presses.force_n),
             shape=presses.shape,
             rise_std=presses.rise_std,
             press=presses.press,
@@ -249,13 +251,14 @@ class Calibrator:
                 f"all presses are on cell {tuple(pressed[0])}: press at least one more, which "
                 "tells how much cells differ"
             )
+        date = now()
         calibration = Calibration(
-            unit_id=self.unit_id,
-            date=self.date,
+            unit_id=self.board.unit_id,
+            date=date,
             method=self.method,
-            rest=Rest.of(self.method, self.knowledge, self.date),
+            rest=Rest.of(self.method, self._knowledge, date),
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
-            nominal_wire_ohm=self.knowledge.nominal_wire_ohm,
+            nominal_wire_ohm=self.nominal_wire_ohm,
         )
         return calibration, found.message_

@@ -35,7 +35,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.files import naming, read_bounded, whole_file
+from ohmskin.files import naming, read_bounded, save_table
+from ohmskin.force.curve import require_rows
 from ohmskin.record.readings import MAX_CELLS
 
 # An hour of a sensor at 1 kHz, with columns of other things.
@@ -64,7 +65,6 @@ _COLUMNS: Final = (*_NEEDED, "conductance_std")
 PRESS: Final = np.dtype([(name, np.int64 if name in _CELL else np.float64) for name in _COLUMNS])
 # Presses (n,), each of the type `PRESS`.
 PressTable = NDArray[np.void]
-
 # What to do with a column of another unit, by the column that is missing.
 _UNITS: Final = {
     "time_s": " (seconds: 0.001 times milliseconds)",
@@ -92,22 +92,18 @@ class ForceLog:
 
     def __post_init__(self, rows: NDArray[np.int64] | None) -> None:
         time_s, force_n = self.time_s, self.force_n
-        if time_s.ndim != 1 or time_s.shape != force_n.shape:
-            raise ValueError(
-                f"time_s has shape {time_s.shape}, force_n {force_n.shape}: not (n,) both"
-            )
         if time_s.size < MIN_SAMPLES:
             raise ValueError(f"too few samples: {time_s.size}, {MIN_SAMPLES} are needed")
         later = np.diff(time_s, prepend=-np.inf) > 0
-        _require(later, "time_s", time_s, "it must be later than the one before", rows)
+        require_rows("time_s", time_s, later, "later than the one before", rows)
         if np.ptp(force_n) == 0:
             raise ValueError(f"force_n is {force_n[0]:g} throughout: does the sensor measure?")
         limit = max(NEGATIVE_N, NEGATIVE_SHARE * float(force_n.max()))
         if np.count_nonzero(force_n < -limit) > np.count_nonzero(force_n > limit):
             least = float(force_n.min())
             raise ValueError(f"forces go down to {least:g} N, a press is negative: turn the sign")
-        must = f"below -{limit:.2g} N: zero the sensor"
-        _require(force_n >= -limit, "force_n", force_n, must, rows)
+        must = f"-{limit:.2g} N or more: zero the sensor"
+        require_rows("force_n", force_n, force_n >= -limit, must, rows)
 
     def at(self, time_s: ArrayLike) -> Float:
         """Force [N] at these times of the sensor's clock, of any shape: linear between samples.
@@ -134,7 +130,7 @@ def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
 def load_force_log(path: str | os.PathLike[str]) -> ForceLog:
     """Read a force log. Raises ValueError: see the module."""
     with naming(path):
-        columns, rows = _read(path, ("time_s", "force_n"), others=True)
+        columns, rows = _read(path, ("time_s", "force_n"))
         return ForceLog(**columns, rows=rows)
 
 
@@ -144,29 +140,21 @@ def load_force_log(path: str | os.PathLike[str]) -> ForceLog:
 def load_press_table(path: str | os.PathLike[str]) -> PressTable:
     """Read a table of presses, (n,) of `PRESS`, at least one. Raises ValueError: see the module."""
     with naming(path):
-        columns, rows = _read(path, _NEEDED, _COLUMNS[len(_NEEDED) :], others=False)
+        columns, rows = _read(path, _NEEDED, _COLUMNS[len(_NEEDED) :])
         if not rows.size:
             raise ValueError("no press is in it")
-        for name, values in columns.items():
-            _check_presses(name, values, rows)
         table = np.zeros(rows.size, PRESS)
         for name, values in columns.items():
+            most, must = MAX_CONDUCTANCE, "0 to 1 S: of microsiemens, write 1e-6 times as much"
+            if name in _CELL:
+                most, must = MAX_CELLS - 1, f"a whole number from 0 to {MAX_CELLS - 1}"
+            elif name == "force_n":
+                most, must = MAX_NUMBER, "0 or more: zero the force sensor, or leave the row out"
+            good = (values >= 0) & (values <= most)
+            good &= (name not in _CELL) | (values == np.floor(values))
+            require_rows(name, values, good, must, rows)
             table[name] = values
         return table
-
-
-def _check_presses(name: str, values: Float, rows: NDArray[np.int64]) -> None:
-    """Raise ValueError for values that cannot be. Whether the skin has such a cell is not known."""
-    if name in _CELL:
-        must = f"it must be a whole number from 0 to {MAX_CELLS - 1}"
-        good = (values >= 0) & (values < MAX_CELLS) & (values == np.floor(values))
-    elif name == "force_n":
-        must = "it must be 0 or more: zero the force sensor, or leave the row out"
-        good = values >= 0
-    else:
-        must = "it must be 0 to 1 S: of microsiemens, write 1e-6 times as much"
-        good = (values >= 0) & (values <= MAX_CONDUCTANCE)
-    _require(good, name, values, must, rows)
 
 
 def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
@@ -174,45 +162,27 @@ def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
 
     Raises ValueError if it cannot be written.
     """
-    with whole_file(path) as file:
-        text = io.TextIOWrapper(file, encoding="ascii", newline="", write_through=True)
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows(table.tolist())
-        text.detach()
-
-
-def _require(
-    good: NDArray[np.bool_], name: str, values: Float, must: str, rows: NDArray[np.int64] | None
-) -> None:
-    """Raise ValueError, naming the first value that is not good, and its row in the file if any."""
-    if not good.all():
-        at = int(np.argmin(good))
-        place = f"sample {at}" if rows is None else f"row {rows[at]}"
-        raise ValueError(f"{place}: {name} is {values[at]:.12g}, {must}")
+    save_table(path, _COLUMNS, table.tolist())
 
 
 # ------------------------------------------------------------------------------------ CSV files
 
 
 def _read(
-    path: str | os.PathLike[str],
-    needed: Sequence[str],
-    optional: Sequence[str] = (),
-    *,
-    others: bool,
+    path: str | os.PathLike[str], needed: Sequence[str], optional: Sequence[str] | None = None
 ) -> tuple[dict[str, Float], NDArray[np.int64]]:
     """Columns (n,) by name, and the number (n,) in the file of each row.
 
-    needed, optional: names, matched whatever their case. others: ignore further columns, in which
-    may stand what is no UTF-8; else refuse them. Empty rows count, but hold nothing.
+    needed, optional: names, matched whatever their case. Further columns are refused; where no
+    optional ones are told they are ignored, and may hold what is no UTF-8. Empty rows count, but
+    hold nothing.
     """
     octets = read_bounded(path, MAX_FILE_BYTES)
     if octets.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise ValueError("it is UTF-16: save it as UTF-8")
     lines = _rows(io.TextIOWrapper(io.BytesIO(octets), "utf-8-sig", errors="replace", newline=""))
     _, header = next(lines, (1, []))
-    places = _places(header, needed, optional, others=others)
+    places = _places(header, needed, optional)
     columns = {name: array("d") for name in places}
     rows = array("q")
     for row, cells in lines:
@@ -243,11 +213,11 @@ def _rows(text: io.TextIOWrapper) -> Iterator[tuple[int, list[str]]]:
 
 
 def _places(
-    header: list[str], needed: Sequence[str], optional: Sequence[str], *, others: bool
+    header: list[str], needed: Sequence[str], optional: Sequence[str] | None
 ) -> dict[str, int]:
     """In which field of a row each of our columns stands."""
     names = [name.strip().lower() for name in header]
-    ours = [*needed, *optional]
+    ours = [*needed, *(optional or ())]
     for name in needed:
         if name not in names:
             shown = ",".join(header)[:_SHOWN]
@@ -257,7 +227,7 @@ def _places(
                 f"{','.join(needed)}, it is {shown!r}{hint}"
             )
     for title, name in zip(header, names, strict=True):
-        if name not in ours and not others:
+        if name not in ours and optional is not None:
             known = ", ".join(ours)
             raise ValueError(f"unknown column {title[:_SHOWN]!r}: leave it out; known are {known}")
         if name in ours and names.count(name) > 1:

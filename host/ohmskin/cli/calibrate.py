@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ohmskin calibrate``: with weights, from a recording, from a table of presses."""
+"""``ohmskin calibrate``: with weights, from a recording, from a table of presses; ``tare``."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, track
 
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
 from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step, still_wanted
-from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
+from ohmskin.calibrate.presses import Calibrator, Presses, check_cell, find_presses
 from ohmskin.calibrate.tables import (
     PRESS,
     ForceLog,
@@ -25,15 +24,16 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli.record import cell_table, until_stopped
+from ohmskin.cli.record import until_stopped
+from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import naming
-from ohmskin.force.reader import DEFAULT_METHOD, TARE_S, now
+from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.force.regression import MIN_PRESSES
 from ohmskin.link.device import Device
-from ohmskin.link.messages import Hello
+from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recording import Recording, load_recording
 
 # Standard gravity [m/s^2].
@@ -71,7 +71,7 @@ def weights(
     out: Out,
     grams: Annotated[str, typer.Option(help="the weights you have, in gram, such as 50,100")],
     indenter_mm2: Indenter,
-    repeats: Annotated[int, typer.Option(help="times each weight is put on each cell")] = 2,
+    repeats: Annotated[int, typer.Option(min=1, help="times each weight is put on each cell")] = 2,
     cells: Annotated[str, typer.Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
     redo: Annotated[
         list[str] | None, typer.Option(help="row,column: drop this cell's presses first")
@@ -87,17 +87,12 @@ def weights(
 
     Every press is kept at once: after Ctrl-C the same command goes on.
     """
-    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm)
-    if method == VOLTAGE:
-        raise ValueError(f"presses are kept as conductances, which '{VOLTAGE}' knows nothing of")
+    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm, table=True)
     forces_n = [1e-3 * mass_g * GRAVITY for mass_g in _grams(grams)]
-    if repeats < 1:
-        raise ValueError(f"--repeats is {repeats}, it must be 1 or more")
-    only, again = _cells(cells), _cells(" ".join(redo or ()))
     kept = _KeptPresses(table or out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         shape = skin.info.rows, skin.info.columns
-        _check_cells([*only, *again], shape)
+        only, again = (_cells(text, shape) for text in (cells, " ".join(redo or ())))
         wanted = [
             Press(cell, force_n)
             for cell in only or np.ndindex(shape)
@@ -112,8 +107,8 @@ def weights(
         with naming(kept.path):
             calibrator.presses_in_table(kept.table)  # raises ValueError for another skin's
         if again:
-            kept.drop(again)
-        rest_us = 1e6 * calibrator.estimator().rest_level()
+            kept.keep(kept.table[[press.cell not in again for press in kept.presses]])
+        rest_us = 1e6 * calibrator.rest_level
         _out.print(f"rest: {rest_us.min():.2f} to {rest_us.max():.2f} microsiemens")
         left = _guided(skin, calibrator, kept, missing, len(wanted)) if missing else 0
     if left:
@@ -150,20 +145,24 @@ def recording(
     if not given.scans:
         raise RecordingError(f"{recording}: no scan in it")
     log = None if forces is None else load_force_log(forces)
-    with naming(recording), _progress(method, len(given.scans)) as progress:
-        log = log or _force_log(given)
+    with naming(recording):
+        if log is None and not given.forces:
+            raise ValueError("no force in it: say --forces LOG.csv")
+        if log is None:  # the scans have the same clock
+            samples = np.array([(each.host_time_s, each.force_n) for each in given.forces])
+            log = ForceLog(*samples.T)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s))
-        history = calibrator.measure(given.scans, progress)
+        history = calibrator.measure(given.scans, _with_progress)
         alignment = align(history.time_s, history.of_skin, log)
         presses = find_presses(history, log, alignment.offset_s)
-    notes = [
+    note = (
         f"offset of the clocks {alignment.offset_s:+.3f} s, correlation "
         f"{alignment.correlation:.2f} over {alignment.overlap_s:.0f} s; zero of the force sensor "
         f"{presses.zero_n:+.3f} N"
-    ]
+    )
     if presses.shared:
-        notes.append(f"{presses.shared} scans left out: two cells were pressed")
-    _finish(calibrator, presses, recording, out, notes)
+        note += f"\n{presses.shared} scans left out: two cells were pressed"
+    _finish(calibrator, presses, recording, out, note)
 
 
 @calibrate.command()
@@ -180,11 +179,40 @@ def table(
     bottom_wire_ohm: BottomWire = None,
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
-    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm)
+    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
         calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s))
     _from_table(calibrator, rows, table, out)
+
+
+def tare(
+    port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
+    calibration: Annotated[Path, typer.Argument(help="calibration file (.json), to be changed")],
+    seconds: Annotated[
+        float, typer.Option(help="so long nothing touches the skin, in seconds")
+    ] = TARE_S,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="return to the rest of the calibration")
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="even if cells seem touched: rest has drifted")
+    ] = False,
+) -> None:
+    """Take what the skin at PORT reads now for no force, from now on: nothing may touch it.
+
+    Is refused while something does. The rest that was calibrated is kept, for --undo.
+    """
+    with ohmskin.open(port, calibration=calibration) as skin:
+        if undo:
+            skin.undo_tare()
+            done = f"rest of {skin.calibration.rest.date}"
+        else:
+            largest_n = abs(skin.latest().force_n).max()
+            skin.tare(seconds, force=force)
+            done = f"tared, largest force before it {largest_n:.3f} N"
+        skin.calibration.save(calibration)
+    _out.print(f"{calibration}: {done}", markup=False)
 
 
 # ---------------------------------------------------------------------- what they have in common
@@ -196,33 +224,26 @@ def _options(
     indenter_mm2: float,
     top_wire_ohm: float | None,
     bottom_wire_ohm: float | None,
+    *,
+    table: bool = False,
 ) -> Callable[[Hello, Float], Calibrator]:
     """Check what all commands are told, before anybody presses cells for an hour.
 
-    Returns what makes the calibrator of a board and the readings (R, C, 4) of its untouched skin.
+    table: whether presses are in a table. Returns what makes the calibrator of a board and the
+    readings (R, C, 4) of its untouched skin.
     """
     wires = WireOhm(top_wire_ohm, bottom_wire_ohm)
     wires.check()
     if method not in LEVEL_METHODS:
         raise ValueError(f"no method '{method}': there are {', '.join(LEVEL_METHODS)}")
+    if table and method == VOLTAGE:
+        raise ValueError(f"a table has conductances, which '{VOLTAGE}' knows nothing of")
     if not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     if out.is_dir() or not out.parent.is_dir():
         raise ValueError(f"{out}: cannot be written: say a file in a directory there is")
-
-    def calibrator_of(board: Hello, rest_ratio: Float) -> Calibrator:
-        knowledge = SkinKnowledge.of(board, rest_ratio, wires)
-        return Calibrator(knowledge, method, 1e-6 * indenter_mm2, board.unit_id, now())
-
-    return calibrator_of
-
-
-def _force_log(given: Recording) -> ForceLog:
-    """The forces of a recording, whose scans have the same clock."""
-    if not given.forces:
-        raise ValueError("no force in it: say --forces LOG.csv")
-    time_s, force_n = np.array([(each.host_time_s, each.force_n) for each in given.forces]).T
-    return ForceLog(time_s, force_n)
+    area_m2 = 1e-6 * indenter_mm2
+    return lambda board, rest: Calibrator(board, rest, method, area_m2, wires)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
@@ -243,26 +264,22 @@ def _from_table(calibrator: Calibrator, table: PressTable, source: Path, out: Pa
 
 
 def _finish(
-    calibrator: Calibrator, presses: Presses, source: Path, out: Path, notes: Sequence[str] = ()
+    calibrator: Calibrator, presses: Presses, source: Path, out: Path, note: str = ""
 ) -> None:
     """Write the calibration that the presses from `source` tell, and say what it is worth."""
     with naming(source):
         calibration, message = calibrator.calibration(presses)
     calibration.save(out)
-    for note in notes:
-        _out.print(note)
     model = calibration.model
-    table = [
-        [
-            f"{rmse_n:.2f} ({count}){'*' if pooled else ''}"
-            for rmse_n, count, pooled in zip(*row, strict=True)
-        ]
-        for row in zip(model.held_out_rmse, presses.counts, model.pooled, strict=True)
+    every_cell = zip(model.held_out_rmse.flat, presses.counts.flat, model.pooled.flat, strict=True)
+    texts = [
+        f"{rmse_n:.2f} ({count}){'*' if of_all else ''}" for rmse_n, count, of_all in every_cell
     ]
     title = "held-out error [N], of so many presses; *: no curve of its own"
-    _out.print(cell_table(table, title))
-    if message:
-        _out.print(message)
+    table = cell_table(np.reshape(texts, model.pooled.shape).tolist(), title)
+    for each in (note, table, message):
+        if each:
+            _out.print(each)
     if calibration.nominal_wire_ohm.both is None:
         _out.print(
             "wires are not told (--top-wire, --bottom-wire): forces' standard deviations are wide"
@@ -270,12 +287,10 @@ def _finish(
     _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 
 
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    messages = Console(stderr=True)
-    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done: progress.update(task, completed=done)
+def _with_progress(scans: Iterable[Scan]) -> Iterable[Scan]:
+    """The scans, and a bar in a terminal that says how many have been read."""
+    console = Console(stderr=True)
+    return track(scans, "scans", console=console, transient=True, disable=not console.is_terminal)
 
 
 # -------------------------------------------------------------------------------- with weights
@@ -297,13 +312,10 @@ class _KeptPresses:
         """Keep one more press, under which the cell had this conductance [S]."""
         # The table has no conductance below 0.
         one = np.array([(*press.cell, press.force_n, max(conductance, 0.0), std)], PRESS)
-        self._keep(np.concatenate([self.table, one]))
+        self.keep(np.concatenate([self.table, one]))
 
-    def drop(self, cells: Cells) -> None:
-        """Forget all presses of these cells."""
-        self._keep(self.table[[press.cell not in cells for press in self.presses]])
-
-    def _keep(self, table: PressTable) -> None:
+    def keep(self, table: PressTable) -> None:
+        """Keep this table in place of the one before."""
         if table.size:
             save_press_table(self.path, table)
         else:
@@ -314,65 +326,53 @@ class _KeptPresses:
 def _guided(
     skin: Device, calibrator: Calibrator, kept: _KeptPresses, missing: list[Press], total: int
 ) -> int:
-    """Ask for what is missing. Returns how much still is, after an interruption."""
-    guide, estimator, left = Guide(missing), calibrator.estimator(), len(missing)
-    rest = estimator.rest_level()
-    voice = _Voice(total)
-    with until_stopped() as watched, voice.bar:
-        for scan in watched(iter(skin.latest, None)):
-            found = estimator.estimate(scan.ratio)
+    """Ask for what is missing. Returns how much still is, after an interruption.
+
+    Lines say what to do next. A terminal also gets a bar, and a bell for each press.
+    """
+    guide, rest = Guide(missing), calibrator.rest_level
+    done, said = total - len(missing), ""
+    columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
+    bar = Progress(*columns, console=_out, transient=True, disable=not _out.is_terminal)
+    task = bar.add_task("", total=total)
+    with bar:
+        for scan in until_stopped(iter(skin.latest, None)):
+            found = calibrator.estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
             if step.wanted is not None and step.rise is not None:
                 kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
-                left -= 1
-            voice.say(step, total - left)
+                done += 1
+                _out.bell()
+            line, now = _said_of(step)
+            if line and line != said:
+                counted = f"{done} of {total}: " if step.rise is not None else ""
+                _out.print(counted + line, markup=False, highlight=False)
+                said = line
+            bar.update(task, completed=done, description=now)
             if step.state is State.DONE:
                 break
-    return left
+    return total - done
 
 
-class _Voice:
-    """Says what to do next, by lines; in a terminal also by a bar, and a bell for each press."""
-
-    def __init__(self, total: int) -> None:
-        self._total = total
-        self._said = ""
-        self.bar = Progress(
-            BarColumn(20),
-            MofNCompleteColumn(),
-            TextColumn("{task.description}", markup=False),
-            console=_out,
-            transient=True,
-            disable=not _out.is_terminal,
-        )
-        self._task = self.bar.add_task("", total=total)
-
-    def say(self, step: Step, done: int) -> None:
-        """Say what a scan has led to; nothing twice."""
-        line, press = "", step.wanted
-        if step.rise is not None:
-            _out.bell()
-            line = (
-                f"{done} of {self._total}: {1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} "
-                "microsiemens above rest: take it off"
-            )
-        elif press is not None and step.state is State.PUT:
-            weight = f"{1e3 * press.force_n / GRAVITY:.6g} g ({press.force_n:.3f} N)"
-            row, column = press.cell
-            line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
-        elif press is not None and step.state is State.WRONG:
-            cells = ", ".join(map(str, step.cells))
-            pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"
-            line = f"{pressed} pressed: put the weight on {press.cell} alone"
-        if line and line != self._said:
-            _out.print(line, markup=False, highlight=False)
-            self._said = line
-        now = "" if step.state is State.DONE else step.state.value
-        if step.state is State.HOLD:
-            now = "reading"
-            if step.change is not None:
-                now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
-        self.bar.update(self._task, completed=done, description=now)
+def _said_of(step: Step) -> tuple[str, str]:
+    """What to do next, empty where nothing changes, and what goes on meanwhile."""
+    press, line, now = step.wanted, "", step.state.value
+    if press is None:
+        return "", ""
+    if step.rise is not None:
+        rise = f"{1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} microsiemens above rest"
+        line = f"{rise}: take it off"
+    elif step.state is State.PUT:
+        weight = f"{1e3 * press.force_n / GRAVITY:.6g} g ({press.force_n:.3f} N)"
+        row, column = press.cell
+        line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
+    elif step.state is State.WRONG:
+        cells = ", ".join(map(str, step.cells))
+        pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"
+        line = f"{pressed} pressed: put the weight on {press.cell} alone"
+    elif step.change is not None:
+        now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
+    return line, now
 
 
 def _grams(text: str) -> list[float]:
@@ -387,23 +387,15 @@ def _grams(text: str) -> list[float]:
     return masses_g
 
 
-def _cells(text: str) -> Cells:
+def _cells(text: str, shape: tuple[int, int]) -> Cells:
+    """The cells that a text names, each once, in its order."""
     cells = []
     for part in text.split():
         row, comma, column = part.partition(",")
         if not (comma and row.isdecimal() and column.isdecimal()):
             raise ValueError(f"'{part:.40}' is no cell: write row,column, such as 0,1")
-        cells.append((int(row), int(column)))
+        cells.append(check_cell(int(row), int(column), shape))
     return tuple(dict.fromkeys(cells))
-
-
-def _check_cells(cells: Sequence[tuple[int, int]], shape: tuple[int, int]) -> None:
-    for row, column in cells:
-        if row >= shape[0] or column >= shape[1]:
-            raise ValueError(
-                f"cell ({row}, {column}) is not on this {shape[0]}x{shape[1]} skin, whose first "
-                "is (0, 0)"
-            )
 
 
 def _check_enough(presses: list[Press], shape: tuple[int, int]) -> None:

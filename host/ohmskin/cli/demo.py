@@ -1,147 +1,94 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ohmskin demo``: the main job on an emulated skin, compared with the truth."""
+"""Without a board: ``ohmskin demo``, the main job compared with the truth, and ``emulate``."""
 
+import signal
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated, Final
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
+from rich.columns import Columns
 from rich.console import Console
-from rich.table import Table
 
 import ohmskin
-from ohmskin.arrays import Float
-from ohmskin.cli.stream import FULL_SCALE_US, cells_table
-from ohmskin.emulate.scenes import Scene
-from ohmskin.errors import OhmskinError, PortError
+from ohmskin.arrays import Bool, Float
+from ohmskin.cli.stream import FULL_SCALE_US, conductances
+from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
+from ohmskin.emulate.scenes import SCENES
+from ohmskin.errors import OhmskinError
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.link.messages import BoardStats
+from ohmskin.opening import emulated
 
-URL: Final = "emulator://8x8?scene=ghost&seed=1"
+_URL: Final = "emulator://8x8?scene=ghost&seed=1"
 _METHODS: Final = ("ohm", "joint")
+# Where nothing says how wide the output is, three tables stand side by side [characters].
 _WIDTH: Final = 160
 _out = Console()
+
+# What is seen of a skin: a name, conductances [S] and touched cells, each (R, C).
+_View = tuple[str, Float, Bool]
+
+EPILOGS: Final = {
+    "emulate": f"Scenes: {'; '.join(f'{k}: {v}' for k, v in SCENES.items())}. "
+    f"Faults of the line: {'; '.join(f'{k}: {v}' for k, v in LINE_FAULTS.items())}. "
+    f"Faults of the skin: {'; '.join(f'{k}: {v}' for k, v in SKIN_FAULTS.items())}."
+}
 
 
 def demo(
     seconds: Annotated[float, typer.Option(help="how long to scan")] = 3.0,
-    port: Annotated[str, typer.Option(help="an emulator:// URL")] = URL,
+    port: Annotated[str, typer.Option(help="an emulator:// URL")] = _URL,
     picture: Annotated[Path, typer.Option(help="PNG to write")] = Path("ohmskin-demo.png"),
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
-    result = run(port, seconds)
-    # Three tables stand side by side where nothing says how wide the output is.
-    wide = Console(width=_WIDTH) if not _out.is_terminal else _out
-    report(result, wide)
-    try:
-        save_picture(picture, result.panels, result.title)
-    except OhmskinError as exc:
-        _out.print(f"no picture: {exc}", markup=False)
-    else:
-        _out.print(f"picture: {picture}")
-
-
-@dataclass(frozen=True)
-class Demo:
-    """What was seen. panels: name, conductance [S] and touched cells of truth and each method."""
-
-    title: str
-    panels: list[tuple[str, Float, NDArray[np.bool_]]]
-    rate_hz: float
-    stats: BoardStats
-    estimate_ms: dict[str, float]
-
-    @property
-    def ghosts(self) -> dict[str, int]:
-        """Cells that a method takes for touched and nothing touches."""
-        truth = self.panels[0][2]
-        return {name: int((touched & ~truth).sum()) for name, _, touched in self.panels[1:]}
-
-
-def run(url: str, seconds: float) -> Demo:
-    """Scan `url`, an emulated port, for so long, with every scan through every method.
-
-    :raises PortError: the truth behind this port is not known.
-    """
-    scene = _scene_of(url)
-    with ohmskin.open(url) as skin:
+    _, scene, _ = emulated(port)
+    with ohmskin.open(port) as skin:
         board = skin.info
-        knowledge = SkinKnowledge(
-            board.rows,
-            board.columns,
-            ref_top_ohm=board.ref_top_ohm,
-            ref_bottom_ohm=board.ref_bottom_ohm,
-            adc_bits=board.adc_bits,
-            rest_ratio=ratio_from_codes(quantise(scene.rest_ratio)),
-        )
+        rest_ratio = ratio_from_codes(quantise(scene.rest_ratio))
+        knowledge = SkinKnowledge.of(board, rest_ratio)
         estimators = [make_estimator(method, knowledge) for method in _METHODS]
-        times: dict[str, list[float]] = {method: [] for method in _METHODS}
-        estimates = {}
-        scan = first = skin.latest()
-        end_s = time.monotonic() + seconds
+        end_s, found = time.monotonic() + seconds, []
         for scan in skin:
-            for estimator in estimators:
-                estimates[estimator.name] = estimator.estimate(scan.ratio)
-                times[estimator.name].append(estimates[estimator.name].seconds)
+            found.append([estimator.estimate(scan.ratio) for estimator in estimators])
             if time.monotonic() >= end_s:
                 break
-        rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
         stats = skin.stats
-    now_s = scan.time_us * 1e-6
-    panels = [("truth", scene.skin(now_s).cell_siemens, scene.touched(now_s))]
-    panels += [(name, e.cell_siemens, e.touched) for name, e in estimates.items()]
-    milliseconds = {name: 1e3 * float(np.median(taken)) for name, taken in times.items()}
+    now_s = 1e-6 * scan.time_us
+    truth = scene.touched(now_s)
+    views: list[_View] = [("truth", scene.skin(now_s).cell_siemens, truth)]
+    views += [
+        (method, estimate.cell_siemens, estimate.touched)
+        for method, estimate in zip(_METHODS, found[-1], strict=True)
+    ]
     title = f"scene '{scene.name}', simulated {board.rows}x{board.columns} skin"
-    return Demo(title, panels, rate_hz, stats, milliseconds)
-
-
-def _scene_of(url: str) -> Scene:
-    parts = urlsplit(url)
-    options = {key: values[-1] for key, values in parse_qs(parts.query).items()}
-    if parts.scheme != "emulator" or "readings" in options:
-        raise PortError(f"{url}: the demo needs the truth: use {URL}")
-    try:
-        rows, columns = map(int, parts.netloc.split("x"))
-        seed = int(options.get("seed", "0"))
-        return Scene(options.get("scene", "rest"), rows, columns, seed=seed)
-    except ValueError as exc:
-        raise PortError(f"{url}: {exc}") from exc
-
-
-def report(demo: Demo, console: Console) -> None:
-    """Print truth and estimates side by side, and what they say."""
-    console.print(f"{demo.title}: cell conductance in microsiemens")
-    tables = [cells_table(cells, name) for name, cells, _ in demo.panels]
-    widths = [console.measure(table).maximum for table in tables]
-    if sum(widths) <= console.width:
-        beside = Table.grid()
-        beside.add_row(*tables)
-        console.print(beside)
-    else:
-        console.print(*tables, sep="\n")
-    for name, ghosts in demo.ghosts.items():
-        verdict = f"{ghosts} ghosts" if ghosts != 1 else "1 ghost"
-        console.print(
-            f"{name:>8}: {verdict if ghosts else 'no ghost'}, "
-            f"{demo.estimate_ms[name]:.2f} ms a scan"
-        )
-    console.print(
-        f"{demo.stats.scans} scans at {demo.rate_hz:.2f} Hz, {demo.stats.missed} missed, "
-        f"{demo.stats.line.damaged} damaged"
+    out = _out if _out.is_terminal else Console(width=_WIDTH)
+    out.print(f"{title}: cell conductance in microsiemens")
+    out.print(Columns([conductances(cell_siemens, name) for name, cell_siemens, _ in views]))
+    for (name, _, touched), estimates in zip(views[1:], zip(*found, strict=True), strict=True):
+        ghosts = int((touched & ~truth).sum())
+        said = f"{ghosts or 'no'} ghost{'s' if ghosts > 1 else ''}"
+        took_ms = 1e3 * float(np.median([estimate.seconds for estimate in estimates]))
+        out.print(f"{name:>8}: {said}, {took_ms:.2f} ms a scan")
+    out.print(
+        f"{stats.scans} scans at {board.rate_hz:.2f} Hz, {stats.missed} missed, "
+        f"{stats.line.damaged} damaged"
     )
+    try:
+        _save_picture(picture, views, title)
+    except OhmskinError as exc:
+        out.print(f"no picture: {exc}", markup=False)
+    else:
+        out.print(f"picture: {picture}")
 
 
-def save_picture(
-    path: Path, panels: Sequence[tuple[str, Float, NDArray[np.bool_]]], title: str
-) -> None:
-    """A PNG of skins side by side: title, conductances [S] and touched cells of each.
+def _save_picture(path: Path, views: Sequence[_View], title: str) -> None:
+    """A PNG of a skin as it was seen, side by side.
 
     :raises OhmskinError: matplotlib is not installed.
     """
@@ -149,30 +96,39 @@ def save_picture(
         from matplotlib.figure import Figure
     except ImportError as exc:
         raise OhmskinError("pictures need matplotlib: pip install 'ohmskin[plot]'") from exc
-    figure = Figure(figsize=(3.4 * len(panels) + 0.8, 3.9), layout="constrained")
+    figure = Figure(figsize=(3.4 * len(views) + 0.8, 3.9), layout="constrained")
     figure.suptitle(title)
-    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    image = None
-    for axes, (name, cell_siemens, touched) in zip(all_axes, panels, strict=True):
-        image = axes.imshow(
-            np.maximum(1e6 * cell_siemens, 0.1), norm="log", vmin=0.5, vmax=FULL_SCALE_US
-        )
-        image.set_cmap("viridis")
+    all_axes = figure.subplots(1, len(views), squeeze=False)[0]
+    for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
+        seen_us = np.maximum(1e6 * cell_siemens, 0.1)
+        axes.imshow(seen_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
         for row, column in np.argwhere(touched):
-            axes.text(
-                column,
-                row,
-                f"{1e6 * cell_siemens[row, column]:.0f}",
-                ha="center",
-                va="center",
-                color="white" if cell_siemens[row, column] < 5e-5 else "black",
-                fontsize=8,
-            )
-        axes.set_title(name, fontsize=10)
-        axes.set_xlabel("column")
-        axes.set_ylabel("row")
-        axes.set_xticks(range(cell_siemens.shape[1]))
-        axes.set_yticks(range(cell_siemens.shape[0]))
-    assert image is not None
-    figure.colorbar(image, ax=all_axes, label="cell conductance [µS]", shrink=0.9)
+            text = f"{seen_us[row, column]:.0f}"
+            colour = "white" if seen_us[row, column] < 50 else "black"
+            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
+        rows, columns = map(range, cell_siemens.shape)
+        axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
+    figure.colorbar(all_axes[0].images[0], ax=all_axes, label="cell conductance [µS]", shrink=0.9)
     figure.savefig(path, dpi=120)
+
+
+def emulate(
+    url: Annotated[str, typer.Argument(help="an emulator:// URL")] = _URL,
+    link: Annotated[
+        Path | None, typer.Option(help="also make this symbolic link to the pseudo-terminal")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+) -> None:
+    """Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C ends it."""
+    board, _, faults = emulated(url)
+    with ExitStack() as stack:
+        server = stack.enter_context(PtyServer(board, faults))
+        if link is not None:
+            if link.is_symlink():
+                link.unlink()
+            link.symlink_to(server.path)
+            stack.callback(link.unlink, missing_ok=True)
+        print(server.path, flush=True)  # noqa: T201
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # the link goes then, too
+        with suppress(KeyboardInterrupt):
+            server.serve(seconds or float("inf"))

@@ -5,7 +5,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -13,31 +12,30 @@ import typer
 from rich.console import Console
 
 import ohmskin
+from ohmskin import errors
 from ohmskin.cli import doctor_words as words
 from ohmskin.doctor.examine import Evidence, examine
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Severity, found
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
-from ohmskin.errors import (
-    CommandRefused,
-    DeviceLost,
-    DeviceSilent,
-    OhmskinError,
-    PortError,
-    ProtocolMismatch,
-)
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
-from ohmskin.link.serial_port import latency_ms, latency_timer_file
+from ohmskin.link.serial_port import latency_timer
 
 WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
 LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
+_UNANSWERED: Final = {
+    errors.DeviceLost: Kind.LOST,
+    errors.DeviceSilent: Kind.NOTHING_ANSWERS,
+    errors.PortError: Kind.PORT_UNUSABLE,
+    errors.ProtocolMismatch: Kind.PROTOCOL_MISMATCH,
+}
 
-_out = Console(soft_wrap=True)
-Progress = Callable[[str], None]
-Ask = Callable[[CornerScans], None]
+_out = Console(soft_wrap=True, markup=False, highlight=False)
+# Says what is being done, and before it what a person is asked to press, if anything.
+Tell = Callable[..., None]
 
 
 def doctor(
@@ -64,8 +62,15 @@ def doctor(
     wire_ohm = None if told is None else told.nominal_wire_ohm.both
     if wires:
         wire_ohm = _wires(wires)
-    with _terminal() as (progress, ask):
-        diagnosis = diagnose(port, told, wire_ohm, progress, ask if press else None)
+    with _terminal() as tell:
+        try:
+            device = ohmskin.open(port, start=False)
+        except errors.OhmskinError as exc:
+            diagnosis = Diagnosis([_unanswered(port, exc)])
+        else:
+            with device:
+                evidence = gather(device, tell, told, wire_ohm, press=press)
+            diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201
@@ -85,95 +90,77 @@ def _wires(text: str) -> tuple[float, float]:
     return top, bottom
 
 
+def _unanswered(port: str, error: errors.OhmskinError) -> Finding:
+    """Why there is nothing to examine. Raises what is a wrong use instead."""
+    kind = _UNANSWERED.get(type(error))
+    wrong_url = kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None)
+    if kind is None or wrong_url:
+        raise error
+    told = {"port": port, "problem": error.problem, "remedy": error.remedy}
+    return Finding(kind, WHOLE_SKIN, {name: told[name] for name in kind.names})
+
+
 @contextmanager
-def _terminal() -> Iterator[tuple[Progress, Ask]]:
-    """Ways to say what is done, and what to press.
+def _terminal() -> Iterator[Tell]:
+    """On a terminal, one line changes. Elsewhere each request is printed once, and no progress."""
+    console, said = Console(stderr=True, markup=False, highlight=False), {""}
 
-    On a terminal, one line changes. Elsewhere the progress is not told, and each request once.
-    """
-    errors = Console(stderr=True)
-    if errors.is_terminal:
-        with errors.status("connecting") as status:
-            yield (
-                status.update,
-                lambda presses: status.update(f"{words.request(presses)}; {words.answer(presses)}"),
-            )
+    def print_once(doing: str, request: str = "") -> None:
+        if request not in said:
+            said.add(request)
+            console.print(request)
+
+    if not console.is_terminal:
+        yield print_once
         return
-    said: list[str] = []
-
-    def ask(presses: CornerScans) -> None:
-        if words.request(presses) not in said:
-            said.append(words.request(presses))
-            errors.print(said[-1], markup=False, highlight=False)
-
-    yield lambda text: None, ask
+    with console.status("connecting") as status:
+        yield lambda doing, request="": status.update(f"{request}; {doing}" if request else doing)
 
 
 # ------------------------------------------------------------------------------- the examination
 
 
-def diagnose(
-    port: str,
+def gather(
+    device: Device,
+    tell: Tell = lambda *told: None,
     calibration: Calibration | None = None,
     wire_ohm: tuple[float, float] | None = None,
-    progress: Progress = lambda text: None,
-    ask: Ask | None = None,
-) -> Diagnosis:
-    """Examine the board at `port`. A port at which there is nothing to examine is a finding, too.
+    *,
+    press: bool = False,
+) -> Evidence:
+    """What `examine` goes by, as far as the board lets. Leaves the board as it was.
 
-    ask: tells a person where to press; without, nobody is asked.
-
-    :raises PortError: the URL is wrong.
     :raises ValueError: the calibration is of another unit or geometry, or somebody would be asked
         to press a skin of one row or column.
     """
+    board, path = device.info, device.name.partition("?")[0]
+    evidence = Evidence(board, host_version=ohmskin.__version__)
+    # Wires of no resistance are none that could have changed.
+    evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
+    if calibration is not None:
+        calibration.check(board.unit_id, board.rows, board.columns)
+        evidence.rest_ratio = calibration.rest.ratio
+    evidence.latency = None if "://" in path else latency_timer(path)
+    presses = CornerScans(board) if press else None
     try:
-        device = ohmskin.open(port, start=False)
-    except (DeviceSilent, DeviceLost, ProtocolMismatch, PortError) as exc:
-        return Diagnosis([_unanswered(port, exc)])
-    with device:
-        board = device.info
-        evidence = Evidence(board, host_version=ohmskin.__version__)
-        # Wires of no resistance are none that could have changed.
-        evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
-        if calibration is not None:
-            calibration.check(board.unit_id, board.rows, board.columns)
-            evidence.rest_ratio = calibration.rest.ratio
-        path = port.partition("?")[0]
-        timer_ms = None if "://" in port else latency_ms(path)
-        if timer_ms is not None:
-            evidence.latency = timer_ms, str(latency_timer_file(path))
-        gather(device, evidence, progress, ask)
-    return examine(evidence)
-
-
-def gather(
-    device: Device,
-    evidence: Evidence,
-    progress: Progress = lambda text: None,
-    ask: Ask | None = None,
-) -> None:
-    """Read into `evidence` what `examine` goes by, as far as the board lets. Leave it as it was.
-
-    :raises ValueError: somebody would be asked to press a skin of one row or column.
-    """
-    presses = None if ask is None else CornerScans(device.info)
-    try:
-        progress("self-test")
-        with suppress(CommandRefused):  # a recording has none
+        tell("self-test")
+        with suppress(errors.CommandRefused):  # a recording has none
             evidence.report = device.self_test()
-        progress(f"scanning the untouched skin for {REST_S} s")
+        tell(f"scanning the untouched skin for {REST_S} s")
         _scan(device, evidence.scans, REST_S)
         evidence.board = device.info
-        progress("scanning with a longer settle time")
-        with suppress(CommandRefused):
+        tell("scanning with a longer settle time")
+        with suppress(errors.CommandRefused):
             _scan_settled(device, evidence)
-        if ask is not None and presses is not None:
+        if presses is not None:
             evidence.presses = presses
-            _scan_presses(device, presses, ask)
-    except DeviceLost as exc:
+            _scan_presses(device, presses, tell)
+    except errors.RecordingEnded:
+        pass  # all of the recording was read
+    except errors.DeviceLost as exc:
         evidence.board, evidence.lost = device.info, str(exc)
     evidence.stats = device.stats
+    return evidence
 
 
 def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
@@ -197,7 +184,7 @@ def _scan_settled(device: Device, evidence: Evidence) -> None:
         device.configure(rate_hz=board.rate_asked_mhz / 1000, settle_us=board.settle_asked_us)
 
 
-def _scan_presses(device: Device, presses: CornerScans, ask: Ask) -> None:
+def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
     """Until three corners and then three others were pressed, or it has taken too long."""
     begin_s = None
     for scan in device:
@@ -205,43 +192,31 @@ def _scan_presses(device: Device, presses: CornerScans, ask: Ask) -> None:
         presses.take(scan)
         if presses.done or scan.host_time_s - begin_s >= WAIT_S:
             return
-        ask(presses)
-
-
-def _unanswered(port: str, error: OhmskinError) -> Finding:
-    """Why there is nothing to examine. Raises what is a wrong use instead."""
-    if isinstance(error, DeviceLost):
-        return found(Kind.LOST, problem=error.problem)
-    kinds = {ProtocolMismatch: Kind.PROTOCOL_MISMATCH, DeviceSilent: Kind.NOTHING_ANSWERS}
-    kind = kinds.get(type(error), Kind.PORT_UNUSABLE)
-    if kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None):
-        raise error  # no serial port has refused: the URL is wrong
-    return found(kind, port=port, problem=error.problem, remedy=error.remedy)
+        tell(*words.guidance(presses))
 
 
 # ----------------------------------------------------------------------------------- the page
 
 
 def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
-    """What ``--json`` prints."""
-    findings = []
-    for finding in diagnosis.findings:
-        kind, data = finding.kind, {"place": asdict(finding.place), "values": finding.values}
-        findings.append(
-            {"id": kind.id, "severity": kind.severity, **words.words_of(finding), **data}
-        )
+    """What ``--json`` prints, with places and shares that `asdict` takes apart."""
     return {
         "port": port,
         "sound": not diagnosis.worse,
         "verdict": words.verdict(diagnosis),
-        "findings": findings,
+        "findings": [
+            {"id": each.kind.id, "severity": each.kind.severity}
+            | words.words_of(each)
+            | {"place": each.place, "values": each.values}
+            for each in diagnosis.findings
+        ],
         "measured": words.measured_in_words(diagnosis),
     }
 
 
 def _print(page: dict[str, Any]) -> None:
     """What `as_object` has, for people."""
-    show = partial(_out.print, markup=False, highlight=False)
+    show = _out.print
     show(f"{page['port']}: {page['verdict']}")
     for number, finding in enumerate(page["findings"], start=1):
         severity, name = finding["severity"], finding["id"].replace("_", " ")

@@ -2,7 +2,6 @@
 """The words of ``ohmskin doctor``; those of each kind of finding are in ``doctor_words.toml``."""
 
 import tomllib
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,71 +12,62 @@ from ohmskin.link.protocol import ENUMS
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
 MOST_CELLS: Final = 6  # [cells] More are not named one by one.
 
+_TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
 _WIDE: Final = "not known: press with something smaller than a cell, further apart"
 
 
-@cache
-def _table() -> dict[str, Any]:
-    return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-
-
 def words_of(finding: Finding) -> dict[str, str]:
     """What is told of a finding, by the names in `FIELDS`."""
-    name, cases, more = _case(finding, finding.values)
-    told = _table()[name]
-    for case in cases:
-        told = told | told.get(case, {})
-    words = {"where": named(finding.place), **finding.values, **more}
+    kind, place, values = finding.kind, finding.place, finding.values
+    words = {"where": named(place), "one_place": place != WHOLE_SKIN, **values, **_words(finding)}
+    table = _TABLES[words.get("table", kind.id)]
+    told = dict(table)
+    for case in table.keys() - FIELDS:
+        if words.get(case) or case in words.values():
+            told |= table[case]
     return {field: told[field].format(**words) for field in FIELDS}
 
 
-def _case(finding: Finding, values: Any) -> tuple[str, list[str], dict[str, Any]]:
-    """The table of a finding, the cases in it that apply, and words besides the values."""
-    name, cases, words = finding.kind.id, [], {}
-    place = finding.place
-    what, lines = ("row", place.rows) if place.rows else ("column", place.columns)
-    if place != WHOLE_SKIN:
-        cases.append("one_place")
+def _words(finding: Finding) -> dict[str, Any]:
+    """Words and cases of a finding that its values do not have."""
+    values = finding.values
+    line, lines = "row", finding.place.rows
+    if not lines:
+        line, lines = "column", finding.place.columns
     match finding.kind:
         case Kind.PORT_UNUSABLE:
-            cases += [] if values["remedy"] else ["unknown"]
+            return {"unknown": not values["remedy"]}
         case Kind.SELF_TEST:
             side, _, fault = values["name"].partition("_")
             doc = ENUMS["finding"].docs.get(values["name"], "a finding of a newer firmware")
-            cases, words = [fault], {"side": side, "doc": doc}
-        case Kind.NOTHING_CONDUCTS if values["cell_count"] == 1:
-            cases.append("one_cell")
+            return {"side": side, "fault": fault, "doc": doc}
+        case Kind.NOTHING_CONDUCTS:
+            return {"one_cell": values["cell_count"] == 1}
         case Kind.OPEN_ROW | Kind.OPEN_COLUMN:
-            name, words = "open", {"line": what, "first": lines[0]}
-            cases += ["one_cell"] if values["cells_per_line"] == 1 else []
             # Lines beyond the skin look open, too.
             beyond = lines == tuple(range(lines[0], values["line_count"]))
-            cases += ["last_lines"] if beyond else []
+            cases = {"one_cell": values["cells_per_line"] == 1, "last_lines": beyond}
+            return {"table": "open", "line": line, "first": lines[0], **cases}
         case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS:
-            name, words = "short", {"line": what, "joined": " and ".join(map(str, lines))}
+            return {"table": "short", "line": line, "joined": " and ".join(map(str, lines))}
         case Kind.REFERENCE_RATIO:
-            nominal = values["ref_top_ohm"] / values["ref_bottom_ohm"]
-            words = {"percent": abs(values["off_percent"]), "nominal_ratio": nominal}
-            cases += ["low"] if values["off_percent"] < 0 else []
-        case Kind.RESET_CAUSE:
-            cases.append(values["cause"])
+            nominal, off = values["ref_top_ohm"] / values["ref_bottom_ohm"], values["off_percent"]
+            return {"nominal_ratio": nominal, "percent": abs(off), "low": off < 0}
         case Kind.RESTARTED:
-            words = {"last": ", ".join(values["causes"]) or "unknown"}
-        case Kind.LOSS if values["dropped_by_board"] or not values["missed"]:
-            cases.append("dropped" if values["missed"] else "few")
+            return {"last": ", ".join(values["causes"]) or "unknown"}
+        case Kind.LOSS:
+            missed = values["missed"]
+            return {"dropped": missed and values["dropped_by_board"], "few": not missed}
         case Kind.HUM:
-            words = {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
+            return {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
         case Kind.WIRES:
             share, ohm = values["share"], dict(zip(LAYERS, values["nominal_ohm"], strict=True))
-            words = {"told": _ohm(share, ohm), "nominal": ohm[share.layers[0]], **ohm}
-            words["times"] = share.share
-            cases += ["both"] if len(share.layers) > 1 else []
-            cases += [] if lines else [f"all_{'_'.join(share.layers)}"]
-        case Kind.TOUCHED if values["moves"]:
-            cases.append("moves")
-    return name, cases, words
+            cases = {"both": len(share.layers) > 1, f"all_{'_'.join(share.layers)}": not lines}
+            told = {"told": _ohm(share, ohm), "times": share.share, **ohm}
+            return {"nominal": ohm[share.layers[0]], **told, **cases}
+    return {}
 
 
 def named(place: Place) -> str:
@@ -111,20 +101,17 @@ def verdict(diagnosis: Diagnosis) -> str:
 
 def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:
     """The figures; and the wires of layers and lines in words, where they were judged."""
-    if not diagnosis.untouched:
+    if diagnosis.nominal_ohm is None:
         return diagnosis.measured
-    ohm = dict(zip(LAYERS, diagnosis.nominal_ohm, strict=True))
-    layers = [
-        f"{each.layers[0]} {_ohm(each, ohm)}" for each in diagnosis.untouched[:2] if each.known
-    ]
-    lines = [
-        f"{named(each.place)}: {each.share:.2f} +- {each.std:.2f}"
-        for each in diagnosis.untouched[2:]
-    ]
-    told = "; ".join(layers) or _UNTOUCHED
-    if diagnosis.pressed is not None:
-        told = _ohm(diagnosis.pressed[0], ohm) if diagnosis.pressed else _NOT_PRESSED
-        lines += [f"{named(each.place)}: {_times(each)}" for each in diagnosis.pressed[1:]]
+    ohm, pressed = dict(zip(LAYERS, diagnosis.nominal_ohm, strict=True)), diagnosis.pressed
+    if pressed is None:
+        layers = [
+            f"{each.layers[0]} {_ohm(each, ohm)}" for each in diagnosis.untouched if each.known
+        ]
+        told = "; ".join(layers) or _UNTOUCHED
+    else:
+        told = _ohm(pressed[0], ohm) if pressed else _NOT_PRESSED
+    lines = [f"{named(each.place)}: {_times(each)}" for each in (pressed or ())[1:]]
     return {**diagnosis.measured, "wires": told, "wires_of_lines": lines}
 
 
@@ -143,14 +130,10 @@ def _ohm(share: WireShare, nominal_ohm: dict[str, float]) -> str:
     return f"{_times(share)}: top {top}, bottom {bottom} ohm a segment, if both changed alike"
 
 
-def request(presses: CornerScans) -> str:
-    """Where to press next."""
+def guidance(presses: CornerScans) -> tuple[str, str]:
+    """What is pressed meanwhile, and where to press next."""
     cells = " ".join(map(str, sorted(presses.wanted)))
-    return f"{'now' if presses.again else 'press firmly, at once:'} {cells}"
-
-
-def answer(presses: CornerScans) -> str:
-    """What is pressed meanwhile."""
+    request = f"{'now' if presses.again else 'press firmly, at once:'} {cells}"
     if presses.hold:
-        return "hold still"
-    return f"pressed: {' '.join(map(str, presses.pressed)) or 'nothing'}"
+        return "hold still", request
+    return f"pressed: {' '.join(map(str, presses.pressed)) or 'nothing'}", request

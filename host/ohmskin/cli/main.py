@@ -21,19 +21,19 @@ _COMMANDS: Final = {
     "board.info": "Say what board is at PORT and how it scans.",
     "board.configure": "Change how the board scans; what is not given stays. Lasts until its "
     "reset, or --save.",
-    "flash.flash": "Build the firmware, write it to a board, and check that it answers.",
+    "board.flash": "Build the firmware, write it to a board, and check that it answers.",
     "stream.stream": "Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it.",
     "view.view": "Show skins live on a page in the browser: heat map, contacts, tare, recording.",
-    "tare.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
+    "calibrate.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
     "touch it.",
     "doctor.doctor": "Say what is wrong with the skin board at PORT, and what to do. Touch "
     "nothing meanwhile.",
-    "estimate.estimate": "Estimate every cell of every frame of a readings file.",
+    "record.estimate": "Estimate every cell of every frame of a readings file.",
     "record.record": "Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a "
     "mark.",
     "record.export": "Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as "
     "a table (.csv).",
-    "emulate.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
+    "demo.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
     "ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
     "calibrate.calibrate": "Learn each cell's force from presses of single cells: a calibration "
@@ -49,14 +49,15 @@ class _Command(TyperCommand):
         super().__init__(name, help=help_)
 
     def load(self) -> Any:
-        """The command itself, or the group of them. Its module may have an EPILOG for its help."""
+        """The command itself, or the group of them. Its module may have EPILOGS for their help."""
         assert self.name is not None
         module = import_module(f"ohmskin.cli.{self._module}")
         found, made = getattr(module, self.name), typer.Typer(add_completion=False)
         if isinstance(found, typer.Typer):
             made.add_typer(found, name=self.name)
         else:
-            made.command(self.name, epilog=getattr(module, "EPILOG", None))(found)
+            epilog = getattr(module, "EPILOGS", {}).get(self.name)
+            made.command(self.name, epilog=epilog)(found)
         return typer.main.get_group(made).commands[self.name]
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
@@ -89,16 +90,13 @@ def run(commands: Callable[..., Any], program: str) -> None:
             sys.exit(code)
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(program, str(exc))
-    except typer.Abort:
-        sys.exit(130)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except Exception as exc:
-        if _is_ctrl_c(exc):
+    except (Exception, KeyboardInterrupt) as exc:
+        if isinstance(exc, typer.Abort) or _is_ctrl_c(exc):
             sys.exit(130)
-        if not hasattr(exc, "format_message"):
+        said = getattr(exc, "format_message", None)
+        if said is None:
             raise
-        if text := exc.format_message():  # a wrong use of the command line
+        if text := said():  # a wrong use of the command line
             _fail(program, text)
         sys.exit(2)  # no command at all: the help is the answer
 

@@ -1,43 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ohmskin record`` and ``ohmskin export``."""
+"""``ohmskin record``, ``export`` and ``estimate``: scans in files."""
 
 import os
-import select
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
 import typer
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
+from rich.progress import Progress
 from rich.text import Text
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
+from ohmskin.cli.stream import cell_table
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
+from ohmskin.estimate.methods import METHODS
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
-from ohmskin.record.export import FORMATS
-from ohmskin.record.export import export as export_recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
+from ohmskin.record.readings import estimate_file, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import Mark, load_recording
+from ohmskin.record.recording import FORMATS, Mark, load_recording
+from ohmskin.record.recording import export as export_recording
 
 # With a force sensor the first scans are a tare of so many seconds, unless told.
 FORCE_TARE_S: Final = 2.0
 # A display looks at ten scans a second [s].
 _SEE_EVERY_S: Final = 0.1
-# How long the end of a recording may wait for the thread that reads typed lines [s].
-_TYPED_EVERY_S: Final = 0.2
+# So many different messages of estimates are printed for a file.
+_MESSAGES: Final = 8
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 _out = Console(soft_wrap=True)
@@ -88,11 +89,12 @@ def record(
                 live = Live(get_renderable=display.picture, console=_out, transient=True)
                 stack.enter_context(live)
                 see = display.see
-        stack.enter_context(_marks_typed(recorder))
-        watched = stack.enter_context(until_stopped())
+        if sys.stdin is not None and sys.stdin.isatty():
+            # The end of the recording does not wait for a line.
+            threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
             recording.record(
-                *(skin, recorder, watched(skin)),
+                *(skin, recorder, until_stopped(skin)),
                 count=scans,
                 seconds=seconds,
                 tare_s=tare_s,
@@ -108,42 +110,32 @@ def record(
     _out.print(f"{file}: {done}", markup=False)
 
 
-@contextmanager
-def until_stopped() -> Iterator[Callable[[Iterable[_T]], Iterator[_T]]]:
-    """Ctrl-C and SIGTERM end what is inside between two scans, never amid a write.
+def until_stopped(scans: Iterable[_T]) -> Iterator[_T]:
+    """Pass scans on until Ctrl-C or SIGTERM comes: they end between two, never amid a write.
 
-    Gives a function that passes scans on until such a signal has come. The signal interrupts the
-    wait for the next scan, and nothing else.
+    The signal interrupts the wait for the next scan, and nothing else.
     """
     is_stopped = waits = False
 
-    def handle(number: int, frame: FrameType | None) -> None:
+    def handle(*_: object) -> None:
         nonlocal is_stopped
         is_stopped = True
         if waits:
             raise KeyboardInterrupt
 
-    def watched(scans: Iterable[_T]) -> Iterator[_T]:
-        nonlocal waits
-        source = iter(scans)
-        while True:
-            try:
-                waits = True
-                if is_stopped:
-                    return
-                scan = next(source)
-            except (KeyboardInterrupt, StopIteration):
-                return
-            finally:
-                waits = False
-            yield scan
-
-    before = [signal.signal(number, handle) for number in _SIGNALS]
+    before = {number: signal.signal(number, handle) for number in _SIGNALS}
     try:
         with suppress(KeyboardInterrupt):
-            yield watched
+            source = iter(scans)
+            while True:
+                waits = True
+                scan = None if is_stopped else next(source, None)
+                waits = False
+                if scan is None:
+                    return
+                yield scan
     finally:
-        for number, handler in zip(_SIGNALS, before, strict=True):
+        for number, handler in before.items():
             signal.signal(number, handler)
 
 
@@ -192,44 +184,14 @@ class PressDisplay:
         return Group(Text(head), cell_table(styled, "presses of each cell"))
 
 
-def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
-    """A text for each cell, row by row, beside the numbers of rows and columns."""
-    table = Table(box=None, title=title)
-    for heading in ("", *map(str, range(len(cells[0])))):
-        table.add_column(heading, justify="right")
-    for row, texts in enumerate(cells):
-        table.add_row(str(row), *texts)
-    return table
-
-
-@contextmanager
-def _marks_typed(recorder: Recorder) -> Iterator[None]:
-    """Lines typed at a terminal become marks; a file or pipe at stdin is left alone."""
-    if os.name != "posix" or sys.stdin is None or not sys.stdin.isatty():
-        yield  # elsewhere a wait for a line cannot be ended
-        return
-    done = threading.Event()
-
-    def work() -> None:
-        number, text = sys.stdin.fileno(), b""
-        with suppress(OhmskinError, OSError):  # the file is full: the scans' loop says so
-            while not done.is_set():
-                if not select.select([number], [], [], _TYPED_EVERY_S)[0]:
-                    continue
-                typed = os.read(number, 4096)
-                if not typed:
-                    return
-                *lines, text = (text + typed).split(b"\n")
-                for line in lines:
-                    recorder.add(Mark(line.decode(errors="replace").strip(), time.monotonic()))
-
-    thread = threading.Thread(target=work, name="marks")
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
+def _take_marks(recorder: Recorder) -> None:
+    """Lines typed at the terminal become marks, for as long as the recording can be written."""
+    text = b""
+    with suppress(OhmskinError, OSError):  # the file is full: the scans' loop says so
+        while typed := os.read(sys.stdin.fileno(), 4096):
+            *lines, text = (text + typed).split(b"\n")
+            for line in lines:
+                recorder.add(Mark(line.decode(errors="replace").strip(), time.monotonic()))
 
 
 def export(
@@ -253,3 +215,28 @@ def export(
     _out.print(f"{out}: {scans} scans", markup=False)
     if given.cut_off:
         print(f"{recording} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
+
+
+def estimate(
+    readings: Annotated[Path, typer.Argument(help="readings file (.npz)")],
+    method: Annotated[str, typer.Option(help=" | ".join(METHODS))],
+    out: Annotated[Path, typer.Option(help="file to write (.npz)")],
+    cold: Annotated[bool, typer.Option(help="start every frame afresh")] = False,
+) -> None:
+    """Estimate every cell of every frame of a readings file."""
+    given = load_readings(readings)
+    errors = Console(stderr=True)
+    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
+        task = progress.add_task(method, total=len(given.ratio))
+        answers = estimate_file(
+            given, method, cold=cold, progress=lambda done, _: progress.update(task, completed=done)
+        )
+    save_arrays(out, answers)
+    frames = len(answers["converged"])
+    _out.print(
+        f"{out}: {frames} frames, {int(answers['converged'].sum())} converged, "
+        f"median {1e3 * float(np.median(answers['seconds'])):.2f} ms a frame"
+    )
+    for message, count in Counter(answers["message"].tolist()).most_common(_MESSAGES):
+        if message:
+            _out.print(f"  {count} of {frames}: {message}")

@@ -4,7 +4,7 @@
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -34,6 +34,8 @@ FULL_SCALE_N: Final = 10.0
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 # Time between two pictures in a terminal [s]; every scan is counted all the same.
 _DISPLAY_EVERY_S: Final = 0.1
+# What is printed of a contact.
+_OF_CONTACT: Final = ("identity", "row", "column", "force_n", "force_n_std")
 
 
 def stream(
@@ -48,9 +50,7 @@ def stream(
     calibration: Annotated[
         Path | None, typer.Option(help="calibration file (.json): show forces")
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="take a calibration of another unit")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     tare_s: Annotated[
         float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its rest")
     ] = 0.0,
@@ -110,27 +110,17 @@ def _print_scans(skin: Device, reader: SkinReader | None, count: int, seconds: f
             line["converged"] = found.estimate.converged
             line["message"] = found.estimate.message
             if reader.has_forces:
-                line |= forces_as_json(found)
+                line["force_n"] = _numbers(found.force_n)
+                line["force_n_std"] = _numbers(found.force_n_std)
+                line["contacts"] = [
+                    {name: _numbers(getattr(contact, name)) for name in _OF_CONTACT}
+                    for contact in found.contacts
+                ]
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
         except BrokenPipeError:
             sys.stderr.close()  # the reader, such as `head`, has had enough
             return
-
-
-def forces_as_json(scan: ForceScan) -> dict[str, Any]:
-    """Forces and contacts of a scan."""
-    return {
-        "force_n": _numbers(scan.force_n),
-        "force_n_std": _numbers(scan.force_n_std),
-        "contacts": [
-            {
-                name: _numbers(getattr(contact, name))
-                for name in ("identity", "row", "column", "force_n", "force_n_std")
-            }
-            for contact in scan.contacts
-        ],
-    }
 
 
 def _numbers(values: ArrayLike) -> Any:
@@ -142,38 +132,33 @@ def _numbers(values: ArrayLike) -> Any:
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
-    rate_hz, shown_s = 0.0, 0.0
-    first: Scan | None = None
+    shown_s = 0.0
     with Live(console=_out, auto_refresh=False) as live:
         for scan in _limited(iter(skin), count, seconds):
-            if first is None or scan.time_us < first.time_us:
-                first = scan  # or the board has restarted
-            elif scan.time_us > first.time_us:
-                rate_hz = (scan.number - first.number) * 1e6 / (scan.time_us - first.time_us)
             if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
                 shown_s = scan.host_time_s
-                live.update(_picture(skin, reader, scan, rate_hz), refresh=True)
+                live.update(_picture(skin, reader, scan), refresh=True)
 
 
-def _picture(skin: Device, reader: SkinReader | None, scan: Scan, rate_hz: float) -> Group:
+def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     stats = skin.stats
     caption = (
-        f"scan {scan.number}  {rate_hz:.1f} Hz  missed {stats.missed}  "
+        f"scan {scan.number}  {skin.info.rate_hz:.1f} Hz  missed {stats.missed}  "
         f"damaged {stats.line.damaged}  restarts {stats.restarts}"
     )
     if reader is None:
         title = f"{skin.name}: reading B in thousandths of Vdd"
-        return Group(Text(title), cells_table(1e-3 * scan.ratio[:, :, 1], ""), Text(caption))
+        return Group(Text(title), conductances(1e-3 * scan.ratio[:, :, 1]), Text(caption))
     found = reader.read(scan)
     if not found.estimate.converged:
         caption += f"  not converged: {found.estimate.message}"
     if reader.has_forces:
         title = f"{skin.name}: force by '{reader.method}' [N]"
-        table = forces_table(found.force_n, "")
+        table = _coloured(found.force_n, FULL_SCALE_N)
         caption = f"{_contact_line(found)}\n{caption}"
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
-        table = cells_table(found.estimate.cell_siemens, "")
+        table = conductances(found.estimate.cell_siemens)
     return Group(Text(title), table, Text(caption))
 
 
@@ -187,26 +172,21 @@ def _contact_line(scan: ForceScan) -> str:
     )
 
 
-def cells_table(cell_siemens: Float, title: str) -> Table:
+def conductances(cell_siemens: Float, title: str = "") -> Table:
     """Conductances [S], shape (rows, columns), as a table in microsiemens, coloured by value."""
-    return _table(1e6 * cell_siemens, title, 1.0, FULL_SCALE_US)
+    return _coloured(1e6 * cell_siemens, FULL_SCALE_US, title)
 
 
-def forces_table(force_n: Float, title: str) -> Table:
-    """Forces [N], shape (rows, columns), as a table, coloured by value."""
-    return _table(force_n, title, FULL_SCALE_N / 100, FULL_SCALE_N)
+def _coloured(values: Float, full_scale: float, title: str = "") -> Table:
+    texts = [[Text(_short(value), _colour(value / full_scale)) for value in row] for row in values]
+    return cell_table(texts, title)
 
 
-def _table(values: Float, title: str, low: float, high: float) -> Table:
-    """Colours on a logarithmic scale from `low` to `high`."""
-    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
-    table.add_column("", justify="right", style="dim")
-    for column in range(values.shape[1]):
-        table.add_column(str(column), justify="right", min_width=3, header_style="dim")
-    for row, cells in enumerate(values):
-        styled = (Text(_short(value), style=_colour(value, low, high)) for value in cells)
-        table.add_row(str(row), *styled)
-    return table
+def _colour(share: float) -> str:
+    """Of a share of the full scale, on a logarithmic scale from a hundredth of it."""
+    if not share > 0.01:
+        return _COLOURS[0]
+    return _COLOURS[min(int((1 + np.log10(share) / 2) * len(_COLOURS)), len(_COLOURS) - 1)]
 
 
 def _short(value: float) -> str:
@@ -215,8 +195,12 @@ def _short(value: float) -> str:
     return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
 
 
-def _colour(value: float, low: float, high: float) -> str:
-    if not value > low:
-        return _COLOURS[0]
-    share = np.log(value / low) / np.log(high / low)
-    return _COLOURS[int(np.clip(share * len(_COLOURS), 0, len(_COLOURS) - 1))]
+def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
+    """A text for each cell, row by row, beside the numbers of rows and columns."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
+    table.add_column("", justify="right", style="dim")
+    for column in range(len(cells[0])):
+        table.add_column(str(column), justify="right", min_width=3, header_style="dim")
+    for row, texts in enumerate(cells):
+        table.add_row(str(row), *texts)
+    return table

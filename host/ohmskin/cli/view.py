@@ -26,9 +26,7 @@ def view(
         list[Path] | None,
         typer.Option(help="calibration file (.json): show forces; may be given for each unit"),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="take a calibration of another unit")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     host: Annotated[
         str, typer.Option(help="address to listen at; another than loopback asks for a token")
     ] = "127.0.0.1",

@@ -30,18 +30,13 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
-from ohmskin.doctor.signal import RestScans, mean_std_lsb
+from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
+from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.link.codes import ratio_from_codes
-from ohmskin.link.messages import Hello
-
-Bool = NDArray[np.bool_]
 
 WIRE_OHM: Final = (100.0, 200.0)  # [ohm] Top and bottom segments are so unless told otherwise.
 
@@ -77,75 +72,59 @@ RATIO_TOLERANCE: Final = 0.03  # [1] The ratio of two resistors of 1 % is off by
 RATIO_STDS: Final = 3.0  # [deviations] Noise and rounding change the ratio by less than this.
 
 
-def examine_circuit(
-    rest: RestScans,
-    noise_lsb: float,
-    wire_ohm: tuple[float, float],
-    diagnosis: Diagnosis,
-    *,
-    moved: bool,
-) -> tuple[Bool, Bool]:
+def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> tuple[Bool, Bool]:
     """Adds lines, cells and references to a diagnosis. Returns two masks of cells, (R, C): those
     that are touched, and those that are dead or saturated or have an open or shorted line.
 
-    noise_lsb: of a reading. wire_ohm: a segment of the top and bottom layer. moved: something
-    touches the skin and moves; then shorted lines and dead cells are not judged, because the means
-    are of no one skin.
+    Shorted lines and dead cells are not judged while something moves on the skin.
     """
-    board, mean_codes, findings = rest.board, rest.mean, diagnosis.findings
-    full = (1 << board.adc_bits) - 1
-    shown = np.where(READING_SIGN > 0, mean_codes, full - mean_codes)
+    noise_lsb, full = rest.noise_lsb, (1 << rest.board.adc_bits) - 1
+    shown = np.where(READING_SIGN > 0, rest.codes, full - rest.codes)
     current = shown.mean(axis=2)
     rows, columns = current.shape
     usual = float(np.median(current))
     least = max(DARK_LSB + DARK_NOISE * noise_lsb, min(OFFSET_LSB, DARK_SHARE * usual))
     dark = current < least
-    nothing = np.zeros(current.shape, dtype=np.bool_)
+    shorted = np.zeros(current.shape, dtype=np.bool_)
     if dark.all():
-        findings.append(found(Kind.NOTHING_CONDUCTS, cell_count=dark.size))
+        diagnosis.add(Kind.NOTHING_CONDUCTS, cell_count=dark.size)
         diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
-        return nothing, ~nothing
+        return shorted, dark
     no_row, no_column = dark.all(axis=1), dark.all(axis=0)
-    for kind, place, count, cells in (
-        (Kind.OPEN_ROW, Place(rows=lines_of(no_row)), rows, columns),
-        (Kind.OPEN_COLUMN, Place(columns=lines_of(no_column)), columns, rows),
-    ):
-        if place != WHOLE_SKIN:
-            findings.append(found(kind, place, line_count=count, cells_per_line=cells))
+    if no_row.any():
+        place = Place(rows=lines_of(no_row))
+        diagnosis.add(Kind.OPEN_ROW, place, line_count=rows, cells_per_line=columns)
+    if no_column.any():
+        place = Place(columns=lines_of(no_column))
+        diagnosis.add(Kind.OPEN_COLUMN, place, line_count=columns, cells_per_line=rows)
     out = no_row[:, None] | no_column
-    siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
-    shorted = nothing.copy()
-    if not moved:
-        std = noise_lsb / (4 * len(rest.codes)) ** 0.5
-        row_groups = _shorted(current, siemens, std, out)
-        column_groups = _shorted(current.T, siemens.T, std, out.T)
-        for group in row_groups:
-            findings.append(found(Kind.SHORT_ROWS, Place(rows=tuple(group))))
-            shorted[group] = True
-            no_row[group[1:]] = True
-        for group in column_groups:
-            findings.append(found(Kind.SHORT_COLUMNS, Place(columns=tuple(group))))
-            shorted[:, group] = True
-            no_column[group[1:]] = True
+    siemens, siemens_std = _cells(rest, no_row, no_column)
+    if not rest.moves:
+        std = noise_lsb / (4 * rest.scans) ** 0.5
+        for group in _shorted(current, siemens, std, out):
+            diagnosis.add(Kind.SHORT_ROWS, Place(rows=tuple(group)))
+            shorted[group] = no_row[group[1:]] = True
+        for group in _shorted(current.T, siemens.T, std, out.T):
+            diagnosis.add(Kind.SHORT_COLUMNS, Place(columns=tuple(group)))
+            shorted[:, group] = no_column[group[1:]] = True
         if shorted.any():
             # Shorted lines are one: the network without the others is right for all other cells.
-            siemens, siemens_std = _cells(mean_codes, board, no_row, no_column)
+            siemens, siemens_std = _cells(rest, no_row, no_column)
     wrong = out | shorted
-    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, wire_ohm, findings, moved=moved)
-    mean_std = mean_std_lsb(noise_lsb, len(rest.codes))
-    ratio = _reference_ratio(shown[~dark], mean_std, board, findings)
+    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, rest, diagnosis)
+    ratio = _reference_ratio(shown[~dark], rest, diagnosis)
     cell_ohm = 1 / np.nanmedian(siemens)
     diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
     return touched, wrong | bad
 
 
-def _cells(mean_codes: Float, board: Hello, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
+def _cells(rest: Rest, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
     """Conductances and their deviations, (R, C) [S], NaN in the lines that are left out."""
     kept = np.ix_(~no_row, ~no_column)
-    ratio = ratio_from_codes(mean_codes[kept], board.adc_bits)
-    rest_of_board = replace(board, rows=ratio.shape[0], columns=ratio.shape[1])
+    ratio = rest.ratio[kept]
+    rest_of_board = replace(rest.board, rows=ratio.shape[0], columns=ratio.shape[1])
     estimate = make_estimator("matrix", SkinKnowledge.of(rest_of_board)).estimate(ratio)
-    siemens, std = np.full((2, *mean_codes.shape[:2]), np.nan)
+    siemens, std = np.full((2, *rest.codes.shape[:2]), np.nan)
     siemens[kept], std[kept] = estimate.cell_siemens, estimate.cell_siemens_std
     return siemens, std
 
@@ -156,18 +135,14 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
     current, siemens = current[np.ix_(lines, ports)], siemens[np.ix_(lines, ports)]
     apart = np.abs(current[:, None] - current[None, :]).max(axis=2)
     alike = apart < ALIKE_LSB + ALIKE_STDS * std * 2**0.5
-    np.fill_diagonal(alike, False)
-    level = np.median(siemens, axis=1)
+    level, few = np.median(siemens, axis=1), len(ports) < ALIKE_PORTS
     groups: list[list[int]] = []
     for line in range(len(lines)):
         members = [line, *np.flatnonzero(alike[line, line + 1 :]) + line + 1]
         if len(members) < 2 or any(int(lines[line]) in group for group in groups):
             continue
-        others = np.log(np.delete(level, members))
-        few = len(ports) < ALIKE_PORTS
-        if not len(others):
-            is_short = not few
-        else:
+        is_short, others = not few, np.log(np.delete(level, members))
+        if len(others):
             rise = float(np.log(level[members].min()) - np.median(others))
             is_short = rise > max(np.log(DOUBLED), RISE_STDS * few * float(np.std(others)))
         if is_short:
@@ -176,21 +151,20 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
 
 
 def _judge_cells(
-    siemens: Float,
-    std: Float,
-    judged: Bool,
-    wire_ohm: tuple[float, float],
-    findings: list[Finding],
-    *,
-    moved: bool,
+    siemens: Float, std: Float, judged: Bool, rest: Rest, diagnosis: Diagnosis
 ) -> tuple[Bool, Bool]:
-    """Adds dead and saturated cells to findings. Returns touched cells, and these."""
+    """Adds dead and saturated cells. Returns touched cells, and these."""
     dead: Bool = np.zeros(siemens.shape, dtype=np.bool_)
     if not judged.any():
         return dead, dead
-    rest = min(float(np.quantile(siemens[judged], REST_QUANTILE)), MOST_AT_REST_SIEMENS)
-    high: Bool = judged & (siemens > _touched_share(siemens[judged]) * rest)
-    if not moved and high.sum() < judged.sum() > 1:
+    level = min(float(np.quantile(siemens[judged], REST_QUANTILE)), MOST_AT_REST_SIEMENS)
+    share = TOUCHED_SHARE
+    if judged.sum() >= MANY_CELLS:  # cells at rest differ
+        lower, middle = np.quantile(siemens[judged], (0.16, 0.5))  # one deviation apart
+        spread = min(float(np.log(middle / lower)), MOST_SPREAD)
+        share = max(share, float(np.exp(TOUCHED_STDS * spread)))
+    high: Bool = judged & (siemens > share * level)
+    if not rest.moves and high.sum() < judged.sum() > 1:
         usual = float(np.median(siemens[judged & ~high]))
         hidden = np.logical_and.outer(high.any(axis=1), high.any(axis=0))
         # Untouched cells are well known; their deviation has what a wrong reference does to it.
@@ -198,39 +172,33 @@ def _judge_cells(
         dead = np.asarray(judged & ~hidden & (siemens + doubt < DEAD_SHARE * usual))
     if dead.any():
         percent = 100 * float(np.max(siemens[dead] / usual))
-        findings.append(found(Kind.DEAD_CELL, Place.of_cells(dead), percent_of_usual=percent))
+        diagnosis.add(Kind.DEAD_CELL, Place.of_cells(dead), percent_of_usual=percent)
     rows, columns = siemens.shape
-    top, bottom = wire_ohm
+    top, bottom = rest.wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
     saturated = high & (siemens * (WIRE_SPREAD * path_ohm + SHORTED_OHM) > 1)
     if saturated.any():
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
-        findings.append(found(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / rest))
+        diagnosis.add(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / level)
     return high & ~saturated, dead | saturated
 
 
-def _touched_share(siemens: Float) -> float:
-    """From where on a cell counts as touched, over the level at rest: cells at rest differ."""
-    if siemens.size < MANY_CELLS:
-        return TOUCHED_SHARE
-    lower, middle = np.quantile(siemens, (0.16, 0.5))  # one deviation apart
-    spread = min(float(np.log(middle / lower)), MOST_SPREAD)
-    return max(TOUCHED_SHARE, float(np.exp(TOUCHED_STDS * spread)))
+def _reference_ratio(lit: Float, rest: Rest, diagnosis: Diagnosis) -> float:
+    """R_top / R_bottom. Adds a finding if it is far from what the board says.
 
-
-def _reference_ratio(lit: Float, mean_std: float, board: Hello, findings: list[Finding]) -> float:
-    """R_top / R_bottom. Adds to findings if it is far from what the board says.
-
-    lit: what the ports (P, 4) with a current show of it, with the deviation mean_std [LSB].
+    lit: what the ports (P, 4) with a current show of it [LSB].
     """
     ratio = float(lit[:, READING_SENSES_TOP].sum() / lit[:, ~READING_SENSES_TOP].sum())
     # Of A and D, one rounds as the other; the same of B and C.
-    ratio_std = mean_std * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
-    top, bottom = board.ref_top_ohm, board.ref_bottom_ohm
+    ratio_std = rest.std_lsb * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
+    top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
     if abs(off) >= RATIO_TOLERANCE + RATIO_STDS * ratio_std:
-        refs = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
-        findings.append(
-            found(Kind.REFERENCE_RATIO, WHOLE_SKIN, ratio=ratio, off_percent=100 * off, **refs)
+        diagnosis.add(
+            Kind.REFERENCE_RATIO,
+            ratio=ratio,
+            off_percent=100 * off,
+            ref_top_ohm=top,
+            ref_bottom_ohm=bottom,
         )
     return ratio

@@ -8,7 +8,6 @@ A skin that is touched is not at fault: touched cells are told and left out, and
 is not judged.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -17,8 +16,8 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, found
-from ohmskin.doctor.signal import RestScans, examine_settling, examine_signal, mean_std_lsb
+from ohmskin.doctor.findings import Diagnosis, Kind, Place
+from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans, measure_untouched
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
@@ -58,7 +57,7 @@ def examine(evidence: Evidence) -> Diagnosis:
     board, stats = evidence.board, evidence.stats
     usual = RestScans.of(board, evidence.scans)
     rates_hz = None if usual is None else _rates_hz(evidence.scans)
-    diagnosis = Diagnosis([*_of_board(evidence), *_of_line(evidence, rates_hz)])
+    diagnosis = Diagnosis()
     diagnosis.measured = {
         "board": board.board,
         "unit_id": board.unit_id,
@@ -71,6 +70,8 @@ def examine(evidence: Evidence) -> Diagnosis:
         "restarts": stats.restarts,
         "rate_hz": None if rates_hz is None else round(rates_hz[0], 3),
     }
+    _examine_board(evidence, diagnosis)
+    _examine_line(evidence, rates_hz, diagnosis)
     if usual is not None:
         with one_blas_thread:
             _examine_skin(evidence, usual, diagnosis)
@@ -80,69 +81,61 @@ def examine(evidence: Evidence) -> Diagnosis:
 
 
 def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
-    """Adds what the scans show: signal, circuit, and the wires if nothing hides them."""
+    """Adds what the scans show: signal, circuit, and the wires if nothing hides them.
+
+    Wires are at fault only if an earlier rest or nominal wires were told.
+    """
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
-    moves, rest = bool(moved.any()), usual
+    moves, scans = bool(moved.any()), usual
     if settled is not None and not moves and examine_settling(usual, settled, diagnosis):
-        rest = settled
-    wire_ohm = evidence.wire_ohm or WIRE_OHM
-    touched, wrong = examine_circuit(rest, noise_lsb, wire_ohm, diagnosis, moved=moves)
+        scans = settled
+    wire_ohm, presses = evidence.wire_ohm or WIRE_OHM, evidence.presses
+    rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
+    touched, wrong = examine_circuit(rest, diagnosis)
     touched = touched if touched.any() else moved
     if touched.any():
-        diagnosis.findings.append(found(Kind.TOUCHED, Place.of_cells(touched), moves=moves))
-    elif not wrong.any():
-        _examine_wires(evidence, rest, noise_lsb, diagnosis)
-
-
-def _examine_wires(
-    evidence: Evidence, rest: RestScans, noise_lsb: float, diagnosis: Diagnosis
-) -> None:
-    """Adds the wires. They are at fault only if nominal ones or an earlier rest were told."""
-    scans, earlier, told = len(rest.codes), evidence.rest_ratio, evidence.wire_ohm is not None
-    diagnosis.nominal_ohm = wire_ohm = evidence.wire_ohm or WIRE_OHM
-    mean_std = mean_std_lsb(noise_lsb, scans)
-    untouched = measure_untouched(rest.mean, mean_std, evidence.board, wire_ohm, earlier)
-    diagnosis.untouched = untouched if earlier is not None else untouched[:2]
-    if evidence.presses is not None:
-        diagnosis.pressed = evidence.presses.measure(rest.mean, scans, noise_lsb, wire_ohm)
-    changed = [each for each in untouched if each.differs and (told or earlier is not None)]
-    if told and not changed:
+        diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
+    if touched.any() or wrong.any():
+        return
+    diagnosis.nominal_ohm = wire_ohm
+    if evidence.rest_ratio is not None:
+        diagnosis.untouched = measure_untouched(rest, evidence.rest_ratio)
+    if presses is not None:
+        diagnosis.pressed = presses.measure(rest)
+    changed = [each for each in diagnosis.untouched if each.differs]
+    if evidence.wire_ohm is not None and not changed:
         changed = [each for each in diagnosis.pressed or () if each.differs]
     for each in changed:
-        finding = found(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
-        diagnosis.findings.append(finding)
+        diagnosis.add(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
 
 
-# --------------------------------------------------------------------------- board and line
-
-
-def _of_board(evidence: Evidence) -> Iterator[Finding]:
-    """What the board, its self-test and its USB bridge say."""
-    board, report = evidence.board, evidence.report
+def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
+    """Adds what the board, its self-test and its USB bridge say."""
+    board, report, add = evidence.board, evidence.report, diagnosis.add
     if evidence.lost:
-        yield found(Kind.LOST, problem=evidence.lost)
+        add(Kind.LOST, problem=evidence.lost)
     if report is not None:
         for name in report.findings:
-            yield found(
-                Kind.SELF_TEST, name=name, code_min=report.code_min, code_max=report.code_max
-            )
+            add(Kind.SELF_TEST, name=name, code_min=report.code_min, code_max=report.code_max)
     for cause in board.reset_cause:
         if cause in BAD_RESETS:
-            yield found(Kind.RESET_CAUSE, cause=cause)
+            add(Kind.RESET_CAUSE, cause=cause)
     if evidence.host_version and board.version != evidence.host_version:
-        yield found(Kind.VERSION, firmware=board.version, host=evidence.host_version)
+        add(Kind.VERSION, firmware=board.version, host=evidence.host_version)
     if evidence.latency is not None and evidence.latency[0] > LEAST_TIMER_MS:
-        yield found(Kind.USB_LATENCY, timer_ms=evidence.latency[0], file=evidence.latency[1])
+        add(Kind.USB_LATENCY, timer_ms=evidence.latency[0], file=evidence.latency[1])
 
 
-def _of_line(evidence: Evidence, rates_hz: tuple[float, float] | None) -> Iterator[Finding]:
-    """What the connection has counted, and the scan rate by the board's and the host's clock."""
-    board, stats = evidence.board, evidence.stats
+def _examine_line(
+    evidence: Evidence, rates_hz: tuple[float, float] | None, diagnosis: Diagnosis
+) -> None:
+    """Adds what the connection has counted, and scan rates by the board's and the host's clock."""
+    board, stats, add = evidence.board, evidence.stats, diagnosis.add
     if stats.restarts:
-        yield found(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
+        add(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
     if stats.missed or (rates_hz is None and not stats.restarts):
-        yield found(
+        add(
             Kind.LOSS,
             received=len(evidence.scans),
             missed=stats.missed,
@@ -151,17 +144,17 @@ def _of_line(evidence: Evidence, rates_hz: tuple[float, float] | None) -> Iterat
             rate_hz=board.rate_hz,
         )
     if stats.line.damaged:
-        yield found(Kind.DAMAGED, damaged=stats.line.damaged, crc_errors=stats.line.crc_errors)
+        add(Kind.DAMAGED, damaged=stats.line.damaged, crc_errors=stats.line.crc_errors)
     if stats.board_rx_errors:
-        yield found(Kind.RECEIVE_ERRORS, commands=stats.board_rx_errors)
+        add(Kind.RECEIVE_ERRORS, commands=stats.board_rx_errors)
     if rates_hz is None:
         return
     rate_hz, host_rate_hz = rates_hz
     asked_hz = board.rate_asked_mhz / 1000 or board.rate_hz
     if abs(rate_hz / asked_hz - 1) > RATE_TOLERANCE:
-        yield found(Kind.RATE, rate_hz=rate_hz, asked_hz=asked_hz)
+        add(Kind.RATE, rate_hz=rate_hz, asked_hz=asked_hz)
     if abs(host_rate_hz / rate_hz - 1) > SLOW_HOST and not stats.missed and not stats.restarts:
-        yield found(Kind.SLOW_HOST, host_rate_hz=host_rate_hz, rate_hz=rate_hz)
+        add(Kind.SLOW_HOST, host_rate_hz=host_rate_hz, rate_hz=rate_hz)
 
 
 def _rates_hz(scans: list[Scan]) -> tuple[float, float]:

@@ -101,11 +101,6 @@ class Finding:
             raise ValueError(f"{self.kind.id} has {set(self.kind.names)}, not {set(self.values)}")
 
 
-def found(kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> Finding:
-    """A finding with these values."""
-    return Finding(kind, place, values)
-
-
 @dataclass(frozen=True)
 class WireShare:
     """Wire resistance over the nominal one, and its deviation.
@@ -128,16 +123,20 @@ class Diagnosis:
     """All that was found. Findings stand in the order of their kinds.
 
     measured: figures by name, None for one that could not be had. nominal_ohm: wires of a segment,
-    top and bottom. untouched: shares of both layers, then of each line if an earlier rest was told;
-    empty if touches or faults hide the wires. pressed: the share of all wires that presses show,
-    then of each row and column; None if nobody was asked to press.
+    top and bottom; None if touches or faults hide the wires. untouched: the share of each layer, if
+    an earlier rest was told. pressed: the share of all wires that presses show, then of each row
+    and column; None if nobody was asked to press.
     """
 
     findings: list[Finding] = field(default_factory=list)
     measured: dict[str, Any] = field(default_factory=dict)
-    nominal_ohm: tuple[float, float] = (0.0, 0.0)
+    nominal_ohm: tuple[float, float] | None = None
     untouched: list[WireShare] = field(default_factory=list)
     pressed: list[WireShare] | None = None
+
+    def add(self, kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> None:
+        """Add a finding with these values."""
+        self.findings.append(Finding(kind, place, values))
 
     @property
     def worse(self) -> list[Finding]:
@@ -147,5 +146,5 @@ class Diagnosis:
     @property
     def wires_hidden(self) -> bool:
         """Whether the wires were judged, but are not known of any layer."""
-        layers = self.untouched[:2] if self.pressed is None else self.pressed[:1]
-        return bool(self.untouched) and not any(each.known for each in layers)
+        layers = self.untouched if self.pressed is None else self.pressed[:1]
+        return self.nominal_ohm is not None and not any(each.known for each in layers)

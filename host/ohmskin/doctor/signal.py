@@ -27,18 +27,19 @@ drift.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, found, lines_of
+from ohmskin.arrays import Bool, Float
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
+from ohmskin.link.clock import reading_offsets_s, slot_s
+from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
-from ohmskin.link.timing import reading_offsets_s, slot_s
 
-Bool = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
 
 REST_S: Final = 2.5  # [s] The first look takes this long: with all else, less than 10 s pass.
@@ -93,17 +94,58 @@ class RestScans:
         codes = np.stack([scan.codes for scan in fit]).astype(np.float64)
         return cls(board, codes, np.array([1e-6 * scan.time_us for scan in fit]))
 
-    @property
+    @cached_property
     def mean(self) -> Float:
         """Mean codes (R, C, 4)."""
         return np.asarray(self.codes.mean(axis=0))
 
+    @cached_property
+    def window(self) -> Float:
+        """w (N,)."""
+        window = np.hanning(len(self.codes) + 2)[1:-1]
+        return np.asarray(window / window.sum())
+
+    def amplitude(self, frequency_hz: float) -> Complex:
+        """c (R, C, 4)."""
+        turn = np.exp(-2j * np.pi * frequency_hz * self.time_s)
+        return 2 * np.tensordot(self.window * turn, self.codes - self.mean, axes=1)
+
+    def power(self, frequency_hz: float) -> float:
+        """P."""
+        return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
+
     @property
     def hidden_hz(self) -> tuple[float, ...]:
         """Mains that these scans cannot show [Hz]."""
-        if len(self.codes) < LEAST_SCANS:
-            return MAINS_HZ
-        return _hidden_hz(self.board.rate_hz, float(np.ptp(self.time_s)))
+        seconds = float(np.ptp(self.time_s)) if len(self.codes) >= LEAST_SCANS else 0.0
+        return _hidden_hz(self.board.rate_hz, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """The skin at rest, by the means of scans.
+
+    codes: means (R, C, 4) of so many scans. noise_lsb: of a reading, without hum. wire_ohm: nominal
+    ones of a segment, top and bottom. moves: something touches the skin and moves, so that the
+    means are of no one skin.
+    """
+
+    board: Hello
+    codes: Float
+    scans: int
+    noise_lsb: float
+    wire_ohm: tuple[float, float]
+    moves: bool = False
+
+    @property
+    def ratio(self) -> Float:
+        """The same as ratios to Vdd."""
+        return ratio_from_codes(self.codes, self.board.adc_bits)
+
+    @property
+    def std_lsb(self) -> float:
+        """Deviation of these means, rounding included."""
+        return float(np.hypot(rounding_std_lsb(self.noise_lsb), self.noise_lsb / self.scans**0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +182,20 @@ def examine_signal(
         hum = find_hum(other)
         hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
     if hum is not None:
-        diagnosis.findings.append(_hum_finding(hum, scans.board))
+        by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
+        # The worst cell is named if it has twice as much as others.
+        worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
+        diagnosis.add(
+            Kind.HUM,
+            Place.of_cells(worst),
+            mains_hz=hum.mains_hz,
+            amplitude_lsb=hum.lsb,
+            most_lsb=HUM_LSB,
+            rate_hz=scans.board.rate_hz,
+            seen_hz=_seen_hz(hum.frequency_hz, scans.board.rate_hz),
+        )
     if len(scans.codes) >= LEAST_SCANS and not moved.any():
-        diagnosis.findings += _noise(np.sqrt(variance.mean(axis=2)))
+        _examine_noise(np.sqrt(variance.mean(axis=2)), diagnosis)
     diagnosis.measured |= {
         "noise_lsb": round(noise_lsb, 3),
         "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
@@ -150,11 +203,6 @@ def examine_signal(
         "hum_not_visible": list(hidden_hz),
     }
     return noise_lsb, moved
-
-
-def mean_std_lsb(noise_lsb: float, scans: int) -> float:
-    """Deviation of the mean of so many codes [LSB], each with this noise, rounding included."""
-    return float(np.hypot(rounding_std_lsb(noise_lsb), noise_lsb / scans**0.5))
 
 
 def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
@@ -170,86 +218,57 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 # ----------------------------------------------------------------------------------------- hum
 
 
-class _Spectrum:
-    """c(f) and P(f) of scans, and the power that noise alone would have."""
-
-    def __init__(self, scans: RestScans) -> None:
-        rest = scans.codes - scans.mean
-        window = np.hanning(len(rest) + 2)[1:-1]
-        self._window = window / window.sum()
-        self._weighted = self._window[:, None] * rest.reshape(len(rest), -1)
-        self._time_s = scans.time_s
-        self.seconds = float(np.ptp(scans.time_s))
-        self._shape = rest.shape[1:]
-        self.noise = 4 * float((rest**2).mean()) * float(np.sum(self._window**2))
-
-    def amplitude(self, frequency_hz: float) -> Complex:
-        """c (R, C, 4)."""
-        turn = np.exp(-2j * np.pi * frequency_hz * self._time_s)
-        return np.asarray(2 * (turn @ self._weighted).reshape(self._shape))
-
-    def power(self, frequency_hz: float) -> float:
-        """P."""
-        return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
-
-    def sine(self, frequency_hz: float) -> tuple[float, Complex]:
-        """What share of P a sine at f has, and its complex amplitude (R, C, 4).
-
-        A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image
-        overlap by m. At half the rate only a part of it is seen, half of its power on average.
-        """
-        amplitude = self.amplitude(frequency_hz)
-        mirror = complex(self._window @ np.exp(-4j * np.pi * frequency_hz * self._time_s))
-        if abs(mirror) ** 2 >= OVERLAP:
-            return 0.5, amplitude / 2
-        sine = (amplitude - mirror * np.conj(amplitude)) / (1 - abs(mirror) ** 2)
-        return float(np.mean(np.abs(sine) ** 2)) / self.power(frequency_hz), sine
-
-
 def find_hum(scans: RestScans) -> Hum | None:
-    """The mains hum in the scans; None if there is none, or none can be seen."""
+    """The mains hum in the scans; None if there is none, or none can be seen.
+
+    Of two mains that are found, the stronger one, or else the one with one phase, or both.
+    """
     if not np.ptp(scans.codes, axis=0).any():
         return None
-    spectrum = _Spectrum(scans)
-    heard = [
-        _hum_at(mains_hz, spectrum) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz
-    ]
-    match [hum for hum in heard if hum is not None]:
-        case [one, other]:
-            return _the_right_one(one, other, spectrum, reading_offsets_s(scans.board))
-        case some:
-            return some[0] if some else None
+    seen = [_hum_at(mains_hz, scans) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
+    hums = [hum for hum in seen if hum is not None]
+    if len(hums) < 2:
+        return hums[0] if hums else None
+    offsets_s = reading_offsets_s(scans.board)
 
-
-def _hum_at(mains_hz: float, spectrum: _Spectrum) -> Hum | None:
-    """Hum near one of the mains, if it matters and stands out."""
-    frequency_hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=spectrum.power)
-    power = spectrum.power(frequency_hz)
-    share, sine = spectrum.sine(frequency_hz)
-    lsb = max(share * (power - spectrum.noise), 0.0) ** 0.5
-    beside = np.median([spectrum.power(frequency_hz + far / spectrum.seconds) for far in BESIDE])
-    over_noise = power > spectrum.noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
-    if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
-        return Hum((mains_hz,), frequency_hz, sine, lsb)
-    return None
-
-
-def _the_right_one(one: Hum, other: Hum, spectrum: _Spectrum, offsets_s: Float) -> Hum:
-    """Of two mains that were found: the stronger one, or else the one with one phase, or both."""
+    def power(hum: Hum) -> float:
+        return scans.power(hum.frequency_hz)
 
     def agreement(hum: Hum) -> float:
         """1 if all readings have one phase, less if they have not."""
-        amplitude = spectrum.amplitude(hum.frequency_hz)
-        at_reading = amplitude * np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
+        turn = np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
+        at_reading = scans.amplitude(hum.frequency_hz) * turn
         return float(np.abs(at_reading.mean()) / np.abs(at_reading).mean())
 
-    power, other_power = (spectrum.power(each.frequency_hz) for each in (one, other))
-    if max(power, other_power) > ALIKE_POWER * min(power, other_power):
-        return one if power > other_power else other
-    agree, other_agree = agreement(one), agreement(other)
-    if max(agree, other_agree) > IN_PHASE * min(agree, other_agree):
-        return one if agree > other_agree else other
-    return replace(one, mains_hz=one.mains_hz + other.mains_hz)
+    for measure, clear in ((power, ALIKE_POWER), (agreement, IN_PHASE)):
+        less, more = sorted(hums, key=measure)
+        if measure(more) > clear * measure(less):
+            return more
+    return replace(hums[0], mains_hz=MAINS_HZ)
+
+
+def _hum_at(mains_hz: float, scans: RestScans) -> Hum | None:
+    """Hum near one of the mains, if it matters and stands out.
+
+    A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image overlap
+    by m. At half the rate only a part of it is seen, half of its power on average.
+    """
+    hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=scans.power)
+    power, sine = scans.power(hz), scans.amplitude(hz)
+    mirror = complex(scans.window @ np.exp(-4j * np.pi * hz * scans.time_s))
+    if abs(mirror) ** 2 >= OVERLAP:
+        share, sine = 0.5, sine / 2
+    else:
+        sine = (sine - mirror * np.conj(sine)) / (1 - abs(mirror) ** 2)
+        share = float(np.mean(np.abs(sine) ** 2)) / power
+    of_noise = 4 * float(np.mean((scans.codes - scans.mean) ** 2) * np.sum(scans.window**2))
+    lsb = max(share * (power - of_noise), 0.0) ** 0.5
+    seconds = np.ptp(scans.time_s)
+    beside = np.median([scans.power(hz + far / seconds) for far in BESIDE])
+    over_noise = power > of_noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
+    if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
+        return Hum((mains_hz,), hz, sine, lsb)
+    return None
 
 
 def _seen_hz(mains_hz: float, rate_hz: float) -> float:
@@ -261,21 +280,6 @@ def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
     """Mains that this scan rate shows too slow to tell them from drift [Hz]."""
     least_hz = STILL_HZ + 4 / max(seconds, 1e-3)
     return tuple(each for each in MAINS_HZ if _seen_hz(each, rate_hz) < least_hz)
-
-
-def _hum_finding(hum: Hum, board: Hello) -> Finding:
-    """Hum of a board; cells: the worst one, if it has twice as much as others."""
-    by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
-    worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
-    return found(
-        Kind.HUM,
-        Place.of_cells(worst),
-        mains_hz=hum.mains_hz,
-        amplitude_lsb=hum.lsb,
-        most_lsb=HUM_LSB,
-        rate_hz=board.rate_hz,
-        seen_hz=_seen_hz(hum.frequency_hz, board.rate_hz),
-    )
 
 
 # --------------------------------------------------------------------------- noise, what moves
@@ -290,22 +294,19 @@ def _moved(rest: Float, variance: Float) -> Bool:
     return np.asarray((np.ptp(means, axis=0) > MOVED_LSB + CLEAR_STDS * of_noise).any(axis=2))
 
 
-def _noise(cell_lsb: Float) -> list[Finding]:
-    """Noise of each cell [LSB], (R, C), against that of a sound board: lines, or else cells."""
+def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
+    """Adds noisy lines, or else cells, or else the skin. cell_lsb: noise of each cell, (R, C)."""
     usual = float(np.median(cell_lsb))
     limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
-    rows, columns = lines_of(row_lsb > limit), lines_of(column_lsb > limit)
-    cells = () if rows or columns else Place.of_cells(cell_lsb > limit).cells
-    lsb = usual
-    if rows or columns:
+    place, lsb = Place(lines_of(row_lsb > limit), lines_of(column_lsb > limit)), usual
+    if place != WHOLE_SKIN:
         lsb = float(max(row_lsb.max(), column_lsb.max()))
-    elif cells:
-        lsb = float(cell_lsb.max())
-    elif usual <= NOISY_LSB:
-        return []
-    place, sound = Place(rows, columns, cells), SOUND_NOISE_LSB
-    return [found(Kind.NOISE, place, noise_lsb=lsb, sound_lsb=sound, adc_lsb=ADC_NOISE_LSB)]
+    elif (cell_lsb > limit).any():
+        place, lsb = Place.of_cells(cell_lsb > limit), float(cell_lsb.max())
+    if place != WHOLE_SKIN or usual > NOISY_LSB:
+        sound = {"sound_lsb": SOUND_NOISE_LSB, "adc_lsb": ADC_NOISE_LSB}
+        diagnosis.add(Kind.NOISE, place, noise_lsb=lsb, **sound)
 
 
 # ------------------------------------------------------------------------------------ settling
@@ -320,7 +321,7 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
     most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
     longer_us = min(max(LONGER * board.settle_us, LEAST_LONGER_US), most_us)
-    if not _is_longer(longer_us, board.settle_us) and not _hidden_hz(board.rate_hz, REST_S):
+    if longer_us <= NOT_LONGER * board.settle_us and not _hidden_hz(board.rate_hz, REST_S):
         return None
     slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
@@ -329,15 +330,11 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     return longer_us, max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
 
 
-def _is_longer(settle_us: int, than_us: int) -> bool:
-    return settle_us > NOT_LONGER * than_us
-
-
 def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis) -> bool:
     """Adds to a diagnosis how means change with a longer settle time. Returns whether they do."""
     settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
     diagnosis.measured["settling_lsb"] = 0.0
-    if not _is_longer(longer_us, settle_us):
+    if longer_us <= NOT_LONGER * settle_us:
         return False
     change = np.abs(usual.mean - settled.mean)
     scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
@@ -351,7 +348,7 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(float(change.max()), 0.9 * swing)
     needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
-    finding = found(
+    diagnosis.add(
         Kind.SETTLING,
         WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
         change_lsb=float(change.max()),
@@ -360,5 +357,4 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
         longer_us=longer_us,
         needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
     )
-    diagnosis.findings.append(finding)
     return True

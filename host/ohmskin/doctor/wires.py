@@ -14,18 +14,22 @@ n      (RC,)        deviations of what was read [ohm]
 B      (RC, RC)     slopes of the model by the cells' log resistances [ohm]
 W      (RC, 2RC)    slopes of the model by the segments' log resistances [ohm]
 s      ()           deviation of a cell's log resistance from the model's, to be found
-x      (2+R+C,)     what the wires have more than nominal, as a share: all top wires, all
-                    bottom ones, those of each row, those of each column
-A      (RC, 2+R+C)  slopes of the model by x: sums of W [ohm]
+x      (2,)         what the wires of each layer have more than nominal, as a share
+A      (RC, 2)      slopes of the model by x: sums of W [ohm]
+L      (RC, R+C)    slopes of the model by the wires of each row and column [ohm]
 y      ()           log of the wires over nominal
 u      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
 ====== ============ =====================================================================
 
-Untouched skin. The model is the nominal wires and the cells that an earlier rest shows; without
-one, equal cells. With z = A x + B (common + each) + noise, x is the generalised least squares
-answer under wide priors; s is chosen so that the residual has the size it should. Cells of 1 MOhm
-hide wires of 100 ohm behind their own scatter: without an earlier rest only gross changes show, and
-with one a factor of two shows on large skins alone.
+Untouched skin. The model is the nominal wires and the cells that an earlier rest shows, so
+
+    z = A x + L line + B (common + cell) + noise ,
+    S = n^2 + LAYER_STD^2 A A^T + LINE_STD^2 L L^T + B (COMMON_STD^2 1 1^T + s^2) B^T ,
+    x = LAYER_STD^2 A^T S^-1 z
+
+with s such that z^T S^-1 z is the number of readings. Cells of 1 MOhm hide wires of 100 ohm behind
+their own scatter: on large skins a factor of two shows, on others only gross changes. Without an
+earlier rest, and of single lines, an untouched skin shows nothing.
 
 Pressed corners. A pressed cell hides the wires behind it, too, because its own resistance is in the
 same reading. Three corners of a rectangle do not: with (a, b) the one between the other two,
@@ -49,43 +53,37 @@ cells and their neighbours, since a fingertip may press these as well. What stay
 the deviation.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import permutations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
-from ohmskin.doctor.signal import rounding_std_lsb
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.doctor.signal import Rest, rounding_std_lsb
+from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import ADC_BITS
 
 Corners = tuple[Cell, Cell, Cell]
-Bool = NDArray[np.bool_]
 
 LAYERS: Final = ("top", "bottom")
 
 # What is told. Shares are over nominal; deviations of pressed ones are those of their logs.
 KNOWN: Final = 0.15  # [share] A deviation above this is too close to a change to tell the share.
 CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of a layer anyway.
-LINE_CHANGED: Final = 0.75  # [share] A line matters less than a layer: it moves fewer cells.
-CLEAR_STDS: Final = 5.0  # [deviations] By chance, none of up to 34 shares differs by this.
+CLEAR_STDS: Final = 5.0  # [deviations] By chance, no share of a layer differs by this.
 PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
 
 # Standard deviations before the readings, of an untouched skin.
 LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
 LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
-ODD_LINE_STD: Final = 30.0  # [share] The line that is asked about may have changed by any factor.
 COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
 LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
 # Standard deviations before the readings, of a pressed skin.
@@ -102,76 +100,48 @@ LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
 CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
 
 
-def _port_ohm(ratio: Float, noise_lsb: Float | float, board: Hello) -> tuple[Float, Float]:
-    """Port resistances of readings (R, C, 4) and their deviations [ohm], each (RC,).
+def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Float, Float, Float]:
+    """Port resistances of readings (R, C, 4), their deviations, and log resistances of the cells.
 
-    noise_lsb: deviation of a port's reading, one for all or (R, C).
+    std_lsb: deviation of a port's reading, one for all or (R, C). All (RC,) [ohm].
     """
-    refs = (board.ref_top_ohm, board.ref_bottom_ohm)
+    known = matrix.knowledge
+    refs = (known.ref_top_ohm, known.ref_bottom_ohm)
     loop_ohm = (1 / np.maximum(current_from_ratio(ratio, *refs), 1e-9)).ravel()
-    std_siemens = current_std(2.0**-board.adc_bits, *refs) * np.ravel(noise_lsb)
-    return loop_ohm - sum(refs), std_siemens * loop_ohm**2
+    std_siemens = current_std(2.0**-ADC_BITS, *refs) * np.ravel(std_lsb)
+    log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
+    return loop_ohm - known.ref_ohm, std_siemens * loop_ohm**2, log_ohm
 
 
 # ------------------------------------------------------------------------- the untouched skin
 
 
-def measure_untouched(
-    mean_codes: Float,
-    mean_std: float,
-    board: Hello,
-    wire_ohm: tuple[float, float],
-    rest_ratio: Float | None,
-) -> list[WireShare]:
-    """Shares of both layers, of each row, and of each column.
-
-    mean_codes: of rest, (R, C, 4), with the deviation mean_std [LSB]. wire_ohm: nominal ones of a
-    segment, top and bottom. rest_ratio: readings (R, C, 4) of an earlier rest.
-    """
-    shape = rows, columns = mean_codes.shape[:2]
-    ratio = ratio_from_codes(mean_codes, board.adc_bits)
-    matrix = make_estimator("matrix", SkinKnowledge.of(board))
-    cell = matrix.estimate(ratio if rest_ratio is None else rest_ratio).cell_siemens
-    if rest_ratio is None:
-        cell = np.full(shape, float(np.exp(np.mean(np.log(cell)))))
-    else:
-        mean_std *= 2**0.5  # an earlier rest is a mean of such codes as well
-    model = port_sensitivity(cell, *(np.full(shape, ohm) for ohm in wire_ohm))
-    now_ohm, noise_ohm = _port_ohm(ratio, mean_std, board)
-    expected_ohm = model.port_ohm if rest_ratio is None else _port_ohm(rest_ratio, 0.0, board)[0]
-    z, by_cell = now_ohm - expected_ohm, model.by_cell
-    by_wire = model.by_wires().reshape(-1, 2, rows, columns)
-    slopes = np.concatenate(
-        [by_wire.sum(axis=(2, 3)), by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1
-    )
-    alike = np.array([LAYER_STD] * 2 + [LINE_STD] * (rows + columns))
-    common = COMMON_STD * by_cell.sum(axis=1)
+def measure_untouched(rest: Rest, earlier_ratio: Float) -> list[WireShare]:
+    """The share of each layer. earlier_ratio: readings (R, C, 4) of an earlier rest."""
+    shape, matrix = rest.codes.shape[:2], make_estimator("matrix", SkinKnowledge.of(rest.board))
+    rest_ohm, _, log_ohm = _ports(earlier_ratio, rest.std_lsb, matrix)
+    port_ohm, port_std, _ = _ports(rest.ratio, rest.std_lsb, matrix)
+    z = port_ohm - rest_ohm
+    siemens = np.exp(-log_ohm).reshape(shape)
+    model = port_sensitivity(siemens, *(np.full(shape, ohm) for ohm in rest.wire_ohm))
+    by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *shape)
+    layers = by_wire.sum(axis=(2, 3))  # A
+    lines = np.concatenate([by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1)  # L
+    common = by_cell.sum(axis=1)
+    but_cells = np.diag(2 * port_std**2) + COMMON_STD**2 * np.outer(common, common)
+    but_cells += LAYER_STD**2 * layers @ layers.T + LINE_STD**2 * lines @ lines.T
     for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
         # The smallest scatter of cells that, with all else, explains the readings.
-        but_wires = np.outer(common, common) + np.diag(noise_ohm**2)
-        but_wires += float(cell_std) ** 2 * by_cell @ by_cell.T
-        if z @ np.linalg.solve(but_wires + (slopes * alike**2) @ slopes.T, z) < len(z):
+        covariance = but_cells + cell_std**2 * by_cell @ by_cell.T
+        weighed = np.linalg.solve(covariance, np.column_stack([z, layers]))
+        if z @ weighed[:, 0] < len(z):
             break
-
-    shares: list[WireShare] = []
-    for at in range(len(alike)):
-        line, layer = at - 2, at
-        place, prior, least = WHOLE_SKIN, alike, CHANGED
-        if line >= 0:
-            layer = int(line >= rows)
-            place = Place(columns=(line - rows,)) if layer else Place(rows=(line,))
-            # Each line in turn may be unlike the others of its layer.
-            prior = np.where(np.arange(len(alike)) == at, ODD_LINE_STD, alike)
-            least = np.inf if shares[layer].differs else LINE_CHANGED
-        spread = slopes * prior**2
-        gain = np.linalg.solve(but_wires + spread @ slopes.T, spread)
-        posterior = np.diag(prior**2) - spread.T @ gain
-        summed = sorted({layer, at})
-        more = float((gain.T @ z)[summed].sum())
-        std = max(float(posterior[np.ix_(summed, summed)].sum()), 0.0) ** 0.5
-        differs = abs(more) > max(least, CLEAR_STDS * std)
-        shares.append(WireShare((LAYERS[layer],), place, 1 + more, std, std < KNOWN, differs))
-    return shares
+    gain = LAYER_STD**2 * layers.T @ weighed
+    more, std = gain[:, 0], LAYER_STD * np.sqrt(np.maximum(1 - np.diagonal(gain[:, 1:]), 0.0))
+    known, differs = std < KNOWN, np.abs(more) > np.maximum(CHANGED, CLEAR_STDS * std)
+    columns = (each.tolist() for each in (1 + more, std, known, differs))
+    told = zip(LAYERS, *columns, strict=True)
+    return [WireShare((layer,), WHOLE_SKIN, *figures) for layer, *figures in told]
 
 
 # --------------------------------------------------------------------------- pressed corners
@@ -247,36 +217,33 @@ class CornerScans:
             self.hold, self.again, self.done = False, True, self.again
             self._first, self.wanted = corners, moved_across(corners)
 
-    def measure(
-        self,
-        rest_codes: Float,
-        rest_scans: int,
-        noise_lsb: float,
-        wire_ohm: tuple[float, float],
-    ) -> list[WireShare]:
-        """The share of both layers, then that of each row and column; none if none was pressed.
-
-        rest_codes: mean codes (R, C, 4) of so many scans of the untouched skin, each reading with
-        this noise. wire_ohm: nominal ones of a segment, top and bottom.
-        """
-        rest = self._ports(rest_codes, np.full(1, noise_lsb), noise_lsb, rest_scans)
+    def measure(self, rest: Rest) -> list[WireShare]:
+        """The share of both layers, then that of each row and column; none if none was pressed."""
+        at_rest = _ports(rest.ratio, rest.std_lsb, self._matrix)
         most = max(map(len, self._codes.values()), default=0)
         found = []
         for corners, codes in self._codes.items():
             if len(codes) < HELD_SHARE * most:
                 continue
             # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
-            scatter_lsb = np.maximum(np.std(codes, axis=0), noise_lsb)
-            pressed = self._ports(np.mean(codes, axis=0), scatter_lsb, noise_lsb, len(codes))
-            free = _free(rest.log_ohm.shape, corners)
-            found.append((corners[0], *_pressed_fit(rest, pressed, free, wire_ohm)))
+            scatter_lsb = np.maximum(np.std(codes, axis=0), rest.noise_lsb)
+            variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1)
+            std_lsb = np.sqrt(variance + rest.noise_lsb**2 / len(codes))
+            ratio = ratio_from_codes(np.mean(codes, axis=0), self._board.adc_bits)
+            pressed, free = _ports(ratio, std_lsb, self._matrix), self._free(corners)
+            found.append((corners[0], *_pressed_fit(at_rest, pressed, free, rest.wire_ohm)))
         return shares_of(found)
 
-    def _ports(self, mean: Float, scatter_lsb: Float, noise_lsb: float, scans: int) -> _Ports:
-        ratio = ratio_from_codes(mean, self._board.adc_bits)
-        variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1) + noise_lsb**2 / scans
-        port_ohm, std_ohm = _port_ohm(ratio, np.sqrt(variance), self._board)
-        return _Ports(port_ohm, std_ohm, -np.log(self._matrix.estimate(ratio).cell_siemens))
+    def _free(self, corners: Corners) -> Bool:
+        """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
+        rows, columns = np.indices((self._board.rows, self._board.columns))
+        *near, near_fourth = (
+            np.maximum(np.abs(rows - row), np.abs(columns - column)) <= 1
+            for row, column in (*corners, moved_across(corners)[0])
+        )
+        free = np.any(near, axis=0) & ~near_fourth
+        free[tuple(np.transpose(corners))] = True
+        return np.asarray(free)
 
 
 def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
@@ -300,24 +267,15 @@ def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
     return [share(mean, mean_std, alike), *each]
 
 
-@dataclass(frozen=True, eq=False)
-class _Ports:
-    """Port resistances and deviations (RC,) [ohm]; log resistances of the cells by `matrix`."""
-
-    port_ohm: Float
-    std_ohm: Float
-    log_ohm: Float
-
-
 def _pressed_fit(
-    rest: _Ports, pressed: _Ports, free: Bool, wire_ohm: tuple[float, float]
+    rest: tuple[Float, ...], pressed: tuple[Float, ...], free: Bool, wire_ohm: tuple[float, float]
 ) -> tuple[float, float]:
-    """y and its deviation."""
-    shape = free.shape
+    """y and its deviation. rest, pressed: what `_ports` gives."""
+    shape, free = free.shape, free.ravel()
+    (rest_ohm, rest_std, untouched), (port_ohm, port_std, touched) = rest, pressed
     log_share = 0.0
-    untouched = rest.log_ohm.ravel()
-    lift = np.where(free, pressed.log_ohm - rest.log_ohm, 0.0).ravel()
-    variance = np.where(free, UNLIMITED_STD, DRIFT_STD).ravel() ** 2
+    lift = np.where(free, touched - untouched, 0.0)
+    variance = np.where(free, UNLIMITED_STD, DRIFT_STD) ** 2
     for _ in range(MOST_STEPS):
         top, bottom = (np.full(shape, ohm * np.exp(log_share)) for ohm in wire_ohm)
         before, now = (
@@ -327,13 +285,13 @@ def _pressed_fit(
         at_rest = np.linalg.inv(before.by_cell)
         through = now.by_cell @ at_rest  # B1 B0^-1
         by_rest_wires = before.by_wires()
-        off_rest = rest.port_ohm - before.port_ohm
-        residual = pressed.port_ohm - now.port_ohm - through @ off_rest  # r
+        off_rest = rest_ohm - before.port_ohm
+        residual = port_ohm - now.port_ohm - through @ off_rest  # r
         by_segment = now.by_wires() - through @ by_rest_wires  # W
         slopes = by_segment.sum(axis=1)  # w
         spread = now.by_cell * variance
         covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
-        covariance += (through * rest.std_ohm**2) @ through.T + np.diag(pressed.std_ohm**2)
+        covariance += (through * rest_std**2) @ through.T + np.diag(port_std**2)
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
         known = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
         pull = float(slopes @ weighed[:, 1]) - log_share * BEFORE_STD**-2
@@ -341,18 +299,8 @@ def _pressed_fit(
         log_share += step
         untouched = untouched + at_rest @ (off_rest - step * by_rest_wires.sum(axis=1))
         more = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
-        lift += np.where(free.ravel(), np.clip(more, -LONGEST_STEP, LONGEST_STEP), 0.0)
+        lift += np.where(free, np.clip(more, -LONGEST_STEP, LONGEST_STEP), 0.0)
         if abs(step) < CLOSE:
             break
     misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
     return log_share, (max(misfit, 1.0) / known) ** 0.5
-
-
-def _free(shape: tuple[int, ...], corners: Corners) -> Bool:
-    """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
-    cells = np.array([*corners, moved_across(corners)[0]])
-    rows, columns = np.indices(shape)[..., None]
-    near = np.maximum(np.abs(rows - cells[:, 0]), np.abs(columns - cells[:, 1])) <= 1
-    free = near[..., :3].any(axis=-1) & ~near[..., 3]
-    free[tuple(np.transpose(corners))] = True
-    return np.asarray(free)

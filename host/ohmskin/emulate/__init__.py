@@ -2,8 +2,7 @@
 """Boards without hardware, behind the interface of a port.
 
 `board` is an emulated board, `simavr` the built firmware in a simulator. `scenes` and `press` are
-their skins; `skin_faults` and `line_faults` are what is wrong with skin and line. `pty_server` puts
-an emulated board at a pseudo-terminal.
+their skins; `faults` are what is wrong with skin and line.
 
 Takes a scene and its faults, gives a `Link`. The emulated board shares the circuit model with the
 estimators, so a round trip through both proves little.

@@ -3,18 +3,21 @@
 
 `EmulatedBoard` speaks the board's side of the protocol, without input, output or a clock of its
 own. `receive` takes bytes from the host; `advance` lets time pass and returns the bytes that the
-board has sent by then. `EmulatorLink` runs a board in real time behind the interface of a port.
+board has sent by then. `EmulatorLink` runs a board in real time behind the interface of a port,
+`PtyServer` at a pseudo-terminal, which programs can open like a serial port.
 
 Not modelled:
 
 - the speed of the line: a scan's bytes come all at once at the scan's end, and none is dropped;
 - EEPROM beyond the life of the object;
-- findings of the self-test: the board itself is sound (`skin_faults` are faults of the skin).
+- findings of the self-test: the board itself is sound (`SkinFaults` are faults of the skin).
 
 ``simavr://`` has all these, for it runs the firmware itself.
 """
 
 import math
+import os
+import select
 import threading
 import time
 from collections.abc import Callable
@@ -25,8 +28,9 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, READING_OFFSET
-from ohmskin.emulate.line_faults import Faults
-from ohmskin.errors import DeviceLost
+from ohmskin.emulate.faults import LineFaults
+from ohmskin.errors import DeviceLost, PortError
+from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.serial_port import READ_TIMEOUT_S
@@ -46,6 +50,10 @@ _DEFAULT_PRESCALER = "clock_500khz"
 _SELECT_CYCLES = 120
 _SELECT_CYCLES_FREE_RUNNING = 180
 _SLOT_CYCLES_MAX = 60_000
+# At a pseudo-terminal: without scans, faults that are due are looked for as often as this [s].
+_IDLE_S = 0.2
+# The largest number of bytes that is taken there from the host at once.
+_READ_SIZE = 4096
 
 
 class EmulatedBoard:
@@ -137,7 +145,7 @@ class EmulatedBoard:
         self._out.clear()
         return sent
 
-    def heard(self, faults: Faults, now_s: float) -> bytes:
+    def heard(self, faults: LineFaults, now_s: float) -> bytes:
         """As `advance`, at the other end of a bad line; `faults` may also reset the board."""
         if faults.resets(now_s):
             self.reset()
@@ -146,8 +154,7 @@ class EmulatedBoard:
     def codes_at(self, time_s: float) -> NDArray[np.uint16]:
         """Codes of a scan, shape (rows, columns, 4); lines beyond the skin are open."""
         rows, columns = self._settings["rows"], self._settings["columns"]
-        ratio = np.empty((rows, columns, protocol.READINGS_PER_CELL))
-        ratio[:] = READING_OFFSET  # no current flows
+        ratio = np.tile(READING_OFFSET, (rows, columns, 1))  # no current flows
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s)[: have[0], : have[1]]
         if self._sampled is not None:
@@ -292,20 +299,27 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
     return {"scan_cycles": period, "slot_cycles": slot, "settle_us": settle_us}
 
 
-class EmulatorLink:
-    """An `EmulatedBoard` in real time, as a `Link`, with the `Faults` of a bad line."""
+class _Running:
+    """An `EmulatedBoard` in real time, from now on, with the `LineFaults` of a bad line."""
 
-    def __init__(self, board: EmulatedBoard, name: str, faults: Faults | None = None) -> None:
-        self.name = name
+    def __init__(self, board: EmulatedBoard, faults: LineFaults | None) -> None:
         self._board = board
-        self._faults = faults or Faults()
+        self._faults = faults or LineFaults()
         self._begin_s = time.monotonic()
-        self._wake = threading.Condition()
-        self._waiting = bytearray()  # bytes that the host has not read yet
-        self._closed = False
 
     def _now_s(self) -> float:
         return time.monotonic() - self._begin_s
+
+
+class EmulatorLink(_Running):
+    """A running board as a `Link`."""
+
+    def __init__(self, board: EmulatedBoard, name: str, faults: LineFaults | None = None) -> None:
+        super().__init__(board, faults)
+        self.name = name
+        self._wake = threading.Condition()
+        self._waiting = bytearray()  # bytes that the host has not read yet
+        self._closed = False
 
     def read(self) -> bytes:
         """See `Link.read`."""
@@ -342,3 +356,46 @@ class EmulatorLink:
         with self._wake:
             self._closed = True
             self._wake.notify_all()
+
+
+class PtyServer(_Running, Closing):
+    """Serves a running board at `path`, for as long as `serve` runs.
+
+    Bytes that no program takes are thrown away, as a serial port does that nobody has open.
+    `dropped_bytes` counts them.
+
+    :raises PortError: this system has no pseudo-terminals.
+    """
+
+    def __init__(self, board: EmulatedBoard, faults: LineFaults | None = None) -> None:
+        try:
+            import tty
+        except ImportError as exc:
+            raise PortError("this system has no pseudo-terminals: use emulator:// itself") from exc
+        super().__init__(board, faults)
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        self.dropped_bytes = 0
+
+    def serve(self, seconds: float = float("inf")) -> None:
+        """Serve for `seconds`, or until the faults let the board vanish."""
+        end_s = self._now_s() + seconds
+        while (now := self._now_s()) < end_s and not self._faults.vanished(now):
+            self._write(self._board.heard(self._faults, now))
+            wake_s = min(now + _IDLE_S, end_s, self._board.next_scan_s or end_s)
+            if select.select([self._master], [], [], max(0.0, wake_s - self._now_s()))[0]:
+                self._write(self._board.heard(self._faults, self._now_s()))
+                self._board.receive(os.read(self._master, _READ_SIZE))
+
+    def _write(self, octets: bytes) -> None:
+        try:
+            self.dropped_bytes += len(octets) - (os.write(self._master, octets) if octets else 0)
+        except BlockingIOError:
+            self.dropped_bytes += len(octets)
+
+    def close(self) -> None:
+        """Take the pseudo-terminal away."""
+        os.close(self._master)
+        os.close(self._slave)

@@ -56,14 +56,11 @@ modelled are a force below which the layers do not touch, and pressure that spre
 [Findley] Findley, Lai and Onaran, "Creep and Relaxation of Nonlinear Viscoelastic Materials", 1976.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Float
 
@@ -82,7 +79,7 @@ class PressModel:
     siemens_at_1n: k [S/N^b]. exponent: b. full_contact_siemens: full [S]. play_n: h [N]. creep: a.
     creep_time_s: T. noise, drift: standard deviations of n and d. noise_time_s, drift_time_s: their
     time constants. gain_spread, exponent_spread: those of ln k and ln b between cells. seed: of the
-    cells and of the noise. Raises ValueError for a value that cannot be.
+    cells and of the noise. The first three and all times are above 0.
     """
 
     siemens_at_1n: float = 30e-6
@@ -99,36 +96,22 @@ class PressModel:
     exponent_spread: float = 0.03
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        above_zero = ("siemens_at_1n", "exponent", "full_contact_siemens")
-        for field in fields(self):
-            value = getattr(self, field.name)
-            above = field.name in above_zero or field.name.endswith("_time_s")
-            if not (np.isfinite(value) and (value > 0 if above else value >= 0)):
-                least = "above 0" if above else "0 or more"
-                raise ValueError(f"{field.name} is {value}, it must be {least}")
-
-    def without_memory(self) -> PressModel:
-        """The same cells and the same noise, without hysteresis and creep."""
-        return replace(self, play_n=0.0, creep=0.0)
-
-    def rise(self, time_s: ArrayLike, force_n: ArrayLike) -> Float:
+    def rise(self, time_s: Float, force_n: Float) -> Float:
         """Conductance above rest G [S] over a history of forces [N], both (n,) or (n, R, C).
 
-        time_s (n,) rises. The first force has always been there. The same arguments give the same
-        answer. Raises ValueError, which names the row, for times that do not rise and for forces
-        below 0.
+        time_s (n,) rises, and no force is below 0. The first force has always been there. The same
+        arguments give the same answer.
         """
-        times, forces = _checked(time_s, force_n)
-        cells = forces.reshape(len(times), -1)
+        cells = force_n.reshape(len(time_s), -1)
         random = np.random.default_rng(self.seed)
         log_gain = self.gain_spread * random.standard_normal(cells.shape[1])
         log_exponent = self.exponent_spread * random.standard_normal(cells.shape[1])
         gain, exponent = self.siemens_at_1n * np.exp(log_gain), self.exponent * np.exp(log_exponent)
-        log_noise = self.noise * _wander(times, cells.shape[1], self.noise_time_s, random)
-        log_noise += self.drift * _wander(times, cells.shape[1], self.drift_time_s, random)
-        contact = gain * self._pressing(times, cells) ** exponent * np.exp(log_noise)
-        return np.asarray(contact / (1 + contact / self.full_contact_siemens)).reshape(forces.shape)
+        log_noise = self.noise * _wander(time_s, cells.shape[1], self.noise_time_s, random)
+        log_noise += self.drift * _wander(time_s, cells.shape[1], self.drift_time_s, random)
+        contact = gain * self._pressing(time_s, cells) ** exponent * np.exp(log_noise)
+        rise = contact / (1 + contact / self.full_contact_siemens)
+        return np.asarray(rise).reshape(force_n.shape)
 
     def _pressing(self, times: Float, forces: Float) -> Float:
         """p of the module's table [N], (n, cells)."""
@@ -137,18 +120,15 @@ class PressModel:
         # Exact where forces are straight between the times.
         of_step = 1 + np.expm1(-steps) / steps
         pressing = np.empty_like(forces)
-        crept = before = forces[0]
-        pressing[0] = before
-        for i in range(1, len(times)):
-            step_n = forces[i] - forces[i - 1]
+        pressing[0] = crept = forces[0]
+        for i, (stay, of_change) in enumerate(zip(stays, of_step, strict=True), start=1):
             crept = (
-                stays[i - 1] * crept + (1 - stays[i - 1]) * forces[i - 1] + of_step[i - 1] * step_n
+                stay * crept + (1 - stay) * forces[i - 1] + of_change * (forces[i] - forces[i - 1])
             )
             depth = (forces[i] + self.creep * crept) / (1 + self.creep)
             width = depth + self.play_n
             unloading = depth + self.play_n * depth / np.where(width > 0, width, 1.0)
-            before = np.maximum(depth, np.minimum(unloading, before))
-            pressing[i] = before
+            pressing[i] = np.maximum(depth, np.minimum(unloading, pressing[i - 1]))
         return pressing
 
 
@@ -177,24 +157,3 @@ def _wander(times: Float, cells: int, time_constant_s: float, random: np.random.
     for i, (stay, new) in enumerate(zip(stays, fresh, strict=True), start=1):
         values[i] = stay * values[i - 1] + new * values[i]
     return values
-
-
-def _checked(time_s: ArrayLike, force_n: ArrayLike) -> tuple[Float, Float]:
-    times = np.asarray(time_s, dtype=np.float64)
-    forces = np.asarray(force_n, dtype=np.float64)
-    if times.ndim != 1 or not times.size:
-        raise ValueError(f"time_s has shape {times.shape}, it must be (n,) with n above 0")
-    if forces.ndim not in (1, 3) or len(forces) != len(times):
-        raise ValueError(
-            f"force_n has shape {forces.shape}, it must be ({len(times)},) or "
-            f"({len(times)}, rows, columns)"
-        )
-    # Both conditions are written so that NaN fails too.
-    rising = np.isfinite(times) & np.append(True, np.diff(times) > 0)
-    if not rising.all():
-        row = int(np.argmin(rising))
-        raise ValueError(f"row {row}: time_s is {times[row]:g}, it must rise from row to row")
-    good = (np.isfinite(forces) & (forces >= 0)).reshape(len(times), -1).all(axis=1)
-    if not good.all():
-        raise ValueError(f"row {int(np.argmin(good))}: a force is below 0 or not finite")
-    return times, forces

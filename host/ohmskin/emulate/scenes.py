@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
+from ohmskin.emulate.faults import SkinFaults
 from ohmskin.emulate.press import LEAVE_S, PressModel, robot_presses
-from ohmskin.emulate.skin_faults import SkinFaults
 
 # Medians of an untouched cell and of the wire segments of rows and of columns [ohm], in the range
 # of a knitted skin. Single ones are spread log-normally, by this share.
@@ -80,8 +80,8 @@ class Scene:
         self.rows = rows
         self.columns = columns
         self.moves = name in ("corners", "moving", "press")
-        self._faults = faults or SkinFaults()
-        self._faults.check(rows, columns)
+        self.faults = faults or SkinFaults()
+        self.faults.check(rows, columns)
         random = np.random.default_rng(seed)
 
         def spread(middle: float) -> Float:
@@ -95,7 +95,7 @@ class Scene:
     @property
     def rest_ratio(self) -> Float:
         """Exact readings of the untouched skin, shape (rows, columns, 4)."""
-        return self._faults.readings(self._faults.damaged(self._rest))
+        return self.faults.readings(self.faults.damaged(self._rest))
 
     def skin(self, time_s: float) -> Skin:
         """Every resistance of the skin at a time."""
@@ -106,22 +106,20 @@ class Scene:
         else:
             touch = self._finger(time_s) if self.moves else self._touches
         touched = replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
-        return self._faults.damaged(touched)
+        return self.faults.damaged(touched)
 
     def force_n(self, time_s: float) -> Float:
         """Force on every cell in the scene "press" [N], shape (rows, columns).
 
         :raises ValueError: other scenes press with conductances, and no force is known.
         """
-        if self._robot is not None:
-            return self._robot.touch(time_s)[1]
-        if self.name == "rest":
-            return np.zeros((self.rows, self.columns))
-        raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
+        if self._robot is None:
+            raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
+        return self._robot.touch(time_s)[1]
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
         """Cells whose conductance a touch raises by 1 uS or more, shape (rows, columns)."""
-        rest_siemens = self._faults.damaged(self._rest).cell_siemens
+        rest_siemens = self.faults.damaged(self._rest).cell_siemens
         return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= _TOUCHED_SIEMENS)
 
     def ratio(self, time_s: float) -> Float:
@@ -129,7 +127,7 @@ class Scene:
         return self._readings(time_s) if self.moves else self._still_ratio()
 
     def _readings(self, time_s: float) -> Float:
-        return self._faults.readings(self.skin(time_s))
+        return self.faults.readings(self.skin(time_s))
 
     def _place(self, random: np.random.Generator) -> Float:
         touches = np.zeros((self.rows, self.columns))

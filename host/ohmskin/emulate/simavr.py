@@ -8,7 +8,6 @@ firmware/sim/README.md lists what is not modelled. Above all these are noise, th
 and its sample-and-hold capacitor, crystal tolerance, and everything on the USB side of the UART.
 """
 
-import os
 import struct
 import subprocess
 import tempfile
@@ -18,14 +17,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
 from ohmskin.link.serial_port import SerialLink
 
 BOARDS: Final = ("uno", "megaatmega2560")
+_REPOSITORY: Final = Path(__file__).resolve().parents[3]
+# The simulator, in a checkout; it need not exist.
+PROGRAM: Final = _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
 # The simulator's table of readings has this shape; a cell without current reads like this.
 _TABLE_SHAPE: Final = (16, 16, 4)
 _NO_CURRENT: Final = (1.0, 0.0, 1.0, 0.0)
@@ -35,41 +37,37 @@ _HEADER: Final = struct.Struct("<BI")
 _EXIT_TIMEOUT_S: Final = 2.0
 # The skin's readings follow a moving scene in steps of this time [s].
 _TABLE_EVERY_S: Final = 0.02
-_REPOSITORY: Final = Path(__file__).resolve().parents[3]
 
 
 class SimulationError(RuntimeError):
     """The simulator refused a request, its processor crashed, or the program is gone."""
 
 
-def default_program() -> Path:
-    """Path of `skinsim` in this repository; it need not exist."""
-    return _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
-
-
 class SkinSim(Closing):
     """A board with a skin, simulated cycle by cycle.
 
-    board: one of `BOARDS`. elf: the firmware. pty: run in real time, from `power_on` on, with the
-    UART on the pseudo-terminal `pty_path`; else time passes only in requests that run the board.
+    board: one of `BOARDS`. elf: the firmware. pty: run in real time, from the request "G" on, with
+    the UART on the pseudo-terminal `pty_path`; else time passes only in requests that run the
+    board.
 
     Raises FileNotFoundError if the simulator or the firmware is not built, SimulationError if the
     simulator does not start. Not thread-safe.
     """
 
-    def __init__(self, board: str, elf: str | os.PathLike[str], *, pty: bool = False) -> None:
-        program = default_program()
-        if not program.exists():
-            raise FileNotFoundError(f"{program} is missing: run 'make -C firmware/sim'")
-        if not Path(elf).is_file():
-            raise FileNotFoundError(f"no firmware at {elf}: run 'make firmware' in a checkout")
-        command = [str(program), "--board", board, *(["--pty"] if pty else []), os.fspath(elf)]
+    def __init__(self, board: str, elf: Path, *, pty: bool = False) -> None:
+        for path, made_by in ((PROGRAM, "make sim"), (elf, "make firmware")):
+            if not path.is_file():
+                raise FileNotFoundError(f"{path} is missing: run '{made_by}' in a checkout")
+        command = [str(PROGRAM), "--board", board, *(["--pty"] if pty else []), str(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._stderr)
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._requests, self._replies = self._process.stdin, self._process.stdout
         try:
             # Either answer shows that the simulator has started.
-            self.pty_path = self._receive("P").decode() if pty else ""
+            self.pty_path = self._reply("P").decode() if pty else ""
             if not pty:
                 self.request("S")
         except BaseException:
@@ -78,10 +76,9 @@ class SkinSim(Closing):
 
     def close(self) -> None:
         """End the simulator. Further calls raise SimulationError. May be called again."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                with suppress(BrokenPipeError):
-                    pipe.close()
+        for pipe in (self._requests, self._replies):
+            with suppress(BrokenPipeError):
+                pipe.close()
         try:
             self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -89,55 +86,34 @@ class SkinSim(Closing):
             self._process.wait()
         self._stderr.close()
 
-    def power_on(self) -> None:
-        """Let a board with a pseudo-terminal run; its port should be open by then."""
-        self.request("G")
-
-    def set_table(self, ratio: ArrayLike) -> None:
+    def set_table(self, ratio: Float) -> None:
         """Set sense voltage / Vdd, shape (rows, columns, 4), up to 16 rows and columns.
 
         The last axis is configuration A, B, C, D. Cells beyond the array carry no current: 1, 0,
         1, 0. A conversion gives the code min(1023, floor(1024 ratio)). With a settling time the
-        nodes head for the new values from this cycle on. Raises ValueError for a bad shape or a
-        ratio that is not finite.
+        nodes head for the new values from this cycle on. Raises SimulationError for a ratio that is
+        not finite.
         """
-        given = np.asarray(ratio, dtype=np.float64)
-        if given.ndim != 3 or given.shape[2] != 4 or max(given.shape[:2]) > 16:
-            raise ValueError(
-                f"ratio has shape {given.shape}: must be (rows, columns, 4), at most (16, 16, 4)"
-            )
-        if not np.isfinite(given).all():
-            raise ValueError("ratio has values that are not finite")
         table = np.empty(_TABLE_SHAPE, dtype="<f8")
         table[:] = _NO_CURRENT
-        table[: given.shape[0], : given.shape[1]] = given
+        table[: ratio.shape[0], : ratio.shape[1]] = ratio
         self.request("T", table.tobytes())
-
-    def set_tau_us(self, tau_us: float) -> None:
-        """Time constant [us] with which a node settles after a change of pins; 0 is at once.
-
-        Raises ValueError unless 0 to 1e9.
-        """
-        if not 0 <= tau_us <= 1e9:
-            raise ValueError(f"tau_us is {tau_us}: must be from 0 to 1e9")
-        self.request("U", struct.pack("<d", tau_us))
 
     def request(self, op: str, payload: bytes = b"") -> bytes:
         """The reply to an operation of firmware/sim/README.md.
 
         Raises SimulationError if it is refused or the simulator is gone.
         """
-        pipe = self._process.stdin
-        if pipe is None or pipe.closed:
+        if self._requests.closed:
             raise SimulationError("the simulator is closed")
         try:
-            pipe.write(_HEADER.pack(ord(op), len(payload)) + payload)
-            pipe.flush()
+            self._requests.write(_HEADER.pack(ord(op), len(payload)) + payload)
+            self._requests.flush()
         except BrokenPipeError:
             raise self._death() from None
-        return self._receive(op)
+        return self._reply(op)
 
-    def _receive(self, op: str) -> bytes:
+    def _reply(self, op: str) -> bytes:
         reply_op, length = _HEADER.unpack(self._read(_HEADER.size))
         payload = self._read(length)
         if chr(reply_op) == "!":
@@ -147,45 +123,37 @@ class SkinSim(Closing):
         return payload
 
     def _read(self, count: int) -> bytes:
-        pipe = self._process.stdout
-        assert pipe is not None
-        octets = pipe.read(count)
+        octets = self._replies.read(count)
         if len(octets) < count:
             raise self._death()
         return octets
 
     def _death(self) -> SimulationError:
-        try:
-            code = self._process.wait(_EXIT_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            code = None
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_EXIT_TIMEOUT_S)
         self._stderr.seek(0)
-        said = self._stderr.read().decode(errors="replace").strip()
-        return SimulationError(f"skinsim ended with code {code}: {said[-2000:] or 'no message'}")
+        said = self._stderr.read().decode(errors="replace").strip()[-2000:] or "no message"
+        return SimulationError(f"skinsim ended with code {self._process.returncode}: {said}")
 
 
 class SimavrLink(SerialLink):
     """A simulated board's pseudo-terminal, and the skin that it reads.
 
-    board: one of `BOARDS`. elf: the firmware, by default the one that `make firmware` builds.
-    tau_us: time constant of the skin's wiring [us].
+    board: one of `BOARDS`, with the firmware that `make firmware` builds.
 
     :raises PortError: there is no such board, or firmware or simulator are not built.
     """
 
-    def __init__(
-        self, board: str, scene: Scene, elf: Path | None = None, tau_us: float = 0.0, name: str = ""
-    ) -> None:
+    def __init__(self, board: str, scene: Scene, name: str = "") -> None:
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
-        elf = elf or _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
+        elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
         with ExitStack() as opened:
             try:
                 self.sim = opened.enter_context(SkinSim(board, elf, pty=True))
-                self.sim.set_tau_us(tau_us)
                 self.sim.set_table(scene.ratio(0.0))
                 super().__init__(self.sim.pty_path)
-                self.sim.power_on()  # the port is open: nothing that the board says is lost
+                self.sim.request("G")  # the port is open: nothing that the board says is lost
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
             opened.pop_all()

@@ -31,7 +31,7 @@ import json
 import os
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import naming, read_bounded, whole_file
-from ohmskin.force.curve import ForceModel
+from ohmskin.force.curve import ForceModel, require
 from ohmskin.record.readings import MAX_CELLS
 
 FORMAT: Final = "ohmskin calibration"
@@ -55,9 +55,8 @@ MAX_NUMBER: Final = 1e60
 _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 _RESTS: Final = ("rest", "tare")
 _WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm")
+_PLAIN: Final = {"unit_id": int, "date": str, "method": str, "indenter_area_m2": float}
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +75,9 @@ class Rest:
         if self.level.ndim != 2 or 0 in self.level.shape:
             raise ValueError(f"level at rest has shape {self.level.shape}, not (rows, columns)")
         good = np.isfinite(self.level) & (self.level >= 0)
-        if not good.all():
-            row, column = (int(index) for index in np.argwhere(~good)[0])
-            raise ValueError(f"level at rest of cell ({row}, {column}) is not finite and >= 0")
+        require("level at rest", good, "not finite and >= 0")
         rows, columns = self.level.shape
-        check_ratio(self.ratio, rows, columns, name="ratio at rest")
+        check_ratio(self.ratio, rows, columns, "ratio at rest")
 
     @classmethod
     def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
@@ -111,9 +108,8 @@ class Calibration:
             raise ValueError(f"unit_id is {self.unit_id}, not in 0..{MAX_UNIT_ID}")
         _check_date(self.date)
         if self.method not in LEVEL_METHODS:
-            raise ValueError(
-                f"method is {self.method[:40]!r}, not one of {', '.join(LEVEL_METHODS)}"
-            )
+            methods = ", ".join(LEVEL_METHODS)
+            raise ValueError(f"method is {self.method[:40]!r}, not one of {methods}")
         shape = self.model.kind.shape
         for name, rest in (("rest", self.rest), ("tare", self.tare)):
             if rest is not None and rest.level.shape != shape:
@@ -163,10 +159,9 @@ class Calibration:
         Raises ValueError if it cannot be written.
         """
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
-        for name in ("unit_id", "date", "method", "rows", "columns"):
+        for name in ("unit_id", "date", "method", "rows", "columns", "indenter_area_m2"):
             content[name] = getattr(self, name)
         content |= dict(zip(_WIRES, self.nominal_wire_ohm, strict=True))
-        content["indenter_area_m2"] = self.indenter_area_m2
         for name in _RESTS:
             rest = getattr(self, name)
             content[name] = None if rest is None else vars(rest)
@@ -197,16 +192,10 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     with naming(path):
         octets = read_bounded(path, MAX_FILE_BYTES)
         try:
-            content = json.loads(
-                octets.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_repeats
-            )
+            content = json.loads(octets, object_pairs_hook=_no_repeats)
         except (ValueError, RecursionError) as error:
             raise ValueError(f"no JSON of ours: {error}") from error
         return _from_content(content)
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no number")
 
 
 def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -223,24 +212,18 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
     if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
-    known = {"format", "schema", "unit_id", "date", "method", "rows", "columns", *_RESTS}
-    _require_fields(content, known | {*_WIRES, "indenter_area_m2", *_MODEL_FIELDS})
-    rows, columns, unit_id = (
-        _of_type(name, content[name], int) for name in ("rows", "columns", "unit_id")
+    known = {"format", "schema", "rows", "columns", *_PLAIN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
+    _require_fields(content, known)
+    shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
+    model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
+    wires = (
+        None if content[name] is None else _value(name, content[name], float) for name in _WIRES
     )
-    if min(rows, columns) < 1 or rows * columns > MAX_CELLS:
-        raise ValueError(f"rows and columns: not 1 to {MAX_CELLS} cells")
-    shape = (rows, columns)
-    arrays = {name: _array(name, content[name], shape) for name in _MODEL_FIELDS}
-    wires = (None if content[name] is None else _number(name, content[name]) for name in _WIRES)
     return Calibration(
-        unit_id=unit_id,
-        date=_of_type("date", content["date"], str),
-        method=_of_type("method", content["method"], str),
+        **{name: _value(name, content[name], wanted) for name, wanted in _PLAIN.items()},
         rest=_rest("rest", content["rest"], shape),
         tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
-        model=ForceModel(**arrays),
-        indenter_area_m2=_number("indenter_area_m2", content["indenter_area_m2"]),
+        model=model,
         nominal_wire_ohm=WireOhm(*wires),
     )
 
@@ -252,15 +235,13 @@ def _require_fields(content: dict[str, Any], known: set[str], place: str = "") -
         raise ValueError(f"unknown field '{place}{name[:40]}'")
 
 
-def _rest(name: str, content: Any, shape: tuple[int, int]) -> Rest:
-    _require_fields(_of_type(name, content, dict), {"date", "ratio", "level"}, f"{name}.")
-    date = _of_type(f"{name}.date", content["date"], str)
+def _rest(name: str, content: Any, shape: tuple[int, ...]) -> Rest:
+    _require_fields(_value(name, content, dict), {"date", "ratio", "level"}, f"{name}.")
+    date = _value(f"{name}.date", content["date"], str)
     ratio = _array(f"{name}.ratio", content["ratio"], (*shape, READINGS_PER_CELL))
     level = _array(f"{name}.level", content["level"], shape)
-    try:
+    with naming(name):
         return Rest(date, ratio, level)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
 
 
 def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -268,31 +249,23 @@ def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     cells = np.array(nested, dtype=object)
     if cells.shape != shape:
         raise ValueError(f"{name} has not the shape {shape}")
-    if name == "pooled":
-        return np.array([_of_type(name, cell, bool) for cell in cells.flat]).reshape(shape)
-    if name == "kind":
-        # Cut, because a long text makes all cells as long.
-        return np.array([_of_type(name, cell, str)[:16] for cell in cells.flat]).reshape(shape)
+    wanted = {"pooled": bool, "kind": str}.get(name, float)
     may_be_null = name in _NULL_FIELDS
-    numbers = [
-        np.nan if cell is None and may_be_null else _number(name, cell) for cell in cells.flat
+    found = [
+        np.nan if cell is None and may_be_null else _value(name, cell, wanted)
+        for cell in cells.flat
     ]
-    return np.array(numbers, dtype=np.float64).reshape(shape)
+    # Texts are cut, because a long one makes all cells as long.
+    return np.array(found, dtype="U16" if wanted is str else wanted).reshape(shape)
 
 
-def _of_type(name: str, value: Any, wanted: type[_T]) -> _T:
-    if type(value) is not wanted:
-        raise ValueError(f"{name} holds {type(value).__name__}, not {wanted.__name__}")
-    return value
-
-
-def _number(name: str, value: Any) -> float:
-    if type(value) not in (int, float):
-        raise ValueError(f"{name} holds {type(value).__name__}, not numbers")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = np.inf
-    if not abs(number) <= MAX_NUMBER:
+def _value(name: str, value: Any, wanted: type) -> Any:
+    """A value of JSON, if it is of this type; float: any number within `MAX_NUMBER`."""
+    found = type(value)
+    if found is not wanted and (found, wanted) != (int, float):
+        raise ValueError(f"{name} holds {found.__name__}, not {wanted.__name__}")
+    if wanted is not float:
+        return value
+    if not abs(value) <= MAX_NUMBER:  # so that NaN fails too
         raise ValueError(f"{name} holds a number that is not finite, or beyond {MAX_NUMBER:g}")
-    return number
+    return float(value)

@@ -57,63 +57,50 @@ class ContactTracker:
         self, time_us: int, touched: NDArray[np.bool_], force_n: Float, force_n_std: Float
     ) -> tuple[Contact, ...]:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
-        limits_us = {self._before_us: SLOWEST_SCAN_US}
-        self._known = [
-            each
-            for each in self._known
-            if 0 <= time_us - each[1] <= limits_us.get(each[1], MEMORY_US)
-        ]
+        known = []
+        for contact, seen_us in self._known:
+            longest_us = SLOWEST_SCAN_US if seen_us == self._before_us else MEMORY_US
+            if 0 <= time_us - seen_us <= longest_us:
+                known.append((contact, seen_us))
         self._before_us = time_us
         found = _found(touched, force_n, force_n_std)
-        same = self._matches(found)
+        for new, old in _matches(found, [contact for contact, _ in known]):
+            found[new] = replace(found[new], identity=known[old][0].identity)
         for index, contact in enumerate(found):
-            if index in same:
-                identity = self._known[same[index]][0].identity
-            else:
-                self._last = identity = self._last + 1
-            found[index] = replace(contact, identity=identity)
+            if not contact.identity:
+                self._last += 1
+                found[index] = replace(contact, identity=self._last)
         found.sort(key=lambda contact: contact.identity)
-        gone = [each for index, each in enumerate(self._known) if index not in same.values()]
+        here = {contact.identity for contact in found}
+        gone = [each for each in known if each[0].identity not in here]
         self._known = [*gone, *((contact, time_us) for contact in found)]
         return tuple(found)
 
-    def _matches(self, found: list[Contact]) -> dict[int, int]:
-        """By the index of a contact that is found, the index of the known contact that it is."""
-        from scipy.optimize import linear_sum_assignment
 
-        if not found or not self._known:
-            return {}
-        new = np.array([(contact.row, contact.column) for contact in found])
-        old = np.array([(known.row, known.column) for known, _ in self._known])
-        away = np.hypot(*(new[:, None] - old[None]).transpose(2, 0, 1))
-        away[away > FARTHEST_CELLS] = _FAR
-        pairs = zip(*linear_sum_assignment(away), strict=True)
-        return {int(one): int(other) for one, other in pairs if away[one, other] < _FAR}
+def _matches(found: list[Contact], known: list[Contact]) -> list[tuple[int, int]]:
+    """Indices of a contact that is found and of the known contact that it is."""
+    from scipy.optimize import linear_sum_assignment
+
+    if not found or not known:
+        return []
+    new, old = (np.array([(each.row, each.column) for each in some]) for some in (found, known))
+    away = np.hypot(*(new[:, None] - old[None]).transpose(2, 0, 1))
+    away[away > FARTHEST_CELLS] = _FAR
+    pairs = zip(*linear_sum_assignment(away), strict=True)
+    return [(one, other) for one, other in pairs if away[one, other] < _FAR]
 
 
 def _found(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> list[Contact]:
     """The contacts of a scan, without their numbers."""
-    from scipy.ndimage import label
+    from scipy.ndimage import center_of_mass, label
 
-    if not touched.any():
-        return []
     labels, count = label(touched, structure=_EIGHT_NEIGHBOURS)
     contacts = []
     for number in range(1, count + 1):
         cells = labels == number
-        rows, columns = np.nonzero(cells)
-        weights = force_n[cells]
-        total_n = float(weights.sum())
-        if total_n <= 0:  # too light for its curve: all cells alike
-            weights = np.ones(rows.size)
-        contacts.append(
-            Contact(
-                identity=0,
-                row=float(np.average(rows, weights=weights)),
-                column=float(np.average(columns, weights=weights)),
-                force_n=total_n,
-                force_n_std=float(np.sqrt(np.sum(force_n_std[cells] ** 2))),
-                cells=cells,
-            )
-        )
+        total_n = float(force_n[cells].sum())
+        # Where it is too light for its curve, all cells count alike.
+        row, column = center_of_mass(force_n if total_n > 0 else cells, cells)
+        std_n = float(np.sqrt(np.sum(force_n_std[cells] ** 2)))
+        contacts.append(Contact(0, float(row), float(column), total_n, std_n, cells))
     return contacts

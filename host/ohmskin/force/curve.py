@@ -10,7 +10,7 @@ x      (R, C)  rise above rest: conductance g - g_rest, or the reading's (`volta
 F      (R, C)  force normal to the skin                                                N
 a      (R, C)  `slope`                                                                 N / x^b
 b      (R, C)  `exponent`, 1 where the cell is linear                                  1
-c      (R, C)  `intercept`, 0 unless asked for                                         N
+c      (R, C)  `intercept`; `regression` learns none: 0                                N
 K      (2, 2)  covariance of a cell's two free coefficients: (a, c), or (a, b)
 s0     (R, C)  `residual_std`: scatter of presses about the curve at no force          N
 s1     (R, C)  `residual_share`: how that grows with force                             1
@@ -28,9 +28,8 @@ For a line d = a dx. For x^b with b < 1 the differential is infinite at rest, th
 `regression` learns the curves.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,23 +77,23 @@ class ForceModel:
             if array.shape != shape:
                 raise ValueError(f"{field.name} has shape {array.shape}, kind {shape}")
         power = self.kind == POWER
-        _require("kind", power | (self.kind == LINEAR), f"neither {LINEAR} nor {POWER}")
-        for name in ("slope", "exponent", "intercept", "correlation"):
-            _require(name, np.isfinite(getattr(self, name)), "not finite")
+        require("kind", power | (self.kind == LINEAR), f"neither {LINEAR} nor {POWER}")
+        require("slope", (self.slope > 0) & np.isfinite(self.slope), "not above 0")
+        require("intercept", np.isfinite(self.intercept), "not finite")
+        require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
+        inside = (self.exponent >= MIN_EXPONENT) & (self.exponent <= MAX_EXPONENT)
+        require("exponent", inside, f"not in {MIN_EXPONENT:g}..{MAX_EXPONENT:g}")
         for name in ("slope_std", "exponent_std", "intercept_std"):
             std = getattr(self, name)
-            _require(name, np.isfinite(std) & (std >= 0), "not finite and >= 0")
+            require(name, np.isfinite(std) & (std >= 0), "not finite and >= 0")
         for name in ("residual_std", "residual_share", "held_out_rmse"):
             known = getattr(self, name)
-            _require(name, np.isnan(known) | (np.isfinite(known) & (known >= 0)), "negative or inf")
-        _require("slope", self.slope > 0, "not above 0")
-        _require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
-        inside = (self.exponent >= MIN_EXPONENT) & (self.exponent <= MAX_EXPONENT)
-        _require("exponent", inside, f"not in {MIN_EXPONENT:g}..{MAX_EXPONENT:g}")
-        _require("exponent", power | (self.exponent == 1), "not 1, as of a linear cell")
-        _require("exponent_std", power | (self.exponent_std == 0), "not 0, as of a linear cell")
-        _require("intercept", ~power | (self.intercept == 0), "not 0, as of a power law")
-        _require("intercept_std", ~power | (self.intercept_std == 0), "not 0, as of a power law")
+            require(name, np.isnan(known) | (np.isfinite(known) & (known >= 0)), "negative or inf")
+        for name, fixed in (("exponent", 1), ("exponent_std", 0)):
+            good = power | (getattr(self, name) == fixed)
+            require(name, good, f"not {fixed}, as of a linear cell")
+        for name in ("intercept", "intercept_std"):
+            require(name, ~power | (getattr(self, name) == 0), "not 0, as of a power law")
 
     def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
         """Force and its standard deviation [N], each (R, C), of rises above rest (R, C).
@@ -104,11 +103,15 @@ class ForceModel:
         data when one cell alone was pressed, say. Raises ValueError, naming the cell, for a shape
         or a value that cannot be.
         """
-        x, dx = self._checked("rise", rise), self._checked("rise_std", rise_std)
-        _require("rise", np.isfinite(x), "not finite")
-        _require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
-        force_n = self._force(x)
-        of_rise = spread(self._force, x, np.nan_to_num(dx))
+        x, dx = (np.asarray(each, dtype=np.float64) for each in (rise, rise_std))
+        for name, array in (("rise", x), ("rise_std", dx)):
+            if array.shape != self.kind.shape:
+                raise ValueError(
+                    f"{name} has shape {array.shape}, this calibration {self.kind.shape}"
+                )
+        require("rise", np.isfinite(x), "not finite")
+        require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
+        of_rise = spread(self, x, np.nan_to_num(dx))
         power = self.kind == POWER
         above = np.maximum(x, 0.0)
         safe = np.where(above > 0, above, 1.0)
@@ -119,40 +122,60 @@ class ForceModel:
         )
         # The two nearly cancel in a power law, whose slope is that at 1 S: far from any press.
         of_fit = by_slope**2 + by_other**2 + 2 * self.correlation * by_slope * by_other
-        reported_n = np.maximum(force_n, 0.0)
+        reported_n = np.maximum(force_by(self, x), 0.0)
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
         variance = of_rise**2 + scatter + np.maximum(of_fit, 0.0)
         return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))
 
-    def _force(self, x: Float) -> Float:
-        return force_by(self.kind, self.slope, self.exponent, self.intercept, x)
 
-    def _checked(self, name: str, values: ArrayLike) -> Float:
-        array = np.asarray(values, dtype=np.float64)
-        if array.shape != self.kind.shape:
-            raise ValueError(f"{name} has shape {array.shape}, this calibration {self.kind.shape}")
-        return array
+@dataclass(frozen=True)
+class Curve:
+    """One cell's curve: the fields of `ForceModel`, as numbers."""
+
+    kind: str
+    slope: float
+    slope_std: float
+    residual_std: float = 0.0
+    residual_share: float = 0.0
+    correlation: float = 0.0
+    exponent: float = 1.0
+    exponent_std: float = 0.0
+    intercept: float = 0.0
+    intercept_std: float = 0.0
+    held_out_rmse: float = np.nan
 
 
-def force_by(
-    kind: str | NDArray[np.str_],
-    slope: float | Float,
-    exponent: float | Float,
-    intercept: float | Float,
-    x: Float,
-) -> Float:
+def force_by(curve: ForceModel | Curve, x: Float) -> Float:
     """F of the module's equations [N], before forces below 0 are cut, shape of x."""
-    power = slope * np.maximum(x, 0.0) ** exponent
-    return np.where(np.asarray(kind) == POWER, power, slope * x + intercept)
+    power = curve.slope * np.maximum(x, 0.0) ** curve.exponent
+    return np.where(np.asarray(curve.kind) == POWER, power, curve.slope * x + curve.intercept)
 
 
-def spread(force: Callable[[Float], Float], x: Float, dx: Float) -> Float:
+def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
     """d of the module [N]: how far the force is off if x is off by dx."""
-    here = force(x)
-    return np.maximum(force(x + dx) - here, here - force(x - dx))
+    here = force_by(curve, x)
+    return np.maximum(force_by(curve, x + dx) - here, here - force_by(curve, x - dx))
 
 
-def _require(name: str, good: NDArray[np.bool_], what: str) -> None:
+def require(name: str, good: NDArray[np.bool_], what: str) -> None:
+    """Raise ValueError, naming the first cell where it is not so. good: (R, C)."""
     if not good.all():
         row, column = (int(index) for index in np.argwhere(~good)[0])
         raise ValueError(f"{name} of cell ({row}, {column}) is {what}")
+
+
+def require_rows(
+    name: str,
+    values: NDArray[Any],
+    good: NDArray[np.bool_],
+    must: str,
+    rows: NDArray[np.int64] | None = None,
+) -> None:
+    """Raise ValueError, naming the first row where it is not so, by its number in `rows`, if told.
+
+    values, good, rows: (n,). must: what the value has to be.
+    """
+    if not good.all():
+        at = int(np.argmin(good))
+        row = at if rows is None else rows[at]
+        raise ValueError(f"row {row}: {name} is {values[at]:.12g}, it must be {must}")

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from collections.abc import Iterator
@@ -64,27 +65,6 @@ class Untouched:
     date: str
 
 
-class _Rests:
-    """The rests before each tare, and the one in force, of all readers of one skin."""
-
-    def __init__(self, rests: list[Untouched | None]) -> None:
-        self.all = rests
-        self._replayed: list[Float] = []
-        self._lock = threading.Lock()
-
-    @property
-    def newest(self) -> Untouched | None:
-        """The rest in force."""
-        return self.all[-1]
-
-    def replay(self, ratio: Float) -> None:
-        """Take a recorded tare, when the first reader comes to it."""
-        with self._lock:
-            if not any(ratio is each for each in self._replayed):
-                self._replayed.append(ratio)
-                self.all.append(Untouched(ratio, now()))
-
-
 class SkinReader:
     """Reads scan after scan of one skin: the same scans in the same order give the same forces.
 
@@ -108,24 +88,25 @@ class SkinReader:
     ) -> None:
         self.board = board
         self._calibration = calibration
+        self._wanted = method or DEFAULT_METHOD
+        # The rests before each tare, and the one in force. All readers of one skin share it, and
+        # the recorded tares that one of them has come to.
+        self._rests: list[Rest | Untouched | None] = [None]
+        self._replayed: list[Float] = []
+        self._lock = threading.Lock()
         if calibration is not None:
             calibration.check(calibration.unit_id, board.rows, board.columns)
-        rests: list[Untouched | None] = [None]
-        if rest_ratio is not None:
-            rests = [Untouched(rest_ratio, now())]
-        if calibration is not None:
+            self._wanted = method or calibration.method
             known = (calibration.rest, calibration.tare)
-            rests = [Untouched(each.ratio, each.date) for each in known if each is not None]
-        self._rests = _Rests(rests)
-        self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
-        self._tracker = ContactTracker()
-        self._make()
+            self._rests = [each for each in known if each is not None]
+        elif rest_ratio is not None:
+            self._rests = [Untouched(rest_ratio, now())]
+        self._begin()
 
     def another(self) -> Self:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
-        other = type(self)(self.board, self._calibration, method=self._wanted)
-        other._rests = self._rests
-        other._make()
+        other = copy.copy(self)
+        other._begin()
         return other
 
     # ------------------------------------------------------------------------- what is known
@@ -141,27 +122,24 @@ class SkinReader:
         return self._calibration is not None and self._calibration.method == self._made[0]
 
     @property
-    def rest(self) -> Untouched | None:
+    def rest(self) -> Rest | Untouched | None:
         """The rest in force; None where it is not known."""
-        return self._rests.newest
+        return self._rests[-1]
 
     @property
     def is_tared(self) -> bool:
         """Whether there is a tare to undo."""
-        return len(self._rests.all) > 1
+        return len(self._rests) > 1
 
     @property
     def calibration(self) -> Calibration | None:
         """The calibration with the latest tare; `Calibration.save` makes that last."""
-        rest, calibration = self._rests.newest, self._calibration
-        if calibration is None or rest is None:
+        tare, calibration = self.rest, self._calibration
+        if calibration is None or tare is calibration.untouched:
             return calibration
-        tare = self._in_file(rest)
-        if tare is None:
-            tare = Rest.of(calibration.method, self._knowledge(rest), rest.date)
-        if tare is calibration.rest:
-            tare = None
-        return calibration if tare is calibration.tare else replace(calibration, tare=tare)
+        if isinstance(tare, Untouched):
+            tare = Rest.of(calibration.method, self._knowledge(tare), tare.date)
+        return replace(calibration, tare=None if tare is calibration.rest else tare)
 
     def use(self, method: str) -> None:
         """Go on with another method, from the next scan on. Raises ValueError for no such."""
@@ -183,7 +161,7 @@ class SkinReader:
                 f"{touched_cells(touched)}: take everything off the skin, or force the tare if "
                 "nothing is on it"
             )
-        self._rests.all.append(Untouched(rest_ratio, now()))
+        self._rests.append(Untouched(rest_ratio, now()))
         return _recorded(rest_ratio)
 
     def undo_tare(self) -> Tare | None:
@@ -193,9 +171,8 @@ class SkinReader:
         """
         if not self.is_tared:
             raise TareRefused("there is no tare to undo")
-        self._rests.all.pop()
-        rest = self._rests.newest
-        return None if rest is None else _recorded(rest.ratio)
+        self._rests.pop()
+        return None if self.rest is None else _recorded(self.rest.ratio)
 
     # -------------------------------------------------------------------------------- scans
 
@@ -211,53 +188,43 @@ class SkinReader:
     def read(self, scan: Scan) -> ForceScan:
         """What a scan shows. Raises ValueError if it is of other cells."""
         if scan.rest_ratio is not None and scan.rest_ratio.shape == scan.codes.shape:
-            self._rests.replay(scan.rest_ratio)
-        if self._made != (self._wanted, self._rests.newest):
+            self._replay(scan.rest_ratio)
+        if self._made != (self._wanted, self.rest):
             self._make()
         found = self.estimate(scan.ratio)
         rise = self.rise(found)
+        force_n = force_n_std = np.full(rise.shape, np.nan)
+        weight, weight_std = np.maximum(rise, 0.0), found.level_std
         if self._calibration is not None and self.has_forces:
             force_n, force_n_std = self._calibration.model.predict(rise, found.level_std)
             weight, weight_std = force_n, force_n_std
-        else:
-            force_n = force_n_std = np.full(rise.shape, np.nan)
-            weight, weight_std = np.maximum(rise, 0.0), found.level_std
         contacts = self._tracker.update(scan.time_us, found.touched, weight, weight_std)
-        return ForceScan(
-            scan.codes,
-            scan.number,
-            scan.time_us,
-            scan.host_time_s,
-            scan.missed,
-            rest_ratio=scan.rest_ratio,
-            force_n=force_n,
-            force_n_std=force_n_std,
-            contacts=contacts,
-            estimate=found,
-        )
+        seen = {"force_n": force_n, "force_n_std": force_n_std}
+        return ForceScan(**(vars(scan) | seen | {"contacts": contacts, "estimate": found}))
+
+    def _replay(self, ratio: Float) -> None:
+        """Take a recorded tare, when the first reader comes to it."""
+        with self._lock:
+            if not any(ratio is each for each in self._replayed):
+                self._replayed.append(ratio)
+                self._rests.append(Untouched(ratio, now()))
+
+    def _begin(self) -> None:
+        """Begin with no contact, and as if no scan had come before."""
+        self._tracker = ContactTracker()
+        self._make()
 
     def _make(self) -> None:
-        """Begin anew with the method and the rest that are in force."""
-        self._made = self._wanted, self._rests.newest
-        method, rest = self._made
+        """Estimate anew with the method and the rest that are in force."""
+        method, rest = self._made = self._wanted, self.rest
         self._estimator = make_estimator(method, self._knowledge(rest))
-        in_file = self._in_file(rest) if self.has_forces else None
         self._rest_level: Float | None = None
-        if in_file is not None:
-            self._rest_level = in_file.level
+        if isinstance(rest, Rest) and self.has_forces:
+            self._rest_level = rest.level
         elif rest is not None:
             self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
 
-    def _in_file(self, rest: Untouched | None) -> Rest | None:
-        """The rest or tare of the calibration that has these readings, if one has."""
-        known = self._calibration
-        if known is None or rest is None:
-            return None
-        if known.tare is not None and rest.ratio is known.tare.ratio:
-            return known.tare
-        return known.rest if rest.ratio is known.rest.ratio else None
-
-    def _knowledge(self, rest: Untouched | None) -> SkinKnowledge:
+    def _knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
         wires = NO_WIRES if self._calibration is None else self._calibration.nominal_wire_ohm
         return SkinKnowledge.of(self.board, None if rest is None else rest.ratio, wires)
 
@@ -276,8 +243,7 @@ class CalibratedSkin(Closing):
         board = device.info
         calibration.check(board.unit_id, board.rows, board.columns, force=force)
         self._reader = SkinReader(board, calibration)  # even forced, it must have the same cells
-        self._newest = self._reader.another()
-        self._newest_lock = threading.Lock()
+        self._lock = threading.Lock()
 
     @property
     def name(self) -> str:
@@ -312,8 +278,8 @@ class CalibratedSkin(Closing):
     def latest(self, timeout_s: float | None = None) -> ForceScan:
         """The newest scan, with its forces."""
         scan = self.device.latest(timeout_s)
-        with self._newest_lock:
-            return self._newest.read(scan)
+        with self._lock:
+            return self._reader.read(scan)
 
     def tare(self, seconds: float = TARE_S, *, force: bool = False) -> Tare:
         """Take the mean of the coming scans, of so many seconds, for the skin's rest.

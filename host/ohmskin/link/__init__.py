@@ -5,7 +5,7 @@
 
 Takes a port (`serial_port`, or any `Link`), gives `Scan`, `Hello` and other messages. `protocol`
 is the only source of the link's numbers: it reads ``protocol/frames.toml``. `codes` makes ratios of
-ADC codes. `timing` says when readings were taken; `clock` puts boards on the host's clock.
+ADC codes. `clock` says when readings were taken, and puts boards on the host's clock.
 
 May import: `ohmskin.errors`, `files`, `arrays`. `framing` and `messages` never import ``serial``.
 """

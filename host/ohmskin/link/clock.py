@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a board's clock to the host's, learned from when its scans arrived.
+"""When scans were taken: by the board's clock, and by the host's, learned from their arrival.
+
+A board takes one reading a slot, cell after cell, column by column; its `hello` says how long a
+slot is. The slots after the last reading, up to the start of the next scan, are idle.
 
 Symbols
 
@@ -34,7 +37,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.link.messages import Scan
+from ohmskin.link import protocol
+from ohmskin.link.framing import MAX_BLOCK, cobs_encode
+from ohmskin.link.messages import Hello, Scan
 
 # Board time of the points that a line is fitted to [s]. A ceramic resonator that warms drifts by up
 # to 10 ppm a second, which bends the line by 1 ms in this time.
@@ -52,8 +57,61 @@ _SLEW_S: Final = 1.0
 # The jitter is this percentile of the delays of so many scans.
 _JITTER_PERCENT: Final = 95
 _JITTER_SCANS: Final = 2048
+# A byte takes ten bits on a line of 8N1: a start bit, eight data bits and a stop bit.
+_BITS_PER_BYTE: Final = 10
+# The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
+_UNKNOWN_CRC: Final = b"\x01\x01"
+# The last conversion and the pass of the main loop that packs its cell [s]: 0.1 ms fits the built
+# firmware in the simulator (tests/link/test_timing.py).
+_FIRMWARE_S: Final = 0.1e-3
 
 _Point = tuple[float, float]
+
+
+def slot_s(board: Hello) -> float:
+    """Time from one reading of a scan to the next [s]."""
+    return board.slot_cycles / board.clock_hz
+
+
+def scan_s(board: Hello) -> float:
+    """Time from a scan's first reading to its end [s]; idle slots come after that."""
+    return board.rows * board.columns * board.readings_per_cell * slot_s(board)
+
+
+def reading_offsets_s(board: Hello) -> Float:
+    """Time of each reading since the first of its scan [s], shape (rows, columns, readings)."""
+    shape = (board.columns, board.rows, board.readings_per_cell)
+    order = np.arange(np.prod(shape), dtype=np.float64).reshape(shape)
+    return np.asarray(slot_s(board) * order.transpose(1, 0, 2))
+
+
+def line_delay_s(scan: Scan, board: Hello) -> float:
+    """Time from a scan's end to its last byte at the end of a serial line [s], without USB.
+
+    The board sends a COBS block when it knows the block's last byte, because the length comes
+    first. Up to 254 bytes (5 ms at 500 kbaud) wait for the next zero in the codes, so what a skin
+    shows moves the arrival of its scans. The delay is the maximum over all blocks of (time from the
+    scan's end until the block is known + time that the line takes from this block on). It leaves
+    out the up to 10 ms for which frames wait where scans come faster than the line carries them.
+    """
+    if board.board == "emulated":
+        # An emulated board sends a whole scan at the end of its period.
+        return 1 / board.rate_hz - scan_s(board)
+    kind = protocol.FRAMES["scan"]
+    # With numbers of any scan, because zeros among them end blocks that are early anyway.
+    fields = {"scan": 1, "time_us": 1, "dropped": 0, "rx_errors": 0}
+    header = bytes([kind.id, 1]) + kind.pack(**fields, rows=scan.rows, columns=scan.columns)
+    codes = protocol.pack_codes(scan.codes)
+    wire = cobs_encode(header + codes + _UNKNOWN_CRC)
+    byte_s = _BITS_PER_BYTE / board.baud
+    known_byte_s = scan_s(board) / len(codes)
+    delay_s, at, unknown = 0.0, 0, len(header) + len(codes)
+    while at < len(wire):
+        unknown -= wire[at] - (wire[at] == MAX_BLOCK)  # no zero stands for the end of a full block
+        line_s = (len(wire) + 1 - at) * byte_s
+        delay_s = max(delay_s, line_s - max(unknown, 0) * known_byte_s)
+        at += wire[at]
+    return delay_s + _FIRMWARE_S
 
 
 class _Line(NamedTuple):
@@ -104,7 +162,8 @@ class BoardClock:
         self._slew_s, self._slew_from_s = 0.0, 0.0
         self._late_since_s: float | None = None
         self._lates_s: deque[float] = deque(maxlen=_JITTER_SCANS)
-        self._jitter_s = math.nan
+        self.jitter_s = math.nan
+        """95 % of the last 2048 scans came at most this much after h [s]; at first NaN."""
 
     def add(self, time_us: float, host_time_s: float) -> None:
         """Learn that something at `time_us` of the board's clock was known here at `host_time_s`.
@@ -129,7 +188,7 @@ class BoardClock:
         if ends_block or late_s < 0:
             self._learn(u_s)
         if ends_block:
-            self._jitter_s = float(np.percentile(self._lates_s, _JITTER_PERCENT))
+            self.jitter_s = float(np.percentile(self._lates_s, _JITTER_PERCENT))
 
     def host_s(self, time_us: float) -> float:
         """Host time at which the board's clock showed `time_us`, on `time.monotonic()` [s].
@@ -141,11 +200,6 @@ class BoardClock:
         u_s = 1e-6 * time_us
         left = 1 - max(u_s - self._slew_from_s, 0.0) / _SLEW_S
         return self._line.at(u_s) + self._slew_s * max(left, 0.0)
-
-    @property
-    def jitter_s(self) -> float:
-        """95 % of the last 2048 scans came at most this much after h [s]; at first NaN."""
-        return self._jitter_s
 
     def _restart(self, u_s: float, t_s: float) -> None:
         rate = self._line.rate if self._line else 1.0  # a restart does not change the resonator

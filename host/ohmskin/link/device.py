@@ -2,52 +2,27 @@
 """What gives scans, as programs see it: a board, or a recording that is played."""
 
 import threading
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from dataclasses import replace
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.errors import DeviceLost
+from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
 from ohmskin.link import protocol
-from ohmskin.link.feed import ScanFeed
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-from ohmskin.link.session import COMMAND_TRIES, configuration
 
 # A device that should scan and is silent for so long counts as lost [s].
 SILENCE_TIMEOUT_S = 5.0
-
-
-class Source(Protocol):
-    """What a `Device` is made of: a board's `Session`, or a recording.
-
-    feed: its scans. report: of the last self-test. want_scans: it is to scan. commands: held for
-    as long as one command, or a few that belong together, take.
-    """
-
-    feed: ScanFeed
-    commands: threading.RLock
-    report: SelfTestReport | None
-    want_scans: bool
-
-    @property
-    def hello(self) -> Hello:
-        """What it has last said of itself."""
-
-    @property
-    def stats(self) -> BoardStats:
-        """Counts since the connection was made, as a copy."""
-
-    def command(self, name: str, **values: protocol.Value) -> None:
-        """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
-
-    def refresh(self) -> Hello:
-        """Ask for `hello` anew."""
-
-    def close(self) -> None:
-        """Give the port or file back. May be called again."""
+# Scans that are kept for an iterator that is slower than the board: 11 s at 90 Hz.
+QUEUE_SCANS = 1024
+# Times that a command is sent before the board counts as lost.
+COMMAND_TRIES = 3
 
 
 class Device(Closing):
@@ -58,44 +33,64 @@ class Device(Closing):
     several threads. ``with`` closes a device, and so does `close`.
     """
 
-    def __init__(self, source: Source, *, start: bool = True) -> None:
-        self._source = source
-        self._feed = source.feed
+    # `Session` and `Replay` say how commands are done, and have the one thread that publishes
+    # scans. All other threads wait on `_changed`.
+
+    def __init__(self, name: str, stats: BoardStats) -> None:
+        self.name = name
+        """The port's name."""
+        self._stats = stats
+        self._changed = threading.Condition()
+        self._hello: Hello | None = None
+        self._report: SelfTestReport | None = None  # of the last self-test
+        self._failure: OhmskinError | None = None  # why no more scans come
+        self._newest: Scan | None = None  # until `latest` gives it
+        # By id, and weak: an iterator that is dropped unused takes its queue along.
+        self._queues: WeakValueDictionary[int, deque[Scan]] = WeakValueDictionary()
+        self._asked = False  # somebody has begun to read
+        self._commands = threading.RLock()  # held while commands that belong together are done
+        self._want_scans = False
         self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
-        if start:
-            try:
-                self.start()
-            except BaseException:
-                self.close()
-                raise
 
     # ------------------------------------------------------------------------------- reading
 
     @property
     def info(self) -> Hello:
         """What the board has last said of itself."""
-        return self._source.hello
+        assert self._hello is not None
+        return self._hello
 
     @property
     def stats(self) -> BoardStats:
         """Counts since the connection was made, as a copy."""
-        return self._source.stats
-
-    @property
-    def name(self) -> str:
-        """The port's name."""
-        return self._feed.name
+        with self._changed:
+            return replace(self._stats, line=replace(self._stats.line))
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan from now on; ``missed`` of each counts what was lost before it.
 
-        An iterator that falls behind by more than `feed.QUEUE_SCANS` loses the oldest scans, which
-        are counted too. It ends with the recording at a ``replay://`` port.
+        An iterator that falls behind by more than `QUEUE_SCANS` loses the oldest scans, which are
+        counted too. It ends with the recording at a ``replay://`` port.
 
         :raises DeviceLost: the board went away, or said nothing for `SILENCE_TIMEOUT_S`.
         """
         self.start()
-        return self._feed.scans(self._silence_s)
+        queue: deque[Scan] = deque()
+        with self._changed:
+            self._queues[id(queue)] = queue
+            self._asked = True
+            self._changed.notify_all()
+        return self._taken(queue)
+
+    def _taken(self, queue: deque[Scan]) -> Iterator[Scan]:
+        while True:
+            with self._changed:
+                try:
+                    self._wait_for_scan(lambda: bool(queue))
+                except RecordingEnded:
+                    return
+                scan = queue.popleft()
+            yield scan
 
     def latest(self, timeout_s: float | None = None) -> Scan:
         """The newest scan. Each is given once: waits for the next if this one was given already.
@@ -105,7 +100,21 @@ class Device(Closing):
         :raises DeviceLost: the board went away, or no scan came in time.
         """
         self.start()
-        return self._feed.latest(self._silence_s() if timeout_s is None else timeout_s)
+        with self._changed:
+            self._asked = True
+            self._changed.notify_all()
+            self._wait_for_scan(lambda: self._newest is not None, timeout_s)
+            scan, self._newest = self._newest, None
+        assert scan is not None
+        return scan
+
+    def _wait_for_scan(self, ready: Callable[[], bool], limit_s: float | None = None) -> None:
+        limit_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz if limit_s is None else limit_s
+        if not self._wait(ready, limit_s):
+            raise DeviceLost(
+                f"{self.name} has said nothing for {limit_s:.1f} s: unplug and plug it"
+            )
+        self._changed.notify_all()  # a replay may go on
 
     def mean_ratio(self, seconds: float) -> Float:
         """Mean readings of the coming scans, shape (R, C, 4): of so many seconds, at least one.
@@ -125,32 +134,29 @@ class Device(Closing):
             raise DeviceLost(f"{self.name} gives no more scans")
         return np.asarray(np.mean(ratios, axis=0))
 
-    def _silence_s(self) -> float:
-        return SILENCE_TIMEOUT_S + 2 / self.info.rate_hz
-
     # ------------------------------------------------------------------------------ commands
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already."""
-        source = self._source
-        with source.commands:
-            if source.want_scans:
+        with self._commands:
+            if self._want_scans:
                 return
             for _ in range(COMMAND_TRIES):
                 self._restore()
-                self._feed.forget_newest()
-                source.command("start")
+                with self._changed:
+                    self._newest = None  # it is of another configuration
+                self._command("start")
                 # The hello of a reset that came in between was read before this ack.
                 if self._is_as_wanted():
                     break
-                source.command("stop")
-            source.want_scans = True
+                self._command("stop")
+            self._want_scans = True
 
     def stop(self) -> None:
         """Stop scanning, after a whole scan."""
-        with self._source.commands:
-            self._source.want_scans = False
-            self._source.command("stop")
+        with self._commands:
+            self._want_scans = False
+            self._command("stop")
 
     def configure(
         self,
@@ -181,54 +187,52 @@ class Device(Closing):
         with self._paused():
             wanted = configuration(self.info)
             wanted.update({name: value for name, value in given.items() if value is not None})
-            self._source.command("configure", **wanted)
+            self._command("configure", **wanted)
             self._wanted = wanted
-            self._source.refresh()
+            self._refresh()
             self._restore()
             return self.info
 
     def set_unit_id(self, unit_id: int) -> None:
         """Name this skin; `save` makes the name last."""
-        with self._source.commands:
-            self._source.command("set_unit_id", unit_id=unit_id)
-            self._source.refresh()
+        with self._commands:
+            self._command("set_unit_id", unit_id=unit_id)
+            self._refresh()
 
     def save(self) -> None:
         """Keep configuration and unit id in the board's EEPROM.
 
         :raises CommandRefused: the EEPROM is worn out.
         """
-        self._source.command("save")
+        self._command("save")
 
     def load_defaults(self) -> Hello:
         """Return to the built-in configuration; the EEPROM keeps what it holds until `save`."""
         with self._paused():
-            self._source.command("load_defaults")
+            self._command("load_defaults")
             self._wanted = None
-            return self._source.refresh()
+            return self._refresh()
 
     def self_test(self) -> SelfTestReport:
         """Read both sense nodes with each drive at all multiplexer inputs, and judge them."""
-        source = self._source
         with self._paused():
-            source.report = None
-            source.command("self_test")
-            if source.report is None:
+            self._report = None
+            self._command("self_test")
+            if self._report is None:
                 raise DeviceLost(f"{self.name}: the report of the self-test was lost: try again")
-            return source.report
+            return self._report
 
     @contextmanager
     def _paused(self) -> Iterator[None]:
         """Hold the scan for commands that are refused meanwhile, and go on whatever they did."""
-        source = self._source
-        with source.commands:
-            was_scanning = source.want_scans
+        with self._commands:
+            was_scanning = self._want_scans
             if was_scanning:
                 self.stop()
             try:
                 yield
             finally:
-                if was_scanning and self._feed.failure is None:
+                if was_scanning and self._failure is None:
                     self.start()
 
     def _is_as_wanted(self) -> bool:
@@ -239,11 +243,62 @@ class Device(Closing):
         for _ in range(COMMAND_TRIES):
             if self._is_as_wanted() or self._wanted is None:
                 return
-            self._source.command("configure", **self._wanted)
-            self._source.refresh()
+            self._command("configure", **self._wanted)
+            self._refresh()
 
-    # ------------------------------------------------------------------------------- closing
+    @abstractmethod
+    def _command(self, name: str, **values: protocol.Value) -> None:
+        """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
+
+    def _refresh(self) -> Hello:
+        """Ask for `hello`, which comes before the answer."""
+        self._command("get_hello")
+        return self.info
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
-        self._source.close()
+        with self._changed:
+            self._newest = None
+            if self._failure is None or isinstance(self._failure, RecordingEnded):
+                self._fail(DeviceLost(f"{self.name} was closed"))
+
+    # ----------------------------------------------------------------------- for a board's thread
+
+    def _publish(self, scan: Scan) -> None:
+        """Give a scan to all who read; what a slow iterator loses is missed before its next."""
+        with self._changed:
+            self._newest = scan
+            for queue in self._queues.values():
+                queue.append(scan)
+                if len(queue) > QUEUE_SCANS:
+                    lost = 1 + queue.popleft().missed
+                    queue[0] = replace(queue[0], missed=queue[0].missed + lost)
+                    self._stats.overflowed += 1
+            self._changed.notify_all()
+
+    def _fail(self, error: OhmskinError) -> None:
+        """Say why no more scans come. Whoever waits, now or later, gets this error."""
+        with self._changed:
+            self._failure = error
+            self._changed.notify_all()
+
+    def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:
+        """Wait, holding `_changed`, for `ready()`: whether it is so within `limit_s`.
+
+        :raises OhmskinError: the device has failed meanwhile.
+        """
+        self._changed.wait_for(lambda: ready() or self._failure is not None, limit_s)
+        if self._failure is not None and not ready():
+            raise self._failure
+        return ready()
+
+
+def configuration(board: Hello) -> dict[str, protocol.Value]:
+    """What `configure` would have to say for a board to scan as this one does."""
+    return {
+        "rows": board.rows,
+        "columns": board.columns,
+        "rate_mhz": board.rate_asked_mhz,
+        "settle_us": board.settle_asked_us,
+        "adc_prescaler": board.adc_prescaler,
+    }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from ohmskin.link import protocol
 
 # The longest COBS block [bytes]: its length byte and 254 others.
-_MAX_BLOCK = 0xFF
+MAX_BLOCK = 0xFF
 _HEADER_SIZE = 2
 _CRC = struct.Struct("<H")
 _LARGEST_CONTENT = (
@@ -21,7 +21,7 @@ _LARGEST_CONTENT = (
     + _CRC.size
 )
 # The longest stretch between two delimiters that can be a frame [bytes].
-LARGEST_FRAME = _LARGEST_CONTENT + 1 + _LARGEST_CONTENT // (_MAX_BLOCK - 1)
+LARGEST_FRAME = _LARGEST_CONTENT + 1 + _LARGEST_CONTENT // (MAX_BLOCK - 1)
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def cobs_encode(content: bytes) -> bytes:
     out = bytearray()
     for stretch in content.split(protocol.DELIMITER):
         *full, rest = (
-            stretch[at : at + _MAX_BLOCK - 1] for at in range(0, len(stretch) + 1, _MAX_BLOCK - 1)
+            stretch[at : at + MAX_BLOCK - 1] for at in range(0, len(stretch) + 1, MAX_BLOCK - 1)
         )
         for block in full:
-            out += bytes([_MAX_BLOCK]) + block
+            out += bytes([MAX_BLOCK]) + block
         out += bytes([len(rest) + 1]) + rest
     if full and not rest:
         out.pop()  # nothing follows a full block at the end
@@ -78,7 +78,7 @@ def cobs_decode(stuffed: bytes) -> bytes | None:
         if end > size:
             return None
         out += stuffed[at + 1 : end]
-        if block != _MAX_BLOCK and end < size:
+        if block != MAX_BLOCK and end < size:
             out.append(0)
         at = end
     return bytes(out)
@@ -118,10 +118,8 @@ class Decoder:
         return frames
 
     def _decode(self, stretch: bytes) -> RawFrame | None:
-        if self._skipping:
-            self._skipping = False  # this is its rest: it was counted when it became too long
-            return None
-        if not stretch:
+        if self._skipping or not stretch:
+            self._skipping = False  # the rest of a stretch that was counted when it became too long
             return None
         if len(stretch) > LARGEST_FRAME:
             self.stats.overlong += 1

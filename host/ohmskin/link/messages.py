@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board says, as Python objects. They are decoded from bytes, without port or thread."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -163,13 +163,9 @@ class BoardDecoder:
 
     def feed(self, chunk: bytes, host_time_s: float) -> list[Message]:
         """The messages that `chunk`, read at `host_time_s`, completes."""
-        messages: list[Message] = []
-        for frame in self._frames.feed(chunk):
-            message = self._message(frame, host_time_s)
-            if message is None:
-                self.stats.unknown += 1
-            else:
-                messages.append(message)
+        found = [self._message(frame, host_time_s) for frame in self._frames.feed(chunk)]
+        messages = [message for message in found if message is not None]
+        self.stats.unknown += len(found) - len(messages)
         return messages
 
     def _message(self, raw: RawFrame, host_time_s: float) -> Message | None:
@@ -230,7 +226,3 @@ class BoardDecoder:
         time_us = counter_us + _COUNTER_SPAN * round((expected_us - counter_us) / _COUNTER_SPAN)
         near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + _RATE_ERROR * elapsed_us
         return time_us if near else counter_us
-
-    def snapshot(self) -> BoardStats:
-        """The counts now, as a copy."""
-        return replace(self.stats, line=replace(self.stats.line))

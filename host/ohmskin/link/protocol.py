@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 _PACKAGE_DIR = Path(__file__).parents[1]
 # A wheel carries the definition in the package; a checkout has it in protocol/.
-_PLACES = (_PACKAGE_DIR / "frames.toml", _PACKAGE_DIR.parents[1] / "protocol" / "frames.toml")
+_IN_PACKAGE = _PACKAGE_DIR / "frames.toml"
+_IN_CHECKOUT = _PACKAGE_DIR.parents[1] / "protocol" / "frames.toml"
 _STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I"}  # by the names of types in frames.toml
 
 Value = int | str | tuple[str, ...] | tuple[int, ...]
@@ -63,11 +64,17 @@ class Field:
         return integers
 
     def value(self, integers: tuple[int, ...]) -> Value:
-        """The value that integers of a payload stand for."""
+        """The value that integers of a payload stand for.
+
+        A member of a newer definition is ``"unknown_<integer>"``.
+        """
         if self.enum:
-            return ENUMS[self.enum].name_of(integers[0])
+            names = {value: name for name, value in ENUMS[self.enum].values.items()}
+            return names.get(integers[0], f"unknown_{integers[0]}")
         if self.flags:
-            return ENUMS[self.flags].names_in(integers[0])
+            return tuple(
+                name for name, bit in ENUMS[self.flags].values.items() if integers[0] & bit
+            )
         return integers if self.count > 1 else integers[0]
 
 
@@ -79,26 +86,18 @@ class Enum:
     values: dict[str, int]
     docs: dict[str, str]
 
-    def name_of(self, value: int) -> str:
-        """The member's name, or ``"unknown_<value>"`` for a value of a newer definition."""
-        return next((n for n, v in self.values.items() if v == value), f"unknown_{value}")
-
-    def names_in(self, bits: int) -> tuple[str, ...]:
-        """The names of the members whose bit is set in `bits`."""
-        return tuple(n for n, v in self.values.items() if bits & v)
-
 
 class Frame:
     """A frame type: its id, direction and payload fields."""
 
-    def __init__(self, entry: Mapping[str, Any], constants: Mapping[str, int]) -> None:
+    def __init__(self, entry: Mapping[str, Any]) -> None:
         self.name: str = entry["name"]
         self.id: int = entry["id"]
         self.sender: str = entry["from"]
         self.doc: str = entry["doc"]
         self.tail: Mapping[str, str] | None = entry.get("tail")
         self.fields = tuple(
-            Field(**{**field, "count": constants[field["count"]] if "count" in field else 1})
+            Field(**{**field, "count": CONSTANTS[field["count"]] if "count" in field else 1})
             for field in entry["fields"]
         )
         codes = (f"{f.count if f.count > 1 else ''}{_STRUCT_CODES[f.type]}" for f in self.fields)
@@ -127,28 +126,13 @@ class Frame:
         return {f.name: f.value(tuple(islice(flat, f.count))) for f in self.fields}
 
 
-def _load() -> dict[str, Any]:
-    for place in _PLACES:
-        if place.is_file():
-            return tomllib.loads(place.read_text(encoding="utf-8"))
-    raise FileNotFoundError(f"protocol definition not found: {' or '.join(map(str, _PLACES))}")
-
-
 def crc16(octets: bytes) -> int:
     """CRC-16/IBM-3740 (polynomial 0x1021, start 0xFFFF, not reflected) of `octets`."""
     return binascii.crc_hqx(octets, _CRC_INITIAL)
 
 
-def _without_docs(node: Any) -> Any:
-    """The definition as far as it decides what bytes mean."""
-    if isinstance(node, dict):
-        return {k: _without_docs(v) for k, v in node.items() if k not in ("doc", "unit")}
-    if isinstance(node, list):
-        return [_without_docs(v) for v in node]
-    return node
-
-
-DEFINITION = _load()
+_PLACE = _IN_PACKAGE if _IN_PACKAGE.is_file() else _IN_CHECKOUT
+DEFINITION: dict[str, Any] = tomllib.loads(_PLACE.read_text(encoding="utf-8"))
 _CRC_INITIAL: int = DEFINITION["framing"]["crc_initial"]
 DELIMITER = bytes([DEFINITION["framing"]["delimiter"]])
 CONSTANTS: dict[str, int] = {k: v["value"] for k, v in DEFINITION["constants"].items()}
@@ -160,11 +144,14 @@ ENUMS: dict[str, Enum] = {
     )
     for name, e in DEFINITION["enums"].items()
 }
-FRAMES: dict[str, Frame] = {e["name"]: Frame(e, CONSTANTS) for e in DEFINITION["frames"]}
+FRAMES: dict[str, Frame] = {e["name"]: Frame(e) for e in DEFINITION["frames"]}
 FRAMES_BY_ID: dict[int, Frame] = {f.id: f for f in FRAMES.values()}
-LAYOUT_CRC = crc16(
-    json.dumps(_without_docs(DEFINITION), sort_keys=True, separators=(",", ":")).encode()
+# The definition as far as it decides what bytes mean.
+_LAYOUT = json.loads(
+    json.dumps(DEFINITION),
+    object_hook=lambda node: {k: v for k, v in node.items() if k not in ("doc", "unit")},
 )
+LAYOUT_CRC = crc16(json.dumps(_LAYOUT, sort_keys=True, separators=(",", ":")).encode())
 
 READINGS_PER_CELL = CONSTANTS["readings_per_cell"]
 ADC_BITS = CONSTANTS["adc_bits"]

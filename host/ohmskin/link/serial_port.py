@@ -132,17 +132,14 @@ def serial_ports() -> list[SerialPort]:
     return sorted(found, key=lambda port: port.path)
 
 
-def latency_timer_file(port: str, devices: Path = USB_SERIAL) -> Path:
-    """Where Linux sets the latency timer of a port; the file exists if the port has one.
+def latency_timer(port: str) -> tuple[int, str] | None:
+    """The latency timer of a USB serial bridge [ms], and the file in which Linux sets it.
 
-    A USB serial bridge holds back a few bytes until this timer ends. `port` may be a link.
+    A bridge holds back a few bytes until this timer ends. `port` may be a link. None: it has no
+    such timer, as ports of other systems.
     """
-    return devices / Path(os.path.realpath(port)).name / "latency_timer"
-
-
-def latency_ms(port: str, devices: Path = USB_SERIAL) -> int | None:
-    """The latency timer of a port [ms]; None if none can be read, as on other systems."""
+    file = USB_SERIAL / Path(os.path.realpath(port)).name / "latency_timer"
     try:
-        return int(latency_timer_file(port, devices).read_text(encoding="ascii"))
+        return int(file.read_text(encoding="ascii")), str(file)
     except (OSError, ValueError):
         return None

@@ -39,34 +39,27 @@ class ForceLineDecoder:
     def __init__(self, newtons_per_unit: float = 1.0) -> None:
         self.damaged = 0
         self._newtons_per_unit = newtons_per_unit
-        self._line = bytearray()
+        self._partial = b""
         self._skips = True  # the rest of this line: of the first one, or of one that is too long
 
     def feed(self, octets: bytes) -> list[float]:
         """The forces [N] of the lines that these bytes complete, in order."""
         forces_n: list[float] = []
-        *ends, rest = re.split(rb"[\r\n]", octets)
-        for end in ends:
-            self._keep(end)
-            if self._line.strip():
-                number = _NUMBER.fullmatch(self._line)
+        *lines, self._partial = re.split(rb"[\r\n]", self._partial + octets)
+        for line in lines:
+            if line.strip() and not self._skips:
+                number = _NUMBER.fullmatch(line) if len(line) <= self.LARGEST_LINE else None
                 force_n = self._newtons_per_unit * float(number[1]) if number else math.inf
                 if math.isfinite(force_n):
                     forces_n.append(force_n)
                 else:
                     self.damaged += 1
-            self._line.clear()
             self._skips = False
-        self._keep(rest)
+        if len(self._partial) > self.LARGEST_LINE:
+            self._partial = b""
+            self.damaged += not self._skips
+            self._skips = True
         return forces_n
-
-    def _keep(self, part: bytes) -> None:
-        if not self._skips:
-            self._line += part[: self.LARGEST_LINE + 1]
-            if len(self._line) > self.LARGEST_LINE:
-                self.damaged += 1
-                self._line.clear()
-                self._skips = True
 
 
 class ForceSensor(Closing):
@@ -91,9 +84,8 @@ class ForceSensor(Closing):
         self._octets = 0  # since the last force
         self._changed = threading.Condition()
         self._waiting: deque[ForceSample] = deque()
-        self._failure: DeviceLost | None = None
         self._last_s = time.monotonic()
-        self._closing = False
+        self._closing = self._is_gone = False
         self._thread = threading.Thread(target=self._read, name=f"read {path}", daemon=True)
         self._thread.start()
 
@@ -125,8 +117,8 @@ class ForceSensor(Closing):
                 self._changed.wait(0.1)
 
     def _check(self) -> None:
-        if self._failure is not None:
-            raise self._failure
+        if self._is_gone:
+            raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_S:
             return
         if not self._octets:
@@ -148,11 +140,7 @@ class ForceSensor(Closing):
                 if octets:
                     self._keep(octets, time.monotonic())
         except DeviceLost:
-            with self._changed:
-                self._failure = DeviceLost(
-                    f"{self.path} is gone: is the force sensor still plugged in?"
-                )
-                self._changed.notify_all()
+            self._is_gone = True
 
     def _keep(self, octets: bytes, now_s: float) -> None:
         with self._changed:

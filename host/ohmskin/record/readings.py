@@ -35,7 +35,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, READINGS_PER_CELL
 from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.files import whole_file
+from ohmskin.files import naming, whole_file
 
 MAX_ARRAY_BYTES: Final = 200_000_000
 # The estimators' matrices grow with the square: 4096 cells make 134 MB.
@@ -90,8 +90,8 @@ class Readings:
     def one_skin_per_frame(self) -> bool:
         """Whether rest or wires are given per frame: then frames are not one skin in time."""
         wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
-        per_frame_rest = self.rest_ratio is not None and self.rest_ratio.ndim == 4
-        return per_frame_rest or any(wire is not None and wire.ndim == 1 for wire in wires)
+        given = [(self.rest_ratio, 3), *((wire_ohm, 0) for wire_ohm in wires)]
+        return any(array is not None and array.ndim > ndim for array, ndim in given)
 
     def knowledge(self, frame: int) -> SkinKnowledge:
         """What an estimator is told before it reads `frame`."""
@@ -123,27 +123,23 @@ def load_readings(path: str | os.PathLike[str]) -> Readings:
     """
     arrays: dict[str, Any] = {}
     name = "the archive"
-    try:
-        with zipfile.ZipFile(path) as archive:
-            present = {info.filename: info for info in archive.infolist()}
-            for name in Readings.__dataclass_fields__:
-                info = present.get(f"{name}.npy")
-                if info is not None:
-                    arrays[name] = _read_array(archive, info)
-    except _UNREADABLE as error:
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        if isinstance(error, OSError) and error.strerror:
-            reason = error.strerror
-        raise ValueError(f"{os.fspath(path)}: {name} cannot be read: {reason}") from error
-    if "ratio" not in arrays:
-        raise ValueError(f"{os.fspath(path)}: no array 'ratio'")
-    try:
+    with naming(path):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                present = {info.filename: info for info in archive.infolist()}
+                for name in Readings.__dataclass_fields__:
+                    info = present.get(f"{name}.npy")
+                    if info is not None:
+                        arrays[name] = _read_array(archive, info)
+        except _UNREADABLE as error:
+            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            raise ValueError(f"{name} cannot be read: {reason}") from error
+        if "ratio" not in arrays:
+            raise ValueError("no array 'ratio'")
         for name in ("ref_top_ohm", "ref_bottom_ohm", "adc_bits"):
             if name in arrays:
                 arrays[name] = _scalar(name, arrays[name])
         return Readings(**arrays)
-    except ValueError as error:
-        raise ValueError(f"{os.fspath(path)}: {error}") from error
 
 
 def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Float:
@@ -204,7 +200,5 @@ def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]]
     for name, array in arrays.items():
         if array.dtype.hasobject:
             raise ValueError(f"{name} holds Python objects, which no .npz of ours may")
-    with whole_file(path) as file, zipfile.ZipFile(file, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+    with whole_file(path) as file:
+        np.savez(file, **dict[str, Any](arrays))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes recordings (`ohmskin.record.recording` says what is in them).
 
-What is written reaches the file at least every `FLUSH_EVERY_S`, as whole chunks, or not at all: a
-file of a recorder that was killed, or whose disk was full, can be read up to its last whole chunk.
+What is added reaches the file within `FLUSH_EVERY_S`, as a chunk. The file of a recorder that was
+killed, or whose disk was full, can be read up to its last whole chunk.
 """
 
 import json
@@ -11,14 +11,11 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
-from io import RawIOBase
 from pathlib import Path
-from typing import IO, Any, Final, cast
+from typing import Final
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
+from mcap.writer import Writer
 
 from ohmskin.arrays import Float
 from ohmskin.errors import RecordingError
@@ -27,11 +24,11 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.force_sensor import ForceSensor
 from ohmskin.record.recording import (
+    KINDS,
     LARGEST_RECORD,
     SCHEMAS,
     TOPIC,
     ForceSample,
-    Mark,
     Recorded,
     Tare,
 )
@@ -43,17 +40,14 @@ FLUSH_EVERY_S: Final = 0.5
 class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed or the disk is full.
 
-    board: what the board says of itself, which comes first. file: for tests, written to instead of
-    a new file `path`. scans, missed, forces: counts of what was added. board, tare, force: the
-    newest that was added.
+    board: what the board says of itself, which comes first. scans, missed, forces: counts of what
+    was added. board, tare, force: the newest that was added.
 
     :raises RecordingError: the file is there already, or cannot be written. From then on nothing
         more is written, and what was written before can be read.
     """
 
-    def __init__(
-        self, path: str | os.PathLike[str], board: Hello, *, file: RawIOBase | None = None
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], board: Hello) -> None:
         self.path = Path(path)
         self.scans = self.missed = self.forces = 0
         self.board = board
@@ -63,25 +57,23 @@ class Recorder(Closing):
         self._closed = threading.Event()
         self._lock = threading.Lock()
         try:
-            self._tail = _Tail(file or cast(RawIOBase, self.path.open("xb", buffering=0)))
+            self._file = self.path.open("xb")
         except FileExistsError:
             raise RecordingError(f"{path} is there already: choose another name") from None
         except OSError as exc:
             raise RecordingError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
-        self._writer = Writer(
-            cast(IO[Any], self._tail),
-            chunk_size=LARGEST_RECORD // 4,
-            compression=CompressionType.ZSTD,
-        )
-        self._writer.start(profile="", library="ohmskin")
-        self._channels = {name: self._channel(name) for name in SCHEMAS}
+        self._writer = Writer(self._file, chunk_size=LARGEST_RECORD // 4)
         self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
         try:
+            with self._writing():
+                self._writer.start(profile="", library="ohmskin")
+                self._channels = {name: self._channel(name) for name in SCHEMAS}
             self.add(board)
             self._flush()
         except BaseException:
-            self._tail.close()
+            with suppress(OSError):
+                self._file.close()
             raise
         self._flusher.start()
 
@@ -104,39 +96,31 @@ class Recorder(Closing):
 
         :raises RecordingError: the file can no longer be written.
         """
-        match message:
-            case Hello():
-                self._write("hello", {"host_time_s": time.monotonic(), **asdict(message)})
-                self.board = message
-            case Scan(codes=codes):
-                content = {
-                    "number": message.number,
-                    "time_us": message.time_us,
-                    "host_time_s": message.host_time_s,
-                    "missed": message.missed,
-                    **_cells("codes", codes),
-                }
-                self._write("scan", content, sequence=message.number & 0xFFFFFFFF)
-                self.scans += 1
-                self.missed += message.missed
-            case Tare(rest_ratio, host_time_s):
-                content = {"host_time_s": host_time_s, **_cells("rest_ratio", rest_ratio)}
-                self._write("tare", content)
-                self.tare = message
-            case Mark():
-                self._write("mark", asdict(message))
-            case ForceSample():
-                self._write("force", asdict(message))
-                self.force = message
-                self.forces += 1
-
-    def _write(self, name: str, content: dict[str, Any], sequence: int = 0) -> None:
+        name = next(name for name, kind in KINDS.items() if isinstance(message, kind))
+        content = {"host_time_s": time.monotonic(), **vars(message)}
+        for array in {"codes", "rest_ratio"} & SCHEMAS[name].keys():
+            readings = content[array]
+            rows, columns, _ = readings.shape
+            content |= {"rows": rows, "columns": columns, array: readings.reshape(-1).tolist()}
+        number = content.get("number", 0) & 0xFFFFFFFF
+        content = {key: content[key] for key in SCHEMAS[name]}
         octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
         log_ns = self._epoch_ns + round(content["host_time_s"] * 1e9)
         with self._writing():
             if self._closed.is_set():
                 raise RecordingError(f"{self.path}: the recording is closed")
-            self._writer.add_message(self._channels[name], log_ns, octets, log_ns, sequence)
+            self._writer.add_message(self._channels[name], log_ns, octets, log_ns, number)
+        match message:
+            case Hello():
+                self.board = message
+            case Scan():
+                self.scans += 1
+                self.missed += message.missed
+            case Tare():
+                self.tare = message
+            case ForceSample():
+                self.force = message
+                self.forces += 1
 
     def _flush(self) -> None:
         with self._writing():
@@ -176,11 +160,12 @@ class Recorder(Closing):
         self._flusher.join()
         try:
             with self._writing():
-                self._writer.flush()  # type: ignore[no-untyped-call]
                 self._writer.finish()  # type: ignore[no-untyped-call]
-                self._tail.flush(sync=True)
+                self._file.flush()
+                os.fsync(self._file.fileno())
         finally:
-            self._tail.close()
+            with suppress(OSError):  # what did not fit still does not
+                self._file.close()
 
 
 def record(
@@ -213,10 +198,12 @@ def record(
                 recorder.add(skin.info)
             recorder.add(scan)
             if tare_s and elapsed_s <= tare_s:
+                if untouched and untouched[0].shape != scan.ratio.shape:
+                    untouched.clear()  # somebody has configured the board
                 untouched.append(scan.ratio)
             elif untouched:
-                recorder.add(_tare(untouched))
-                untouched = []
+                recorder.add(Tare(np.mean(untouched, axis=0), time.monotonic()))
+                untouched.clear()
             for sample in sensor.take() if sensor is not None else ():
                 recorder.add(sample)
             if beside is not None:
@@ -225,51 +212,4 @@ def record(
                 return
     finally:
         if untouched:
-            recorder.add(_tare(untouched))
-
-
-def _tare(untouched: list[Float]) -> Tare:
-    newest = untouched[-1].shape  # somebody may have configured the board meanwhile
-    of_size = [ratio for ratio in untouched if ratio.shape == newest]
-    return Tare(np.mean(of_size, axis=0), time.monotonic())
-
-
-def _cells(name: str, readings: NDArray[Any]) -> dict[str, Any]:
-    """Codes or ratios (R, C, 4) as JSON has them."""
-    rows, columns, _ = readings.shape
-    return {"rows": rows, "columns": columns, name: readings.reshape(-1).tolist()}
-
-
-class _Tail:
-    """The file as `Writer` sees it: grows by whole flushes, or by nothing at all."""
-
-    def __init__(self, file: RawIOBase) -> None:
-        self._file = file
-        self._written = 0
-        self._waiting = bytearray()
-
-    def tell(self) -> int:
-        return self._written + len(self._waiting)
-
-    def write(self, octets: bytes) -> int:
-        self._waiting += octets
-        return len(octets)
-
-    def flush(self, *, sync: bool = False) -> None:
-        view = memoryview(bytes(self._waiting))
-        try:
-            at = 0
-            while at < len(view):
-                at += self._file.write(view[at:]) or 0
-            if sync:
-                with suppress(ValueError):  # a file of the tests
-                    os.fsync(self._file.fileno())
-        except OSError:
-            with suppress(OSError):
-                self._file.truncate(self._written)
-            raise
-        self._written += len(view)
-        self._waiting.clear()
-
-    def close(self) -> None:
-        self._file.close()
+            recorder.add(Tare(np.mean(untouched, axis=0), time.monotonic()))

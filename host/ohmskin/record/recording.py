@@ -18,7 +18,8 @@ other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were a
 ``host_time_s`` is that of `Scan`; log times are the same instants since 1970.
 
 `recorder` writes them; `messages` reads one by one, `load_recording` all at once. A file
-that was cut off anywhere is read up to its last whole chunk.
+that was cut off anywhere is read up to its last whole chunk. `export` writes readings files (.npz),
+for `ohmskin estimate`, and tables (.csv).
 """
 
 import json
@@ -26,8 +27,10 @@ import math
 import os
 import struct
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field, fields
-from typing import IO, Any, Final, cast
+from dataclasses import dataclass, fields, replace
+from operator import attrgetter
+from pathlib import Path
+from typing import IO, Any, Final, TypeVar, cast
 
 import lz4.frame
 import numpy as np
@@ -36,60 +39,30 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, Footer, McapRecord
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
+from ohmskin.files import save_table
+from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
 # A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
 LARGEST_RECORD: Final = 16_000_000
-_LARGEST_CELLS: Final = 4096
 _LARGEST_CODE: Final = 0xFFFF
 _LARGEST_COUNTER: Final = (1 << 63) - 1
-
-_NUMBER: Final = {"type": "number"}
-_INTEGER: Final = {"type": "integer"}
-_TEXT: Final = {"type": "string"}
-_HOST_TIME: Final = {"type": "number", "description": "host's monotonic clock [s]"}
-_SIZE: Final = {"rows": _INTEGER, "columns": _INTEGER}
-SCHEMAS: Final[dict[str, dict[str, Any]]] = {
-    "hello": {
-        "host_time_s": _HOST_TIME,
-        **{
-            f.name: {"str": _TEXT, "int": _INTEGER}.get(
-                str(f.type), {"type": "array", "items": _TEXT}
-            )
-            for f in fields(Hello)
-        },
-    },
-    "scan": {
-        "number": {"type": "integer", "description": "of the scan since the board was started"},
-        "time_us": {"type": "integer", "description": "board time at the scan's start [us]"},
-        "host_time_s": _HOST_TIME,
-        "missed": {"type": "integer", "description": "scans before this one that never came"},
-        **_SIZE,
-        "codes": {
-            "type": "array",
-            "items": _INTEGER,
-            "description": "ADC codes: row by row, in it column by column, A B C D of each cell",
-        },
-    },
-    "tare": {
-        "host_time_s": _HOST_TIME,
-        **_SIZE,
-        "rest_ratio": {"type": "array", "items": _NUMBER, "description": "V/Vdd, order of codes"},
-    },
-    "mark": {"host_time_s": _HOST_TIME, "text": _TEXT},
-    "force": {
-        "host_time_s": _HOST_TIME,
-        "force_n": {"type": "number", "description": "reference force [N]"},
-        "row": {"type": "integer", "description": "of the cell it acts on; -1: not known"},
-        "column": {"type": "integer", "description": "of the cell it acts on; -1: not known"},
-        "source": {"type": "string", "description": "what measured it"},
-    },
-}
-TOPIC: Final = "/skin/"
+# What `export` writes.
+FORMATS: Final = (".npz", ".csv")
+# What both formats have of each scan, besides its readings.
+_OF_SCAN: Final = ("number", "time_us", "host_time_s", "missed")
+# What mcap and its packers raise for bytes that are no MCAP file.
+_DAMAGE: Final = (
+    *(CRCValidationError, McapError, struct.error, UnicodeDecodeError),
+    *(zstandard.ZstdError, RuntimeError, MemoryError),
+)
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,16 +95,61 @@ class ForceSample:
 Recorded = Hello | Scan | Tare | Mark | ForceSample
 
 
+def _is(kind: str, description: str, **more: Any) -> dict[str, Any]:
+    return {"type": kind, "description": description, **more}
+
+
+TOPIC: Final = "/skin/"
+_TEXT: Final = {"type": "string"}
+_OF_TYPE: Final[dict[object, dict[str, Any]]] = {
+    int: {"type": "integer"},
+    str: _TEXT,
+    tuple[str, ...]: {"type": "array", "items": _TEXT},
+}
+_HOST_TIME: Final = _is("number", "host's monotonic clock [s]")
+_CELL: Final = _is("integer", "of the cell it acts on; -1: not known", minimum=-1)
+_SIZE: Final = {key: {"type": "integer", "minimum": 1} for key in ("rows", "columns")}
+_ORDER: Final = "row by row, in it column by column, A B C D of each cell"
+# By what follows `TOPIC`: the properties of its messages, in the words of JSON Schema.
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+    "hello": {"host_time_s": _HOST_TIME, **{f.name: _OF_TYPE[f.type] for f in fields(Hello)}},
+    "scan": {
+        "number": _is("integer", "of the scan since the board was started"),
+        "time_us": _is("integer", "board time at the scan's start [us]"),
+        "host_time_s": _HOST_TIME,
+        "missed": _is("integer", "scans before this one that never came"),
+        **_SIZE,
+        "codes": _is("array", f"ADC codes: {_ORDER}", items={"type": "integer"}),
+    },
+    "tare": {
+        "host_time_s": _HOST_TIME,
+        **_SIZE,
+        "rest_ratio": _is("array", f"V/Vdd: {_ORDER}", items={"type": "number"}),
+    },
+    "mark": {"host_time_s": _HOST_TIME, "text": _TEXT},
+    "force": {
+        "host_time_s": _HOST_TIME,
+        "force_n": _is("number", "reference force [N]"),
+        "row": _CELL,
+        "column": _CELL,
+        "source": _is("string", "what measured it"),
+    },
+}
+KINDS: Final[dict[str, type[Recorded]]] = dict(
+    zip(SCHEMAS, (Hello, Scan, Tare, Mark, ForceSample), strict=True)
+)
+
+
 @dataclass(eq=False)
 class Recording:
     """All of a recording. `cut_off`: it was not ended properly, and its last second may be gone."""
 
-    hellos: list[Hello] = field(default_factory=list)
-    scans: list[Scan] = field(default_factory=list)
-    tares: list[Tare] = field(default_factory=list)
-    marks: list[Mark] = field(default_factory=list)
-    forces: list[ForceSample] = field(default_factory=list)
-    cut_off: bool = True
+    hellos: list[Hello]
+    scans: list[Scan]
+    tares: list[Tare]
+    marks: list[Mark]
+    forces: list[ForceSample]
+    cut_off: bool
 
 
 def load_recording(path: str | os.PathLike[str]) -> Recording:
@@ -139,22 +157,13 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
 
     :raises RecordingError: one line that names the file and what is wrong with it.
     """
-    recording = Recording()
-    for message in messages(path):
-        match message:
-            case Hello():
-                recording.hellos.append(message)
-            case Scan():
-                recording.scans.append(message)
-            case Tare():
-                recording.tares.append(message)
-            case Mark():
-                recording.marks.append(message)
-            case ForceSample():
-                recording.forces.append(message)
-            case None:
-                recording.cut_off = False
-    return recording
+    found = list(messages(path))
+
+    def of(kind: type[_T]) -> list[_T]:
+        return [message for message in found if isinstance(message, kind)]
+
+    whole = found[-1] is None
+    return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), not whole)
 
 
 def messages(path: str | os.PathLike[str]) -> Generator[Recorded | None, None, None]:
@@ -186,7 +195,7 @@ def messages(path: str | os.PathLike[str]) -> Generator[Recorded | None, None, N
             yield None
     except OSError as exc:
         raise RecordingError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
-    except (ValueError, KeyError, TypeError, RecursionError) as exc:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as exc:
         text = f"no field {exc}" if isinstance(exc, KeyError) else str(exc).partition("\n")[0]
         raise RecordingError(f"{path}: {text}") from exc
 
@@ -217,7 +226,7 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
             if first:
                 raise ValueError("the file is cut off before its first record") from None
             return
-        except (McapError, struct.error, UnicodeDecodeError) as exc:
+        except _DAMAGE as exc:
             raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
         first = False
         if not isinstance(record, Chunk):
@@ -228,13 +237,9 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
         try:
             if _unpacked_size(record) > LARGEST_RECORD:
                 raise ValueError("damaged: a chunk larger than any recorder writes")
-            inside = breakup_chunk(record, validate_crc=True)
-        except (
-            *(CRCValidationError, McapError, struct.error, UnicodeDecodeError),
-            *(zstandard.ZstdError, RuntimeError, MemoryError),
-        ) as exc:
+            yield from breakup_chunk(record, validate_crc=True)
+        except _DAMAGE as exc:
             raise ValueError(f"damaged: {exc}") from exc
-        yield from inside
 
 
 def _unpacked_size(chunk: Chunk) -> int:
@@ -252,67 +257,124 @@ def _message(name: str, octets: bytes) -> Recorded:
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
     if name == "hello":
-        return _hello(content)
-    host_time_s = _real(content, "host_time_s")
-    if name == "scan":
-        rows, columns, codes = _cells(content, "codes")
-        if any(type(code) is not int or not 0 <= code <= _LARGEST_CODE for code in codes):
-            raise ValueError("a code is out of range")
-        return Scan(
-            np.array(codes, np.uint16).reshape(rows, columns, READINGS_PER_CELL),
-            _integer(content, "number"),
-            _integer(content, "time_us"),
-            host_time_s,
-            _integer(content, "missed"),
-        )
-    if name == "tare":
-        rows, columns, ratio = _cells(content, "rest_ratio")
-        rest_ratio = np.array(ratio, np.float64).reshape(rows, columns, READINGS_PER_CELL)
-        return Tare(rest_ratio, host_time_s)
-    if name == "mark":
-        return Mark(str(content["text"]), host_time_s)
-    cell = (_integer(content, "row", least=-1), _integer(content, "column", least=-1))
-    return ForceSample(_real(content, "force_n"), host_time_s, *cell, str(content["source"]))
+        content = {"slot_cycles": 0, **content}  # older boards did not say it
+    values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
+    if name == "hello":
+        return _hello(values)
+    for array in {"codes", "rest_ratio"} & values.keys():
+        shape = values.pop("rows"), values.pop("columns"), READINGS_PER_CELL
+        values[array] = _cells(array, values[array], shape)
+    return KINDS[name](**values)
 
 
-def _hello(content: dict[str, Any]) -> Hello:
-    values: dict[str, Any] = {}
-    for each in fields(Hello):
-        if each.name == "slot_cycles" and each.name not in content:
-            # Older boards did not say it: their readings filled the scan, in slots of at most
-            # 60,000 cycles, unless a settle time was asked for.
-            readings = values["rows"] * values["columns"] * values["readings_per_cell"]
-            values[each.name] = min(values["scan_cycles"] // max(readings, 1), 60_000)
-        elif each.type == "int":
-            values[each.name] = _integer(content, each.name)
-        elif each.type == "str":
-            values[each.name] = str(content[each.name])
-        else:
-            values[each.name] = tuple(map(str, content[each.name]))
-    if not values["clock_hz"] or not values["scan_cycles"]:
+def _hello(values: dict[str, Any]) -> Hello:
+    del values["host_time_s"]
+    values["reset_cause"] = tuple(map(str, values["reset_cause"]))
+    hello = Hello(**values)
+    if not hello.clock_hz or not hello.scan_cycles:
         raise ValueError("hello: a board without a clock")
-    return Hello(**values)
+    if hello.slot_cycles:
+        return hello
+    # Where no settle time was asked for, readings fill a scan, in slots of at most 60,000 cycles.
+    readings = max(hello.rows * hello.columns * hello.readings_per_cell, 1)
+    return replace(hello, slot_cycles=min(hello.scan_cycles // readings, 60_000))
 
 
-def _cells(content: dict[str, Any], name: str) -> tuple[int, int, list[Any]]:
-    rows, columns = _integer(content, "rows", least=1), _integer(content, "columns", least=1)
-    values = content[name]
-    if rows * columns > _LARGEST_CELLS or not isinstance(values, list):
+def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
+    rows, columns, _ = shape
+    if rows * columns > MAX_CELLS:
         raise ValueError(f"{name}: no {rows}x{columns} cells")
-    if len(values) != rows * columns * READINGS_PER_CELL:
-        raise ValueError(f"{len(values)} {name} do not make {rows}x{columns} cells")
-    return rows, columns, values
+    readings = np.array(values) if name == "codes" else np.array(values, np.float64)
+    if readings.size != math.prod(shape):
+        raise ValueError(f"{readings.size} {name} do not make {rows}x{columns} cells")
+    if name == "codes":
+        if readings.dtype.kind != "i" or readings.min() < 0 or readings.max() > _LARGEST_CODE:
+            raise ValueError("a code is out of range")
+        readings = readings.astype(np.uint16)
+    return readings.reshape(shape)
 
 
-def _integer(content: dict[str, Any], name: str, least: int = 0) -> int:
-    number = content[name]
-    if type(number) is not int or not least <= number <= _LARGEST_COUNTER:
-        raise ValueError(f"{name} is {number!r:.40}, not an integer from {least}")
-    return number
+def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
+    """A value that has this form. Those of arrays are not looked at."""
+    if form["type"] == "integer":
+        least = form.get("minimum", 0)
+        if type(value) is not int or not least <= value <= _LARGEST_COUNTER:
+            raise ValueError(f"{name} is {value!r:.40}, not an integer from {least}")
+    elif form["type"] == "number":
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise ValueError(f"{name} is {value!r:.40}, not a number")
+        return float(value)
+    return str(value) if form["type"] == "string" else value
 
 
-def _real(content: dict[str, Any], name: str) -> float:
-    number = content[name]
-    if type(number) not in (int, float) or not math.isfinite(number):
-        raise ValueError(f"{name} is {number!r:.40}, not a number")
-    return float(number)
+# ------------------------------------------------------------------------- to other programs
+
+
+def export(recording: Recording, out: Path, begin_s: float = 0.0, end_s: float = 0.0) -> int:
+    """Write the scans from `begin_s` to `end_s` [s after the first; 0: to the last] to `out`.
+
+    The file is complete or not there. Returns the number of scans.
+
+    :raises RecordingError: there are none, or they have not all the same size.
+    :raises ValueError: an unknown format, or `out` cannot be written.
+    """
+    if out.suffix not in FORMATS:
+        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
+    scans = _between(recording.scans, begin_s, end_s)
+    if out.suffix == ".csv":
+        _save_csv(scans, out)
+        return len(scans)
+    arrays = _arrays(recording, scans)
+    if arrays["ratio"].nbytes > MAX_ARRAY_BYTES:
+        raise RecordingError(
+            f"{len(scans)} scans are more than a readings file holds: export a part of them, "
+            "--begin and --end"
+        )
+    save_arrays(out, arrays)
+    return len(scans)
+
+
+def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
+    first_s = scans[0].host_time_s if scans else 0.0
+    last_s = first_s + end_s if end_s else float("inf")
+    scans = [scan for scan in scans if first_s + begin_s <= scan.host_time_s <= last_s]
+    if not scans:
+        raise RecordingError("no scans: neither in the recording nor in this part of it")
+    size = scans[0].codes.shape
+    for scan in scans:
+        if scan.codes.shape != size:
+            at_s = scan.host_time_s - first_s
+            raise RecordingError(
+                f"{size[0]}x{size[1]} cells become {scan.rows}x{scan.columns} after {at_s:.3f} s: "
+                "export each part by itself, --begin and --end"
+            )
+    return scans
+
+
+def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
+    """The arrays of a readings file, and besides those of `_OF_SCAN`.
+
+    `rest_ratio` is the last tare of this size. `ratio` in single precision is exact.
+    """
+    board = recording.hellos[0]
+    codes = np.array([scan.codes for scan in scans])
+    arrays: dict[str, Any] = {
+        "ratio": ratio_from_codes(codes, board.adc_bits).astype(np.float32),
+        "ref_top_ohm": float(board.ref_top_ohm),
+        "ref_bottom_ohm": float(board.ref_bottom_ohm),
+        "adc_bits": board.adc_bits,
+        **{name: [getattr(scan, name) for scan in scans] for name in _OF_SCAN},
+    }
+    for tare in recording.tares:
+        if tare.rest_ratio.shape == codes.shape[1:]:
+            arrays["rest_ratio"] = tare.rest_ratio
+    return {name: np.array(each) for name, each in arrays.items()}
+
+
+def _save_csv(scans: list[Scan], out: Path) -> None:
+    """A row a scan: its times, then the codes of each cell, named by row, column and reading."""
+    cells = np.ndindex(*scans[0].codes.shape)
+    names = [f"r{row}c{column}{'abcd'[reading]}" for row, column, reading in cells]
+    times = attrgetter(*_OF_SCAN)
+    rows = ([*times(scan), *scan.codes.reshape(-1).tolist()] for scan in scans)
+    save_table(out, [*_OF_SCAN, *names], rows)

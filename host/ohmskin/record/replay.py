@@ -21,15 +21,14 @@ from typing import Final
 
 from ohmskin.errors import (
     CommandRefused,
-    DeviceLost,
     OhmskinError,
     PortError,
     RecordingEnded,
     RecordingError,
 )
 from ohmskin.link import protocol
-from ohmskin.link.feed import ScanFeed
-from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+from ohmskin.link.device import QUEUE_SCANS, Device
+from ohmskin.link.messages import BoardStats, Hello, Scan
 from ohmskin.record.recording import Tare, messages
 
 # Longest time between two scans of a replay [s]: shorter than the silence of a lost board.
@@ -38,10 +37,10 @@ LONGEST_PAUSE_S: Final = 2.0
 _LOOK_EVERY_S: Final = 0.2
 
 
-class Replay:
+class Replay(Device):
     """Plays the recording `path`, `speed` times as fast as it came; 0: as fast as it is taken.
 
-    It is a `Source` for a `Device`. name: as it was opened.
+    name: as it was opened. info: what the board had said when the last scan came.
 
     :raises RecordingError: it cannot be read.
     :raises PortError: it was made with another converter than this protocol knows.
@@ -51,10 +50,7 @@ class Replay:
     def __init__(self, path: str, speed: float = 1.0, name: str = "") -> None:
         if not 0 <= speed < float("inf"):
             raise ValueError(f"speed must be 0 or more, not {speed}")
-        self.feed = ScanFeed(name or f"replay://{path}")
-        self.commands = threading.RLock()
-        self.report: SelfTestReport | None = None
-        self.want_scans = False
+        super().__init__(name or f"replay://{path}", BoardStats())
         self._speed = speed
         self._messages = messages(path)
         hello = next(self._messages)
@@ -67,108 +63,84 @@ class Replay:
                 "'ohmskin export' reads it"
             )
         self._hello = hello
-        self._stats = BoardStats()
-        self._running = False
+        self._running = self._closing = False
         self._last: tuple[float, float] | None = None  # when a scan was due, and was recorded [s]
-        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._play, name=f"play {path}", daemon=True)
         self._thread.start()
 
-    @property
-    def hello(self) -> Hello:
-        """What the recording says of its board, as of the scan that was played last."""
-        return self._hello
-
-    def refresh(self) -> Hello:
-        """See `hello`."""
-        return self._hello
-
-    @property
-    def stats(self) -> BoardStats:
-        """Counts of the scans that were played, as a copy."""
-        with self.feed.changed:
-            return replace(self._stats, overflowed=self.feed.overflowed)
-
-    def command(self, name: str, **values: protocol.Value) -> None:
+    def _command(self, name: str, **values: protocol.Value) -> None:
         """Start or stop.
 
         :raises CommandRefused: a recording can do nothing else.
         """
         if name not in ("start", "stop"):
-            reason = f"{self.feed.name} is a recording, which stays as it is"
+            reason = f"{self.name} is a recording, which stays as it is"
             raise CommandRefused(name, "recorded", reason)
-        with self.feed.changed:
-            if self.feed.failure is not None:
-                raise self.feed.failure
+        with self._changed:
+            if self._failure is not None:
+                raise self._failure
             self._running, self._last = name == "start", None
-            self.feed.changed.notify_all()
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """End the replay. May be called again."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+        self._messages.close()
+        super().close()
 
     # --------------------------------------------------------------------------- the thread
 
     def _play(self) -> None:
-        rest_ratio, name = None, self.feed.name
-        error: OhmskinError = RecordingEnded(f"{name} has been played to where it was cut off")
+        rest_ratio = None
+        error: OhmskinError = RecordingEnded(f"{self.name} has been played to where it was cut off")
         try:
             for message in self._messages:
-                if isinstance(message, Scan):
-                    if not self._wait_for(message):
-                        return
-                    self._publish(replace(message, rest_ratio=rest_ratio))
-                elif isinstance(message, Hello):
-                    if not self._wait_for_readers():
-                        return
-                    self._hello = message
-                elif isinstance(message, Tare):
-                    rest_ratio = message.rest_ratio
-                elif message is None:
-                    error = RecordingEnded(f"{name} has been played to its end")
+                if isinstance(message, Hello | Scan) and not self._wait_for(message):
+                    return
+                match message:
+                    case Scan():
+                        self._play_scan(replace(message, rest_ratio=rest_ratio))
+                    case Hello():
+                        self._hello = message
+                    case Tare():
+                        rest_ratio = message.rest_ratio
+                    case None:
+                        error = RecordingEnded(f"{self.name} has been played to its end")
         except RecordingError as exc:
             error = exc
-        self.feed.fail(error)
+        self._fail(error)
 
-    def _publish(self, scan: Scan) -> None:
+    def _play_scan(self, scan: Scan) -> None:
         if int(scan.codes.max()) >> protocol.ADC_BITS:
-            raise RecordingError(
-                f"{self.feed.name}: scan {scan.number} has a code beyond the converter"
-            )
-        with self.feed.changed:
+            raise RecordingError(f"{self.name}: scan {scan.number} has a code beyond the converter")
+        with self._changed:
             self._stats.scans += 1
             self._stats.missed += scan.missed
-            self.feed.publish(replace(scan, host_time_s=time.monotonic()))
+            self._publish(replace(scan, host_time_s=time.monotonic()))
 
-    def _wait_for_readers(self) -> bool:
-        """Wait until a scan may come: whether it may, or the replay was closed."""
-        feed = self.feed
-        with feed.changed:
-            while not self._closing.is_set():
-                waits = self._speed == 0 and feed.is_behind
-                if self._running and feed.asked and not waits:
+    def _wait_for(self, message: Hello | Scan) -> bool:
+        """Wait until somebody reads, and until a scan is due: False if the replay was closed."""
+        with self._changed:
+            while not self._closing:
+                now_s = due_s = time.monotonic()
+                waits = self._speed == 0 and self._readers_are_behind()
+                if waits or not (self._running and self._asked):
+                    due_s = float("inf")
+                elif isinstance(message, Scan) and self._speed and self._last is not None:
+                    pause_s = (message.host_time_s - self._last[1]) / self._speed
+                    due_s = self._last[0] + min(max(pause_s, 0.0), LONGEST_PAUSE_S)
+                if now_s >= due_s:
+                    if isinstance(message, Scan):
+                        self._last = (due_s, message.host_time_s)
                     return True
-                feed.changed.wait(_LOOK_EVERY_S)
+                self._changed.wait(min(due_s - now_s, _LOOK_EVERY_S))
         return False
 
-    def _wait_for(self, scan: Scan) -> bool:
-        """Wait until a scan is due: whether it is, or the replay was closed."""
-        while self._wait_for_readers():
-            now_s = time.monotonic()
-            due_s = now_s
-            if self._speed and self._last is not None:
-                pause_s = (scan.host_time_s - self._last[1]) / self._speed
-                due_s = self._last[0] + min(max(pause_s, 0.0), LONGEST_PAUSE_S)
-            if now_s >= due_s:
-                self._last = (due_s, scan.host_time_s)
-                return True
-            self._closing.wait(min(due_s - now_s, _LOOK_EVERY_S))
-        return False
-
-    def close(self) -> None:
-        """End the replay. May be called again."""
-        self._closing.set()
-        with self.feed.changed:
-            self._running = False
-            self.feed.changed.notify_all()
-        self._thread.join()
-        self._messages.close()
-        self.feed.forget_newest()
-        if self.feed.failure is None or isinstance(self.feed.failure, RecordingEnded):
-            self.feed.fail(DeviceLost(f"{self.feed.name} was closed"))
+    def _readers_are_behind(self) -> bool:
+        """Whether they have not yet taken what was published."""
+        if self._queues:
+            return any(len(queue) >= QUEUE_SCANS // 2 for queue in self._queues.values())
+        return self._newest is not None

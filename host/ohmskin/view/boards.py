@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """The boards of the page: a thread opens and reads each, and opens it again if it goes away."""
 
+import json
+import math
+import struct
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
+from itertools import count, takewhile
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
+from ohmskin import opening
+from ohmskin.arrays import Bool, Float
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.base import Estimate, SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import MEMORY_US
-from ohmskin.force.reader import TARE_S, SkinReader
+from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import Device
-from ohmskin.link.messages import Hello, Scan
-from ohmskin.opening import open_device
+from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
-from ohmskin.view.board_recording import BoardRecording
-from ohmskin.view.shown import Shown
 
 # The paper's programmes take minutes for a frame of 8x8.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
@@ -32,12 +38,119 @@ LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "reg
 MOST_BOARDS: Final = 16
 # Time until a port that is not there is tried again [s].
 AGAIN_S: Final = 1.0
-# The scan rate that is shown is a mean over so long [s].
-_RATE_OVER_S: Final = 2.0
 # `close` waits so long for the thread: a port that never answers must not hold it up [s].
 _CLOSE_S: Final = 1.0
 # Characters of a mark at most.
 _LONGEST_MARK: Final = 1000
+# What the page says of a board.
+_OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
+# What it says of a contact.
+_numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
+# What makes boards the same skin: methods, rest and tare of one are good for the other.
+_skin_of: Final = attrgetter(
+    *("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One scan of a page. raw: by the method `ohm`, what the electrodes read, ghosts included.
+
+    method: that of `found`. has_forces: there are newtons. missed: scans, since the connection was
+    made. rate_hz: the board's scan rate [Hz]. recorded: scans in the recording that goes on, if one
+    does.
+    """
+
+    found: ForceScan
+    raw: Estimate
+    method: str
+    has_forces: bool
+    missed: int
+    rate_hz: float
+    recorded: int
+
+    @cached_property
+    def message(self) -> bytes:
+        """The bytes of it.
+
+        ==============  ==================================================================
+        4 bytes         length of the header, little-endian
+        header          JSON, padded with spaces to a multiple of 4 bytes
+        planes          those that the header names, each R x C float32, little-endian, by row
+        ==============  ==================================================================
+        """
+        planes: dict[str, Float | Bool] = {
+            "raw": self.raw.cell_siemens,
+            "raw_touched": self.raw.touched,
+            "siemens": self.found.estimate.cell_siemens,
+            "siemens_std": self.found.estimate.cell_siemens_std,
+            "touched": self.found.estimate.touched,
+        }
+        if self.has_forces:
+            planes |= {"force": self.found.force_n, "force_std": self.found.force_n_std}
+        scan, estimate = self.found, self.found.estimate
+        content = {
+            "scan": scan.number,
+            "host_time_s": scan.host_time_s,
+            "rows": scan.rows,
+            "columns": scan.columns,
+            "planes": list(planes),
+            "method": self.method,
+            "chi2": _number(estimate.chi2),
+            "estimate_s": estimate.seconds,
+            "text": estimate.message,
+            "rate_hz": self.rate_hz,
+            "missed": self.missed,
+            "recorded": self.recorded,
+            "contacts": [list(map(_number, _numbers_of(each))) for each in scan.contacts],
+        }
+        header = json.dumps(content, allow_nan=False).encode()
+        header += b" " * (-len(header) % 4)
+        values = np.stack(list(planes.values())).astype("<f4")
+        return struct.pack("<I", len(header)) + header + values.tobytes()
+
+
+def _number(value: float) -> float | None:
+    """As JSON has it, which knows no NaN."""
+    return value if math.isfinite(value) else None
+
+
+class _Recording(Closing):
+    """Records `skin` to `path` in a thread of its own, until it is closed or the board is gone.
+
+    tare: the one in force. ended: is called, from that thread, when the file is whole. text: then
+    says how it went.
+
+    :raises RecordingError: the file cannot be written.
+    """
+
+    def __init__(
+        self, skin: Device, path: Path, tare: Tare | None, ended: Callable[[], None]
+    ) -> None:
+        self.text = ""
+        self.recorder = Recorder(path, skin.info)
+        self._until_s = float("inf")
+        self._thread = threading.Thread(target=self._work, args=(skin, tare, ended))
+        self._thread.start()
+
+    def _work(self, skin: Device, tare: Tare | None, ended: Callable[[], None]) -> None:
+        trouble = ""
+        try:
+            with self.recorder as recorder:
+                if tare is not None:
+                    recorder.add(tare)
+                in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, skin)
+                record(skin, recorder, in_time)
+        except OhmskinError as exc:
+            trouble = f"; {exc}"
+        counts = f"{recorder.scans} scans, missed {recorder.missed}"
+        self.text = f"{recorder.path}: {counts}{trouble}"
+        ended()
+
+    def close(self) -> None:
+        """End with the scans that have come until now. Returns when the file is whole."""
+        self._until_s = min(self._until_s, time.monotonic())
+        self._thread.join()
 
 
 class ViewedBoard(Closing):
@@ -58,33 +171,21 @@ class ViewedBoard(Closing):
         self._status, self._text, self._note = "opening", "", ""
         self._skin: Device | None = None
         self._reader: SkinReader | None = None
-        self._recording: BoardRecording | None = None
-        self._watchers: set[Callable[[], None]] = set()
+        self._recording: _Recording | None = None
+        self.watchers: set[Callable[[], None]] = set()
+        """They are called, from any thread, when `shown` or `state` may be new."""
         self._commands = threading.Lock()
-        self._closing = threading.Event()
+        self.closing = threading.Event()
+        """Is set when `close` is called."""
         # A port that never answers does not hold up the end of the program.
         self._thread = threading.Thread(target=self._work, name=f"view {port}", daemon=True)
         self._thread.start()
 
     # ----------------------------------------------------------------------------- for the page
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether `close` was called."""
-        return self._closing.is_set()
-
-    @contextmanager
-    def watched(self, changed: Callable[[], None]) -> Iterator[None]:
-        """Meanwhile `changed` is called, from any thread, when `shown` or `state` may be new."""
-        self._watchers.add(changed)
-        try:
-            yield
-        finally:
-            self._watchers.discard(changed)
-
     def state(self) -> dict[str, Any]:
         """What the page says beside the scans, as JSON has it."""
-        reader, recording = self._reader, self._recording
+        reader, recording, running = self._reader, self._recording, self._running()
         board = None if reader is None else reader.board
         rest = None if reader is None else reader.rest
         return {
@@ -92,26 +193,18 @@ class ViewedBoard(Closing):
             "status": self._status,
             "text": self._text,
             "note": self._note,
-            "board": board
-            and {
-                "name": board.board,
-                "unit_id": board.unit_id,
-                "version": board.version,
-                "rows": board.rows,
-                "columns": board.columns,
-                "rate_hz": board.rate_hz,
-            },
+            "board": board and {name: getattr(board, name) for name in _OF_BOARD},
             "methods": [] if reader is None else _methods(reader),
             "method": "" if reader is None else reader.method,
             "force_method": None if reader is None else _force_method(reader),
             "rest_date": rest and rest.date,
             "tared": reader is not None and reader.is_tared,
-            "recording": "" if recording is None or recording.text else str(recording.path),
+            "recording": "" if running is None else str(running.recorder.path),
             "recorded": "" if recording is None else recording.text,
         }
 
     def _changed(self) -> None:
-        for watcher in tuple(self._watchers):
+        for watcher in tuple(self.watchers):
             watcher()
 
     # --------------------------------------------------------------------------------- commands
@@ -140,10 +233,8 @@ class ViewedBoard(Closing):
     def undo_tare(self) -> str:
         """Return to the rest before the last tare."""
         with self._one_at_a_time():
-            rest = self._there()[1].undo_tare()
-            if rest is None:
-                return "the tare is undone: rest is not known"
-            self._record_rest(rest)
+            if (rest := self._there()[1].undo_tare()) is not None:
+                self._record_rest(rest)
         return "the tare is undone: rest is as it was before"
 
     def record(self) -> str:
@@ -151,13 +242,12 @@ class ViewedBoard(Closing):
         with self._one_at_a_time():
             skin, reader = self._there()
             if (running := self._running()) is not None:
-                raise OhmskinError(f"{running.path} is being recorded already")
+                raise OhmskinError(f"{running.recorder.path} is being recorded already")
             tare = None
             if reader.is_tared and reader.rest is not None:
                 tare = Tare(reader.rest.ratio, time.monotonic())
             path = self._new_file(reader.board.unit_id)
-            self._recording = BoardRecording(skin, path, tare, self._changed)
-        self._changed()
+            self._recording = _Recording(skin, path, tare, self._changed)
         return "recording: every scan, whatever is shown"
 
     def stop_recording(self) -> str:
@@ -175,7 +265,7 @@ class ViewedBoard(Closing):
             raise OhmskinError("a mark goes into a recording: start one first")
         if not 0 < len(text) <= _LONGEST_MARK:
             raise OhmskinError(f"a mark is a text of 1 to {_LONGEST_MARK} characters")
-        recording.add(Mark(text, time.monotonic()))
+        recording.recorder.add(Mark(text, time.monotonic()))
         return f"marked: {text}"
 
     def _there(self) -> tuple[Device, SkinReader]:
@@ -194,13 +284,13 @@ class ViewedBoard(Closing):
             self._commands.release()
             self._changed()
 
-    def _running(self) -> BoardRecording | None:
+    def _running(self) -> _Recording | None:
         recording = self._recording
         return None if recording is None or recording.text else recording
 
     def _record_rest(self, rest: Tare) -> None:
         if (recording := self._running()) is not None:
-            recording.add(rest)
+            recording.recorder.add(rest)
 
     def _new_file(self, unit_id: int) -> Path:
         stem = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
@@ -213,7 +303,7 @@ class ViewedBoard(Closing):
     # ----------------------------------------------------------------------------------- thread
 
     def _work(self) -> None:
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             try:
                 self._follow()
             except RecordingEnded as exc:
@@ -224,37 +314,38 @@ class ViewedBoard(Closing):
             except Exception as exc:
                 self._say("ended", f"a defect of this program: {exc!r}")
                 raise
-            self._closing.wait(AGAIN_S)
+            self.closing.wait(AGAIN_S)
 
     def _say(self, status: str, text: str = "") -> None:
         self._status, self._text = status, text
         self._changed()
 
     def _follow(self) -> None:
-        with open_device(self.port) as skin:
+        with opening.open(self.port) as skin:
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
             raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
+            seen_us = newest_us = 0
             try:
-                rate, seen = _Rate(), _SeenTime()
-                while not self._closing.is_set():
-                    scan = skin.latest()
-                    rate_hz, running = rate.of(scan), self._running()
+                while not self.closing.is_set():
+                    scan, running = skin.latest(), self._running()
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
-                    if self._watchers:
+                    if self.watchers:
+                        # Contacts that nobody looked at meanwhile have not gone.
+                        step_us = max(scan.time_us - newest_us, 0)
+                        seen_us += min(step_us, MEMORY_US // 2)
+                        newest_us = scan.time_us
                         self.shown = Shown(
-                            reader.read(seen.at(scan)),
+                            reader.read(replace(scan, time_us=seen_us)),
                             raw.estimate(scan.ratio),
                             reader.method,
                             reader.has_forces,
-                            skin.stats,
-                            rate_hz,
-                            0 if running is None else running.scans,
+                            skin.stats.missed,
+                            skin.info.rate_hz,
+                            0 if running is None else running.recorder.scans,
                         )
-                    if self._status != "scanning":
-                        self._status, self._text = "scanning", ""
-                    self._changed()
+                    self._say("scanning")
             finally:
                 self._skin = None
                 skin.close()  # its scans end, and so does the recording
@@ -264,23 +355,21 @@ class ViewedBoard(Closing):
     def _reader_of(self, skin: Device) -> SkinReader:
         """A board that is there again is read as before, with method and tare."""
         board, before = skin.info, self._reader
-        if before is not None and _same(before.board, board):
+        if before is not None and _skin_of(before.board) == _skin_of(board):
             return before
-        self._note = ""
+        self._note = note = ""
         for calibration in self._calibrations:
             try:
                 calibration.check(board.unit_id, board.rows, board.columns, force=self._force)
-                reader = SkinReader(board, calibration)
+                return SkinReader(board, calibration)
             except ValueError as exc:
-                self._note = f"no forces: {exc}"
-            else:
-                self._note = ""
-                return reader
+                note = f"no forces: {exc}"
+        self._note = note
         return SkinReader(board)
 
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""
-        self._closing.set()
+        self.closing.set()
         skin, recording = self._skin, self._recording
         if skin is not None:
             skin.close()
@@ -288,40 +377,6 @@ class ViewedBoard(Closing):
             recording.close()
         self._thread.join(_CLOSE_S)
         self._changed()
-
-
-class _Rate:
-    """The board's scan rate over the last `_RATE_OVER_S`, those that were missed included."""
-
-    def __init__(self) -> None:
-        self._scans: deque[tuple[int, int]] = deque()
-
-    def of(self, scan: Scan) -> float:
-        scans = self._scans
-        if scans and scan.time_us <= scans[-1][1]:
-            scans.clear()  # the board has restarted
-        scans.append((scan.number, scan.time_us))
-        while scan.time_us - scans[0][1] > 1e6 * _RATE_OVER_S:
-            scans.popleft()
-        if len(scans) < 2:
-            return 0.0
-        return 1e6 * (scan.number - scans[0][0]) / (scan.time_us - scans[0][1])
-
-
-class _SeenTime:
-    """Board time without gaps: contacts that nobody looked at meanwhile have not gone."""
-
-    def __init__(self) -> None:
-        self._newest_us: int | None = None
-        self._time_us = 0
-
-    def at(self, scan: Scan) -> Scan:
-        """The scan at the time that was looked at until it."""
-        if self._newest_us is not None:
-            step_us = max(scan.time_us - self._newest_us, 0)
-            self._time_us += min(step_us, MEMORY_US // 2)
-        self._newest_us = scan.time_us
-        return replace(scan, time_us=self._time_us)
 
 
 def _force_method(reader: SkinReader) -> str | None:
@@ -335,12 +390,7 @@ def _methods(reader: SkinReader) -> tuple[str, ...]:
     return LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
 
 
-def _same(one: Hello, other: Hello) -> bool:
-    names = ("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
-    return all(getattr(one, name) == getattr(other, name) for name in names)
-
-
-class ViewedBoards(Closing):
+class ViewedBoards(Closing, dict[int, ViewedBoard]):
     """The boards of one page, by number, from 0. `ViewedBoard` says what the arguments are."""
 
     def __init__(
@@ -351,9 +401,8 @@ class ViewedBoards(Closing):
         *,
         force: bool = False,
     ) -> None:
-        self._calibrations, self._folder, self._force = calibrations, folder, force
-        self._boards: dict[int, ViewedBoard] = {}
-        self._last = -1
+        self._calibrations, self._folder, self._force = calibrations, folder.resolve(), force
+        self._numbers = count()
         for port in ports:
             self.add(port)
 
@@ -362,31 +411,21 @@ class ViewedBoards(Closing):
 
         :raises ValueError: there are `MOST_BOARDS` already.
         """
-        for number, board in self._boards.items():
+        for number, board in self.items():
             if board.port == port:
                 return number
-        if len(self._boards) >= MOST_BOARDS:
+        if len(self) >= MOST_BOARDS:
             raise ValueError(f"there are {MOST_BOARDS} boards: close one first")
-        self._last += 1
-        folder = self._folder.resolve()
-        self._boards[self._last] = ViewedBoard(port, self._calibrations, folder, force=self._force)
-        return self._last
-
-    def find(self, number: int) -> ViewedBoard | None:
-        """The board of that number, if there is one."""
-        return self._boards.get(number)
-
-    def ports(self) -> dict[int, str]:
-        """The port of each board, by number."""
-        return {number: board.port for number, board in self._boards.items()}
+        number = next(self._numbers)
+        self[number] = ViewedBoard(port, self._calibrations, self._folder, force=self._force)
+        return number
 
     def remove(self, number: int) -> None:
         """Close a board; nothing happens if there is none of that number."""
-        board = self._boards.pop(number, None)
-        if board is not None:
+        if (board := self.pop(number, None)) is not None:
             board.close()
 
     def close(self) -> None:
         """Close all. May be called again."""
         with ThreadPoolExecutor(MOST_BOARDS) as pool:  # some may have to be waited for
-            list(pool.map(self.remove, tuple(self._boards)))
+            list(pool.map(self.remove, tuple(self)))

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One panel of a page: a websocket over which a board is shown and commanded.
 
-To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes, `shown`): the
-newest one, and no other before the page has acknowledged it. So nothing queues up on the way,
-however slow page or network are. From the page come texts, whose ``do`` is one of `_COMMANDS`,
-"ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the host's clock.
+To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes: `Shown.message`).
+The newest scan is sent, and no other before the page has acknowledged it. So nothing queues up on
+the way, however slow page or network are. From the page come texts, whose ``do`` is a command of
+`Panel._asked`, "ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the
+host's clock.
 """
 
 import asyncio
@@ -20,8 +21,7 @@ from anyio.abc import TaskGroup
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ohmskin.errors import OhmskinError, TareRefused
-from ohmskin.view.boards import ViewedBoard
-from ohmskin.view.shown import Shown
+from ohmskin.view.boards import Shown, ViewedBoard
 
 _GONE: Final = 4001  # close code: the board was closed, by this page or another
 _Command = Callable[[], str]
@@ -47,13 +47,15 @@ class Panel:
             with suppress(RuntimeError):  # the loop has just ended
                 loop.call_soon_threadsafe(self._news.set)
 
-        with self._board.watched(wake):
-            try:
-                async with anyio.create_task_group() as tasks:
-                    tasks.start_soon(self._send)
-                    tasks.start_soon(self._receive, tasks)
-            except* WebSocketDisconnect:
-                pass
+        self._board.watchers.add(wake)
+        try:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._send)
+                tasks.start_soon(self._receive, tasks)
+        except* WebSocketDisconnect:
+            pass
+        finally:
+            self._board.watchers.discard(wake)
 
     # ------------------------------------------------------------------------------ to the page
 
@@ -63,7 +65,7 @@ class Panel:
         while True:
             await self._news.wait()
             self._news.clear()
-            if self._board.is_closed:
+            if self._board.closing.is_set():
                 await self._socket.close(_GONE)
                 raise WebSocketDisconnect(_GONE)
             state, shown = self._board.state(), self._board.shown
@@ -132,12 +134,9 @@ class Panel:
 
     async def _run(self, name: str, command: _Command) -> None:
         try:
-            done = await anyio.to_thread.run_sync(command)
-        except TareRefused as exc:
-            answer = {"text": str(exc), "good": False, "refused": name}
+            answer = {"text": await anyio.to_thread.run_sync(command), "good": True, "refused": ""}
         except (OhmskinError, ValueError, OSError) as exc:
-            answer = {"text": str(exc), "good": False, "refused": ""}
-        else:
-            answer = {"text": done, "good": True, "refused": ""}
+            refused = name if isinstance(exc, TareRefused) else ""
+            answer = {"text": str(exc), "good": False, "refused": refused}
         self._is_busy = False
         await self._say("notice", **answer)

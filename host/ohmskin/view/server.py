@@ -1,47 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The server of the page: a few files, the list of boards, a websocket for each panel."""
+"""The server of the page: a few files, the list of boards, a websocket for each panel.
 
+It answers its own page alone, from this machine or with the token. A page of another site must
+neither read the skin nor command it. A browser says in ``Origin`` which page asks, and in ``Host``
+which name it asked for: a foreign name that was made to lead here (DNS rebinding) is refused, and
+so is a foreign page. On other addresses than loopback there are names that nobody here can know;
+there the token in the address takes the place of the check of ``Host``.
+"""
+
+import ipaddress
 import json
+import mimetypes
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
+from urllib.parse import parse_qs, urlsplit
 
 import anyio
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from ohmskin.errors import OhmskinError
 from ohmskin.link.serial_port import serial_ports
-from ohmskin.view.access import Guard, is_loopback
 from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.panel import Panel
 
 _PAGE: Final = Path(__file__).parent / "page"
-_TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _LONGEST_PORT: Final = 500
 _LONGEST_MESSAGE: Final = 8192  # of the page, in bytes
 _SHUTDOWN_S: Final = 2
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS: Final = {
+    "content-security-policy": _POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",  # the address may hold the token
+    "cache-control": "no-store",  # a page of one version never meets a server of another
+}
+_READS: Final = ("GET", "HEAD")
 
 
 def make_app(boards: ViewedBoards, host: str, token: str | None = None) -> Starlette:
     """The page of `boards`, which closes them at its end. host, token: see `Guard`."""
 
     async def ports(request: Request) -> Response:
-        return JSONResponse(
-            [asdict(found) for found in await anyio.to_thread.run_sync(serial_ports)]
-        )
+        found = await anyio.to_thread.run_sync(serial_ports)
+        return JSONResponse([asdict(port) for port in found])
 
     async def list_boards(request: Request) -> Response:
-        return JSONResponse([{"number": n, "port": p} for n, p in boards.ports().items()])
+        return JSONResponse([{"number": n, "port": each.port} for n, each in boards.items()])
 
     async def add_board(request: Request) -> Response:
         try:
@@ -60,7 +81,7 @@ def make_app(boards: ViewedBoards, host: str, token: str | None = None) -> Starl
         return Response(status_code=204)
 
     async def panel(connection: WebSocket) -> None:
-        board = boards.find(connection.path_params["number"])
+        board = boards.get(connection.path_params["number"])
         if board is None:
             await connection.close()
         else:
@@ -71,16 +92,17 @@ def make_app(boards: ViewedBoards, host: str, token: str | None = None) -> Starl
         yield
         await anyio.to_thread.run_sync(boards.close)
 
-    files = _files()
-    public = [path for path in files if path != "/"]
+    # A page asks for its own parts without its token.
+    public = [f"/{file.name}" for file in _PAGE.iterdir() if file.name != "index.html"]
+    mimetypes.add_type("text/javascript", ".js")  # some systems know it by another name
     return Starlette(
         routes=[
-            *(Route(path, _file(name), methods=["GET"]) for path, name in files.items()),
             Route("/ports", ports),
             Route("/boards", list_boards, methods=["GET"]),
             Route("/boards", add_board, methods=["POST"]),
             Route("/boards/{number:int}", remove_board, methods=["DELETE"]),
             WebSocketRoute("/boards/{number:int}", panel),
+            Route("/{path:path}", StaticFiles(directory=_PAGE, html=True)),
         ],
         middleware=[Middleware(Guard, host=host, token=token, public=public)],
         lifespan=lifespan,
@@ -96,57 +118,101 @@ async def _body(request: Request) -> bytes:
     return octets
 
 
-def _files() -> dict[str, str]:
-    """Name of each file of the page, by its path."""
-    names = sorted(file.name for file in _PAGE.iterdir() if file.suffix in _TYPES)
-    return {"/" if name == "index.html" else f"/{name}": name for name in names}
-
-
-def _file(name: str) -> Callable[[Request], Response]:
-    content = (_PAGE / name).read_bytes()
-    media_type = _TYPES[Path(name).suffix]
-
-    def answer(request: Request) -> Response:
-        return Response(content, media_type=media_type)
-
-    return answer
-
-
-def serve(
-    boards: ViewedBoards, host: str, port: int, started: Callable[[str], None] = lambda url: None
-) -> None:
+def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], None]) -> None:
     """Serve until SIGINT or SIGTERM; then the boards are closed. SIGINT raises KeyboardInterrupt.
 
     port: 0: any that is free. started: is called with the page's address when it can be opened.
 
     :raises OhmskinError: the address cannot be had.
     """
-    with boards, _listening(host, port) as listening:
-        number = listening.getsockname()[1]
-        token = None if is_loopback(host) else secrets.token_urlsafe(16)
-        name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-        name = f"[{name}]" if ":" in name else name
-        started(f"http://{name}:{number}/" + ("" if token is None else f"?token={token}"))
-        app = make_app(boards, host, token)
-        config = uvicorn.Config(
-            app,
-            ws="wsproto",
-            ws_max_size=_LONGEST_MESSAGE,
-            log_config=None,
-            access_log=False,
-            server_header=False,
-            proxy_headers=False,
-            timeout_graceful_shutdown=_SHUTDOWN_S,
-        )
-        uvicorn.Server(config).run(sockets=[listening])
-
-
-def _listening(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with boards:
+        try:
+            listening = socket.create_server((host, port), family=family)
+        except OSError as exc:
+            raise OhmskinError(
+                f"{host} port {port} cannot be had: {exc.strerror or exc}: say another with "
+                "--http-port; 0 is any that is free"
+            ) from exc
+        with listening:
+            token = None if _is_loopback(host) else secrets.token_urlsafe(16)
+            name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+            name = f"[{name}]" if ":" in name else name
+            query = "" if token is None else f"?token={token}"
+            started(f"http://{name}:{listening.getsockname()[1]}/{query}")
+            config = uvicorn.Config(
+                make_app(boards, host, token),
+                ws="wsproto",
+                ws_max_size=_LONGEST_MESSAGE,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,
+                timeout_graceful_shutdown=_SHUTDOWN_S,
+            )
+            uvicorn.Server(config).run(sockets=[listening])
+
+
+# -------------------------------------------------------------------------------- who may ask
+
+
+def _is_loopback(host: str) -> bool:
+    """Whether nobody but this machine reaches that address."""
+    if host == "localhost":
+        return True
     try:
-        return socket.create_server((host, port), family=family)
-    except OSError as exc:
-        raise OhmskinError(
-            f"{host} port {port} cannot be had: {exc.strerror or exc}: say another with "
-            "--http-port; 0 is any that is free"
-        ) from exc
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class Guard:
+    """ASGI middleware that refuses strangers.
+
+    host: the address listened at. token: what has to be in the query; None: on loopback, where the
+    name in ``Host`` is checked instead. Its port is not: it is another one through an SSH tunnel.
+    public: paths that need no token, because a page asks for its own parts without one.
+    """
+
+    def __init__(self, app: ASGIApp, host: str, token: str | None, public: Collection[str]) -> None:
+        self._app = app
+        self._public = public
+        self._token = token
+        self._names = {host, "localhost", "127.0.0.1", "::1"}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer 403 to a stranger, and let everybody else through."""
+        refusal = "" if scope["type"] == "lifespan" else self._refusal(scope)
+        if refusal and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal})
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+            await send(message)
+
+        answer = PlainTextResponse(f"{refusal}\n", 403) if refusal else self._app
+        await answer(scope, receive, send_with_headers)
+
+    def _refusal(self, scope: Scope) -> str:
+        headers = Headers(scope=scope)
+        host, origin = headers.get("host", ""), headers.get("origin")
+        if self._token is None:
+            if _name(host) not in self._names:
+                return "this page is at 127.0.0.1, and by no other name"
+        elif scope["path"] not in self._public:
+            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            if not secrets.compare_digest(given.encode(), self._token.encode()):
+                return "open the address that 'ohmskin view' has printed, with its token"
+        changes = scope["type"] == "websocket" or scope["method"] not in _READS
+        if (changes or origin is not None) and origin != f"http://{host}":
+            return "only this page itself may ask that"
+        return ""
+
+
+def _name(host: str) -> str | None:
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:
+        return None

@@ -162,7 +162,7 @@ export class Panel {
     const status = STATUS[state.status];
     say(this.find(".status"), state.text ? `${status}: ${state.text}` : status);
     const board = state.board;
-    say(this.find(".board"), board ? `${board.name}, unit ${board.unit_id}, ${board.rows} × ` +
+    say(this.find(".board"), board ? `${board.board}, unit ${board.unit_id}, ${board.rows} × ` +
       `${board.columns} cells, firmware ${board.version}` : "");
     options(this.find(".method"), state.methods, state.method,
       (name) => (name === state.force_method ? `${name} (calibrated)` : name));

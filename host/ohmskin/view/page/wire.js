@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The bytes of a scan (host/ohmskin/view/shown.py), and the websocket that brings them.
+// The bytes of a scan (`Shown` of host/ohmskin/view/boards.py), and the websocket that brings them.
 
 const AGAIN_MS = 1000;
 const CLOCK_EVERY_MS = 1000;

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a simulated skin and its wiring, to see that it is found.
+"""What can be wrong with an emulated board's line and skin, to see that a host finds it.
 
-Faults of resistances change a `Skin` (`SkinFaults.damaged`). Shorted lines join electrodes of its
-network (`joined_readings`). Hum and slow settling change each reading at its own instant
-(`SkinFaults.sampled`). Faults of the serial line are in `ohmskin.emulate.line_faults`.
+`LineFaults` change the bytes that the board sends. Of `SkinFaults`, those of resistances change a
+`Skin` (`SkinFaults.damaged`). Shorted lines join electrodes of its network (`joined_readings`). Hum
+and slow settling change each reading at its own instant (`SkinFaults.sampled`).
+
+A fault has the name of an option of ``emulator://``. Beside its type stand the kind of its values
+and what ``ohmskin emulate --help`` says of it. Without the option there is no such fault.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import Annotated, Final, Self
+from typing import Annotated, Any, Final, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -21,7 +26,6 @@ from ohmskin.circuit.skin import (
     ratio_from_current,
     readings,
 )
-from ohmskin.emulate.line_faults import texts_of
 from ohmskin.link.protocol import ADC_BITS
 
 # Resistance of a wire that is open [ohm], a million times that of a cell at rest.
@@ -30,22 +34,116 @@ OPEN_OHM: Final = 1e12
 SHORT_SIEMENS: Final = 10.0
 # Conductance of an open cell [S] where a network must be connected: 10 TOhm.
 _LEAST_SIEMENS: Final = 1e-13
+# A stall begins so long after the board's start [s].
+_STALL_AFTER_S: Final = 2.0
 
-_LINES: Final = ("open_row", "open_column")
-_PAIRS: Final = ("short_rows", "short_columns", "dead", "saturated")
+FaultsT = TypeVar("FaultsT")
 Pair = tuple[int, int]
-Line = int | None
-Lines = Pair | None
-Cell = Pair | None
-Ohm = float | None
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How an option is read, which values can be, and what they are in words."""
+
+    read: Callable[[str], Any]
+    can_be: Callable[[Any], bool]
+    words: str
+
+
+def _pair(text: str) -> Pair:
+    first, second = text.split(",")
+    return int(first), int(second)
+
+
+Share = Annotated[float, _Kind(float, lambda share: 0 <= share <= 1, "a share, from 0 to 1")]
+Amount = Annotated[float, _Kind(float, lambda amount: 0 <= amount < math.inf, "0 or more")]
+Factor = Annotated[float, _Kind(float, lambda factor: 0 < factor < math.inf, "above 0")]
+Ohm = Annotated[float | None, _Kind(float, lambda ohm: 0 < ohm < math.inf, "above 0")]
+Line = Annotated[int | None, _Kind(int, lambda line: True, "a number")]
+Lines = Annotated[
+    Pair | None, _Kind(_pair, lambda pair: pair[0] != pair[1], "two different numbers, as 1,2")
+]
+Cell = Annotated[Pair | None, _Kind(_pair, lambda cell: True, "two numbers, as 1,2")]
+
+
+def _options(faults: type) -> dict[str, tuple[_Kind, str]]:
+    """Kind and text of each fault."""
+    hints = get_type_hints(faults, include_extras=True)
+    return {n: hint.__metadata__ for n, hint in hints.items() if hasattr(hint, "__metadata__")}
+
+
+def faults_of(faults: type[FaultsT], options: Mapping[str, str], **others: Any) -> FaultsT:
+    """The faults that the options of a URL name; other options are left alone. others: fields.
+
+    :raises ValueError: a value that cannot be.
+    """
+    for name, (kind, _) in _options(faults).items():
+        if name in options:
+            with suppress(ValueError):
+                others[name] = kind.read(options[name])
+            if name not in others or not kind.can_be(others[name]):
+                raise ValueError(f"{name} must be {kind.words}, not '{options[name]}'")
+    return faults(**others)
+
+
+# ---------------------------------------------------------------------------------- of the line
+
+
+@dataclass
+class LineFaults:
+    """Faults of the line by the names in `LINE_FAULTS`. seed: of all that is random here."""
+
+    drop: Annotated[Share, "share of sent chunks that never arrive"] = 0.0
+    bitflip: Annotated[Share, "share of bits that arrive inverted"] = 0.0
+    garbage: Annotated[Share, "share of sent chunks after which random bytes come"] = 0.0
+    reset: Annotated[Amount, "seconds between resets of the board"] = 0.0
+    stall: Annotated[Amount, "seconds of silence, once, 2 s after the board's start"] = 0.0
+    vanish: Annotated[Amount, "seconds until the board is unplugged"] = 0.0
+    silent: Annotated[Amount, "1: the board never says anything"] = 0.0
+    seed: int = 0
+    _resets_done: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self._random = np.random.default_rng(self.seed)
+
+    def apply(self, chunk: bytes, now_s: float) -> bytes:
+        """What arrives of a chunk sent at `now_s`."""
+        if not chunk:
+            return chunk
+        if self.silent or (self.stall and 0 <= now_s - _STALL_AFTER_S < self.stall):
+            return b""
+        if self.drop and self._random.random() < self.drop:
+            chunk = b""
+        if self.bitflip:
+            octets = np.frombuffer(chunk, dtype=np.uint8)
+            flips = self._random.random((octets.size, 8)) < self.bitflip
+            chunk = (octets ^ np.packbits(flips, axis=1)[:, 0]).tobytes()
+        if self.garbage and self._random.random() < self.garbage:
+            chunk += self._random.bytes(int(self._random.integers(1, 64)))
+        return chunk
+
+    def resets(self, now_s: float) -> bool:
+        """Whether a reset is due; True once for each."""
+        due = int(now_s / self.reset) if self.reset else 0
+        if due <= self._resets_done:
+            return False
+        self._resets_done = due
+        return True
+
+    def vanished(self, now_s: float) -> bool:
+        """Whether the board has been unplugged by now."""
+        return bool(self.vanish) and now_s >= self.vanish
+
+
+LINE_FAULTS: Final = {name: text for name, (_, text) in _options(LineFaults).items()}
+
+
+# ---------------------------------------------------------------------------------- of the skin
 
 
 @dataclass(frozen=True)
 class SkinFaults:
-    """Faults by the names in `SKIN_FAULTS`. None, zero or a factor of 1 stands for no fault.
-
-    Raises ValueError for a value that cannot be.
-    """
+    """Faults of the skin by the names in `SKIN_FAULTS`."""
 
     open_row: Annotated[Line, "number of a row that is not connected to the board"] = None
     open_column: Annotated[Line, "number of a column that is not connected to the board"] = None
@@ -55,47 +153,10 @@ class SkinFaults:
     saturated: Annotated[Cell, "row and column, as 1,2, of a cell whose layers are shorted"] = None
     ref_top: Annotated[Ohm, "true ohms of the rows' reference resistor; hello says 30000"] = None
     ref_bottom: Annotated[Ohm, "the same of the columns"] = None
-    wires: Annotated[float, "factor on all wires"] = 1.0
-    hum: Annotated[float, "hertz of the mains that every reading picks up"] = 0.0
-    hum_lsb: Annotated[float, "amplitude of the hum in LSB, 3 unless told"] = 3.0
-    tau_us: Annotated[float, "microseconds of the sense nodes' time constant of settling"] = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("ref_top", "ref_bottom", "wires"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ValueError(f"{name} must be above 0, not {value}")
-        for name in ("hum", "hum_lsb", "tau_us"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} must be 0 or more, not {getattr(self, name)}")
-        for name in ("short_rows", "short_columns"):
-            pair = getattr(self, name)
-            if pair is not None and pair[0] == pair[1]:
-                raise ValueError(f"{name} wants two different lines, not {pair[0]} twice")
-
-    @classmethod
-    def from_texts(cls, texts: Mapping[str, str]) -> Self:
-        """The faults that the options of a URL name; other options are left alone.
-
-        Raises ValueError for a text that is no such value.
-        """
-        values: dict[str, int | float | Pair] = {}
-        for name in SKIN_FAULTS.keys() & texts.keys():
-            try:
-                if name in _PAIRS:
-                    first, second = texts[name].split(",")
-                    values[name] = (int(first), int(second))
-                else:
-                    values[name] = (int if name in _LINES else float)(texts[name])
-            except ValueError:
-                wanted = "two numbers, as 1,2" if name in _PAIRS else "a number"
-                raise ValueError(f"{name} is {wanted}, not '{texts[name]}'") from None
-        return cls(**values)  # type: ignore[arg-type]
-
-    @property
-    def of_resistances(self) -> bool:
-        """Whether a resistance of the skin or of the board is changed."""
-        return replace(self, hum=0.0, hum_lsb=3.0, tau_us=0.0) != SkinFaults()
+    wires: Annotated[Factor, "factor on all wires"] = 1.0
+    hum: Annotated[Amount, "hertz of the mains that every reading picks up"] = 0.0
+    hum_lsb: Annotated[Amount, "amplitude of the hum in LSB, 3 unless told"] = 3.0
+    tau_us: Annotated[Amount, "microseconds of the sense nodes' time constant of settling"] = 0.0
 
     @property
     def of_sampling(self) -> bool:
@@ -114,8 +175,6 @@ class SkinFaults:
 
     def damaged(self, skin: Skin) -> Skin:
         """`skin` with all faults of resistances except shorted lines."""
-        if not self.of_resistances:
-            return skin
         cell = skin.cell_siemens.copy()
         if self.dead is not None:
             cell[self.dead] = 0.0
@@ -165,7 +224,7 @@ class SkinFaults:
         return np.asarray(read.reshape(order.shape).transpose(1, 0, 2))
 
 
-SKIN_FAULTS: Final = texts_of(SkinFaults)
+SKIN_FAULTS: Final = {name: text for name, (_, text) in _options(SkinFaults).items()}
 
 
 def _settled(voltage: Float, kept: float) -> Float:
