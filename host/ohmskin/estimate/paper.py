@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods `lsq` and `regularized`: the paper's Algorithm 1, up to its step 3 and up to its end.
 
-    step 2   R^t, R^b = 0, R^c from Ohm's law, V^t, V^b from a circuit simulation
+    step 2   R^t, R^b = 0, R^c from Ohm's law, V^t, V^b from a circuit simulation;
+             again with R^c of the method `matrix` if Ipopt does not succeed from there
     step 3   minimise Cost_lsq = 1e6 Cost_f + 1e6 Cost_c
     step 4   minimise Cost_reg = Cost_f + Cost_c + 1e9 Cost_r, from the result of step 3
 
@@ -41,7 +42,7 @@ were taken and why, and what can be expected of the answers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -60,6 +61,7 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
+from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings
 
 OHM_PER_MEGOHM: Final = 1e6
@@ -151,7 +153,7 @@ class PaperEstimator(Estimator):
     Each step starts from its own solution of the frame before, where that was good and no reading
     changed by more than 0.02 since, and otherwise as Algorithm 1 says. Good: converged, and all
     resistances are below 10 megohm. A frame whose warm start ends otherwise is solved again from
-    step 2.
+    step 2, and where that fails too, from the cells that `matrix` finds.
     Converged: Ipopt succeeded in the last step (300 iterations, tolerance 1e-6, circuit laws to
     1e-9 of Vdd), the readings are such that some circuit of the allowed resistances gives them, and
     the reported mean circuit gives them to 1e-3 of Vdd. `iterations` is the sum over all that was
@@ -184,13 +186,22 @@ class PaperEstimator(Estimator):
         self._previous = None
 
     def _solve(self, ports: PortReadings) -> Solution:
-        feasible, message = self._feasible(ports.ratio)
+        known = self.knowledge
+        # The four readings of a cell as its one current gives them. The paper's states have no
+        # noise: where four readings disagree, by a fraction of a code, no circuit gives them all.
+        consistent = ratio_from_current(ports.current, known.ref_top_ohm, known.ref_bottom_ohm)
+        feasible, message = self._feasible(consistent)
         before, answers = self._previous, []
         if before is not None and np.abs(feasible - before.ratio).max() < _JUMP_RATIO:
             answers.append(self._answer(feasible, before.optima))
         if not answers or not answers[0].is_good_start:
-            answers.append(self._answer(feasible, ()))
-        answer = answers[-1]
+            current = current_from_ratio(feasible, known.ref_top_ohm, known.ref_bottom_ohm)
+            answers.append(self._answer(feasible, (), 1.0 / current - known.ref_ohm))
+            if not answers[-1].is_good_start:
+                fit = CellFit(replace(ports, current=current), known.ref_ohm, None)
+                answers.append(self._answer(feasible, (), 1.0 / fit.cell))
+        # The best is the one whose readings are nearest to those that were read.
+        answer = min(answers, key=lambda each: (not each.is_good_start, each.misfit_ratio))
         self._previous = answer if answer.is_good_start else None
         last = answer.optima[-1]
         if not last.success:
@@ -200,7 +211,7 @@ class PaperEstimator(Estimator):
                 f"Ipopt ends with {last.status}, but in states of different circuits: their mean "
                 f"misses the readings by {answer.misfit_ratio:.2g} of Vdd"
             )
-        residual = (ports.ratio - answer.model_ratio) / self.knowledge.ratio_std
+        residual = (ports.ratio - answer.model_ratio) / known.ratio_std
         found = answer.skin
         return Solution(
             cell_siemens=found.cell_siemens,
@@ -212,8 +223,10 @@ class PaperEstimator(Estimator):
             bottom_wire_ohm=found.bottom_wire_ohm,
         )
 
-    def _answer(self, ratio: Float, previous: tuple[Optimum, ...]) -> _Answer:
-        """Steps 2 to the last one, or without step 2 from the optima of the previous frame."""
+    def _answer(
+        self, ratio: Float, previous: tuple[Optimum, ...], cell_ohm: Float | None = None
+    ) -> _Answer:
+        """Steps 2 to the last one from these cells, or from the optima of the previous frame."""
         known = self.knowledge
         optima: list[Optimum] = []
         for place, step in enumerate(self.steps):
@@ -223,7 +236,9 @@ class PaperEstimator(Estimator):
             elif optima:
                 x = optima[-1].x
             else:
-                x = initial_states(ratio, self._reference_megohm, self.start_wire_megohm)
+                assert cell_ohm is not None
+                cell_megohm = cell_ohm / OHM_PER_MEGOHM
+                x = initial_states(cell_megohm, self._reference_megohm, self.start_wire_megohm)
             optima.append(self._program.solve(ratio, self._reference_megohm, step, x, before))
         layers = optima[-1].megohm.mean(axis=0).reshape(3, known.columns, known.rows)
         top, bottom, cell = (OHM_PER_MEGOHM * layer.T for layer in layers)
@@ -269,16 +284,11 @@ class RegularizedEstimator(PaperEstimator):
 
 
 def initial_states(
-    ratio: Float, reference_megohm: tuple[float, float], wire_megohm: float
+    cell_megohm: Float, reference_megohm: tuple[float, float], wire_megohm: float
 ) -> Float:
-    """Step 2: the states (4N, 5N) of wires all alike and cells by Ohm's law, simulated.
-
-    ratio: readings (R, C, 4), each within what a port of positive resistance gives.
-    """
-    rows, columns, _ = ratio.shape
-    cells = rows * columns
-    current = current_from_ratio(ratio, *reference_megohm)
-    cell = np.clip(1.0 / current - sum(reference_megohm), *_START_CELL_MEGOHM)
+    """Step 2: the states (4N, 5N) of wires all alike and these cells (R, C), simulated."""
+    cells = cell_megohm.size
+    cell = np.clip(cell_megohm, *_START_CELL_MEGOHM)
     wire = np.full(cells, wire_megohm)
     states = np.empty((cells, READINGS_PER_CELL, 5 * cells))
     states[..., : 3 * cells] = np.log(np.concatenate([wire, wire, cell.T.ravel()]))
