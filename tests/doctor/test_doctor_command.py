@@ -4,6 +4,7 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from ohmskin.cli import doctor as doctor_command
 from ohmskin.cli.doctor import gather
 from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
+from ohmskin.estimate.base import WireOhm
 from ohmskin.link import session
 from ohmskin.record.recorder import Recorder
 
@@ -134,13 +136,18 @@ def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("benches")
-def test_a_calibration_is_compared_with(run: Run, tmp_path: Path) -> None:
-    calibration(Scene("rest", 8, 8, seed=5).rest_ratio).save(tmp_path / "skin.json")
-    url = "emulator://8x8?seed=5&wires=30"
-    done = run("doctor", url, "--calibration", str(tmp_path / "skin.json"), "--json")
-    names = [each["id"] for each in json.loads(done.out)["findings"]]
-    assert set(names) == {"wires"}
-    assert done.code == 1
+def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path: Path) -> None:
+    path, told = tmp_path / "skin.json", calibration(Scene("rest", 8, 8).rest_ratio)
+    for wire_ohm, more, names in (
+        (told.nominal_wire_ohm, (), ["wires"]),
+        (WireOhm(), (), []),
+        (told.nominal_wire_ohm, ("--wires", "150,300"), []),
+    ):
+        replace(told, nominal_wire_ohm=wire_ohm).save(path)
+        url = "emulator://8x8?scene=corners&wires=1.5"
+        done = run("doctor", url, "--calibration", str(path), "--press", "--json", *more)
+        assert [each["id"] for each in json.loads(done.out)["findings"]] == names
+        assert done.code == len(names)
 
 
 @pytest.mark.parametrize("end", [None, KeyboardInterrupt, RuntimeError])

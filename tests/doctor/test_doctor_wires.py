@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the doctor tells of the wires: of an untouched skin, and of pressed corners."""
+"""What the doctor tells of the wires, from pressed corners."""
 
 from dataclasses import replace
 from functools import cache
@@ -12,7 +12,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.examine import Evidence, examine
-from ohmskin.doctor.findings import Diagnosis, Kind, Place, WireShare
+from ohmskin.doctor.findings import Diagnosis, Kind, Place
 from ohmskin.doctor.signal import Rest
 from ohmskin.doctor.wires import (
     CornerScans,
@@ -93,32 +93,10 @@ def rest_of(skin: Skin) -> Rest:
     return Rest(board, codes, 1, EXACT_LSB, NOMINAL)
 
 
-# ------------------------------------------------------------------------- the untouched skin
-
-
-def test_wires_show_against_an_earlier_rest() -> None:
-    for rows, factor in ((16, 3.0), (8, 10.0)):
-        rest = Scene("rest", rows, rows, seed=3).rest_ratio
-        url = f"emulator://{rows}x{rows}?seed=3&wires={factor}"
-        diagnosis = examine(evidence(url, wire_ohm=NOMINAL, rest_ratio=rest))
-        assert {each.kind for each in diagnosis.findings} == {Kind.WIRES}
-        assert [each.layers for each in diagnosis.untouched] == [("top",), ("bottom",)]
-        for finding in diagnosis.findings:
-            share: WireShare = finding.values["share"]
-            nominal = NOMINAL[share.layers == ("bottom",)]
-            words = words_of(finding)
-            assert words["measured"].startswith(f"{share.share * nominal:.0f} +- ")
-            assert words["expected"] == f"{nominal:.0f} ohm a segment"
-            assert abs(share.share - factor) < 4 * share.std
-
-
-def test_an_untouched_skin_alone_says_nothing_of_its_wires() -> None:
+def test_an_untouched_skin_says_nothing_of_its_wires() -> None:
     diagnosis = examine(evidence("emulator://8x8?wires=1.5", wire_ohm=NOMINAL))
     assert diagnosis.findings == []
     assert diagnosis.wires_hidden
-
-
-# --------------------------------------------------------------------------- pressed corners
 
 
 @pytest.mark.parametrize("size", ["2x2", "2x5", "3x3", "4x4", "8x8", "12x4", "16x16"])

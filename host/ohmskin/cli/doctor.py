@@ -18,7 +18,7 @@ from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
-from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.calibration import load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import latency_timer
@@ -42,7 +42,9 @@ def doctor(
     port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
     calibration: Annotated[
         Path | None,
-        typer.Option(help="calibration file (.json): its rest and wires are what is compared with"),
+        typer.Option(
+            help="calibration file (.json) of this board: --press compares with its wires"
+        ),
     ] = None,
     wires: Annotated[
         str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")
@@ -69,7 +71,9 @@ def doctor(
             diagnosis = Diagnosis([_unanswered(port, exc)])
         else:
             with device:
-                evidence = gather(device, tell, told, wire_ohm, press=press)
+                if told is not None:
+                    told.check(device.info.unit_id, device.info.rows, device.info.columns)
+                evidence = gather(device, tell, wire_ohm, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
     if as_json:
@@ -123,23 +127,18 @@ def _terminal() -> Iterator[Tell]:
 def gather(
     device: Device,
     tell: Tell = lambda *told: None,
-    calibration: Calibration | None = None,
     wire_ohm: tuple[float, float] | None = None,
     *,
     press: bool = False,
 ) -> Evidence:
     """What `examine` goes by, as far as the board lets. Leaves the board as it was.
 
-    :raises ValueError: the calibration is of another unit or geometry, or somebody would be asked
-        to press a skin of one row or column.
+    :raises ValueError: somebody would be asked to press a skin of one row or column.
     """
     board, path = device.info, device.name.partition("?")[0]
     evidence = Evidence(board, host_version=ohmskin.__version__)
     # Wires of no resistance are none that could have changed.
     evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
-    if calibration is not None:
-        calibration.check(board.unit_id, board.rows, board.columns)
-        evidence.rest_ratio = calibration.rest.ratio
     evidence.latency = None if "://" in path else latency_timer(path)
     presses = CornerScans(board) if press else None
     try:

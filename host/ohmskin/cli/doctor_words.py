@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, WireShare
-from ohmskin.doctor.wires import LAYERS, CornerScans
+from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.protocol import ENUMS
 
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
@@ -63,10 +63,8 @@ def _words(finding: Finding) -> dict[str, Any]:
         case Kind.HUM:
             return {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
         case Kind.WIRES:
-            share, ohm = values["share"], dict(zip(LAYERS, values["nominal_ohm"], strict=True))
-            cases = {"both": len(share.layers) > 1, f"all_{'_'.join(share.layers)}": not lines}
-            told = {"told": _ohm(share, ohm), "times": share.share, **ohm}
-            return {"nominal": ohm[share.layers[0]], **told, **cases}
+            top, bottom = nominal_ohm = values["nominal_ohm"]
+            return {"told": _ohm(values["share"], nominal_ohm), "top": top, "bottom": bottom}
     return {}
 
 
@@ -100,17 +98,12 @@ def verdict(diagnosis: Diagnosis) -> str:
 
 
 def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The figures; and the wires of layers and lines in words, where they were judged."""
+    """The figures; and the wires in words, unless touches or faults hide them."""
     if diagnosis.nominal_ohm is None:
         return diagnosis.measured
-    ohm, pressed = dict(zip(LAYERS, diagnosis.nominal_ohm, strict=True)), diagnosis.pressed
-    if pressed is None:
-        layers = [
-            f"{each.layers[0]} {_ohm(each, ohm)}" for each in diagnosis.untouched if each.known
-        ]
-        told = "; ".join(layers) or _UNTOUCHED
-    else:
-        told = _ohm(pressed[0], ohm) if pressed else _NOT_PRESSED
+    told, pressed = _UNTOUCHED, diagnosis.pressed
+    if pressed is not None:
+        told = _ohm(pressed[0], diagnosis.nominal_ohm) if pressed else _NOT_PRESSED
     lines = [f"{named(each.place)}: {_times(each)}" for each in (pressed or ())[1:]]
     return {**diagnosis.measured, "wires": told, "wires_of_lines": lines}
 
@@ -119,14 +112,10 @@ def _times(share: WireShare) -> str:
     return f"{share.share:.2f} +- {share.std:.2f} times nominal" if share.known else _WIDE
 
 
-def _ohm(share: WireShare, nominal_ohm: dict[str, float]) -> str:
-    """The wires of one layer, or of both as presses show them."""
-    if len(share.layers) == 1:
-        ohm = nominal_ohm[share.layers[0]]
-        return f"{share.share * ohm:.0f} +- {share.std * ohm:.0f} ohm a segment"
+def _ohm(share: WireShare, nominal_ohm: tuple[float, float]) -> str:
     if not share.known:
         return _WIDE
-    top, bottom = (f"{share.share * nominal_ohm[layer]:.0f}" for layer in share.layers)
+    top, bottom = (f"{share.share * ohm:.0f}" for ohm in nominal_ohm)
     return f"{_times(share)}: top {top}, bottom {bottom} ohm a segment, if both changed alike"
 
 

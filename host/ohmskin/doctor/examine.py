@@ -13,12 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from ohmskin.arrays import Float
 from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Kind, Place
 from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
-from ohmskin.doctor.wires import CornerScans, measure_untouched
+from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
@@ -34,9 +33,8 @@ class Evidence:
 
     scans: as the board is configured. settled: what the board said of itself with a longer settle
     time, and its scans. stats: of the connection. lost: why the board went away meanwhile.
-    rest_ratio: readings (R, C, 4) of an earlier rest. wire_ohm: nominal wires of a segment, top and
-    bottom. presses: of the same skin, after all else. latency: the USB bridge's timer [ms] and the
-    file that sets it.
+    wire_ohm: nominal wires of a segment, top and bottom. presses: of the same skin, after all else.
+    latency: the USB bridge's timer [ms] and the file that sets it.
     """
 
     board: Hello
@@ -44,7 +42,6 @@ class Evidence:
     stats: BoardStats = field(default_factory=BoardStats)
     settled: tuple[Hello, list[Scan]] | None = None
     report: SelfTestReport | None = None
-    rest_ratio: Float | None = None
     wire_ohm: tuple[float, float] | None = None
     presses: CornerScans | None = None
     latency: tuple[int, str] | None = None
@@ -81,9 +78,8 @@ def examine(evidence: Evidence) -> Diagnosis:
 
 
 def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
-    """Adds what the scans show: signal, circuit, and the wires if nothing hides them.
-
-    Wires are at fault only if an earlier rest or nominal wires were told.
+    """Adds what the scans show: signal, circuit, and the wires if somebody pressed and nothing
+    hides them. Wires are at fault only if nominal ones were told.
     """
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
@@ -99,15 +95,11 @@ def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) ->
     if touched.any() or wrong.any():
         return
     diagnosis.nominal_ohm = wire_ohm
-    if evidence.rest_ratio is not None:
-        diagnosis.untouched = measure_untouched(rest, evidence.rest_ratio)
     if presses is not None:
         diagnosis.pressed = presses.measure(rest)
-    changed = [each for each in diagnosis.untouched if each.differs]
-    if evidence.wire_ohm is not None and not changed:
-        changed = [each for each in diagnosis.pressed or () if each.differs]
-    for each in changed:
-        diagnosis.add(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
+    for each in diagnosis.pressed or ():
+        if each.differs and evidence.wire_ohm is not None:
+            diagnosis.add(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
 
 
 def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:

@@ -105,17 +105,17 @@ class Finding:
 class WireShare:
     """Wire resistance over the nominal one, and its deviation.
 
-    layers: "top", "bottom", or both. place: lines, or the whole layers. known: the deviation is
-    small enough to tell the share. differs: the wires are clearly not nominal, and no other share
-    tells it already.
+    place: lines, or the whole layers. known: the deviation is small enough to tell the share.
+    differs: the wires are clearly not nominal, and no other share tells it already. layers: those
+    whose wires are seen together.
     """
 
-    layers: tuple[str, ...]
     place: Place
     share: float
     std: float
     known: bool
     differs: bool
+    layers: tuple[str, str] = ("top", "bottom")
 
 
 @dataclass
@@ -123,15 +123,13 @@ class Diagnosis:
     """All that was found. Findings stand in the order of their kinds.
 
     measured: figures by name, None for one that could not be had. nominal_ohm: wires of a segment,
-    top and bottom; None if touches or faults hide the wires. untouched: the share of each layer, if
-    an earlier rest was told. pressed: the share of all wires that presses show, then of each row
-    and column; None if nobody was asked to press.
+    top and bottom; None if touches or faults hide the wires. pressed: the share of all wires that
+    presses show, then of each row and column; None if nobody was asked to press.
     """
 
     findings: list[Finding] = field(default_factory=list)
     measured: dict[str, Any] = field(default_factory=dict)
     nominal_ohm: tuple[float, float] | None = None
-    untouched: list[WireShare] = field(default_factory=list)
     pressed: list[WireShare] | None = None
 
     def add(self, kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> None:
@@ -145,6 +143,5 @@ class Diagnosis:
 
     @property
     def wires_hidden(self) -> bool:
-        """Whether the wires were judged, but are not known of any layer."""
-        layers = self.untouched if self.pressed is None else self.pressed[:1]
-        return self.nominal_ohm is not None and not any(each.known for each in layers)
+        """Whether no press has told the wires, though no touch or fault hides them."""
+        return self.nominal_ohm is not None and not (self.pressed and self.pressed[0].known)

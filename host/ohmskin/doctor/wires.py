@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wires of a skin against nominal ones: of an untouched skin, and of three pressed corners.
+"""The wires of a skin against nominal ones, from three corners of a rectangle that are pressed.
 
-Both compare port resistances with those of a model, and find by least squares what the wires have
-to be for both to agree. A figure carries its deviation, which says whether it is worth anything.
+Port resistances are compared with those of a model; what the wires have to be for both to agree is
+found by least squares. A figure carries its deviation, which says whether it is worth anything.
 
-Symbols
+Symbols. Index 0 is the untouched skin, index 1 the pressed one.
 
 ====== ============ =====================================================================
 symbol shape        meaning
@@ -13,35 +13,22 @@ z      (RC,)        port resistances read, less those of the model [ohm]
 n      (RC,)        deviations of what was read [ohm]
 B      (RC, RC)     slopes of the model by the cells' log resistances [ohm]
 W      (RC, 2RC)    slopes of the model by the segments' log resistances [ohm]
-s      ()           deviation of a cell's log resistance from the model's, to be found
-x      (2,)         what the wires of each layer have more than nominal, as a share
-A      (RC, 2)      slopes of the model by x: sums of W [ohm]
-L      (RC, R+C)    slopes of the model by the wires of each row and column [ohm]
 y      ()           log of the wires over nominal
 u      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
 ====== ============ =====================================================================
 
-Untouched skin. The model is the nominal wires and the cells that an earlier rest shows, so
-
-    z = A x + L line + B (common + cell) + noise ,
-    S = n^2 + LAYER_STD^2 A A^T + LINE_STD^2 L L^T + B (COMMON_STD^2 1 1^T + s^2) B^T ,
-    x = LAYER_STD^2 A^T S^-1 z
-
-with s such that z^T S^-1 z is the number of readings. Cells of 1 MOhm hide wires of 100 ohm behind
-their own scatter: on large skins a factor of two shows, on others only gross changes. Without an
-earlier rest, and of single lines, an untouched skin shows nothing.
-
-Pressed corners. A pressed cell hides the wires behind it, too, because its own resistance is in the
-same reading. Three corners of a rectangle do not: with (a, b) the one between the other two,
-(a, b') and (a', b), the current of the fourth goes through all three in series, so that four ports
-see three unknown cells. But for the untouched cells,
+An untouched skin hides its wires: cells of 1 MOhm scatter by far more than wires of 100 ohm. A
+pressed cell hides the wires behind it, too, because its own resistance is in the same reading.
+Three corners of a rectangle do not: with (a, b) the one between the other two, (a, b') and (a', b),
+the current of the fourth goes through all three in series, so that four ports see three unknown
+cells. But for the untouched cells,
 
     rho[a,b] + rho[a,b'] + rho[a',b] - rho[a',b'] = 2 (top + bottom)
 
 with top the wire of row a from its electrode up to the nearer of columns b and b', and bottom that
 of column b up to the nearer of rows a and a'. So only the sum of both layers is seen, and they are
-taken to have changed alike. With index 0 for the untouched skin and 1 for the pressed one, the
-untouched cells follow from what was read of them, dc = B0^-1 (z0 - W0 dy), so
+taken to have changed alike. The untouched cells follow from what was read of them,
+dc = B0^-1 (z0 - W0 dy), so
 
     r = z1 - B1 B0^-1 z0 = W dy + B1 du + noise ,   W = W1 - B1 B0^-1 W0
 
@@ -73,20 +60,12 @@ from ohmskin.link.protocol import ADC_BITS
 
 Corners = tuple[Cell, Cell, Cell]
 
-LAYERS: Final = ("top", "bottom")
-
-# What is told. Shares are over nominal; deviations of pressed ones are those of their logs.
+# What is told. Shares are over nominal; deviations are those of their logs.
 KNOWN: Final = 0.15  # [share] A deviation above this is too close to a change to tell the share.
-CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of a layer anyway.
-CLEAR_STDS: Final = 5.0  # [deviations] By chance, no share of a layer differs by this.
-PRESSED_CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
+CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of the wires anyway.
+CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
 
-# Standard deviations before the readings, of an untouched skin.
-LAYER_STD: Final = 30.0  # [share] A layer may have changed by any factor.
-LINE_STD: Final = 0.05  # [share] The lines of a layer change alike within this.
-COMMON_STD: Final = 1.0  # [log] What all cells have in common says nothing of wires: it drifts.
-LEAST_STD: Final = 0.001  # [log] Cells scatter by this at least.
-# Standard deviations before the readings, of a pressed skin.
+# Standard deviations before the readings.
 BEFORE_STD: Final = 2.0  # [log] All wires may have changed by a factor of seven.
 DRIFT_STD: Final = 0.01  # [log] An untouched cell drifts by this in the seconds since it was read.
 
@@ -111,40 +90,6 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
     std_siemens = current_std(2.0**-ADC_BITS, *refs) * np.ravel(std_lsb)
     log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
     return loop_ohm - known.ref_ohm, std_siemens * loop_ohm**2, log_ohm
-
-
-# ------------------------------------------------------------------------- the untouched skin
-
-
-def measure_untouched(rest: Rest, earlier_ratio: Float) -> list[WireShare]:
-    """The share of each layer. earlier_ratio: readings (R, C, 4) of an earlier rest."""
-    shape, matrix = rest.codes.shape[:2], make_estimator("matrix", SkinKnowledge.of(rest.board))
-    rest_ohm, _, log_ohm = _ports(earlier_ratio, rest.std_lsb, matrix)
-    port_ohm, port_std, _ = _ports(rest.ratio, rest.std_lsb, matrix)
-    z = port_ohm - rest_ohm
-    siemens = np.exp(-log_ohm).reshape(shape)
-    model = port_sensitivity(siemens, *(np.full(shape, ohm) for ohm in rest.wire_ohm))
-    by_cell, by_wire = model.by_cell, model.by_wires().reshape(-1, 2, *shape)
-    layers = by_wire.sum(axis=(2, 3))  # A
-    lines = np.concatenate([by_wire[:, 0].sum(axis=2), by_wire[:, 1].sum(axis=1)], axis=1)  # L
-    common = by_cell.sum(axis=1)
-    but_cells = np.diag(2 * port_std**2) + COMMON_STD**2 * np.outer(common, common)
-    but_cells += LAYER_STD**2 * layers @ layers.T + LINE_STD**2 * lines @ lines.T
-    for cell_std in np.geomspace(LEAST_STD, 1.0, 40):
-        # The smallest scatter of cells that, with all else, explains the readings.
-        covariance = but_cells + cell_std**2 * by_cell @ by_cell.T
-        weighed = np.linalg.solve(covariance, np.column_stack([z, layers]))
-        if z @ weighed[:, 0] < len(z):
-            break
-    gain = LAYER_STD**2 * layers.T @ weighed
-    more, std = gain[:, 0], LAYER_STD * np.sqrt(np.maximum(1 - np.diagonal(gain[:, 1:]), 0.0))
-    known, differs = std < KNOWN, np.abs(more) > np.maximum(CHANGED, CLEAR_STDS * std)
-    columns = (each.tolist() for each in (1 + more, std, known, differs))
-    told = zip(LAYERS, *columns, strict=True)
-    return [WireShare((layer,), WHOLE_SKIN, *figures) for layer, *figures in told]
-
-
-# --------------------------------------------------------------------------- pressed corners
 
 
 def suggested_corners(rows: int, columns: int) -> Corners:
@@ -256,12 +201,12 @@ def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
         return []
     y, std = (np.array([each[at] for each in found]) for at in (1, 2))
     mean, mean_std = float(np.average(y, weights=std**-2.0)), float(np.sum(std**-2.0) ** -0.5)
-    alike = bool(np.all(np.abs(y - mean) < PRESSED_CLEAR_STDS * std))
+    alike = bool(np.all(np.abs(y - mean) < CLEAR_STDS * std))
 
     def share(y: float, std: float, tells: bool, place: Place = WHOLE_SKIN) -> WireShare:
-        clear = abs(y) > max(float(np.log(1 + CHANGED)), PRESSED_CLEAR_STDS * std)
+        clear = abs(y) > max(float(np.log(1 + CHANGED)), CLEAR_STDS * std)
         known, times = std <= KNOWN, float(np.exp(y))
-        return WireShare(LAYERS, place, times, times * std, known, tells and known and clear)
+        return WireShare(place, times, times * std, known, tells and known and clear)
 
     each = [share(y, std, not alike, Place((row,), (column,))) for (row, column), y, std in found]
     return [share(mean, mean_std, alike), *each]
