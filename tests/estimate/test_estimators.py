@@ -288,6 +288,19 @@ def test_touched_with_rest_sees_every_cell_pressed() -> None:
     assert not estimator.estimate(rest).touched.any()
 
 
+@pytest.mark.parametrize("method", WIRE_FREE)
+def test_what_rounding_may_be_is_no_touch_however_much_a_cell_conducts(method: str) -> None:
+    """A code more at a cell of 1 kilohm is 100 uS more. Three codes more are no rounding."""
+    rest = ten_bits(wire_free_readings(np.array([[1e3, REST_OHM]])))
+    estimator = make_estimator(method, told(rest, wires=False))
+    for codes, touched in ((1, False), (3, True)):
+        ratio = rest.copy()
+        ratio[0, 0] += codes / 1024 * np.array([-1, 1, -1, 1])
+        found = estimator.estimate(ratio)
+        assert (found.level - estimator.rest_level())[0, 0] > 100e-6
+        np.testing.assert_array_equal(found.touched, [[touched, False]])
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("wrong", [np.nan, -0.001, 1.001, np.inf])
 def test_the_first_offending_cell_is_named(method: str, wrong: float) -> None:

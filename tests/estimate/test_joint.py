@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`joint` on readings from ngspice, its derivatives by finite differences, and bad readings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from ohmskin.circuit.skin import (
 from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, TAIL, CellPrior, WireBelief
 from ohmskin.link.codes import quantise as codes_of
 from ohmskin.link.codes import ratio_from_codes
@@ -145,6 +148,18 @@ def test_the_papers_sweeps_are_below_a_quarter_of_its_best_error(name: str) -> N
     for (estimate, truth), best in zip(estimates(name, None), PAPER[name], strict=True):
         error = 1 / estimate.cell_siemens - 1 / truth["siemens"]
         assert np.sqrt(np.mean(error**2)) / 1e6 < best / 4
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_cell_that_opened_is_named_though_its_current_hardly_fell(method: str) -> None:
+    """In 12x12 the way past a cell takes over: its port draws more than what drift explains."""
+    rest = skin_at_rest(12, 12, np.random.default_rng(1))
+    cells = rest.cell_siemens.copy()
+    cells[1, 2] *= 0.1
+    known, measured = told(readings(rest)), ten_bits(readings(replace(rest, cell_siemens=cells)))
+    assert not PortReader(known).read(measured).fault
+    found = make_estimator(method, known).estimate(measured)
+    assert found.message == "cell (1, 2): conducts less than at rest, is a line open?"
 
 
 def test_a_hidden_cell_says_that_it_is_uncertain() -> None:

@@ -207,14 +207,39 @@ def test_nonsense_readings_are_answered_with_finite_cells_and_a_message(
 def test_states_of_different_circuits_are_not_called_converged() -> None:
     """Kilohm against megohm within one cell's four readings: no circuit is near all of them."""
     random = np.random.default_rng(0)
-    for _ in range(4):
-        port_ohm = np.exp(random.uniform(np.log(1e2), np.log(1e6), (2, 2, 4)))
+    messages = []
+    for _ in range(8):
+        port_ohm = np.exp(random.uniform(np.log(1e3), np.log(1e6), (1, 2, 4)))
         ratio = READING_OFFSET + READING_SIGN * 30e3 / (60e3 + port_ohm)
-        found = LsqEstimator(SkinKnowledge(2, 2)).estimate(ratio)
+        found = LsqEstimator(SkinKnowledge(1, 2)).estimate(ratio)
         assert np.isfinite(found.cell_ohm).all()
         assert found.chi2 > 1e9
         assert not found.converged
-        assert "Ipopt ends with" in found.message
+        messages.append(found.message)
+    assert all("Ipopt ends with" in message for message in messages)
+    assert any("their mean misses the readings by 0." in message for message in messages)
+
+
+@both_methods
+@pytest.mark.parametrize(
+    ("reading", "ratio", "flagged"),
+    [("A", 0.498, True), ("A", 0.499, False), ("C", 0.498, True), ("D", 0.502, True)],
+)
+def test_a_reading_that_no_port_gives_is_named(
+    method: type[PaperEstimator], reading: str, ratio: float, flagged: bool
+) -> None:
+    """Beyond a short by seven deviations of a reading, or by half as much."""
+    frame = ratio_from_current([[1 / 110e3], [1 / 60e3]], 30e3, 30e3)
+    frame[1, 0, "ABCD".index(reading)] = ratio
+    found = method(SkinKnowledge(2, 1, adc_bits=10)).estimate(frame)
+    said = f"reading {reading} of cell (1, 0) is none of a port from 10 ohm to 18 megohm"
+    assert found.message == (said if flagged else "")
+
+
+@both_methods
+def test_the_step_in_which_ipopt_gives_up_is_named(method: type[PaperEstimator]) -> None:
+    found = method(SkinKnowledge(2, 2, adc_bits=10)).estimate(np.zeros((2, 2, 4)))
+    assert f"; step {method.steps[-1].number}: Ipopt ends with Max" in found.message
 
 
 @both_methods

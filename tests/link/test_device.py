@@ -424,6 +424,28 @@ def test_close_while_another_thread_waits() -> None:
     assert [str(failure) for failure in failures] == ["emulator://1x1?rate=1 was closed"] * 2
 
 
+def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While one is being sent and answered, the other is not written."""
+    link = SteppedLink("emulator://1x1")
+    with Device(Session(link), start=False) as skin:
+        other, written, early = threading.Thread(target=skin.save), threading.Event(), []
+        write = link.write
+
+        def send(octets: bytes) -> None:
+            if threading.current_thread() is other:
+                written.set()
+            elif not other.is_alive():
+                other.start()
+                early.append(written.wait(0.2))
+            write(octets)
+
+        monkeypatch.setattr(link, "write", send)
+        skin.save()
+        other.join()
+    assert early == [False]
+    assert written.is_set()
+
+
 def test_nothing_listens_on_the_network(pty_board: Callable[[str], PtyServer]) -> None:
     from pathlib import Path
 

@@ -12,6 +12,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -337,6 +338,33 @@ def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
         with pytest.raises(RecordingError, match=reason) as refusal:
             load_recording(path)
         assert str(refusal.value).startswith(str(path))
+
+
+class AddedMeanwhile(io.FileIO):
+    """While its second write goes on, the first after the board's hello, another thread adds."""
+
+    writes = 0
+    other: threading.Thread
+    is_kept_waiting = False
+
+    def write(self, octets: object) -> int:
+        self.writes += 1
+        if self.writes == 2:
+            self.other.start()
+            self.other.join(0.2)  # an `add` that waits for nobody takes less
+            self.is_kept_waiting = self.other.is_alive()
+        return super().write(octets)  # type: ignore[arg-type]
+
+
+def test_one_thread_writes_at_a_time(tmp_path: Path, hello: Hello) -> None:
+    path = tmp_path / "a.mcap"
+    file = AddedMeanwhile(path, "wb")
+    with Recorder(path, hello, file=file) as recorder:
+        file.other = threading.Thread(target=recorder.add, args=(scan(1),))
+        recorder.add(scan(0))
+        until(lambda: recorder.scans == 2)
+    assert file.is_kept_waiting
+    assert_same(load_recording(path).scans, [scan(0), scan(1)])
 
 
 class FullDisk(io.FileIO):
