@@ -40,25 +40,30 @@ def scans(decoder: BoardDecoder, octets: bytes, host_time_s: float = 0.0) -> lis
     return [m for m in decoder.feed(octets, host_time_s) if isinstance(m, Scan)]
 
 
-def test_gaps_are_missed_scans() -> None:
+TOP = (1 << 32) - 1
+# What comes first, the numbers of the scans after it, and how many were missed before each.
+NUMBERS = {
+    "gaps": (hello_wire(), [0, 1, 5, 6, 9], [0, 0, 3, 0, 2]),
+    "lost right after the start": (hello_wire(), [4], [4]),
+    "a board that runs already": (hello_wire(scanning=1), [700, 702], [0, 1]),
+    "the number wraps": (b"", [TOP - 1, TOP, 0, 3], [0, 0, 0, 2]),
+    "a restart that nobody has seen": (b"", [1000, 1001, 1, 2], [0, 0, 1, 0]),
+}
+
+
+@pytest.mark.parametrize("what", NUMBERS)
+def test_numbers_tell_which_scans_are_missed(what: str) -> None:
+    before, numbers, missed = NUMBERS[what]
     decoder = BoardDecoder()
-    found = scans(decoder, hello_wire() + b"".join(map(scan_wire, [0, 1, 5, 6, 9])))
-    assert [s.number for s in found] == [0, 1, 5, 6, 9]
-    assert [s.missed for s in found] == [0, 0, 3, 0, 2]
-    assert decoder.stats.scans == 5
-    assert decoder.stats.missed == 5
+    found = scans(decoder, before + b"".join(map(scan_wire, numbers)))
+    assert [s.number for s in found] == numbers
+    assert [s.missed for s in found] == missed
+    assert (decoder.stats.scans, decoder.stats.missed) == (len(numbers), sum(missed))
 
 
-def test_scans_lost_right_after_the_start_are_missed() -> None:
+def test_what_a_running_board_dropped_before_is_not_missed() -> None:
     decoder = BoardDecoder()
-    assert [s.missed for s in scans(decoder, hello_wire() + scan_wire(4))] == [4]
-    assert decoder.stats.missed == 4
-
-
-def test_nothing_is_missed_before_the_first_scan_of_a_running_board() -> None:
-    decoder = BoardDecoder()
-    found = scans(decoder, hello_wire(scanning=1) + scan_wire(700, dropped=9) + scan_wire(702))
-    assert [s.missed for s in found] == [0, 1]
+    scans(decoder, hello_wire(scanning=1) + scan_wire(700, dropped=9) + scan_wire(702, dropped=9))
     assert decoder.stats.missed == 1
 
 
@@ -69,14 +74,6 @@ def test_a_damaged_scan_is_missed_by_the_next() -> None:
     found = scans(decoder, hello_wire() + scan_wire(0) + bytes(damaged) + scan_wire(2))
     assert [(s.number, s.missed) for s in found] == [(0, 0), (2, 1)]
     assert decoder.stats.line.damaged == 1
-
-
-def test_the_scan_number_wraps() -> None:
-    decoder = BoardDecoder()
-    top = (1 << 32) - 1
-    found = scans(decoder, b"".join(map(scan_wire, [top - 1, top, 0, 3])))
-    assert [s.missed for s in found] == [0, 0, 0, 2]
-    assert decoder.stats.missed == 2
 
 
 def test_the_board_time_does_not_wrap() -> None:
@@ -116,12 +113,6 @@ def test_a_restart_in_between_starts_the_numbers_again() -> None:
     assert [s.missed for s in found] == [0, 0, 2, 0]
     assert [s.time_us for s in found] == [9000, 20_000, 400, 11_500]
     assert decoder.stats.missed == 2
-
-
-def test_numbers_that_go_back_tell_of_a_restart_nobody_has_seen() -> None:
-    decoder = BoardDecoder()
-    found = scans(decoder, b"".join(map(scan_wire, [1000, 1001, 1, 2])))
-    assert [s.missed for s in found] == [0, 0, 1, 0]
 
 
 def test_board_time_goes_on_after_a_stop_later_than_its_first_wrap() -> None:
