@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.force.calibration import load_calibration
@@ -26,7 +26,6 @@ TOLD = (
     *("--top-wire", str(TOP_WIRE_OHM), "--bottom-wire", str(BOTTOM_WIRE_OHM)),
 )
 BY_OHM = ("--rest", "1.5", "--method", "ohm")  # the fastest
-Run = Callable[..., Done]
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +63,7 @@ def test_a_recording_and_its_forces_make_a_calibration(
     run: Run, presses: tuple[Path, Path, Path], scene: Scene, tmp_path: Path
 ) -> None:
     recording, _, out = presses
-    done = calibrate(run, presses)
-    assert (done.code, done.err) == (0, "")
+    done = well(calibrate(run, presses))
     offset_s = float(done.out.partition("offset of the clocks ")[2].partition(" s")[0])
     # Creep and the sensor's rate leave some hundredths.
     assert offset_s == pytest.approx(HOST_BEGIN_S - SENSOR_BEGIN_S, abs=0.05)
@@ -106,16 +104,14 @@ def test_a_recording_and_its_forces_make_a_calibration(
         lambda: run("calibrate", "recording", str(both), str(out), *TOLD, *BY_OHM),
         lambda: calibrate(run, presses, *BY_OHM),
     ):
-        done = command()
-        assert (done.code, done.err) == (0, "")
+        done = well(command())
         slopes.append(load_calibration(out).model.slope)
     np.testing.assert_allclose(*slopes, rtol=0.02)
 
 
 @pytest.mark.parametrize("method", ["voltage", "touch"])
 def test_other_methods(run: Run, presses: tuple[Path, Path, Path], method: str) -> None:
-    done = calibrate(run, presses, "--rest", "1.5", "--method", method)
-    assert (done.code, done.err) == (0, "")
+    well(calibrate(run, presses, "--rest", "1.5", "--method", method))
     assert load_calibration(presses[2]).method == method
 
 
@@ -159,8 +155,7 @@ def test_a_gap_in_the_log_costs_its_presses_alone(
         return t[kept], f[kept]
 
     edited(presses[1], with_gap)
-    done = calibrate(run, presses, *BY_OHM)
-    assert (done.code, done.err) == (0, "")
+    well(calibrate(run, presses, *BY_OHM))
     assert load_calibration(presses[2]).model.pooled.sum() <= 1
 
 
@@ -213,8 +208,7 @@ def press_table(path: Path, seed: int = 1) -> Float:
 def test_a_table_makes_a_calibration(run: Run, tmp_path: Path) -> None:
     table, out = tmp_path / "presses.csv", tmp_path / "skin.json"
     rest = press_table(table)
-    done = run("calibrate", "table", REST, str(table), str(out), "--rest", "0.3", *TOLD)
-    assert (done.code, done.err) == (0, "")
+    well(run("calibrate", "table", REST, str(table), str(out), "--rest", "0.3", *TOLD))
     found = load_calibration(out)
     assert (found.unit_id, found.rows, found.columns) == (5, 2, 3)
     np.testing.assert_allclose(found.model.slope, 1e5, rtol=0.02)

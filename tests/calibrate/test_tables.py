@@ -236,8 +236,7 @@ _PRESS = st.tuples(_CELL, _CELL, st.floats(0, 1e60), _SIEMENS, _SIEMENS)
 
 @given(st.lists(_PRESS, min_size=1, max_size=20))
 def test_a_saved_table_is_a_csv_that_is_read_back_bit_for_bit(
-    tmp_path_factory: pytest.TempPathFactory,
-    rows: list[tuple[int, int, float, float, float]],
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[int, int, float, float, float]]
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "round_trip.csv"
     saved = np.array(rows, PRESS)

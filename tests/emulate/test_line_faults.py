@@ -5,7 +5,6 @@ import itertools
 import os
 import threading
 import time
-import tty
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -16,7 +15,6 @@ import ohmskin
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
 from ohmskin.emulate.board import EmulatorLink
-from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import device, framing, protocol, session
@@ -26,6 +24,7 @@ from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
 from ohmskin.opening import emulated, open_link
+from ports import Serve
 from stepped_link import SteppedLink
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -73,7 +72,7 @@ def test_bad_line(fault: str) -> None:
     read_bad_line(f"emulator://8x8?scene=multi&seed=5&noise=0&rate=140&{fault}")
 
 
-def test_bad_line_of_a_serial_port(pty_board: Callable[[str], PtyServer]) -> None:
+def test_bad_line_of_a_serial_port(pty_board: Serve) -> None:
     url = "emulator://8x8?scene=multi&seed=5&noise=0&rate=140&bitflip=1e-4&drop=0.03"
     with ohmskin.open(pty_board(url).path) as skin:
         found = list(itertools.islice(skin, 100))
@@ -226,7 +225,7 @@ def test_a_board_that_is_unplugged(use: str) -> None:
 
 
 @pytest.mark.parametrize("use", READS)
-def test_a_serial_port_that_goes_away(use: str, pty_board: Callable[[str], PtyServer]) -> None:
+def test_a_serial_port_that_goes_away(use: str, pty_board: Serve) -> None:
     server = pty_board("emulator://2x2?rate=300")
     timer = threading.Timer(0.4, server.close)
     with ohmskin.open(server.path) as skin:
@@ -258,11 +257,12 @@ def test_a_silent_port(monkeypatch: pytest.MonkeyPatch) -> None:
         ohmskin.open("emulator://2x2?silent=1")
 
 
-def test_a_port_with_other_things_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_with_other_things_to_say(
+    monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
+) -> None:
     """As of a board with another sketch, which prints lines for ever."""
     monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.7)
-    master, slave = os.openpty()
-    tty.setraw(slave)
+    master, path = silent_port
     done = threading.Event()
 
     def chatter() -> None:
@@ -273,12 +273,10 @@ def test_a_port_with_other_things_to_say(monkeypatch: pytest.MonkeyPatch) -> Non
     thread.start()
     try:
         with pytest.raises(DeviceSilent, match="no frames"):
-            ohmskin.open(os.ttyname(slave))
+            ohmskin.open(path)
     finally:
         done.set()
         thread.join()
-        os.close(master)
-        os.close(slave)
 
 
 def test_a_board_of_another_definition() -> None:
@@ -347,27 +345,19 @@ def test_refusals_on_a_bad_line_stay_refusals() -> None:
         assert skin.latest().codes.shape == (4, 4, 4)
 
 
-def test_no_thread_or_file_is_left_when_opening_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_thread_or_file_is_left_when_opening_fails(
+    monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
+) -> None:
     monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
-    master, slave = os.openpty()  # nobody answers there
-    try:
-        urls = [
-            "emulator://2x2?silent=1",
-            "emulator://2x2?foreign=1",
-            "emulator://2x2?vanish=1e-6",
-        ]
-        for url in [*urls, os.ttyname(slave)]:
-            threads, files = threading.active_count(), len(os.listdir("/proc/self/fd"))
-            with pytest.raises(OhmskinError):
-                ohmskin.open(url)
-            assert threading.active_count() == threads
-            assert len(os.listdir("/proc/self/fd")) == files
-    finally:
-        os.close(master)
-        os.close(slave)
+    for fault in ("silent=1", "foreign=1", "vanish=1e-6", ""):
+        threads, files = threading.active_count(), len(os.listdir("/proc/self/fd"))
+        with pytest.raises(OhmskinError):
+            ohmskin.open(f"emulator://2x2?{fault}" if fault else silent_port[1])
+        assert threading.active_count() == threads
+        assert len(os.listdir("/proc/self/fd")) == files
 
 
-def test_a_wrong_option_leaves_no_port_open(pty_board: Callable[[str], PtyServer]) -> None:
+def test_a_wrong_option_leaves_no_port_open(pty_board: Serve) -> None:
     path = pty_board("emulator://2x2").path
     with pytest.raises(OhmskinError, match="baud=7"):
         ohmskin.open(f"{path}?baud=7")

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin.emulate.pty_server import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
 from ohmskin.link import device, feed, framing, protocol
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
+from ports import Serve
 from stepped_link import SteppedLink
 from waiting import until
 
@@ -41,7 +41,7 @@ BACKENDS = [
 
 
 @pytest.fixture(params=BACKENDS)
-def url(request: pytest.FixtureRequest, pty_board: Callable[[str], PtyServer]) -> str:
+def url(request: pytest.FixtureRequest, pty_board: Serve) -> str:
     emulator = f"emulator://8x8?{SCENE}"
     if request.param == "emulator":
         return emulator
@@ -292,7 +292,7 @@ def test_the_context_closes_on_an_exception(url: str) -> None:
         skin.stop()
 
 
-def test_a_port_can_be_opened_again(pty_board: Callable[[str], PtyServer]) -> None:
+def test_a_port_can_be_opened_again(pty_board: Serve) -> None:
     path = pty_board("emulator://4x4").path
     for round_number in range(3):
         with ohmskin.open(path) as skin:
@@ -301,7 +301,7 @@ def test_a_port_can_be_opened_again(pty_board: Callable[[str], PtyServer]) -> No
             skin.set_unit_id(round_number + 1)
 
 
-def test_close_stops_the_board(pty_board: Callable[[str], PtyServer]) -> None:
+def test_close_stops_the_board(pty_board: Serve) -> None:
     server = pty_board("emulator://4x4")
     with ohmskin.open(server.path) as skin:
         skin.latest()
@@ -309,7 +309,7 @@ def test_close_stops_the_board(pty_board: Callable[[str], PtyServer]) -> None:
     until(lambda: server._board.next_scan_s is None)
 
 
-def test_a_board_left_scanning_is_taken_over(pty_board: Callable[[str], PtyServer]) -> None:
+def test_a_board_left_scanning_is_taken_over(pty_board: Serve) -> None:
     from ohmskin.link.serial_port import SerialLink
 
     path = pty_board("emulator://4x4").path
@@ -325,7 +325,7 @@ def test_a_board_left_scanning_is_taken_over(pty_board: Callable[[str], PtyServe
 
 
 @pytest.mark.parametrize("board", ["pty", pytest.param("uno", marks=pytest.mark.simavr)])
-def test_the_faster_line(board: str, pty_board: Callable[[str], PtyServer]) -> None:
+def test_the_faster_line(board: str, pty_board: Serve) -> None:
     url = pty_board("emulator://8x8").path if board == "pty" else f"simavr://{board}"
     with ohmskin.open(f"{url}?baud=1000000") as skin:
         assert skin.info.baud == 1_000_000
@@ -446,7 +446,7 @@ def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch)
     assert written.is_set()
 
 
-def test_nothing_listens_on_the_network(pty_board: Callable[[str], PtyServer]) -> None:
+def test_nothing_listens_on_the_network(pty_board: Serve) -> None:
     from pathlib import Path
 
     def sockets() -> set[str]:

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -20,7 +19,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.cli.record import PressDisplay
 from ohmskin.errors import DeviceLost, PortError
@@ -36,7 +35,6 @@ from waiting import until
 tty = pytest.importorskip("tty")
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
-Run = Callable[..., Done]
 # Longest time that a test waits for another thread [s].
 PATIENCE_S = 20.0
 
@@ -349,8 +347,7 @@ def test_a_recorded_force_sensor_calibrates(
     monkeypatch.setattr(ohmskin, "open", lambda url, start: skin)
     monkeypatch.setattr("ohmskin.cli.record.ForceSensor", ScriptedSensor(skin).opened)
     force = ("--force-port", "scale", "--force-baud", "57600", "--force-scale", "2")
-    done = run("record", "fast", str(file), *force, "--tare", "1.5", "--seconds", "16.5")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("record", "fast", str(file), *force, "--tare", "1.5", "--seconds", "16.5"))
     assert "touch nothing for 1.5 s" in done.out
     counts = r"presses\.mcap: 66\d scans, missed 0, \d+ bytes, 66\d forces, 2 lines that are no num"
     assert re.search(counts, done.out)
@@ -362,8 +359,7 @@ def test_a_recorded_force_sensor_calibrates(
     assert max(sample.force_n for sample in recording.forces) == pytest.approx(7.03, abs=0.1)
     assert {sample.source for sample in recording.forces} == {"scale"}
 
-    done = run("calibrate", "recording", str(file), str(out), "--indenter-mm2", "100")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("calibrate", "recording", str(file), str(out), "--indenter-mm2", "100"))
     assert "zero of the force sensor +0.029 N" in done.out
     calibration = load_calibration(out)
     for force_n in (2.0, 5.0):
@@ -447,7 +443,7 @@ def test_whatever_ends_a_recording_with_forces_it_is_whole(
         done = run(*arguments)
     if end == "sensor":
         gone = f"{sketch.path} is gone: is the force sensor still plugged in? (what came before is"
-        assert_one_line(replace(done, out=""), gone, "own.mcap")
+        assert_one_line(done._replace(out=""), gone, "own.mcap")
     else:
         assert (done.code, done.err) == (0, "")
     given = load_recording(file)

@@ -10,8 +10,6 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,7 +24,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Command, Done, Run, assert_one_line
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
@@ -39,7 +37,6 @@ from waiting import until
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 URL = "emulator://3x4?scene=multi&seed=3&rate=400"
-Command = Callable[..., "subprocess.Popen[str]"]
 # Scans reach the file within half a second; on a busy machine, within this [s].
 LATE_S = 3.0
 
@@ -612,17 +609,10 @@ def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     assert not list(tmp_path.glob("b*"))
 
 
-def test_typed_lines_become_marks(tmp_path: Path) -> None:
+def test_typed_lines_become_marks(tmp_path: Path, command: Command) -> None:
     path = tmp_path / "a.mcap"
     far, near = os.openpty()
-    host = str(Path(ohmskin.__file__).parents[1])
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ohmskin", "record", URL, str(path)],
-        stdin=near,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env={**os.environ, "PYTHONPATH": host},
-    )
+    process = command("record", URL, str(path), stdin=near)
     os.close(near)
     with os.fdopen(far, "wb", buffering=0) as keyboard:
         until(path.exists)
@@ -636,7 +626,7 @@ def test_typed_lines_become_marks(tmp_path: Path) -> None:
     assert [mark.text for mark in load_recording(path).marks] == ["left hand", "right hand"]
 
 
-def test_the_commands(tmp_path: Path, command: Command, run: Callable[..., Done]) -> None:
+def test_the_commands(tmp_path: Path, command: Command, run: Run) -> None:
     path, out = tmp_path / "a.mcap", tmp_path / "a.npz"
     quiet = "emulator://3x4?scene=rest"
     process = command(

@@ -6,25 +6,23 @@ import io
 import json
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from command_line import Command, Run
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.cli import main as cli
 from ohmskin.estimate.methods import METHODS
 from ohmskin.files import save_whole
 from places import DATA, ROOT
 from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published
-from studies.__main__ import app
 from studies.chart import Plan, Row, Size, pareto_front
 from waiting import until
 
@@ -243,29 +241,14 @@ def test_frames_without_touches_have_a_row_and_a_picture() -> None:
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
+def draw(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
     """A function that runs ``python -m studies chart ARGUMENTS`` with a tiny plan."""
     monkeypatch.setattr(chart, "QUICK", TINY)
-    monkeypatch.setenv("COLUMNS", "120")
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["studies", "chart", "--quick", *arguments])
-        code = 0
-        try:
-            cli.run(app, "studies")
-        except SystemExit as end:
-            code = int(end.code or 0)
-        return code, *capsys.readouterr()
-
-    return call
+    return partial(run, "chart", "--quick", program="studies")
 
 
-def test_chart_writes_picture_and_table(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path, rows: list[Row]
-) -> None:
-    code, out, err = run("--out", str(tmp_path / "new"))
+def test_chart_writes_picture_and_table(draw: Run, tmp_path: Path, rows: list[Row]) -> None:
+    code, out, err = draw("--out", str(tmp_path / "new"))
     assert code == 0
     answer = json.loads(out)
     assert answer["quick"]
@@ -285,22 +268,18 @@ def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatc
 
 
 def test_without_matplotlib_nothing_is_measured(
-    run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    draw: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     monkeypatch.setattr(chart, "measure", lambda *_: pytest.fail("measured in vain"))
-    code, out, err = run("--out", str(tmp_path))
+    code, out, err = draw("--out", str(tmp_path))
     assert (code, out) == (2, "")
     assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
 
 
 @pytest.mark.parametrize("where", ["measure", "picture"])
 def test_ctrl_c_leaves_the_old_files(
-    run: Callable[..., tuple[int, str, str]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    where: str,
-    rows: list[Row],
+    draw: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, where: str, rows: list[Row]
 ) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -308,16 +287,14 @@ def test_ctrl_c_leaves_the_old_files(
     monkeypatch.setattr(chart, "measure", lambda *_: rows)
     monkeypatch.setattr(chart if where == "measure" else chart_figure, where, interrupt)
     (tmp_path / "speed-accuracy.csv").write_text("old")
-    code, out, err = run("--out", str(tmp_path))
+    code, out, err = draw("--out", str(tmp_path))
     assert (code, out) == (130, "")
     assert "Traceback" not in err
     assert [path.name for path in tmp_path.iterdir()] == ["speed-accuracy.csv"]
     assert (tmp_path / "speed-accuracy.csv").read_text() == "old"
 
 
-def test_ctrl_c_is_not_lost_in_ipopt(
-    command: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_ctrl_c_is_not_lost_in_ipopt(command: Command, tmp_path: Path) -> None:
     """CasADi takes the signal; the frame once was just not converged, and the run went on."""
     folder = tmp_path / "new"
     process = command("chart", "--out", str(folder), module="studies")
@@ -332,16 +309,13 @@ def test_ctrl_c_is_not_lost_in_ipopt(
 
 @pytest.mark.parametrize("text", ["returned a result with an exception set", "KeyboardInterrupt"])
 def test_ctrl_c_is_told_from_what_casadi_makes_of_it(
-    run: Callable[..., tuple[int, str, str]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    text: str,
+    draw: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str
 ) -> None:
     def interrupt(*_: object) -> None:
         raise SystemError(text) from (KeyboardInterrupt() if "result" in text else None)
 
     monkeypatch.setattr(chart, "measure", interrupt)
-    code, out, err = run("--out", str(tmp_path))
+    code, out, err = draw("--out", str(tmp_path))
     assert (code, out) == (130, "")
     assert "Traceback" not in err
 

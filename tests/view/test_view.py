@@ -6,8 +6,6 @@ import os
 import re
 import signal
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -22,8 +20,7 @@ from starlette.websockets import WebSocketDisconnect
 
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
-from command_line import Done, assert_one_line
-from ohmskin.emulate.pty_server import PtyServer
+from command_line import Command, Run, assert_one_line, python
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.record.recorder import Recorder
@@ -31,6 +28,7 @@ from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards, server
 from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
 from ohmskin.view.server import make_app
+from ports import Serve
 from waiting import until
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
@@ -333,7 +331,7 @@ def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 
 
 def test_a_board_that_is_pulled_out_comes_back_by_itself(
-    pty_board: Callable[[str], PtyServer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pty_board: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(boards, "AGAIN_S", 0.1)
     port = tmp_path / "skin"
@@ -577,9 +575,7 @@ def test_the_page_is_small_and_asks_no_other_host() -> None:
 # ---------------------------------------------------------------------------- the command itself
 
 
-def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(
-    command: Callable[..., subprocess.Popen[str]],
-) -> None:
+def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) -> None:
     process = command("view", REST, "--http-port", "0", "--no-browser")
     assert process.stdout is not None
     url = process.stdout.readline().strip()
@@ -607,7 +603,7 @@ def listening(pid: int) -> set[tuple[str, int]]:
     return found
 
 
-def test_a_port_that_is_taken(run: Callable[..., Done]) -> None:
+def test_a_port_that_is_taken(run: Run) -> None:
     import socket
 
     with ExitStack() as stack:
@@ -620,11 +616,4 @@ def test_a_port_that_is_taken(run: Callable[..., Done]) -> None:
 
 def test_without_the_extra_it_says_what_to_install() -> None:
     program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__"
-    host = str(Path(ohmskin.__file__).parents[1])
-    done = subprocess.run(
-        [sys.executable, "-c", program, "view"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": host},
-    )
-    assert_one_line(Done(done.returncode, done.stdout, done.stderr), "pip install 'ohmskin[view]'")
+    assert_one_line(python("-c", program, "view"), "pip install 'ohmskin[view]'")
