@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 import ohmskin
-from command_line import Command, Done, Run, assert_one_line
+from command_line import Command, Done, Run, assert_one_line, finish, well
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
@@ -45,6 +45,12 @@ LATE_S = 3.0
 def hello() -> Hello:
     with ohmskin.open(URL, start=False) as skin:
         return skin.info
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where a recording is written."""
+    return tmp_path / "a.mcap"
 
 
 def scan(number: int, rows: int = 3, columns: int = 4, at_s: float | None = None) -> Scan:
@@ -76,8 +82,7 @@ def replayed(path: Path, speed: float = 0) -> list[Scan]:
 # ----------------------------------------------------------------------------- write and read
 
 
-def test_everything_is_read_again(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_everything_is_read_again(path: Path, hello: Hello) -> None:
     with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
         scans = list(itertools.islice(skin, 50))
         for each in scans:
@@ -94,9 +99,8 @@ def test_everything_is_read_again(tmp_path: Path, hello: Hello) -> None:
     assert [*found.marks, *found.forces] == others
 
 
-def test_other_programs_read_it(tmp_path: Path, hello: Hello) -> None:
+def test_other_programs_read_it(path: Path, hello: Hello) -> None:
     """The library's seeking reader, with the index; each message fits its schema's properties."""
-    path = tmp_path / "a.mcap"
     before_ns = time.time_ns()
     write(path, hello, [scan(n, at_s=time.monotonic()) for n in range(20)])
     with path.open("rb") as file:
@@ -122,9 +126,8 @@ def test_other_programs_read_it(tmp_path: Path, hello: Hello) -> None:
                 assert content["codes"] == expected.codes.reshape(-1).tolist()
 
 
-def test_size_on_disk(tmp_path: Path, hello: Hello) -> None:
+def test_size_on_disk(path: Path, hello: Hello) -> None:
     """At most 40 kB/s for 8x8 at 90 Hz, half a second in each chunk."""
-    path = tmp_path / "a.mcap"
     board, _, _ = emulated("emulator://8x8?scene=moving&noise=1")
     with Recorder(path, hello) as recorder:
         for number in range(450):
@@ -134,8 +137,7 @@ def test_size_on_disk(tmp_path: Path, hello: Hello) -> None:
     assert path.stat().st_size < 5 * 40_000
 
 
-def test_an_existing_file_is_left_alone(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_an_existing_file_is_left_alone(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_text("mine")
     with pytest.raises(RecordingError, match="there already"):
         Recorder(path, hello)
@@ -189,8 +191,7 @@ def test_a_closed_recording_takes_no_more(tmp_path: Path, hello: Hello) -> None:
         recorder.add(scan(0))
 
 
-def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_silent_board_s_last_scans_reach_the_file(path: Path, hello: Hello) -> None:
     with Recorder(path, hello) as recorder:
         recorder.add(scan(0))
         until(lambda: load_recording(path).scans, LATE_S)
@@ -202,8 +203,7 @@ def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello
 # ------------------------------------------------------------------------------ what ends badly
 
 
-def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
-    path = tmp_path / "a.mcap"
+def test_killed_at_any_moment(path: Path, command: Command) -> None:
     process = command("record", URL, str(path))
     until(lambda: path.exists() and path.stat().st_size > 20_000)
     time.sleep(0.77)
@@ -220,13 +220,11 @@ def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_properly(tmp_path: Path, command: Command, number: signal.Signals) -> None:
-    path = tmp_path / "a.mcap"
+def test_signals_end_it_properly(path: Path, command: Command, number: signal.Signals) -> None:
     process = command("record", URL, str(path))
     until(lambda: path.exists() and path.stat().st_size > 10_000)
     process.send_signal(number)
-    out, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, "")
+    out = well(finish(process)).out
     found = load_recording(path)
     assert not found.cut_off
     assert f"{len(found.scans)} scans" in out
@@ -276,8 +274,7 @@ def test_cut_off_at_any_byte(tmp_path: Path, hello: Hello) -> None:
     assert set(counts) == set(range(7))
 
 
-def test_damage_is_named(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_damage_is_named(path: Path, hello: Hello) -> None:
     write(path, hello, [scan(n) for n in range(5)])
     octets = bytearray(path.read_bytes())
     outcomes = set()
@@ -310,8 +307,7 @@ def test_an_old_recording_does_not_say_how_long_a_slot_is(tmp_path: Path, hello:
         assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
 
 
-def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_bytes(b"")
     with pytest.raises(RecordingError, match="cut off"):
         load_recording(path)
@@ -353,8 +349,7 @@ class AddedMeanwhile(io.FileIO):
         return super().write(octets)  # type: ignore[arg-type]
 
 
-def test_one_thread_writes_at_a_time(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_one_thread_writes_at_a_time(path: Path, hello: Hello) -> None:
     file = AddedMeanwhile(path, "wb")
     with Recorder(path, hello, file=file) as recorder:
         file.other = threading.Thread(target=recorder.add, args=(scan(1),))
@@ -377,8 +372,7 @@ class FullDisk(io.FileIO):
         return super().write(view[:fits])
 
 
-def test_a_full_disk_ends_the_recording(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_full_disk_ends_the_recording(path: Path, hello: Hello) -> None:
     file = FullDisk(path, "wb")
     file.room = 20_000
 
@@ -398,25 +392,20 @@ def test_a_full_disk_ends_the_recording(tmp_path: Path, hello: Hello) -> None:
     assert 15_000 < path.stat().st_size <= 20_000
 
 
-def test_a_file_that_may_not_grow_ends_the_command(tmp_path: Path, command: Command) -> None:
+def test_a_file_that_may_not_grow_ends_the_command(path: Path, command: Command) -> None:
     resource = pytest.importorskip("resource")
-    path = tmp_path / "a.mcap"
     process = command("record", URL, str(path))
     if not hasattr(resource, "prlimit"):
         pytest.skip("needs prlimit")
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, out) == (2, "")
-    assert err.count("\n") == 1
-    assert "recording ended after" in err
+    assert_one_line(finish(process), "recording ended after")
     assert load_recording(path).scans
 
 
 # -------------------------------------------------------------------------------------- replay
 
 
-def test_replay_is_the_recording_bit_for_bit(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_replay_is_the_recording_bit_for_bit(path: Path, hello: Hello) -> None:
     with ohmskin.open(f"{URL}&drop=0.05") as skin:
         scans = list(itertools.islice(skin, 300))
     assert any(each.missed for each in scans)
@@ -425,8 +414,7 @@ def test_replay_is_the_recording_bit_for_bit(tmp_path: Path, hello: Hello) -> No
     assert_same(replayed(path, speed=4), scans, host_time=False)
 
 
-def test_a_slow_reader_of_a_fast_replay_loses_nothing(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_slow_reader_of_a_fast_replay_loses_nothing(path: Path, hello: Hello) -> None:
     scans = [scan(n, rows=1, columns=1) for n in range(3000)]
     write(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
@@ -439,8 +427,7 @@ def test_a_slow_reader_of_a_fast_replay_loses_nothing(tmp_path: Path, hello: Hel
     assert_same(first, scans, host_time=False)
 
 
-def test_latest_of_a_fast_replay_gives_each(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_latest_of_a_fast_replay_gives_each(path: Path, hello: Hello) -> None:
     scans = [scan(n) for n in range(40)]
     write(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
@@ -452,8 +439,7 @@ def test_latest_of_a_fast_replay_gives_each(tmp_path: Path, hello: Hello) -> Non
             skin.stop()
 
 
-def test_replay_takes_the_recorded_time(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_replay_takes_the_recorded_time(path: Path, hello: Hello) -> None:
     write(path, hello, [scan(n, at_s=7 + n / 10) for n in range(6)])
     begin_s = time.monotonic()
     found = replayed(path, speed=1)
@@ -462,18 +448,16 @@ def test_replay_takes_the_recorded_time(tmp_path: Path, hello: Hello) -> None:
 
 
 def test_replay_shortens_long_pauses(
-    tmp_path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
+    path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ohmskin.record.replay.LONGEST_PAUSE_S", 0.1)
-    path = tmp_path / "a.mcap"
     write(path, hello, [scan(0, at_s=0), scan(1, at_s=3600), scan(2, at_s=10)])
     begin_s = time.monotonic()
     assert len(replayed(path, speed=1)) == 3
     assert time.monotonic() - begin_s < 5
 
 
-def test_a_recording_stays_as_it_is(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
     scans = [scan(n) for n in range(30)]
     write(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
@@ -498,8 +482,7 @@ def test_a_recording_stays_as_it_is(tmp_path: Path, hello: Hello) -> None:
     assert numbers[-1] == 29
 
 
-def test_a_change_of_size_is_replayed(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path) -> None:
     with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
         scans = list(itertools.islice(skin, 5))
         for each in scans:
@@ -516,8 +499,7 @@ def test_a_change_of_size_is_replayed(tmp_path: Path) -> None:
         export(load_recording(path), tmp_path / "a.npz")
 
 
-def test_wrong_replays(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
     write(path, hello, [scan(0)])
     for query in ("speed=-1", "speed=nan", "speed=fast", "baud=9600"):
         with pytest.raises(PortError, match="speed"):
@@ -532,14 +514,12 @@ def test_wrong_replays(tmp_path: Path, hello: Hello) -> None:
         replayed(path)
 
 
-def test_a_skin_larger_than_any_board_is_replayed(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_skin_larger_than_any_board_is_replayed(path: Path, hello: Hello) -> None:
     write(path, hello, [scan(0, rows=20)])
     assert replayed(path)[0].codes.shape == (20, 4, 4)
 
 
-def test_scans_carry_the_tare_in_force(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
     tares = [Tare(np.full((3, 4, 4), ratio), 1.0) for ratio in (0.25, 0.75)]
     with Recorder(path, hello) as recorder:
         for message in (scan(0), tares[0], scan(1), scan(2), tares[1], scan(3)):
@@ -609,8 +589,7 @@ def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     assert not list(tmp_path.glob("b*"))
 
 
-def test_typed_lines_become_marks(tmp_path: Path, command: Command) -> None:
-    path = tmp_path / "a.mcap"
+def test_typed_lines_become_marks(path: Path, command: Command) -> None:
     far, near = os.openpty()
     process = command("record", URL, str(path), stdin=near)
     os.close(near)
@@ -621,8 +600,7 @@ def test_typed_lines_become_marks(tmp_path: Path, command: Command) -> None:
         keyboard.write(b" hand\n")
         until(lambda: len(load_recording(path).marks) == 2)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
-    assert process.returncode == 0
+        assert finish(process).code == 0
     assert [mark.text for mark in load_recording(path).marks] == ["left hand", "right hand"]
 
 
@@ -632,9 +610,7 @@ def test_the_commands(tmp_path: Path, command: Command, run: Run) -> None:
     process = command(
         "record", quiet, str(path), "--scans", "60", "--tare", "0.2", "--mark", "left hand"
     )
-    text, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (0, "")
-    assert text.startswith(f"{path}: 60 scans, missed 0, ")
+    assert well(finish(process)).out.startswith(f"{path}: 60 scans, missed 0, ")
     assert [mark.text for mark in load_recording(path).marks] == ["left hand"]
     assert sum(isinstance(message, Tare) for message in messages(path)) == 1
     assert run("export", str(path), str(out)) == Done(0, f"{out}: 60 scans\n", "")

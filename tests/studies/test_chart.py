@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from command_line import Command, Run
+from command_line import Command, Run, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.methods import METHODS
@@ -301,8 +301,8 @@ def test_ctrl_c_is_not_lost_in_ipopt(command: Command, tmp_path: Path) -> None:
     until(folder.exists)
     time.sleep(1.5)  # by then nearly all time goes into Ipopt, and so for two minutes
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=20)
-    assert (process.returncode, out) == (130, "")
+    code, out, err = finish(process)
+    assert (code, out) == (130, "")
     assert "Traceback" not in err
     assert list(folder.iterdir()) == []
 

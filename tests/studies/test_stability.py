@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from command_line import Command, Run
+from command_line import Command, Run, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.matrix import MatrixEstimator
@@ -281,8 +281,8 @@ def test_ctrl_c_leaves_the_old_files_and_no_process(command: Command, tmp_path: 
     until(lambda: max(map(processor_s, children(process.pid))) > 1.5)
     workers = children(process.pid)
     process.send_signal(signal.SIGINT)  # to it alone: the terminal would tell its workers as well
-    out, err = process.communicate(timeout=20)
-    assert process.returncode == 130, err
+    code, out, err = finish(process)
+    assert code == 130, err
     assert "picture" not in out
     assert [path.name for path in tmp_path.iterdir()] == ["stability.csv"]
     assert (tmp_path / "stability.csv").read_text() == "old"

@@ -20,7 +20,7 @@ from starlette.websockets import WebSocketDisconnect
 
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
-from command_line import Command, Run, assert_one_line, python
+from command_line import Command, Done, Run, assert_one_line, finish, python
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.record.recorder import Recorder
@@ -585,8 +585,7 @@ def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) ->
     with urlopen(url) as page:
         assert page.status == 200
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, out, err) == (0, "", "")
+    assert finish(process) == Done(0, "", "")
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
