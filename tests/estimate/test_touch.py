@@ -11,9 +11,8 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, WireBelief
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
-from ohmskin.record.readings import estimate_file, load_readings
-from places import DATA
-from skins import ten_bits, told
+from ohmskin.record.readings import estimate_file
+from skins import reference, ten_bits, told
 from studies.trials import bent_trial, random_trial, skin_at_rest, touch, trial_of
 
 
@@ -55,17 +54,9 @@ def test_currents_of_the_touched_network_obey_kirchhoff() -> None:
 
 @pytest.mark.parametrize("name", ["random_4x6", "random_8x8", "presses_8x8", "bent_8x8"])
 def test_touch_agrees_with_joint_within_its_standard_deviation(name: str) -> None:
-    exact = load_readings(DATA / f"{name}.npz")
-    assert exact.rest_ratio is not None
-    rounded = replace(
-        exact,
-        ratio=ten_bits(exact.ratio),
-        rest_ratio=ten_bits(exact.rest_ratio),
-        adc_bits=10,
-    )
+    rounded, arrays = reference(name)
     few, all_ = (estimate_file(rounded, method) for method in ("touch", "joint"))
-    with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
-        pressed = 1 / file["cell_ohm"] > 1.5 / file["rest_ohm"]
+    pressed = 1 / arrays["cell_ohm"] > 1.5 / arrays["rest_ohm"]
     apart = np.abs(few["cell_siemens"] - all_["cell_siemens"]) / few["cell_siemens_std"]
     simple = pressed.sum(axis=(1, 2)) <= 12  # frames with more touches are `joint`'s anyway
     # Rounding moves cells at rest in one method and not in the other, and wires learned differ.

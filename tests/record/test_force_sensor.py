@@ -35,9 +35,6 @@ from waiting import until
 tty = pytest.importorskip("tty")
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
-# Longest time that a test waits for another thread [s].
-PATIENCE_S = 20.0
-
 
 # --------------------------------------------------------------------------------------- lines
 
@@ -142,10 +139,7 @@ def sketch() -> Iterator[PtySensor]:
 
 def taken(sensor: ForceSensor, count: int) -> list[ForceSample]:
     samples: list[ForceSample] = []
-    end_s = time.monotonic() + PATIENCE_S
-    while len(samples) < count and time.monotonic() < end_s:
-        samples += sensor.take()
-        time.sleep(0.01)
+    until(lambda: samples.extend(sensor.take()) or len(samples) >= count)
     assert len(samples) == count
     return samples
 
@@ -153,14 +147,9 @@ def taken(sensor: ForceSensor, count: int) -> list[ForceSample]:
 def until_lost(sensor: ForceSensor) -> list[ForceSample]:
     """What can be taken before it raises that the sensor is lost."""
     samples: list[ForceSample] = []
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s:
-        try:
-            samples += sensor.take()
-        except DeviceLost:
-            return samples
-        time.sleep(0.01)
-    pytest.fail("the sensor is never lost")
+    with pytest.raises(DeviceLost):
+        until(lambda: samples.extend(sensor.take()))
+    return samples
 
 
 def test_numbers_are_forces_at_their_time(sketch: PtySensor) -> None:
@@ -208,9 +197,8 @@ def test_a_silent_sensor(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> 
         with pytest.raises(DeviceLost, match=r"has said nothing for 0.2 s: is it the force"):
             sensor.wait()
         sketch.print(b"\n1\n")
-        end_s = time.monotonic() + PATIENCE_S
         samples: list[ForceSample] = []
-        while not samples and time.monotonic() < end_s:
+        while not samples:
             with suppress(DeviceLost):
                 samples = sensor.take()
         assert len(samples) == 1
@@ -415,12 +403,9 @@ def once_scans_are_in(recording: Path, act: Callable[[], None]) -> Iterator[None
     """Act when scans are in a recording: its file has grown beyond the board's hello."""
 
     def work() -> None:
-        sizes: set[int] = set()
-        end_s = time.monotonic() + PATIENCE_S
-        while len(sizes) < 2 and time.monotonic() < end_s:
-            time.sleep(0.02)
-            if recording.exists() and recording.stat().st_size:
-                sizes.add(recording.stat().st_size)
+        until(recording.exists)
+        empty = until(lambda: recording.stat().st_size)
+        until(lambda: recording.stat().st_size > empty)
         act()
 
     thread = threading.Thread(target=work)
