@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated board, sans-IO, and that it and the firmware answer alike."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from ohmskin.errors import PortError
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
+from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 from places import ROOT
 
@@ -27,12 +28,9 @@ DEFAULT = {
 }
 
 
-class Board(Protocol):
-    def exchange(self, octets: bytes, seconds: float) -> bytes:
-        """Send to the board, let time pass, and return what it has sent."""
-
-
 class Emulated:
+    """A board; `exchange` sends to it, lets time pass, and gives what it has sent."""
+
     def __init__(self, **options: Any) -> None:
         self.board = EmulatedBoard(Scene().ratio, 8, 8, **options)
         self._now_s = 0.0
@@ -58,7 +56,7 @@ class Firmware:
 class Host:
     """Asks a board, and waits in the board's own time."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: "Emulated | Firmware") -> None:
         self._board = board
         self._decoder = BoardDecoder()
         self._sequence = 0
@@ -94,14 +92,9 @@ class Host:
         return [m for m in self.messages if isinstance(m, Scan)]
 
 
-def asked_for(hello: Hello) -> dict[str, int]:
-    return {
-        "rows": hello.rows,
-        "columns": hello.columns,
-        "rate_mhz": hello.rate_asked_mhz,
-        "settle_us": hello.settle_asked_us,
-        "adc_prescaler": protocol.ENUMS["adc_prescaler"].values[hello.adc_prescaler],
-    }
+def asked_for(hello: Hello) -> dict[str, protocol.Value]:
+    prescaler = protocol.ENUMS["adc_prescaler"].values[hello.adc_prescaler]
+    return configuration(hello) | {"adc_prescaler": prescaler}
 
 
 # ------------------------------------------------------------------------------ sans-IO board

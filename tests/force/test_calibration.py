@@ -2,7 +2,6 @@
 """The calibration file: the same bits after a round trip, and whatever else it may hold refused."""
 
 import json
-import os
 import re
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -129,26 +128,6 @@ def test_rest_is_what_the_method_reads() -> None:
         Rest.of("ohm", SkinKnowledge(2, 3), "2025-03-01")
 
 
-def test_the_file_is_complete_or_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "skin.json"
-    calibration().save(path)
-    before = path.read_bytes()
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(ValueError, match=r"skin\.json: cannot be written: No space left on device"):
-        replace(calibration(), unit_id=8).save(path)
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["skin.json"]
-    monkeypatch.undo()
-    with pytest.raises(ValueError, match=r"x\.json: cannot be written: No such file or directory"):
-        calibration().save(tmp_path / "none" / "x.json")
-
-
 def test_other_units_and_geometries_are_refused_unless_forced() -> None:
     of_skin = calibration()
     of_skin.check(7, 2, 3)
@@ -160,23 +139,18 @@ def test_other_units_and_geometries_are_refused_unless_forced() -> None:
     of_skin.check(7, 3, 2, force=True)
 
 
-def put(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    def edit(content: dict[str, Any]) -> None:
-        content[name] = value
-
-    return edit
+def cells(value: Any) -> list[list[Any]]:
+    return [[value] * 3] * 2
 
 
-def put_rest(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    def edit(content: dict[str, Any]) -> None:
-        content["rest"][name] = value
+def put(*place: Any) -> Callable[[dict[str, Any]], None]:
+    """An edit that puts the last of these where the others lead to."""
+    *way, last, value = place
 
-    return edit
-
-
-def put_cell(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    def edit(content: dict[str, Any]) -> None:
-        content[name][1][2] = value
+    def edit(content: Any) -> None:
+        for step in way:
+            content = content[step]
+        content[last] = value
 
     return edit
 
@@ -198,30 +172,36 @@ def put_cell(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (put("rows", 0), "rows and columns: not 1 to 4096 cells"),
         (put("columns", 10**18), "rows and columns: not 1 to 4096 cells"),
         (put("slope", [[1.0] * 3, [1.0] * 2]), "slope has not the shape (2, 3)"),
-        (put_cell("kind", "x" * 10**6), "kind of cell (1, 2) is neither linear nor power"),
+        (put("kind", 1, 2, "x" * 10**6), "kind of cell (1, 2) is neither linear nor power"),
         (put("columns", 4), "kind has not the shape (2, 4)"),
         (put("rest", None), "rest holds NoneType, not dict"),
         (put("tare", [1]), "tare holds list, not dict"),
         (put("tare", {"date": "2025-03-02"}), "no field 'tare.level'"),
-        (put_rest("colour", 1), "unknown field 'rest.colour'"),
-        (put_rest("date", "today"), "rest: date is 'today', not ISO 8601"),
-        (put_rest("ratio", [0.5]), "rest.ratio has not the shape (2, 3, 4)"),
-        (put_rest("ratio", [[[2.0] * 4] * 3] * 2), "rest: ratio at rest of cell (0, 0), reading A"),
-        (put_rest("level", None), "rest.level has not the shape (2, 3)"),
-        (put_rest("level", [[-1e-6] * 3] * 2), "rest: level at rest of cell (0, 0) is not finite"),
-        (put_rest("level", [[None] * 3] * 2), "rest.level holds NoneType, not numbers"),
-        (put_cell("slope", "1"), "slope holds str, not numbers"),
-        (put_cell("slope", True), "slope holds bool, not numbers"),
-        (put_cell("slope", 10**400), "slope holds a number that is not finite"),
-        (put_cell("slope", 1e61), "slope holds a number that is not finite, or beyond 1e+60"),
-        (put_cell("slope", -1.0), "slope of cell (1, 2) is not above 0"),
-        (put_cell("slope_std", -1.0), "slope_std of cell (1, 2) is not finite and >= 0"),
-        (put_cell("exponent", 99), "exponent of cell (1, 2) is not in 0.2..5"),
-        (put_cell("correlation", 2), "correlation of cell (1, 2) is not in -1..1"),
-        (put_cell("held_out_rmse", -1), "held_out_rmse of cell (1, 2) is negative or inf"),
-        (put_cell("kind", "cubic"), "kind of cell (1, 2) is neither linear nor power"),
-        (put_cell("kind", 1), "kind holds int, not str"),
-        (put_cell("pooled", 1), "pooled holds int, not bool"),
+        (put("rest", "colour", 1), "unknown field 'rest.colour'"),
+        (put("rest", "date", "today"), "rest: date is 'today', not ISO 8601"),
+        (put("rest", "ratio", [0.5]), "rest.ratio has not the shape (2, 3, 4)"),
+        (
+            put("rest", "ratio", cells([2.0] * 4)),
+            "rest: ratio at rest of cell (0, 0), reading A",
+        ),
+        (put("rest", "level", None), "rest.level has not the shape (2, 3)"),
+        (
+            put("rest", "level", cells(-1e-6)),
+            "rest: level at rest of cell (0, 0) is not finite",
+        ),
+        (put("rest", "level", cells(None)), "rest.level holds NoneType, not numbers"),
+        (put("slope", 1, 2, "1"), "slope holds str, not numbers"),
+        (put("slope", 1, 2, True), "slope holds bool, not numbers"),
+        (put("slope", 1, 2, 10**400), "slope holds a number that is not finite"),
+        (put("slope", 1, 2, 1e61), "slope holds a number that is not finite, or beyond 1e+60"),
+        (put("slope", 1, 2, -1.0), "slope of cell (1, 2) is not above 0"),
+        (put("slope_std", 1, 2, -1.0), "slope_std of cell (1, 2) is not finite and >= 0"),
+        (put("exponent", 1, 2, 99), "exponent of cell (1, 2) is not in 0.2..5"),
+        (put("correlation", 1, 2, 2), "correlation of cell (1, 2) is not in -1..1"),
+        (put("held_out_rmse", 1, 2, -1), "held_out_rmse of cell (1, 2) is negative or inf"),
+        (put("kind", 1, 2, "cubic"), "kind of cell (1, 2) is neither linear nor power"),
+        (put("kind", 1, 2, 1), "kind holds int, not str"),
+        (put("pooled", 1, 2, 1), "pooled holds int, not bool"),
         (put("indenter_area_m2", 0), "indenter_area_m2 is 0.0, it must be above 0"),
         (put("nominal_top_wire_ohm", -1), "nominal_top_wire_ohm is -1.0, it must be finite"),
         (put("nominal_bottom_wire_ohm", []), "nominal_bottom_wire_ohm holds list, not numbers"),

@@ -111,13 +111,8 @@ def test_the_same_refusals_as_the_cobs_package(stuffed: bytes) -> None:
 # ------------------------------------------------------------------------------------ streams
 
 
-@given(frames)
-def test_encode_writes_textbook_bytes(frame: RawFrame) -> None:
-    assert framing.encode(frame.type, frame.sequence, frame.payload) == wire(frame)
-
-
 @given(frames, st.integers(0, 1 << 20))
-def test_sequence_numbers_wrap(frame: RawFrame, wraps: int) -> None:
+def test_encode_writes_textbook_bytes_and_wraps_numbers(frame: RawFrame, wraps: int) -> None:
     sequence = frame.sequence + 256 * wraps
     assert framing.encode(frame.type, sequence, frame.payload) == wire(frame)
 

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import signal
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -261,16 +260,6 @@ def test_stability_writes_picture_and_table(sweep: Run, tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert table.read_text().startswith("sweep,x,method,frames,right,flagged,wrong_unflagged\n")
     assert "wrong and not flagged" in err
-
-
-def test_without_matplotlib_nothing_is_measured(
-    sweep: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setattr(stability, "measure", lambda *_, **__: pytest.fail("measured in vain"))
-    code, out, err = sweep("--out", str(tmp_path))
-    assert (code, out) == (2, "")
-    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
 
 
 def test_ctrl_c_leaves_the_old_files_and_no_process(command: Command, tmp_path: Path) -> None:

@@ -124,6 +124,11 @@ def panel(client: TestClient, number: int = 0, **headers: str) -> Iterator[Page]
         yield Page(socket)
 
 
+def assert_refused(client: TestClient, path: str = "/boards/0", **headers: str) -> None:
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect(path, headers=headers):
+        pass
+
+
 # --------------------------------------------------------------------------------------- scans
 
 
@@ -391,8 +396,7 @@ def test_a_port_is_opened_and_closed_from_the_page() -> None:
             assert closed.value.code == 4001
         assert client.get("/boards").json() == []
         assert client.post("/boards", json={"port": REST}, headers=own).json()["number"] == 1
-        with pytest.raises(WebSocketDisconnect), panel(client, 0):
-            pass
+        assert_refused(client, host=HOST, origin=ORIGIN)
 
 
 def test_there_is_a_limit_of_boards(tmp_path: Path) -> None:
@@ -489,11 +493,7 @@ def test_a_foreign_name_is_refused(host: str) -> None:
     with served() as client:
         for path in ("/", "/boards", "/ports", "/page.js"):
             assert client.get(path, headers={"host": host}).status_code == 403
-        with (
-            pytest.raises(WebSocketDisconnect),
-            panel(client, 0, host=host, origin=f"http://{host}"),
-        ):
-            pass
+        assert_refused(client, host=host, origin=f"http://{host}")
 
 
 @pytest.mark.parametrize("name", ["localhost:8765", "127.0.0.1:9000", "[::1]:8765", "LOCALHOST"])
@@ -509,8 +509,7 @@ def test_names_of_this_machine_are_known_at_any_port(name: str) -> None:
 )
 def test_another_page_is_refused(origin: str) -> None:
     with served(REST) as client:
-        with pytest.raises(WebSocketDisconnect), panel(client, 0, origin=origin):
-            pass
+        assert_refused(client, host=HOST, origin=origin)
         headers = {"origin": origin}
         assert client.get("/boards", headers=headers).status_code == 403
         assert client.post("/boards", json={"port": GHOST}, headers=headers).status_code == 403
@@ -521,11 +520,7 @@ def test_another_page_is_refused(origin: str) -> None:
 def test_nobody_commands_without_saying_who_asks() -> None:
     with served(REST) as client:
         assert client.post("/boards", json={"port": GHOST}).status_code == 403
-        with (
-            pytest.raises(WebSocketDisconnect),
-            client.websocket_connect("/boards/0", headers={"host": HOST}),
-        ):
-            pass
+        assert_refused(client, host=HOST)
 
 
 def test_beyond_loopback_the_token_is_asked_for() -> None:
@@ -540,17 +535,8 @@ def test_beyond_loopback_the_token_is_asked_for() -> None:
             assert client.get(f"{path}?token=secret").status_code == 200
         assert client.get("/page.js").status_code == 200  # the page asks for it without
         for wrong in ("", "?token=", "?token=%C3%A9"):
-            with (
-                pytest.raises(WebSocketDisconnect),
-                client.websocket_connect(f"/boards/0{wrong}", headers=headers),
-            ):
-                pass
-        foreign = {**headers, "origin": "http://evil.example"}
-        with (
-            pytest.raises(WebSocketDisconnect),
-            client.websocket_connect("/boards/0?token=secret", headers=foreign),
-        ):
-            pass
+            assert_refused(client, f"/boards/0{wrong}", **headers)
+        assert_refused(client, "/boards/0?token=secret", host=host, origin="http://evil.example")
         with client.websocket_connect("/boards/0?token=secret", headers=headers) as socket:
             Page(socket).scan()
 
