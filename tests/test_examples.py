@@ -39,7 +39,6 @@ def output_of(*command: str) -> str:
 def first_lines(count: int, *command: str) -> list[str]:
     """Of a program that goes on for ever."""
     process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     try:
         return [process.stdout.readline() for _ in range(count)]
     finally:
@@ -210,7 +209,6 @@ def messages_of(path: Path) -> list[tuple[str, str, str, dict, int, dict]]:
     found = []
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
-            assert schema is not None
             # docs.foxglove.dev, "Custom schema encodings": these, and "type": "object".
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             text = json.loads(schema.data)

@@ -166,8 +166,7 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
         "presses.mcap: no force in it: say --forces LOG.csv",
     )
     assert_one_line(
-        calibrate(run, presses, "--method", "joint"),
-        "presses.mcap: no tare in it: say --rest 2",
+        calibrate(run, presses, "--method", "joint"), "presses.mcap: no tare in it: say --rest 2"
     )
     given = load_recording(recording)
     edited(forces, lambda t, f: (t[t < SENSOR_BEGIN_S + 21], f[t < SENSOR_BEGIN_S + 21]))

@@ -157,11 +157,7 @@ def test_a_finger_is_estimated(
     """Nothing here comes from the circuit that the estimators share."""
     rest_ratio, ratio, cell_siemens = finger
     knowledge = SkinKnowledge(
-        8,
-        8,
-        adc_bits=10,
-        rest_ratio=rest_ratio,
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
+        8, 8, adc_bits=10, rest_ratio=rest_ratio, nominal_wire_ohm=WireOhm(100.0, 200.0)
     )
     estimator = make_estimator(method, knowledge)
     found = [estimator.estimate(frame) for frame in ratio]

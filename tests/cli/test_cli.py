@@ -138,10 +138,8 @@ def test_stream_says_what_was_lost(run: Run) -> None:
 
 def test_stream_ends_when_its_reader_does(command: Command) -> None:
     process = command("stream", EMULATED, "--json")
-    assert process.stdout is not None
     assert json.loads(process.stdout.readline())["missed"] == 0
     process.stdout.close()
-    assert process.stderr is not None
     assert process.stderr.read() == ""
     process.wait(20)
 
@@ -196,7 +194,6 @@ def test_estimate_does_not_leave_half_a_file(run: Run, tmp_path: Path) -> None:
 def test_emulate_serves_other_processes(run: Run, command: Command, tmp_path: Path) -> None:
     link = tmp_path / "skin"
     process = command("emulate", "emulator://3x3?scene=single&noise=0", "--link", str(link))
-    assert process.stdout is not None
     path = process.stdout.readline().strip()
     assert os.readlink(link) == path
     with ohmskin.open(str(link)) as skin:
@@ -275,10 +272,8 @@ def test_nothing_listens_on_the_network(command: Command) -> None:
     if not Path("/proc/net/tcp").exists():
         pytest.skip("needs /proc")
     process = command("emulate")
-    assert process.stdout is not None
     path = process.stdout.readline().strip()
     reader = command("stream", path, "--json")
-    assert reader.stdout is not None
     assert reader.stdout.readline()
     for running in (process, reader):
         for file in Path(f"/proc/{running.pid}/fd").iterdir():
@@ -354,10 +349,8 @@ def test_a_silent_port(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_busy_port(command: Command, run: Run) -> None:
     server = command("emulate")
-    assert server.stdout is not None
     path = server.stdout.readline().strip()
     reader = command("stream", path, "--json")
-    assert reader.stdout is not None
     assert reader.stdout.readline()
     assert_one_line(run("info", path), f"{path} is busy", "close the other program")
 

@@ -79,7 +79,6 @@ def test_tare_lasts_and_is_undone(run: Run, skin: Path) -> None:
     done = well(run("tare", REST, str(skin), "--seconds", "0.3"))
     assert "skin.json: tared, largest force before it 0.00" in done.out
     tared = load_calibration(skin).tare
-    assert tared is not None
     # The same skin as was calibrated.
     np.testing.assert_allclose(tared.level, before.rest.level, rtol=0.05, atol=5e-8)
     done = well(run("tare", REST, str(skin), "--undo"))

@@ -32,11 +32,7 @@ def loaded_after(program: str) -> set[str]:
 
 @pytest.mark.parametrize(
     ("program", "allowed"),
-    [
-        ("import ohmskin", set()),
-        (HELP, {"typer", "rich"}),
-        (JOINT, {"threadpoolctl"}),
-    ],
+    [("import ohmskin", set()), (HELP, {"typer", "rich"}), (JOINT, {"threadpoolctl"})],
     ids=["package", "help", "joint"],
 )
 def test_nothing_heavy_is_loaded(program: str, allowed: set[str]) -> None:

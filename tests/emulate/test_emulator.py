@@ -19,13 +19,7 @@ from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 from places import ROOT
 
-DEFAULT = {
-    "rows": 8,
-    "columns": 8,
-    "rate_mhz": 90_000,
-    "settle_us": 0,
-    "adc_prescaler": 32,
-}
+DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0, "adc_prescaler": 32}
 
 
 class Emulated:

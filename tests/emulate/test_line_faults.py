@@ -204,10 +204,7 @@ READS: dict[str, Callable[[ohmskin.Device], object]] = {
 
 @pytest.mark.parametrize("use", READS)
 def test_a_board_that_is_unplugged(use: str) -> None:
-    with (
-        ohmskin.open("emulator://2x2?vanish=0.6") as skin,
-        pytest.raises(DeviceLost, match="gone"),
-    ):
+    with ohmskin.open("emulator://2x2?vanish=0.6") as skin, pytest.raises(DeviceLost, match="gone"):
         READS[use](skin)
 
 

@@ -92,7 +92,6 @@ def test_all_readings_at_a_rail_are_flagged(method: str, ratio: float) -> None:
 def test_after_nonsense_a_good_frame_is_answered_as_if_nothing_had_been(method: str) -> None:
     random = np.random.default_rng(3)
     knowledge = knowledge_of((8, 8), "all")
-    assert knowledge.rest_ratio is not None
     used, new = (make_estimator(method, knowledge) for _ in range(2))
     for kind in 2 * NONSENSE[:4]:
         used.estimate(frame(kind, (8, 8), random))

@@ -3,14 +3,7 @@
 
 import pytest
 
-from firmware_helpers import (
-    BAUD_DEFAULT,
-    BAUD_FAST,
-    COMMANDS,
-    OTHER_SCAN,
-    VECTORS,
-    reset,
-)
+from firmware_helpers import BAUD_DEFAULT, BAUD_FAST, COMMANDS, OTHER_SCAN, VECTORS, reset
 from lockstep import CPU_HZ, DEFAULT_SCAN, Rig
 from ohmskin.link import framing, protocol
 

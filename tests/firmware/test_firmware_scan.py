@@ -8,13 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_helpers import (
-    CYCLES_PER_US,
-    assert_whole,
-    go_fast,
-    numbers,
-    reset,
-)
+from firmware_helpers import CYCLES_PER_US, assert_whole, go_fast, numbers, reset
 from lockstep import CODES, CPU_HZ, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of, first_holds
 from ohmskin.link import protocol
 

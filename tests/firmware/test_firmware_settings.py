@@ -7,12 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_helpers import (
-    OTHER_SCAN,
-    RECORD_SIZE,
-    assert_whole,
-    reset,
-)
+from firmware_helpers import OTHER_SCAN, RECORD_SIZE, assert_whole, reset
 from lockstep import DEFAULT_SCAN, Rig
 from ohmskin.link import protocol
 

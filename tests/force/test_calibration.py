@@ -109,7 +109,6 @@ def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
     tared.save(path)
     loaded = load_calibration(path)
     assert_same_bits(tared, loaded)
-    assert loaded.tare is not None
     assert not forces(loaded, loaded.tare.level).any()
     assert forces(loaded, loaded.rest.level).any()
     assert not forces(replace(loaded, tare=None), before.rest.level).any()
@@ -180,15 +179,9 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
         (put("rest", "colour", 1), "unknown field 'rest.colour'"),
         (put("rest", "date", "today"), "rest: date is 'today', not ISO 8601"),
         (put("rest", "ratio", [0.5]), "rest.ratio has not the shape (2, 3, 4)"),
-        (
-            put("rest", "ratio", cells([2.0] * 4)),
-            "rest: ratio at rest of cell (0, 0), reading A",
-        ),
+        (put("rest", "ratio", cells([2.0] * 4)), "rest: ratio at rest of cell (0, 0), reading A"),
         (put("rest", "level", None), "rest.level has not the shape (2, 3)"),
-        (
-            put("rest", "level", cells(-1e-6)),
-            "rest: level at rest of cell (0, 0) is not finite",
-        ),
+        (put("rest", "level", cells(-1e-6)), "rest: level at rest of cell (0, 0) is not finite"),
         (put("rest", "level", cells(None)), "rest.level holds NoneType, not numbers"),
         (put("slope", 1, 2, "1"), "slope holds str, not numbers"),
         (put("slope", 1, 2, True), "slope holds bool, not numbers"),

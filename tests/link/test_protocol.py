@@ -229,8 +229,6 @@ class Tree:
 
     def module(self, name: str, path: str) -> Any:
         spec = importlib.util.spec_from_file_location(name, self.path / path)
-        assert spec is not None
-        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         self._monkeypatch.setitem(sys.modules, name, module)
         spec.loader.exec_module(module)

@@ -420,10 +420,7 @@ def test_whatever_ends_a_recording_with_forces_it_is_whole(
 ) -> None:
     file = tmp_path / "own.mcap"
     arguments = ("record", "emulator://2x2", str(file), "--force-port", sketch.path)
-    stop = {
-        "sensor": sketch.vanish,
-        "SIGTERM": lambda: os.kill(os.getpid(), signal.SIGTERM),
-    }
+    stop = {"sensor": sketch.vanish, "SIGTERM": lambda: os.kill(os.getpid(), signal.SIGTERM)}
     with once_scans_are_in(file, stop[end]), speaking(sketch, lambda: b"0.1\n"):
         done = run(*arguments)
     if end == "sensor":

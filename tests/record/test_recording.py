@@ -106,13 +106,10 @@ def test_other_programs_read_it(path: Path, hello: Hello) -> None:
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
         assert summary.statistics.message_count == 21
         topics = {channel.topic for channel in summary.channels.values()}
         assert topics == {f"/skin/{name}" for name in ("hello", "scan", "tare", "mark", "force")}
         for schema, channel, message in reader.iter_messages():
-            assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             definition, content = json.loads(schema.data), json.loads(message.data)
             assert definition["type"] == "object"
@@ -528,7 +525,6 @@ def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
     assert rests[0] is None
     assert rests[1] is rests[2]
     for found, tare in ((rests[2], tares[0]), (rests[3], tares[1])):
-        assert found is not None
         np.testing.assert_array_equal(found, tare.rest_ratio)
 
 

@@ -83,11 +83,7 @@ def test_all_methods_get_the_same_frames(rows: list[Row]) -> None:
         assert len({row.pressed_cells for row in measured}) == 1
         for row in measured:
             assert row.pressed_cells
-            assert row.ms is not None
-            assert row.ms_p90 is not None
             assert 0 < row.ms <= row.ms_p90
-            assert row.error_percent is not None
-            assert row.error_p90_percent is not None
             assert 0 <= row.error_percent <= row.error_p90_percent
 
 
@@ -103,12 +99,7 @@ def test_limits_are_ordered(rows: list[Row]) -> None:
     """What is known more exactly leaves less: wires, and readings."""
     exact, rounded = (of(rows, scene="random", bits=bits)[0] for bits in (None, 10))
     for row in (exact, rounded):
-        assert row.limit_std_percent is not None
-        assert row.limit_percent is not None
-        assert row.limit_told_percent is not None
         assert row.limit_told_percent < row.limit_percent < row.limit_std_percent
-    assert exact.limit_std_percent is not None
-    assert rounded.limit_std_percent is not None
     assert exact.limit_std_percent < rounded.limit_std_percent
 
 
@@ -176,8 +167,6 @@ def test_evaluations_of_numpy_and_casadi_are_in_the_table(rows: list[Row]) -> No
     assert [row.method for row in measured] == ["numpy", "casadi", "casadi_c"]
     for row in measured:
         assert (row.rows, row.columns, row.source, row.on_front) == (2, 2, "measured", False)
-        assert row.ms is not None
-        assert row.ms_p90 is not None
         assert 0 < row.ms <= row.ms_p90
 
 

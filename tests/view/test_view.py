@@ -451,7 +451,6 @@ def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> No
 def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Path) -> None:
     with ViewedBoards([GHOST, "/dev/ttyACM99"], folder=tmp_path) as boards:
         board = boards.find(0)
-        assert board is not None
         until(lambda: board.state()["status"] == "scanning")
         assert board.shown is None  # nobody looks
         board.record()
@@ -563,7 +562,6 @@ def test_the_page_is_small_and_asks_no_other_host() -> None:
 
 def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) -> None:
     process = command("view", REST, "--http-port", "0", "--no-browser")
-    assert process.stdout is not None
     url = process.stdout.readline().strip()
     port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)/", url)[1])  # type: ignore[index]
     if Path("/proc/net/tcp").exists():

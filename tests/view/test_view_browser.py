@@ -49,7 +49,6 @@ class Server:
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
 
     def end(self) -> tuple[int, str]:
