@@ -135,12 +135,6 @@ def test_bad_force_logs(run: Run, presses: tuple[Path, Path, Path]) -> None:
         edited(forces, edit)
         assert_one_line(calibrate(run, presses, *BY_OHM), *words)
         assert not out.exists()
-    for header, words in (
-        ("time_ms,force_n", ["no column time_s (seconds", "time_ms"]),
-        ("time_s,force_g", ["no column force_n (newtons", "force_g"]),
-    ):
-        forces.write_text(good.replace("time_s,force_n", header))
-        assert_one_line(calibrate(run, presses), "forces.csv", *words)
     lines = good.splitlines()
     forces.write_text("\n".join([*lines[:40], "70000.5,", *lines[41:]]))
     assert_one_line(calibrate(run, presses), "forces.csv", "row 41")
@@ -222,13 +216,8 @@ def test_bad_tables(run: Run, tmp_path: Path) -> None:
     good = table.read_text()
     header, *rows = good.splitlines()
     for text, words in (
-        (header, ["no press"]),
-        (f"{header}\n{rows[0]}", ["too few presses: 1"]),
         ("\n".join([header, *rows[:6]]), ["all presses are on cell (0, 0)"]),
         (good.replace("0,0,1,", "2,0,1,"), ["row 3: cell (2, 0) is not on this 2x3 skin"]),
-        (good.replace("0,0,1,", "0,0,-1,"), ["row 3", "force_n is -1"]),
-        (good.replace("conductance", "conductance_us"), ["conductance_us"]),
-        (good.replace("force_n", "force_g"), ["force_g"]),
         ("\n".join([header, *(f"{row[:4]}2,{row[-9:]}" for row in rows)]), ["presses.csv"]),
     ):
         table.write_text(text)

@@ -15,7 +15,7 @@ from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.force.calibration import load_calibration
-from scripted_skin import REST, ScriptedSkin
+from scripted_skin import REST, ScriptedSkin, rise
 
 Cell = tuple[int, int]
 # From when on [s], the cells, and the force on each [N].
@@ -30,11 +30,6 @@ PUT_S, OFF_S = 2.2, 0.8
 
 def newtons(mass_g: float) -> float:
     return 9.80665e-3 * mass_g
-
-
-def rise(force_n: float | Float) -> Float:
-    """Conductance above rest of every cell that has crept [S]."""
-    return np.asarray(30e-6 * force_n**1.7)
 
 
 def on_skin(script: Script, time_s: float) -> Float:

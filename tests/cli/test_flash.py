@@ -71,34 +71,32 @@ def board(says: str = "uno") -> FlashedBoard:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind"),
+    ("arguments", "kind", "bridge"),
     [
-        ([], "uno"),
-        (["uno"], "uno"),
-        (["uno", "--port", "{}"], "uno"),
-        (["--port", "{}"], "uno"),
-        ([], "megaatmega2560"),
+        ([], "uno", "uno"),
+        (["uno"], "uno", "uno"),
+        (["uno", "--port", "{}"], "uno", "uno"),
+        (["--port", "{}"], "uno", "uno"),
+        ([], "megaatmega2560", "megaatmega2560"),
+        (["uno", "--port", "{}"], "uno", ""),  # with another USB bridge
     ],
 )
 def test_it_flashes_and_hears_from_the_board(
-    run: Run, pio: Pio, attach: Attach, pty_board: Serve, arguments: list[str], kind: str
+    run: Run,
+    pio: Pio,
+    attach: Attach,
+    pty_board: Serve,
+    arguments: list[str],
+    kind: str,
+    bridge: str,
 ) -> None:
     port = pty_board(board(kind)).path
-    attach(("/dev/ttyS0", ""), (port, kind))
+    attach(("/dev/ttyS0", ""), (port, bridge))
     done = well(run("flash", *(each.format(port) for each in arguments)))
     assert f"flashing {kind} at {port}" in done.out
     assert f"{port}: {kind}, firmware 0.1.0, answers" in done.out
     expected = ["run", "-d", str(ROOT), "-e", kind, "-t", "upload", "--upload-port", port]
     assert pio.arguments == expected
-
-
-def test_a_board_with_another_usb_bridge_is_named(
-    run: Run, pio: Pio, attach: Attach, pty_board: Serve
-) -> None:
-    port = pty_board(board()).path
-    attach((port, ""))
-    assert run("flash", "uno", "--port", port).code == 0
-    assert pio.arguments[-1] == port
 
 
 def test_the_board_may_take_its_time_to_boot(run: Run, attach: Attach, pty_board: Serve) -> None:

@@ -15,8 +15,6 @@ from ohmskin.force.calibration import load_calibration
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?seed=1"
 
-GHOST = "emulator://8x8?scene=ghost&seed=1"
-
 
 @pytest.fixture
 def skin(tmp_path: Path) -> Path:

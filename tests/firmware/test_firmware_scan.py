@@ -239,21 +239,17 @@ def test_small_scans_at_the_highest_rate_are_dropped_whole_and_carry_their_own_n
     assert_missing_are_dropped(rig)
 
 
-def burst(rig: Rig, *commands: str) -> None:
-    """Send commands back to back; all have to be answered, in order."""
-    before = len(rig.frames("ack"))
-    rig.sim.write(b"".join(rig.encode(name) for name in commands))
-    rig.run(0.03)
-    answers = rig.frames("ack")[before:]
-    assert [a["command"] for a in answers] == [protocol.FRAMES[c].id for c in commands]
-    assert {a["result"] for a in answers} == {"ok"}
-
-
 def test_commands_back_to_back_at_the_highest_rate(rig: Rig, rng: np.random.Generator) -> None:
+    commands = ("get_hello", "start", "get_hello", "start")
     go_fast(rig)
     rig.start_scan(rate_mhz=0)
     for _ in range(40):
-        burst(rig, "get_hello", "start", "get_hello", "start")
+        before = len(rig.frames("ack"))
+        rig.sim.write(b"".join(rig.encode(name) for name in commands))
+        rig.run(0.03)
+        answers = rig.frames("ack")[before:]
+        assert [a["command"] for a in answers] == [protocol.FRAMES[c].id for c in commands]
+        assert {a["result"] for a in answers} == {"ok"}
         rig.run_cycles(int(rng.integers(100_000)))
         rig.randomize(rng)
     rig.must("stop")

@@ -20,6 +20,7 @@ from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
+Record = Callable[[int, int], str]
 
 
 @pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
@@ -149,7 +150,7 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Callable[[int, int], str]:
+def recorded(tmp_path: Path) -> Record:
     """A function that records so many scans of a ghost, and a tare before one of them."""
 
     def record(count: int, tare_at: int) -> str:
@@ -164,16 +165,14 @@ def recorded(tmp_path: Path) -> Callable[[int, int], str]:
     return record
 
 
-def test_latest_follows_the_same_tares(recorded: Callable[[int, int], str]) -> None:
+def test_latest_follows_the_same_tares(recorded: Record) -> None:
     port = f"{recorded(20, 10)}?speed=0"
     with ohmskin.open(port, calibration=of_scene("ghost")) as board:
         contacts = [len(board.latest().contacts) for _ in range(20)]
     assert contacts == 10 * [3] + 10 * [0]
 
 
-def test_latest_does_not_miss_a_tare_whose_scan_it_skips(
-    recorded: Callable[[int, int], str],
-) -> None:
+def test_latest_does_not_miss_a_tare_whose_scan_it_skips(recorded: Record) -> None:
     with ohmskin.open(recorded(90, 20), calibration=of_scene("ghost")) as board:
         first = board.latest()
         assert len(first.contacts) == 3
@@ -183,7 +182,7 @@ def test_latest_does_not_miss_a_tare_whose_scan_it_skips(
         assert later.contacts == ()
 
 
-def test_a_tare_at_the_end_of_a_replay_says_so(recorded: Callable[[int, int], str]) -> None:
+def test_a_tare_at_the_end_of_a_replay_says_so(recorded: Record) -> None:
     port = f"{recorded(5, -1)}?speed=0"
     with ohmskin.open(port, calibration=of_scene("ghost")) as board:
         assert len(list(board)) == 5

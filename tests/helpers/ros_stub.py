@@ -71,13 +71,9 @@ MultiArrayLayout = message("MultiArrayLayout", dim=[MultiArrayDimension], data_o
 Float32MultiArray = message("Float32MultiArray", layout=MultiArrayLayout, data="float32[]")
 
 
-class PointField(Message):
-    FIELDS: ClassVar = {
-        "name": "string",
-        "offset": "uint32",
-        "datatype": "uint8",
-        "count": "uint32",
-    }
+class PointField(
+    message("PointField", name="string", offset="uint32", datatype="uint8", count="uint32")
+):
     INT8, UINT8, INT16, UINT16, INT32, UINT32, FLOAT32, FLOAT64 = range(1, 9)
 
 

@@ -84,11 +84,13 @@ def test_the_board_time_does_not_wrap() -> None:
     assert [s.time_us for s in scans(decoder, stream)] == [n * 20 * MINUTE_US for n in range(12)]
 
 
-def test_the_counter_of_dropped_scans_wraps() -> None:
+def test_the_counters_of_the_board_are_passed_on_and_that_of_dropped_scans_wraps() -> None:
     decoder = BoardDecoder()
-    counts = [65530, 65535, 2, 2]
-    scans(decoder, b"".join(scan_wire(n, dropped=d) for n, d in enumerate(counts)))
-    assert decoder.stats.dropped_by_board == 8
+    counts = [(65530, 3), (65535, 3), (2, 5), (2, 5)]
+    scans(
+        decoder, b"".join(scan_wire(n, dropped=d, rx_errors=e) for n, (d, e) in enumerate(counts))
+    )
+    assert (decoder.stats.dropped_by_board, decoder.stats.board_rx_errors) == (8, 5)
 
 
 def test_the_counter_of_dropped_scans_starts_again_with_the_board() -> None:
@@ -97,12 +99,6 @@ def test_the_counter_of_dropped_scans_starts_again_with_the_board() -> None:
     assert (decoder.stats.dropped_by_board, decoder.stats.missed) == (3, 3)
     scans(decoder, hello_wire() + scan_wire(1, dropped=1) + scan_wire(2, dropped=1))
     assert (decoder.stats.dropped_by_board, decoder.stats.missed) == (4, 4)
-
-
-def test_rx_errors_of_the_board_are_passed_on() -> None:
-    decoder = BoardDecoder()
-    scans(decoder, scan_wire(0, rx_errors=3) + scan_wire(1, rx_errors=5))
-    assert decoder.stats.board_rx_errors == 5
 
 
 def test_a_restart_in_between_starts_the_numbers_again() -> None:
@@ -151,33 +147,27 @@ def test_hello_of_another_definition() -> None:
     assert messages == [ForeignHello(protocol.LAYOUT_CRC)]
 
 
-@pytest.mark.parametrize("frame_type", [0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89])
-def test_frames_of_unknown_type_are_counted(frame_type: int) -> None:
+PAYLOADS = {
+    "ack": bytes(protocol.FRAMES["ack"].struct.size),
+    "self_test_report": bytes(protocol.FRAMES["self_test_report"].struct.size),
+    "scan": scan_payload(5),
+}
+STRANGE = {
+    **{f"type {kind:#x}": (kind, b"abc") for kind in (0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89)},
+    **{f"short {name}": (protocol.FRAMES[name].id, x[:-1]) for name, x in PAYLOADS.items()},
+    **{f"long {name}": (protocol.FRAMES[name].id, x + b"\0") for name, x in PAYLOADS.items()},
+    "an empty hello": (protocol.FRAMES["hello"].id, b""),
+    "a hello without its layout": (protocol.FRAMES["hello"].id, b"\1"),
+}
+
+
+@pytest.mark.parametrize("what", STRANGE)
+def test_frames_of_unknown_type_or_wrong_length_are_counted(what: str) -> None:
+    frame_type, payload = STRANGE[what]
     decoder = BoardDecoder()
-    assert decoder.feed(framing.encode(frame_type, 0, b"abc"), 0.0) == []
-    assert decoder.stats.unknown == 1
-    assert decoder.stats.line.damaged == 0
+    assert decoder.feed(framing.encode(frame_type, 0, payload), 0.0) == []
+    assert (decoder.stats.unknown, decoder.stats.scans, decoder.stats.line.damaged) == (1, 0, 0)
     assert len(scans(decoder, scan_wire(0))) == 1
-
-
-@pytest.mark.parametrize("name", ["ack", "self_test_report", "scan"])
-@pytest.mark.parametrize("change", [-1, 1])
-def test_payloads_of_the_wrong_length_are_counted(name: str, change: int) -> None:
-    kind = protocol.FRAMES[name]
-    payload = scan_payload(5) if name == "scan" else bytes(kind.struct.size)
-    payload = payload[:change] if change < 0 else payload + b"\0"
-    decoder = BoardDecoder()
-    assert decoder.feed(framing.encode(kind.id, 0, payload), 0.0) == []
-    assert decoder.stats.unknown == 1
-    assert decoder.stats.scans == 0
-
-
-@pytest.mark.parametrize("payload", [b"", b"\x01"])
-def test_a_hello_without_layout_is_counted(payload: bytes) -> None:
-    decoder = BoardDecoder()
-    wire = framing.encode(protocol.FRAMES["hello"].id, 0, payload)
-    assert decoder.feed(wire, 0.0) == []
-    assert decoder.stats.unknown == 1
 
 
 def test_a_scan_of_no_cells_does_no_harm() -> None:

@@ -3,7 +3,6 @@
 
 import ast
 import importlib.util
-import json
 import shutil
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_helpers import VECTORS
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import (
     Ack,
@@ -27,8 +27,6 @@ from ohmskin.link.messages import (
     SelfTestReport,
 )
 from places import ROOT
-
-VECTORS = json.loads((ROOT / "protocol" / "vectors.json").read_text(encoding="utf-8"))
 
 each_valid = pytest.mark.parametrize("vector", VECTORS["valid"], ids=lambda v: v["name"])
 each_damaged = pytest.mark.parametrize("vector", VECTORS["damaged"], ids=lambda v: v["name"])

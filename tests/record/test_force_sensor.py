@@ -29,7 +29,7 @@ from ohmskin.link.messages import Scan
 from ohmskin.record.force_sensor import QUEUE_SAMPLES, ForceLineDecoder, ForceSensor
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import ForceSample, load_recording
-from scripted_skin import REST, ScriptedSkin
+from scripted_skin import REST, ScriptedSkin, rise
 from waiting import until
 
 tty = pytest.importorskip("tty")
@@ -281,11 +281,6 @@ def pressed(time_s: float) -> tuple[int, float]:
         if 0 <= share < 1:
             return column, force_n * min(3 * share, 1.0, 3 - 3 * share)
     return 0, 0.0
-
-
-def rise(force_n: float) -> float:
-    """Conductance above rest [S]."""
-    return 30e-6 * force_n**1.7
 
 
 def finger(time_s: float) -> Float:

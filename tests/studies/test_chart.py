@@ -21,7 +21,8 @@ from command_line import Command, Run, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.methods import METHODS
-from places import DATA, ROOT
+from places import ROOT
+from skins import reference
 from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published, stability
 from studies.chart import Plan, Row, Size, pareto_front
 from waiting import until
@@ -120,11 +121,10 @@ def test_the_papers_methods_run_on_small_skins_alone() -> None:
 @pytest.mark.parametrize("name", ["cell_sweep", "wire_sweep"])
 def test_sweeps_are_the_papers(name: str) -> None:
     """Readings of ngspice, made for the same conditions."""
-    with np.load(DATA / f"{name}_3x3.npz") as file:
-        expected, at_rest = file["ratio"], file["rest_ratio"]
-    pairs = published.sweep(name)
-    np.testing.assert_allclose([readings(pressed) for pressed, _ in pairs], expected, atol=1e-7)
-    np.testing.assert_allclose([readings(rest) for _, rest in pairs], at_rest, atol=1e-7)
+    expected, _ = reference(f"{name}_3x3", bits=None)
+    pressed, rest = ([readings(skin) for skin in skins] for skins in zip(*published.sweep(name)))
+    np.testing.assert_allclose(pressed, expected.ratio, atol=1e-7)
+    np.testing.assert_allclose(rest, expected.rest_ratio, atol=1e-7)
 
 
 # --------------------------------------------------------------------------- NumPy against CasADi
@@ -274,12 +274,12 @@ FROM_CASADI.__cause__ = KeyboardInterrupt()
 
 
 @pytest.mark.parametrize(
-    ("module", "where", "error"),
+    ("where", "error"),
     [
-        (chart, "measure", KeyboardInterrupt()),
-        (chart_figure, "picture", KeyboardInterrupt()),
-        (chart, "measure", FROM_CASADI),
-        (chart, "measure", SystemError("KeyboardInterrupt")),
+        ("chart.measure", KeyboardInterrupt()),
+        ("chart_figure.picture", KeyboardInterrupt()),
+        ("chart.measure", FROM_CASADI),
+        ("chart.measure", SystemError("KeyboardInterrupt")),
     ],
 )
 def test_ctrl_c_leaves_the_old_files(
@@ -287,7 +287,6 @@ def test_ctrl_c_leaves_the_old_files(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     rows: list[Row],
-    module: ModuleType,
     where: str,
     error: BaseException,
 ) -> None:
@@ -295,7 +294,7 @@ def test_ctrl_c_leaves_the_old_files(
         raise error
 
     monkeypatch.setattr(chart, "measure", lambda *_: rows)
-    monkeypatch.setattr(module, where, interrupt)
+    monkeypatch.setattr(f"studies.{where}", interrupt)
     (tmp_path / "speed-accuracy.csv").write_text("old")
     code, out, err = draw("--out", str(tmp_path))
     assert (code, out) == (130, "")

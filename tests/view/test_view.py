@@ -95,6 +95,13 @@ class Page:
         self.say(**message)
         return self.until(lambda answer: answer["kind"] == "notice")
 
+    def refused(self, words: str, **message: object) -> Message:
+        """The answer to a command that is refused with these words."""
+        answer = self.command(**message)
+        assert not answer["good"]
+        assert words in answer["text"]
+        return answer
+
 
 def decode(octets: bytes) -> Message:
     """As the page does it: see `ohmskin.view.shown`."""
@@ -235,9 +242,7 @@ def test_a_method_is_switched_and_back() -> None:
         assert "force" not in scan
         assert scan["touched"].sum() > 3
         assert page.state["method"] == "ohm"
-        answer = page.command(do="method", method="magic")
-        assert not answer["good"]
-        assert "joint" in answer["text"]
+        page.refused("joint", do="method", method="magic")
         assert page.command(do="method", method="touch")["good"]
         assert "force" in page.scan(lambda scan: scan["method"] == "touch")
 
@@ -247,10 +252,8 @@ def test_tare_is_refused_while_something_touches_the_skin(calibrated: bool) -> N
     known = [of_scene("ghost")] if calibrated else []
     with served(GHOST, calibrations=known) as client, panel(client) as page:
         page.scan()
-        answer = page.command(do="tare", force=False)
-        assert not answer["good"]
-        assert answer["refused"] == "tare"
-        assert "cells (2, 2), (2, 5), (5, 2) are touched" in answer["text"]
+        words = "cells (2, 2), (2, 5), (5, 2) are touched"
+        assert page.refused(words, do="tare", force=False)["refused"] == "tare"
         assert not page.state["tared"]
         assert page.command(do="tare", force=True)["good"]
         page.until_state(lambda state: state["tared"])
@@ -258,9 +261,7 @@ def test_tare_is_refused_while_something_touches_the_skin(calibrated: bool) -> N
         assert page.command(do="undo")["good"]
         page.scan(lambda scan: scan["touched"].sum() == 3)
         assert not page.state["tared"]
-        answer = page.command(do="undo")
-        assert not answer["good"]
-        assert "no tare" in answer["text"]
+        page.refused("no tare", do="undo")
 
 
 def test_a_tare_makes_a_conductance_certain() -> None:
@@ -278,19 +279,16 @@ def test_one_thing_at_a_time() -> None:
     with served(REST) as client, panel(client) as page, panel(client) as other:
         page.scan()
         page.say(do="tare", force=False)
-        refused = page.command(do="record")
-        assert not refused["good"]
-        assert "one thing at a time" in refused["text"]
-        refused = other.command(do="tare", force=False)
-        assert "one thing at a time" in refused["text"]
+        page.refused("one thing at a time", do="record")
+        other.refused("one thing at a time", do="tare", force=False)
         assert page.until(lambda message: message["kind"] == "notice")["good"]
 
 
 def test_a_recording_holds_every_scan_tare_and_mark(tmp_path: Path) -> None:
     with served(REST, folder=tmp_path) as client, panel(client) as page:
         page.scan()
-        assert "start one first" in page.command(do="mark", text="too soon")["text"]
-        assert "nothing" in page.command(do="stop")["text"]
+        page.refused("start one first", do="mark", text="too soon")
+        page.refused("nothing", do="stop")
         assert page.command(do="record")["good"]
         assert "already" in page.command(do="record")["text"]
         path = Path(page.state["recording"])
@@ -325,9 +323,7 @@ def test_a_recording_holds_every_scan_tare_and_mark(tmp_path: Path) -> None:
 def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     with served(REST, folder=tmp_path / "none") as client, panel(client) as page:
         page.scan()
-        answer = page.command(do="record")
-        assert not answer["good"]
-        assert "cannot be written" in answer["text"]
+        page.refused("cannot be written", do="record")
         assert not page.state["recording"]
         page.scan()
 
@@ -365,6 +361,9 @@ def test_a_board_that_is_pulled_out_comes_back_by_itself(
         assert page.scan()["method"] == "matrix"
 
 
+BAD_PORTS = ("", "[]", "{", '{"port": 3}', '{"port": " "}', '{"port": "a\\u0000"}', "[" * 5000)
+
+
 def test_a_port_is_opened_and_closed_from_the_page() -> None:
     with served() as client:
         assert client.get("/boards").json() == []
@@ -372,15 +371,7 @@ def test_a_port_is_opened_and_closed_from_the_page() -> None:
             {"path", "description", "board"} == set(port) for port in client.get("/ports").json()
         )
         own = {"origin": ORIGIN}
-        for body in (
-            "",
-            "[]",
-            "{",
-            '{"port": 3}',
-            '{"port": " "}',
-            '{"port": "a\\u0000"}',
-            "[" * 5000,
-        ):
+        for body in BAD_PORTS:
             answer = client.post("/boards", content=body, headers=own)
             assert answer.status_code == 400, body
             assert answer.json()["error"]
@@ -442,10 +433,10 @@ def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> No
             if recorder.scans == 30:
                 break
     with served(f"replay://{path}") as client, panel(client) as page:
+        assert page.scan()["touched"].sum() == 3
         state = page.until_state(lambda state: state["status"] == "ended")
         assert "played to its end" in state["text"]
         assert state["tared"]
-        assert page.scan()["touched"].sum() == 3
 
 
 def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Path) -> None:
