@@ -173,12 +173,10 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
             for scan in scans:
                 recorder.add(scan)
         assert_one_line(calibrate(run, (path, forces, out)), *words)
-    foreign = tmp_path / "foreign.mcap"
-    foreign.write_bytes(b"no recording at all")
-    assert_one_line(calibrate(run, (foreign, forces, out)), "foreign.mcap")
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(recording.read_bytes()[:200])
-    assert_one_line(calibrate(run, (cut, forces, out)), "cut.mcap")
+    for name, octets in (("foreign", b"no recording"), ("cut", recording.read_bytes()[:200])):
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(octets)
+        assert_one_line(calibrate(run, (path, forces, out)), f"{name}.mcap")
     assert not out.exists()
 
 

@@ -51,12 +51,6 @@ def test_ports_names_the_boards_it_knows(run: Run, attach: Attach) -> None:
     assert "megaatmega2560" in run("ports").out
 
 
-def test_ports_of_this_machine(run: Run) -> None:
-    done = run("ports", "--json")
-    assert done.code == 0
-    assert all(set(port) == {"path", "description", "board"} for port in json.loads(done.out))
-
-
 def test_info(run: Run) -> None:
     done = well(run("info", EMULATED))
     assert f"0x{LAYOUT_CRC:04X}" in done.out

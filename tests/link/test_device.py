@@ -375,13 +375,6 @@ def test_an_iterator_never_used_costs_nothing(
     assert fast.stats.overflowed <= before.overflowed + 1
 
 
-def test_latest_after_close_is_no_old_scan(fast: ohmskin.Device) -> None:
-    until(lambda: fast.stats.scans > 5)
-    fast.close()
-    with pytest.raises(DeviceLost):
-        fast.latest()
-
-
 def test_latest_waits_as_long_as_told() -> None:
     link = SteppedLink("emulator://1x1?rate=1")
     with Device(Session(link)) as skin:

@@ -86,10 +86,8 @@ def test_the_board_time_does_not_wrap() -> None:
 
 def test_the_counters_of_the_board_are_passed_on_and_that_of_dropped_scans_wraps() -> None:
     decoder = BoardDecoder()
-    counts = [(65530, 3), (65535, 3), (2, 5), (2, 5)]
-    scans(
-        decoder, b"".join(scan_wire(n, dropped=d, rx_errors=e) for n, (d, e) in enumerate(counts))
-    )
+    for number, (dropped, errors) in enumerate([(65530, 3), (65535, 3), (2, 5), (2, 5)]):
+        scans(decoder, scan_wire(number, dropped=dropped, rx_errors=errors))
     assert (decoder.stats.dropped_by_board, decoder.stats.board_rx_errors) == (8, 5)
 
 

@@ -122,7 +122,8 @@ def test_the_papers_methods_run_on_small_skins_alone() -> None:
 def test_sweeps_are_the_papers(name: str) -> None:
     """Readings of ngspice, made for the same conditions."""
     expected, _ = reference(f"{name}_3x3", bits=None)
-    pressed, rest = ([readings(skin) for skin in skins] for skins in zip(*published.sweep(name)))
+    skins = zip(*published.sweep(name), strict=True)
+    pressed, rest = ([readings(skin) for skin in each] for each in skins)
     np.testing.assert_allclose(pressed, expected.ratio, atol=1e-7)
     np.testing.assert_allclose(rest, expected.rest_ratio, atol=1e-7)
 
