@@ -7,20 +7,24 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
-import ohmskin
-from command_line import Done
+from command_line import ENVIRONMENT, Command, Done, Run
 from ohmskin.cli import main as cli
-from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.board import EmulatedBoard, PtyServer
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.opening import emulated
 from places import ROOT
+from ports import USB_IDS, Attach, Serve
+from studies.__main__ import app as studies
 
 OPEN_FILES = Path("/proc/self/fd")
 
@@ -65,20 +69,24 @@ def _open_files() -> int:
 
 
 @pytest.fixture
-def pty_board() -> Iterator[Callable[[str], PtyServer]]:
-    """A function that serves an ``emulator://`` URL at a pseudo-terminal; `close` ends it early."""
+def pty_board() -> Iterator[Serve]:
+    """A function that serves a board, or that of an ``emulator://`` URL, at a pseudo-terminal.
+
+    It is silent at first for `silent_s`. `close` ends it early.
+    """
     with ExitStack() as stack:
 
-        def serve(url: str) -> PtyServer:
-            board, _, faults = emulated(url)
+        def serve(of: str | EmulatedBoard, silent_s: float = 0.0) -> PtyServer:
+            board, _, faults = emulated(of) if isinstance(of, str) else (of, "", None)
             server = PtyServer(board, faults)
             done = threading.Event()
 
             def work() -> None:
+                done.wait(silent_s)
                 while not done.is_set():
                     server.serve(0.05)
 
-            thread = threading.Thread(target=work, name=f"serve {url}")
+            thread = threading.Thread(target=work, name=f"serve {of}")
             thread.start()
             close_files = server.close
 
@@ -95,26 +103,40 @@ def pty_board() -> Iterator[Callable[[str], PtyServer]]:
         yield serve
 
 
-Command = Callable[..., "subprocess.Popen[str]"]
+@pytest.fixture
+def silent_port() -> Iterator[tuple[int, str]]:
+    """The far end and the path of a pseudo-terminal at which nobody answers."""
+    tty = pytest.importorskip("tty")
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.fixture
+def attach(monkeypatch: pytest.MonkeyPatch) -> Attach:
+    """A function that says which ports this machine has: path and board of each, ``""`` if none."""
+
+    def say(*ports: tuple[str, str]) -> None:
+        found = [ListPortInfo(path, skip_link_detection=True) for path, _ in ports]
+        for port, (_, board) in zip(found, ports, strict=True):
+            port.vid, port.pid = USB_IDS[board]
+        monkeypatch.setattr(list_ports, "comports", lambda: found)
+
+    return say
 
 
 @pytest.fixture
 def command() -> Iterator[Command]:
     """A function that starts ``python -m MODULE ARGUMENTS``, MODULE as a rule ohmskin."""
-    path = os.pathsep.join([str(Path(ohmskin.__file__).parents[1]), str(ROOT)])
-    environment = {**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"}
     started: list[subprocess.Popen[str]] = []
 
-    def start(*arguments: str, module: str = "ohmskin") -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
-        started.append(process)
-        return process
+    def start(*arguments: str, module: str = "ohmskin", **options: Any) -> "subprocess.Popen[str]":
+        piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        call = [sys.executable, "-m", module, *arguments]
+        started.append(subprocess.Popen(call, **(piped | {"env": ENVIRONMENT} | options)))
+        return started[-1]
 
     yield start
     for process in started:
@@ -124,19 +146,18 @@ def command() -> Iterator[Command]:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Done]:
-    """A function that runs ``ohmskin ARGUMENTS`` in this process."""
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """A function that runs ``ohmskin ARGUMENTS`` in this process, or ``python -m studies``."""
     monkeypatch.setenv("COLUMNS", "200")
 
-    def call(*arguments: str) -> Done:
-        monkeypatch.setattr(sys, "argv", ["ohmskin", *arguments])
+    def call(*arguments: str, program: str = "ohmskin") -> Done:
+        monkeypatch.setattr(sys, "argv", [program, *arguments])
         capsys.readouterr()
         code = 0
         try:
-            cli.main()
+            cli.main() if program == "ohmskin" else cli.run(studies, program)
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 1
-        captured = capsys.readouterr()
-        return Done(code, captured.out, captured.err)
+        return Done(code, *capsys.readouterr())
 
     return call

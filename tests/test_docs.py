@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages say is there: commands and their options, code, files, names, printed numbers."""
 
-import importlib.util
 import pkgutil
 import re
 import shlex
 import tomllib
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from runpy import run_path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -159,14 +159,9 @@ def test_both_pages_have_the_same_wiring() -> None:
 # --------------------------------------------------------------------------------------- the site
 
 
-def loaded(name: str) -> ModuleType:
-    """A module in docs/."""
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def loaded(name: str) -> SimpleNamespace:
+    """What a module in docs/ defines."""
+    return SimpleNamespace(**run_path(str(DOCS / f"{name}.py")))
 
 
 def page_at(uri: str) -> Any:
@@ -214,25 +209,25 @@ def test_tables_and_sessions_in_docstrings_stay_as_they_are() -> None:
 
 
 @pytest.fixture(scope="module")
-def draw() -> ModuleType:
+def draw() -> SimpleNamespace:
     return loaded("draw")
 
 
 def test_pictures_are_current(
-    draw: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    draw: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["draw.py", "--check"])
     assert (draw.main(), capsys.readouterr().err) == (0, "")
 
 
-def test_changed_numbers_make_a_picture_stale(draw: ModuleType) -> None:
+def test_changed_numbers_make_a_picture_stale(draw: SimpleNamespace) -> None:
     drawn = draw.numbers()
     drawn["slot"]["hold"] += 1
     assert [path.name for path in draw.stale(drawn)] == ["slot.svg"]
 
 
 def test_printed_numbers_are_those_of_the_pages(
-    draw: ModuleType, capsys: pytest.CaptureFixture[str]
+    draw: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
     draw.report(draw.numbers())
     pages = [line for page in ("build.md", "timing.md") for line in Page(DOCS / page).code]
@@ -241,7 +236,7 @@ def test_printed_numbers_are_those_of_the_pages(
     assert [line for line in printed if line.strip() not in pages] == []
 
 
-def test_precision_is_that_of_all_ten_bit_codes(draw: ModuleType) -> None:
+def test_precision_is_that_of_all_ten_bit_codes(draw: SimpleNamespace) -> None:
     """std(g)/g from every code that a cell can give: half the spread of a code, over sqrt(3)."""
     ref_ohm, cell_ohm = 30_000.0, 100_000.0
     current = 1 / (cell_ohm + 2 * ref_ohm)
@@ -252,7 +247,7 @@ def test_precision_is_that_of_all_ten_bit_codes(draw: ModuleType) -> None:
 
 
 @pytest.mark.simavr
-def test_slot_is_that_of_the_firmware(draw: ModuleType) -> None:
+def test_slot_is_that_of_the_firmware(draw: SimpleNamespace) -> None:
     slot = draw.slot()
     with Rig("uno") as rig:
         rig.run(0.05)

@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
 import json
 import re
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
+from runpy import run_path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from mcap.reader import make_reader
 
 import ohmskin
 from calibrations import of_scene
-from command_line import Done
+from command_line import Run, python, well
 from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
@@ -34,15 +33,12 @@ GHOST = "emulator://8x8?scene=ghost&seed=1"
 
 
 def output_of(*command: str) -> str:
-    return subprocess.run(
-        [sys.executable, *command], capture_output=True, text=True, check=True, timeout=60
-    ).stdout
+    return well(python(*command)).out
 
 
 def first_lines(count: int, *command: str) -> list[str]:
     """Of a program that goes on for ever."""
     process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     try:
         return [process.stdout.readline() for _ in range(count)]
     finally:
@@ -50,13 +46,8 @@ def first_lines(count: int, *command: str) -> list[str]:
         process.communicate(timeout=20)
 
 
-def example(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def example(name: str) -> SimpleNamespace:
+    return SimpleNamespace(**run_path(str(EXAMPLES / f"{name}.py")))
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +81,7 @@ def test_forces_prints_contacts(skin_json: str) -> None:
     assert len({each.groups()[1:] for each in found if each}) == 3  # the ghost is none
 
 
-def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Callable[..., Done]) -> None:
+def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> None:
     path, table = tmp_path / "skin.json", str(EXAMPLES / "presses.csv")
     arguments = ("emulator://8x8", table, str(path), "--indenter-mm2", "80")
     assert run("calibrate", "table", *arguments).code == 0
@@ -218,7 +209,6 @@ def messages_of(path: Path) -> list[tuple[str, str, str, dict, int, dict]]:
     found = []
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
-            assert schema is not None
             # docs.foxglove.dev, "Custom schema encodings": these, and "type": "object".
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             text = json.loads(schema.data)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.force.calibration import load_calibration
@@ -26,7 +26,6 @@ TOLD = (
     *("--top-wire", str(TOP_WIRE_OHM), "--bottom-wire", str(BOTTOM_WIRE_OHM)),
 )
 BY_OHM = ("--rest", "1.5", "--method", "ohm")  # the fastest
-Run = Callable[..., Done]
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +63,7 @@ def test_a_recording_and_its_forces_make_a_calibration(
     run: Run, presses: tuple[Path, Path, Path], scene: Scene, tmp_path: Path
 ) -> None:
     recording, _, out = presses
-    done = calibrate(run, presses)
-    assert (done.code, done.err) == (0, "")
+    done = well(calibrate(run, presses))
     offset_s = float(done.out.partition("offset of the clocks ")[2].partition(" s")[0])
     # Creep and the sensor's rate leave some hundredths.
     assert offset_s == pytest.approx(HOST_BEGIN_S - SENSOR_BEGIN_S, abs=0.05)
@@ -106,16 +104,14 @@ def test_a_recording_and_its_forces_make_a_calibration(
         lambda: run("calibrate", "recording", str(both), str(out), *TOLD, *BY_OHM),
         lambda: calibrate(run, presses, *BY_OHM),
     ):
-        done = command()
-        assert (done.code, done.err) == (0, "")
+        done = well(command())
         slopes.append(load_calibration(out).model.slope)
     np.testing.assert_allclose(*slopes, rtol=0.02)
 
 
 @pytest.mark.parametrize("method", ["voltage", "touch"])
 def test_other_methods(run: Run, presses: tuple[Path, Path, Path], method: str) -> None:
-    done = calibrate(run, presses, "--rest", "1.5", "--method", method)
-    assert (done.code, done.err) == (0, "")
+    well(calibrate(run, presses, "--rest", "1.5", "--method", method))
     assert load_calibration(presses[2]).method == method
 
 
@@ -139,12 +135,6 @@ def test_bad_force_logs(run: Run, presses: tuple[Path, Path, Path]) -> None:
         edited(forces, edit)
         assert_one_line(calibrate(run, presses, *BY_OHM), *words)
         assert not out.exists()
-    for header, words in (
-        ("time_ms,force_n", ["no column time_s (seconds", "time_ms"]),
-        ("time_s,force_g", ["no column force_n (newtons", "force_g"]),
-    ):
-        forces.write_text(good.replace("time_s,force_n", header))
-        assert_one_line(calibrate(run, presses), "forces.csv", *words)
     lines = good.splitlines()
     forces.write_text("\n".join([*lines[:40], "70000.5,", *lines[41:]]))
     assert_one_line(calibrate(run, presses), "forces.csv", "row 41")
@@ -159,8 +149,7 @@ def test_a_gap_in_the_log_costs_its_presses_alone(
         return t[kept], f[kept]
 
     edited(presses[1], with_gap)
-    done = calibrate(run, presses, *BY_OHM)
-    assert (done.code, done.err) == (0, "")
+    well(calibrate(run, presses, *BY_OHM))
     assert load_calibration(presses[2]).model.pooled.sum() <= 1
 
 
@@ -171,8 +160,7 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
         "presses.mcap: no force in it: say --forces LOG.csv",
     )
     assert_one_line(
-        calibrate(run, presses, "--method", "joint"),
-        "presses.mcap: no tare in it: say --rest 2",
+        calibrate(run, presses, "--method", "joint"), "presses.mcap: no tare in it: say --rest 2"
     )
     given = load_recording(recording)
     edited(forces, lambda t, f: (t[t < SENSOR_BEGIN_S + 21], f[t < SENSOR_BEGIN_S + 21]))
@@ -185,12 +173,10 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
             for scan in scans:
                 recorder.add(scan)
         assert_one_line(calibrate(run, (path, forces, out)), *words)
-    foreign = tmp_path / "foreign.mcap"
-    foreign.write_bytes(b"no recording at all")
-    assert_one_line(calibrate(run, (foreign, forces, out)), "foreign.mcap")
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(recording.read_bytes()[:200])
-    assert_one_line(calibrate(run, (cut, forces, out)), "cut.mcap")
+    for name, octets in (("foreign", b"no recording"), ("cut", recording.read_bytes()[:200])):
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(octets)
+        assert_one_line(calibrate(run, (path, forces, out)), f"{name}.mcap")
     assert not out.exists()
 
 
@@ -213,8 +199,7 @@ def press_table(path: Path, seed: int = 1) -> Float:
 def test_a_table_makes_a_calibration(run: Run, tmp_path: Path) -> None:
     table, out = tmp_path / "presses.csv", tmp_path / "skin.json"
     rest = press_table(table)
-    done = run("calibrate", "table", REST, str(table), str(out), "--rest", "0.3", *TOLD)
-    assert (done.code, done.err) == (0, "")
+    well(run("calibrate", "table", REST, str(table), str(out), "--rest", "0.3", *TOLD))
     found = load_calibration(out)
     assert (found.unit_id, found.rows, found.columns) == (5, 2, 3)
     np.testing.assert_allclose(found.model.slope, 1e5, rtol=0.02)
@@ -229,13 +214,8 @@ def test_bad_tables(run: Run, tmp_path: Path) -> None:
     good = table.read_text()
     header, *rows = good.splitlines()
     for text, words in (
-        (header, ["no press"]),
-        (f"{header}\n{rows[0]}", ["too few presses: 1"]),
         ("\n".join([header, *rows[:6]]), ["all presses are on cell (0, 0)"]),
         (good.replace("0,0,1,", "2,0,1,"), ["row 3: cell (2, 0) is not on this 2x3 skin"]),
-        (good.replace("0,0,1,", "0,0,-1,"), ["row 3", "force_n is -1"]),
-        (good.replace("conductance", "conductance_us"), ["conductance_us"]),
-        (good.replace("force_n", "force_g"), ["force_g"]),
         ("\n".join([header, *(f"{row[:4]}2,{row[-9:]}" for row in rows)]), ["presses.csv"]),
     ):
         table.write_text(text)

@@ -236,8 +236,7 @@ _PRESS = st.tuples(_CELL, _CELL, st.floats(0, 1e60), _SIEMENS, _SIEMENS)
 
 @given(st.lists(_PRESS, min_size=1, max_size=20))
 def test_a_saved_table_is_a_csv_that_is_read_back_bit_for_bit(
-    tmp_path_factory: pytest.TempPathFactory,
-    rows: list[tuple[int, int, float, float, float]],
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[int, int, float, float, float]]
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "round_trip.csv"
     saved = np.array(rows, PRESS)
@@ -247,22 +246,3 @@ def test_a_saved_table_is_a_csv_that_is_read_back_bit_for_bit(
     assert lines[0] == f"{HEADER},conductance_std"
     by_numpy = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
     np.testing.assert_array_equal(by_numpy, [list(press) for press in rows])
-
-
-def test_a_table_that_cannot_be_written_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = written(tmp_path, f"{HEADER}\n0,0,1,1e-6\n")
-    presses = np.zeros(3, PRESS)
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(ValueError, match=r"table\.csv: cannot be written: No space left"):
-        save_press_table(path, presses)
-    monkeypatch.undo()
-    assert load_press_table(path)["force_n"].tolist() == [1.0]
-    assert [each.name for each in tmp_path.iterdir()] == [path.name]
-    with pytest.raises(ValueError, match=r"table\.csv: cannot be written"):
-        save_press_table(tmp_path / "nowhere" / "table.csv", presses)

@@ -4,21 +4,19 @@
 import os
 import re
 import signal
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.force.calibration import load_calibration
-from scripted_skin import REST, ScriptedSkin
+from scripted_skin import REST, ScriptedSkin, rise
 
-Run = Callable[..., Done]
 Cell = tuple[int, int]
 # From when on [s], the cells, and the force on each [N].
 Script = Sequence[tuple[float, Sequence[Cell], float]]
@@ -32,11 +30,6 @@ PUT_S, OFF_S = 2.2, 0.8
 
 def newtons(mass_g: float) -> float:
     return 9.80665e-3 * mass_g
-
-
-def rise(force_n: float | Float) -> Float:
-    """Conductance above rest of every cell that has crept [S]."""
-    return np.asarray(30e-6 * force_n**1.7)
 
 
 def on_skin(script: Script, time_s: float) -> Float:
@@ -61,7 +54,7 @@ def putting(presses: Sequence[tuple[Cell, float]], begin_s: float = 0.5) -> list
 
 
 @pytest.fixture
-def weigh(monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path) -> Callable[..., Done]:
+def weigh(monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path) -> Run:
     """A function that runs the command for skin.json while somebody acts by a script."""
 
     def call(script: Script, *options: str, interrupt_s: float = float("inf")) -> Done:
@@ -93,7 +86,7 @@ def pairs_of(path: Path) -> list[tuple[Cell, int]]:
     ]
 
 
-def test_weights_are_asked_for_read_and_learned(weigh: Callable[..., Done], tmp_path: Path) -> None:
+def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> None:
     out, table = tmp_path / "skin.json", tmp_path / "skin.presses.csv"
     # The fourth weight is first put on the wrong cell, then beside a hand.
     script = putting(ASKED[:3])
@@ -115,8 +108,7 @@ def test_weights_are_asked_for_read_and_learned(weigh: Callable[..., Done], tmp_
     assert pairs_of(table) == ASKED[:4]
     assert not out.exists()
 
-    done = weigh(putting(ASKED[4:]), *OPTIONS)
-    assert (done.code, done.err) == (0, "")
+    done = well(weigh(putting(ASKED[4:]), *OPTIONS))
     assert done.out.splitlines()[2] == "put 200 g (1.961 N) on cell (0, 1), row 0, column 1"
     assert "held-out error" in done.out
     assert f"{out}: calibration of unit 7" in done.out
@@ -150,7 +142,7 @@ def test_weights_are_asked_for_read_and_learned(weigh: Callable[..., Done], tmp_
     assert after["conductance"][:3].tolist() == before["conductance"][3:].tolist()
 
 
-def test_a_full_table_is_fitted_at_once(weigh: Callable[..., Done], tmp_path: Path) -> None:
+def test_a_full_table_is_fitted_at_once(weigh: Run, tmp_path: Path) -> None:
     table, out = tmp_path / "mine.csv", tmp_path / "skin.json"
     lines = ["row,column,force_n,conductance"]
     for cell, mass_g in ASKED:
@@ -158,8 +150,7 @@ def test_a_full_table_is_fitted_at_once(weigh: Callable[..., Done], tmp_path: Pa
         lines.append(f"{cell[0]},{cell[1]},{newtons(mass_g)},{siemens}")
     table.write_text("\n".join(lines) + "\n")
     of_table = table.read_text()
-    done = weigh([], *OPTIONS, "--table", str(table))
-    assert (done.code, done.err) == (0, "")
+    done = well(weigh([], *OPTIONS, "--table", str(table)))
     assert "put" not in done.out
     assert load_calibration(out).columns == 2
     assert table.read_text() == of_table
@@ -171,7 +162,7 @@ def test_a_full_table_is_fitted_at_once(weigh: Callable[..., Done], tmp_path: Pa
     assert out.read_bytes() == was
 
 
-def test_all_presses_can_be_redone(weigh: Callable[..., Done], tmp_path: Path) -> None:
+def test_all_presses_can_be_redone(weigh: Run, tmp_path: Path) -> None:
     table = tmp_path / "skin.presses.csv"
     table.write_text("row,column,force_n,conductance\n0,0,1,1e-5\n0,1,1,1e-5\n")
     redo = ("--redo", "0,0", "--redo", "0,1")
@@ -209,6 +200,6 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
     table.write_text("row,column,force_n,conductance\n0,0,1,1e-5\n1,1,1,1e-5\n")
     was = table.read_bytes()
     done = run("calibrate", "weights", port, out, *arguments, "--redo", "0,0")
-    assert_one_line(replace(done, out=""), "skin.presses.csv: row 3: cell (1, 1) is not on this")
+    assert_one_line(done._replace(out=""), "skin.presses.csv: row 3: cell (1, 1) is not on this")
     assert table.read_bytes() == was
     assert not Path(out).exists()

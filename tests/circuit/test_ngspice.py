@@ -14,8 +14,8 @@ import pytest
 
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from skins import told
 
 pytestmark = pytest.mark.ngspice
 
@@ -156,14 +156,7 @@ def test_a_finger_is_estimated(
 ) -> None:
     """Nothing here comes from the circuit that the estimators share."""
     rest_ratio, ratio, cell_siemens = finger
-    knowledge = SkinKnowledge(
-        8,
-        8,
-        adc_bits=10,
-        rest_ratio=rest_ratio,
-        nominal_wire_ohm=WireOhm(100.0, 200.0),
-    )
-    estimator = make_estimator(method, knowledge)
+    estimator = make_estimator(method, told(rest_ratio))
     found = [estimator.estimate(frame) for frame in ratio]
     siemens, std = (
         np.array([getattr(each, name) for each in found])

@@ -8,22 +8,19 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from command_line import Done, assert_one_line
+from command_line import Run, assert_one_line, well
 from ohmskin.cli import board as flash_command
-from ohmskin.emulate.board import EmulatedBoard, PtyServer
+from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.link import session
 from ohmskin.link.serial_port import SerialPort
 from ohmskin.opening import emulated
 from places import ROOT
-
-Run = Callable[..., Done]
+from ports import Attach, Serve
 
 
 class FlashedBoard(EmulatedBoard):
@@ -66,41 +63,6 @@ def pio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pio:
     return Pio(place)
 
 
-@pytest.fixture
-def attach(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """A function that says which ports this machine has: path and board of each."""
-
-    def say(*ports: tuple[str, str]) -> None:
-        found = [SerialPort(path, "", board) for path, board in ports]
-        monkeypatch.setattr(flash_command, "serial_ports", lambda: found)
-
-    say()
-    return say
-
-
-@pytest.fixture
-def serve() -> Iterator[Callable[..., str]]:
-    """A function that serves a board at a pseudo-terminal, and gives its port."""
-    with ExitStack() as stack:
-
-        def begin(board: EmulatedBoard, silent_s: float = 0.0) -> str:
-            server = stack.enter_context(PtyServer(board))
-            done = threading.Event()
-
-            def work() -> None:
-                done.wait(silent_s)
-                while not done.is_set():
-                    server.serve(0.05)
-
-            thread = threading.Thread(target=work)
-            thread.start()
-            stack.callback(thread.join)
-            stack.callback(done.set)
-            return server.path
-
-        yield begin
-
-
 def board(says: str = "uno") -> FlashedBoard:
     made = FlashedBoard(emulated("emulator://8x8")[0]._ratio_at, 8, 8)
     made.says = says
@@ -109,54 +71,44 @@ def board(says: str = "uno") -> FlashedBoard:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind"),
+    ("arguments", "kind", "bridge"),
     [
-        ([], "uno"),
-        (["uno"], "uno"),
-        (["uno", "--port", "{}"], "uno"),
-        (["--port", "{}"], "uno"),
-        ([], "megaatmega2560"),
+        ([], "uno", "uno"),
+        (["uno"], "uno", "uno"),
+        (["uno", "--port", "{}"], "uno", "uno"),
+        (["--port", "{}"], "uno", "uno"),
+        ([], "megaatmega2560", "megaatmega2560"),
+        (["uno", "--port", "{}"], "uno", ""),  # with another USB bridge
     ],
 )
 def test_it_flashes_and_hears_from_the_board(
     run: Run,
     pio: Pio,
-    attach: Callable[..., None],
-    serve: Callable[..., str],
+    attach: Attach,
+    pty_board: Serve,
     arguments: list[str],
     kind: str,
+    bridge: str,
 ) -> None:
-    port = serve(board(kind))
-    attach(("/dev/ttyS0", ""), (port, kind))
-    done = run("flash", *(each.format(port) for each in arguments))
-    assert (done.code, done.err) == (0, "")
+    port = pty_board(board(kind)).path
+    attach(("/dev/ttyS0", ""), (port, bridge))
+    done = well(run("flash", *(each.format(port) for each in arguments)))
     assert f"flashing {kind} at {port}" in done.out
     assert f"{port}: {kind}, firmware 0.1.0, answers" in done.out
     expected = ["run", "-d", str(ROOT), "-e", kind, "-t", "upload", "--upload-port", port]
     assert pio.arguments == expected
 
 
-def test_a_board_with_another_usb_bridge_is_named(
-    run: Run, pio: Pio, attach: Callable[..., None], serve: Callable[..., str]
-) -> None:
-    port = serve(board())
-    attach((port, ""))
-    assert run("flash", "uno", "--port", port).code == 0
-    assert pio.arguments[-1] == port
-
-
-def test_the_board_may_take_its_time_to_boot(
-    run: Run, attach: Callable[..., None], serve: Callable[..., str]
-) -> None:
-    port = serve(board(), silent_s=1.0)
+def test_the_board_may_take_its_time_to_boot(run: Run, attach: Attach, pty_board: Serve) -> None:
+    port = pty_board(board(), silent_s=1.0).path
     attach((port, "uno"))
     assert run("flash").code == 0
 
 
 def test_the_port_may_be_gone_for_a_while(
-    run: Run, pio: Pio, attach: Callable[..., None], serve: Callable[..., str], tmp_path: Path
+    run: Run, pio: Pio, attach: Attach, pty_board: Serve, tmp_path: Path
 ) -> None:
-    port, link = serve(board()), tmp_path / "ttyACM0"
+    port, link = pty_board(board()).path, tmp_path / "ttyACM0"
     attach((str(link), "uno"))
     back = threading.Timer(0.7, link.symlink_to, [port])
     back.start()
@@ -165,12 +117,9 @@ def test_the_port_may_be_gone_for_a_while(
 
 
 def test_the_port_may_come_back_by_another_name(
-    run: Run,
-    attach: Callable[..., None],
-    serve: Callable[..., str],
-    monkeypatch: pytest.MonkeyPatch,
+    run: Run, attach: Attach, pty_board: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    port = serve(board())
+    port = pty_board(board()).path
     begin_s = time.monotonic()
 
     def ports() -> list[SerialPort]:
@@ -216,7 +165,7 @@ UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {
 
 @pytest.mark.parametrize("what", UNCLEAR)
 def test_what_is_not_clear_is_asked_and_nothing_is_written(
-    what: str, run: Run, pio: Pio, attach: Callable[..., None]
+    what: str, run: Run, pio: Pio, attach: Attach
 ) -> None:
     arguments, ports, words = UNCLEAR[what]
     attach(*ports)
@@ -225,9 +174,9 @@ def test_what_is_not_clear_is_asked_and_nothing_is_written(
 
 
 def test_the_one_of_that_kind_is_taken(
-    run: Run, pio: Pio, attach: Callable[..., None], serve: Callable[..., str]
+    run: Run, pio: Pio, attach: Attach, pty_board: Serve
 ) -> None:
-    port = serve(board("megaatmega2560"))
+    port = pty_board(board("megaatmega2560")).path
     attach(("/dev/ttyACM0", "uno"), (port, "megaatmega2560"))
     assert run("flash", "megaatmega2560").code == 0
     assert pio.arguments[-1] == port
@@ -241,40 +190,35 @@ def failed(run: Run) -> str:
     return done.err
 
 
-def test_a_failed_upload_is_said(run: Run, pio: Pio, attach: Callable[..., None]) -> None:
+def test_a_failed_upload_is_said(run: Run, pio: Pio, attach: Attach) -> None:
     attach(("/dev/ttyACM0", "uno"))
     pio.end_with(1)
     assert "flashing uno at /dev/ttyACM0 failed" in failed(run)
 
 
 def test_a_board_that_stays_silent_is_said(
-    run: Run,
-    attach: Callable[..., None],
-    serve: Callable[..., str],
-    monkeypatch: pytest.MonkeyPatch,
+    run: Run, attach: Attach, pty_board: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
-    attach((serve(board(), silent_s=30.0), "uno"))
+    attach((pty_board(board(), silent_s=30.0).path, "uno"))
     assert "is silent" in failed(run)
 
 
 def test_a_port_that_does_not_come_back_is_said(
-    run: Run, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    run: Run, attach: Attach, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(flash_command, "REBOOT_S", 0.3)
     attach(("/dev/ttyACM77", "uno"))
     assert "no port /dev/ttyACM77" in failed(run)
 
 
-def test_another_board_at_the_port_is_said(
-    run: Run, attach: Callable[..., None], serve: Callable[..., str]
-) -> None:
-    attach((serve(board("megaatmega2560")), "uno"))
+def test_another_board_at_the_port_is_said(run: Run, attach: Attach, pty_board: Serve) -> None:
+    attach((pty_board(board("megaatmega2560")).path, "uno"))
     assert "answers as 'megaatmega2560', not as uno" in failed(run)
 
 
 def test_without_platformio_it_says_how_to_get_it(
-    run: Run, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    run: Run, attach: Attach, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attach(("/dev/ttyACM0", "uno"))
     monkeypatch.setenv("PATH", os.devnull)
@@ -283,7 +227,7 @@ def test_without_platformio_it_says_how_to_get_it(
 
 
 def test_without_a_checkout_it_says_so(
-    run: Run, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    run: Run, attach: Attach, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     attach(("/dev/ttyACM0", "uno"))
     monkeypatch.setattr(flash_command, "_ROOT", tmp_path)

@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is loaded when: the package and its help are light, and methods load what they need."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 import ohmskin
+from command_line import python
 from ohmskin.cli.main import app
 
 # What takes long to load, and only some commands or methods need.
@@ -29,24 +25,14 @@ assert estimator.estimate(np.tile([0.9, 0.1, 0.9, 0.1], (2, 2, 1))).converged
 
 def loaded_after(program: str) -> set[str]:
     """Modules that a process of its own has loaded at the end of this program."""
-    path = Path(ohmskin.__file__).parents[1]
-    done = subprocess.run(
-        [sys.executable, "-c", f"{program}\nimport sys; print(*sys.modules, file=sys.stderr)"],
-        env={**os.environ, "PYTHONPATH": str(path)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return set(done.stderr.split())
+    done = python("-c", f"{program}\nimport sys; print(*sys.modules, file=sys.stderr)")
+    assert done.code == 0, done.err
+    return set(done.err.split())
 
 
 @pytest.mark.parametrize(
     ("program", "allowed"),
-    [
-        ("import ohmskin", set()),
-        (HELP, {"typer", "rich"}),
-        (JOINT, {"threadpoolctl"}),
-    ],
+    [("import ohmskin", set()), (HELP, {"typer", "rich"}), (JOINT, {"threadpoolctl"})],
     ids=["package", "help", "joint"],
 )
 def test_nothing_heavy_is_loaded(program: str, allowed: set[str]) -> None:

@@ -172,7 +172,6 @@ def test_hum_is_not_seen_in_noise_or_in_other_tones() -> None:
 def rest_of(url: str) -> RestScans:
     read = evidence(url)
     rest = RestScans.of(read.board, read.scans)
-    assert rest is not None
     return rest
 
 
@@ -199,7 +198,6 @@ def test_noise_is_measured_beside_hum_and_drift() -> None:
     noise_lsb, _ = examine_signal(replace(rest, codes=rest.codes + drift), Diagnosis())
     assert noise_lsb == pytest.approx((0.5**2 + 1 / 12) ** 0.5, rel=0.1)
     hum = find_hum(rest)
-    assert hum is not None
     assert hum.lsb == pytest.approx(3.0, rel=0.05)
 
 

@@ -2,7 +2,7 @@
 """``ohmskin doctor`` as a command: what it asks for, what it prints, what it leaves behind."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
@@ -16,16 +16,14 @@ from rich.status import Status
 import ohmskin
 from bench_board import Bench
 from calibrations import calibration
-from command_line import Done, assert_one_line
+from command_line import Run, assert_one_line, well
 from ohmskin.cli import doctor as doctor_command
 from ohmskin.cli.doctor import gather
-from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.base import WireOhm
 from ohmskin.link import session
 from ohmskin.record.recorder import Recorder
-
-Run = Callable[..., Done]
+from ports import Serve
 
 
 @pytest.fixture
@@ -50,8 +48,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_sound_board_takes_less_than_ten_seconds(run: Run, benches: list[Bench]) -> None:
-    done = run("doctor", "emulator://8x8")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("doctor", "emulator://8x8"))
     assert done.out.startswith("emulator://8x8: sound: nothing is wrong that an untouched")
     assert benches[0].now_s < 5  # and a second or two to connect
 
@@ -173,9 +170,7 @@ def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
 
 
 @pytest.mark.usefixtures("hasty")
-def test_ports_that_do_not_answer_are_findings(
-    run: Run, pty_board: Callable[[str], PtyServer]
-) -> None:
+def test_ports_that_do_not_answer_are_findings(run: Run, pty_board: Serve) -> None:
     path = pty_board("emulator://2x2").path
     with serial.Serial(path, exclusive=True):
         busy = json.loads(run("doctor", path, "--json").out)["findings"]
@@ -211,7 +206,7 @@ def test_the_end_of_a_recording_is_no_loss(run: Run, tmp_path: Path, speed: int)
 
 
 @pytest.mark.usefixtures("hasty")
-def test_a_board_at_a_port(run: Run, pty_board: Callable[[str], PtyServer]) -> None:
+def test_a_board_at_a_port(run: Run, pty_board: Serve) -> None:
     path = pty_board("emulator://3x4").path
     with ohmskin.open(path, start=False) as skin:
         before = skin.configure(rate_hz=77.5, settle_us=120)

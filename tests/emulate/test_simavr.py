@@ -52,9 +52,9 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
     @cache
     def compile_for(board: str, source: str) -> Path:
         stem = folder / f"f{len(list(folder.iterdir()))}"
-        assembler = "#include" not in source
+        assembler = "int main" not in source
         path = stem.with_suffix(".S" if assembler else ".c")
-        path.write_text(source)
+        path.write_text(source if assembler else C + source)
         options = ["-nostartfiles", "-nostdlib"] if assembler else ["-std=gnu99"]
         command = ["avr-gcc", f"-mmcu={MCU[board]}", "-DF_CPU=16000000UL", "-Os", *options]
         subprocess.run([*command, "-o", stem.with_suffix(".elf"), path], check=True)
@@ -91,7 +91,7 @@ FREE_RUNNING = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA5) + sts(ADCSRA, 0xE5)
 # The transmitter at 500 kbaud; at 6.
 TRANSMITTER = sts(0xC0, 2) + sts(0xC1, 8)
 
-# Begin of C programs that send.
+# Begin of all C programs: two functions to send with.
 C = """
 #include <avr/io.h>
 #include <util/delay.h>
@@ -190,16 +190,14 @@ def test_data_register_is_locked_between_adcl_and_adch(simulate: Simulate) -> No
     }"""
     table = np.zeros((2, 1, 4))
     table[0, 0, 0], table[1, 0, 0] = 0x155 / 1024, 0x2AA / 1024
-    sim = simulate(C + program)
+    sim = simulate(program)
     sim.set_table(table)
     sent = sim.run(0.01)
     assert sim.stats()["lost_results"] > 10
     assert struct.unpack("<2H", sent) == (0x155, 0x2AA << 6)
 
 
-SCAN = (
-    C
-    + """
+SCAN = """
 #ifdef __AVR_ATmega2560__
 #define SELECT(r, c, top) (PORTA = (r), PORTC = (c), PORTL = (top) ? 1 : 2)
 #define OUTPUTS() (DDRA = 15, DDRC = 15, DDRL = 3)
@@ -224,7 +222,6 @@ int main(void) {
     for (;;) {}
 }
 """
-)
 
 
 @BOARDS
@@ -360,16 +357,13 @@ def test_sleep_ends_at_once_if_an_interrupt_waits(simulate: Simulate, board: str
     assert sim.run_cycles(500) == b"\x07"
 
 
-TIMER0 = (
-    C
-    + """
+TIMER0 = """
 int main(void) {
     transmitter();
     TCCR0A = 0; TCCR0B = 3;
     for (;;) { while (!(TIFR0 & 1)) {} UDR0 = TCNT0; TCNT0 = PRELOAD; TIFR0 = 1; }
 }
 """
-)
 
 
 @pytest.mark.parametrize(("preload", "ticks"), [("TCNT0", 256), ("6", 250), ("128", 128)])
@@ -384,7 +378,6 @@ def test_timer0_polled_overflows(simulate: Simulate, preload: str, ticks: int) -
 # ---- UART --------------------------------------------------------------------------------------
 
 SENDER = """
-#include <avr/io.h>
 int main(void) {
     UCSR0C = FORMAT; UCSR0A = 2; UBRR0 = 3; UCSR0B = 8;
     for (uint8_t n = 0;; n++) { while (!(UCSR0A & 0x20)) {} UDR0 = n; }
@@ -413,9 +406,7 @@ def test_transmitter_holds_two_bytes_and_ignores_a_third(simulate: Simulate) -> 
     assert sim.stats()["tx_ignored"] == 1
 
 
-RECEIVER = (
-    C
-    + """
+RECEIVER = """
 int main(void) {
     UCSR0A = 2; UBRR0L = 3; UCSR0B = 0x18;
     for (;;) {
@@ -426,7 +417,6 @@ int main(void) {
     }
 }
 """
-)
 
 
 @pytest.mark.parametrize(
@@ -449,7 +439,6 @@ def test_receiver_overruns_after_three_bytes(
 
 
 ECHO = """
-#include <avr/io.h>
 #include <avr/interrupt.h>
 #include <avr/sleep.h>
 #ifndef USART_RX_vect
@@ -499,9 +488,7 @@ def test_baud_mismatch_garbles_both_ways(simulate: Simulate) -> None:
 
 # ---- resets, EEPROM, idle time -----------------------------------------------------------------
 
-RESETS = (
-    C
-    + """
+RESETS = """
 #include <avr/wdt.h>
 uint8_t kept __attribute__((section(".noinit")));
 int main(void) {
@@ -517,7 +504,6 @@ int main(void) {
     for (;;) {}
 }
 """
-)
 
 
 @BOARDS
@@ -532,9 +518,7 @@ def test_power_on_watchdog_and_external_reset(simulate: Simulate, board: str) ->
     assert stats["cycles"] >= 0.075 * CPU_HZ
 
 
-EEPROM = (
-    C
-    + """
+EEPROM = """
 #include <avr/eeprom.h>
 int main(void) {
     transmitter();
@@ -548,7 +532,6 @@ int main(void) {
     for (;;) {}
 }
 """
-)
 
 
 @BOARDS

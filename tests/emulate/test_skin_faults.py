@@ -16,15 +16,15 @@ R, C = 4, 5
 
 FAULTS = {
     "none": (SkinFaults(), {}, []),
-    "open row": (SkinFaults(open_row=2), {"top": np.s_[2, 0]}, []),
-    "open column": (SkinFaults(open_column=4), {"bottom": np.s_[0, 4]}, []),
-    "dead": (SkinFaults(dead=(1, 2)), {"dead": (1, 2)}, []),
-    "saturated": (SkinFaults(saturated=(3, 0)), {"saturated": (3, 0)}, []),
+    "open row": (SkinFaults(open_row=2), {"top": ((2, 0), np.inf)}, []),
+    "open column": (SkinFaults(open_column=4), {"bottom": ((0, 4), np.inf)}, []),
+    "dead": (SkinFaults(dead=(1, 2)), {"cell": ((1, 2), 0.0)}, []),
+    "saturated": (SkinFaults(saturated=(3, 0)), {"cell": ((3, 0), 10.0)}, []),
     "rows": (SkinFaults(short_rows=(0, 3)), {}, [(0, 3)]),
     "columns": (SkinFaults(short_columns=(2, 1)), {}, [(R + 2, R + 1)]),
     "many": (
         SkinFaults(short_rows=(0, 1), short_columns=(2, 3), dead=(3, 0), open_column=4),
-        {"dead": (3, 0), "bottom": np.s_[0, 4]},
+        {"cell": ((3, 0), 0.0), "bottom": ((0, 4), np.inf)},
         [(0, 1), (R + 2, R + 3)],
     ),
 }
@@ -34,21 +34,12 @@ FAULTS = {
 def test_readings_are_those_of_the_network(name: str) -> None:
     faults, changes, joints = FAULTS[name]
     sound = Scene("rest", R, C, seed=4).skin(0.0)
-    cell, top, bottom = (
-        each.copy() for each in (sound.cell_siemens, sound.top_wire_ohm, sound.bottom_wire_ohm)
-    )
-    for what, place in changes.items():
-        match what:
-            case "top":
-                top[place] = np.inf
-            case "bottom":
-                bottom[place] = np.inf
-            case "dead":
-                cell[place] = 0.0
-            case "saturated":
-                cell[place] = 10.0
-    finite = [np.where(np.isinf(ohm), 1e15, ohm) for ohm in (top, bottom)]
-    expected = laplacian_readings(Skin(cell, *finite), joints)
+    of = {"cell": sound.cell_siemens, "top": sound.top_wire_ohm, "bottom": sound.bottom_wire_ohm}
+    layers = {layer: values.copy() for layer, values in of.items()}
+    for layer, (place, value) in changes.items():
+        layers[layer][place] = value
+    finite = [np.where(np.isinf(layers[layer]), 1e15, layers[layer]) for layer in layers]
+    expected = laplacian_readings(Skin(*finite), joints)
     found = Scene("rest", R, C, seed=4, faults=faults).ratio(0.0)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     changed = np.abs(found - Scene("rest", R, C, seed=4).ratio(0.0)).max()

@@ -12,8 +12,8 @@ from skins import told
 from studies.trials import skin_at_rest, touch
 
 # Frames of each shape: enough to reach every branch of the estimators. Larger skins take longer.
-FRAMES = {(1, 1): 140, (1, 4): 140, (3, 1): 140, (2, 2): 42, (3, 3): 21}
-NONSENSE = ("noise", "rails", "one current", "all alike", "one cell at a rail")
+FRAMES = {(1, 1): 160, (1, 4): 160, (3, 1): 160, (2, 2): 48, (3, 3): 24, (8, 8): 16}
+NONSENSE = ("noise", "rails", "one current", "all alike", "one cell at a rail", "shorts")
 # The wires learn from a touch, in the state in which nonsense has left the estimator.
 KINDS = (*NONSENSE, "touch", "one reading at a rail")
 
@@ -26,6 +26,8 @@ def frame(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Flo
     ratio = random.random((*shape, 4))
     if kind == "rails":
         return np.round(ratio)
+    if kind == "shorts":
+        return np.where(random.random(shape)[..., None] < 0.5, [1.0, 0.0, 1.0, 0.0], 0.5)
     if kind == "one current":
         current = 0.5 * random.random(shape)[..., None]
         return np.where([True, False, True, False], 1 - current, current)
@@ -43,7 +45,7 @@ def frame(kind: str, shape: tuple[int, int], random: np.random.Generator) -> Flo
 
 def check(estimator: Estimator, ratio: Float) -> None:
     found = estimator.estimate(ratio)
-    assert np.isfinite(found.cell_siemens).all()
+    assert np.isfinite(found.cell_ohm).all()
     assert np.isfinite(found.cell_siemens_std).all()
     assert (found.cell_siemens_std > 0).all()
     assert np.isfinite(found.chi2)
@@ -55,27 +57,19 @@ def check(estimator: Estimator, ratio: Float) -> None:
 
 def knowledge_of(shape: tuple[int, int], what: str) -> SkinKnowledge:
     random = np.random.default_rng(1)
-    if what == "nothing":
-        return SkinKnowledge(*shape, adc_bits=10)
+    if what in ("nothing", "exact"):
+        return SkinKnowledge(*shape, adc_bits=10 if what == "nothing" else None)
     return told(random.random((*shape, 4)) if what == "nonsense" else readings(rest_of(shape)))
 
 
-@pytest.mark.parametrize("what", ["all", "nothing", "nonsense"])
+@pytest.mark.parametrize("what", ["all", "nothing", "exact", "nonsense"])
 @pytest.mark.parametrize("shape", FRAMES)
-@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
 def test_nonsense_is_answered(method: str, shape: tuple[int, int], what: str) -> None:
     random = np.random.default_rng([*shape, len(what)])
     estimator = make_estimator(method, knowledge_of(shape, what))
     for number in range(FRAMES[shape]):
         check(estimator, frame(KINDS[number % len(KINDS)], shape, random))
-
-
-@pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
-def test_nonsense_on_a_whole_skin_is_answered(method: str) -> None:
-    random = np.random.default_rng(2)
-    estimator = make_estimator(method, knowledge_of((8, 8), "all"))
-    for number in range(2 * len(KINDS)):
-        check(estimator, frame(KINDS[number % len(KINDS)], (8, 8), random))
 
 
 @pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
@@ -90,7 +84,6 @@ def test_all_readings_at_a_rail_are_flagged(method: str, ratio: float) -> None:
 def test_after_nonsense_a_good_frame_is_answered_as_if_nothing_had_been(method: str) -> None:
     random = np.random.default_rng(3)
     knowledge = knowledge_of((8, 8), "all")
-    assert knowledge.rest_ratio is not None
     used, new = (make_estimator(method, knowledge) for _ in range(2))
     for kind in 2 * NONSENSE[:4]:
         used.estimate(frame(kind, (8, 8), random))

@@ -1,15 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame is estimated with one BLAS thread, and the program keeps those it had."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 from threadpoolctl import threadpool_info
 
-import ohmskin
+from command_line import python
 
 # Two threads estimate: the first begins, the second begins, the first ends, the second ends. Both
 # threads live on meanwhile. All of it twice.
@@ -55,12 +50,6 @@ with ThreadPoolExecutor(2) as pool:
     reason="this machine's BLAS does not tell its threads",
 )
 def test_one_thread_during_an_estimate_and_as_many_as_before_afterwards() -> None:
-    path = str(Path(ohmskin.__file__).parents[1])
     two = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        env={**os.environ, **two, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python("-c", PROGRAM, **two)
+    assert done.code == 0, done.err

@@ -17,8 +17,7 @@ from ohmskin.estimate.paper import (
     initial_states,
     program_for,
 )
-from places import DATA
-from skins import ten_bits
+from skins import reference, ten_bits
 
 METHODS = (LsqEstimator, RegularizedEstimator)
 both_methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
@@ -41,12 +40,11 @@ def test_at_least_nine_in_ten_frames_of_the_reference_converge(
 ) -> None:
     converged = []
     for name in ("wire_sweep_3x3", "cell_sweep_3x3", "random_2x2"):
-        with np.load(DATA / f"{name}.npz") as reference:
-            frames = reference["ratio"]
+        frames = reference(name, adc_bits)[0].ratio
         estimator = method(SkinKnowledge(*frames.shape[1:3], adc_bits=adc_bits))
         for frame in frames:
             estimator.reset()
-            found = estimator.estimate(frame if adc_bits is None else ten_bits(frame))
+            found = estimator.estimate(frame)
             assert found.iterations <= MAX_ITERATIONS * len(method.steps)
             assert found.converged == (not found.message)
             converged.append(found.converged)
@@ -62,17 +60,16 @@ def test_at_least_nine_in_ten_frames_of_the_reference_converge(
 def test_lightly_pressed_cells_are_nearer_to_the_truth_than_the_paper_reports(
     method: type[PaperEstimator], paper_rmse: tuple[float, float]
 ) -> None:
-    with np.load(DATA / "cell_sweep_3x3.npz") as reference:
-        frames, truth = reference["ratio"][3:], reference["cell_ohm"][3:]
-    for frame, cell_ohm, bound in zip(frames, truth, paper_rmse, strict=True):
+    readings, arrays = reference("cell_sweep_3x3", bits=None)
+    frames = readings.ratio[3:], arrays["cell_ohm"][3:]
+    for frame, cell_ohm, bound in zip(*frames, paper_rmse, strict=True):
         found = method(SkinKnowledge(3, 3)).estimate(frame)
         assert np.sqrt(np.mean((found.cell_ohm - cell_ohm) ** 2)) / 1e6 < bound
 
 
 def test_the_end_of_algorithm_1_is_the_network_without_wires() -> None:
     """lambda = 1e9 against alpha = beta = 1: see docs/paper.md."""
-    with np.load(DATA / "wire_sweep_3x3.npz") as reference:
-        frame = reference["ratio"][2]
+    frame = reference("wire_sweep_3x3", bits=None)[0].ratio[2]
     found = RegularizedEstimator(SkinKnowledge(3, 3)).estimate(frame)
     without_wires = MatrixEstimator(SkinKnowledge(3, 3)).estimate(frame)
     error = np.abs(found.cell_ohm - without_wires.cell_ohm)
@@ -235,6 +232,28 @@ def test_readings_with_noise_are_solved_as_often_as_exact_ones(
     assert np.mean(converged) > 0.9
     if method is RegularizedEstimator:
         assert np.mean(near) > 0.9
+
+
+@both_methods
+@pytest.mark.parametrize(
+    ("reading", "ratio", "flagged"),
+    [("A", 0.498, True), ("A", 0.499, False), ("C", 0.498, True), ("D", 0.502, True)],
+)
+def test_a_reading_that_no_port_gives_is_named(
+    method: type[PaperEstimator], reading: str, ratio: float, flagged: bool
+) -> None:
+    """Beyond a short by seven deviations of a reading, or by half as much."""
+    frame = ratio_from_current([[1 / 110e3], [1 / 60e3]], 30e3, 30e3)
+    frame[1, 0, "ABCD".index(reading)] = ratio
+    found = method(SkinKnowledge(2, 1, adc_bits=10)).estimate(frame)
+    said = f"reading {reading} of cell (1, 0) is none of a port from 10 ohm to 18 megohm"
+    assert found.message == (said if flagged else "")
+
+
+@both_methods
+def test_the_step_in_which_ipopt_gives_up_is_named(method: type[PaperEstimator]) -> None:
+    found = method(SkinKnowledge(2, 2, adc_bits=10)).estimate(np.zeros((2, 2, 4)))
+    assert f"; step {method.steps[-1].number}: Ipopt ends with Max" in found.message
 
 
 @both_methods

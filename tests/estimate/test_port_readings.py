@@ -68,6 +68,16 @@ def test_a_skin_that_drifted_asks_for_new_rest_readings(rest: Skin) -> None:
     assert fault == "the whole skin conducts less than at rest: take the rest readings anew"
 
 
+def test_half_a_code_less_of_what_hardly_conducts_is_noise() -> None:
+    """Cells of 20 megohm: a fifth of their current, but fewer than five deviations."""
+    none = np.zeros((2, 2))
+    rest = ten_bits(readings(Skin(np.full((2, 2), 1 / 20e6), none, none)))
+    reader = PortReader(told(rest, wires=False))
+    less = rest + 0.5 / 1024 * np.array([1, -1, 1, -1])
+    assert np.all(reader.read(less).current < 0.81 * reader.read(rest).current)
+    assert [reader.read(ratio).fault for ratio in (rest, less)] == ["", ""]
+
+
 def test_a_line_open_since_rest_is_named(rest: Skin) -> None:
     wires = rest.top_wire_ohm.copy()
     wires[2, 0] = 1e12

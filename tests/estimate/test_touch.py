@@ -11,9 +11,8 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
-from ohmskin.record.readings import estimate_file, load_readings
-from places import DATA
-from skins import ten_bits, told
+from ohmskin.record.readings import estimate_file
+from skins import reference, ten_bits, told
 from studies.trials import bent_trial, random_trial, skin_at_rest, touch, trial_of
 
 
@@ -55,17 +54,9 @@ def test_currents_of_the_touched_network_obey_kirchhoff() -> None:
 
 @pytest.mark.parametrize("name", ["random_4x6", "random_8x8", "presses_8x8", "bent_8x8"])
 def test_touch_agrees_with_joint_within_its_standard_deviation(name: str) -> None:
-    exact = load_readings(DATA / f"{name}.npz")
-    assert exact.rest_ratio is not None
-    rounded = replace(
-        exact,
-        ratio=ten_bits(exact.ratio),
-        rest_ratio=ten_bits(exact.rest_ratio),
-        adc_bits=10,
-    )
+    rounded, arrays = reference(name)
     few, all_ = (estimate_file(rounded, method) for method in ("touch", "joint"))
-    with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
-        pressed = 1 / file["cell_ohm"] > 1.5 / file["rest_ohm"]
+    pressed = 1 / arrays["cell_ohm"] > 1.5 / arrays["rest_ohm"]
     apart = np.abs(few["cell_siemens"] - all_["cell_siemens"]) / few["cell_siemens_std"]
     simple = pressed.sum(axis=(1, 2)) <= 12  # frames with more touches are `joint`'s anyway
     # Rounding moves cells at rest in one method and not in the other, and wires learned differ.
@@ -179,14 +170,9 @@ def test_a_jump_of_the_wires_is_followed(method: str) -> None:
 @pytest.mark.parametrize("method", ["joint", "touch"])
 def test_a_fingertip_on_a_skin_whose_wires_nobody_knows(method: str) -> None:
     """ngspice's readings of a soft finger that moves: no frame shows a multiple of its force."""
-    exact = load_readings(DATA / "finger_8x8.npz")
-    assert exact.rest_ratio is not None
-    rounded = replace(
-        exact, ratio=ten_bits(exact.ratio), rest_ratio=ten_bits(exact.rest_ratio), adc_bits=10
-    )
+    rounded, skin = reference("finger_8x8")
     out = estimate_file(rounded, method)
-    with np.load(DATA / "finger_8x8.npz", allow_pickle=False) as file:
-        rest, truth = 1 / file["rest_ohm"], 1 / file["cell_ohm"]
+    rest, truth = 1 / skin["rest_ohm"], 1 / skin["cell_ohm"]
     assert out["converged"].all()
     touched = (truth - rest).sum(axis=(1, 2)) > 5e-6
     rise = np.maximum(out["cell_siemens"] - rest, 0).sum(axis=(1, 2))[touched]

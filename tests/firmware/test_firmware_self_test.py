@@ -72,17 +72,11 @@ def test_self_test_finds_a_missing_reference(rig: Rig, rng: np.random.Generator)
         assert findings_on(rig, swapped(ratio)) == ("bottom_reference_missing",)
 
 
-def test_self_test_finds_a_node_at_a_rail(rig: Rig, rng: np.random.Generator) -> None:
-    for rail, name in ((0.0, "low"), (1.0, "high")):
-        ratio = skin_shorted_at_top(rng, rail, pressed=False)
-        assert findings_on(rig, ratio) == (f"top_stuck_{name}",)
-        assert findings_on(rig, swapped(ratio)) == (f"bottom_stuck_{name}",)
-
-
-def test_self_test_of_a_pressed_skin_with_a_node_at_a_rail(
-    rig: Rig, rng: np.random.Generator
+@pytest.mark.parametrize("pressed", [False, True])
+def test_self_test_finds_a_node_at_a_rail(
+    rig: Rig, rng: np.random.Generator, pressed: bool
 ) -> None:
     for rail, name in ((0.0, "low"), (1.0, "high")):
-        ratio = skin_shorted_at_top(rng, rail, pressed=True)
+        ratio = skin_shorted_at_top(rng, rail, pressed=pressed)
         assert findings_on(rig, ratio) == (f"top_stuck_{name}",)
         assert findings_on(rig, swapped(ratio)) == (f"bottom_stuck_{name}",)

@@ -7,12 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_helpers import (
-    OTHER_SCAN,
-    RECORD_SIZE,
-    assert_whole,
-    reset,
-)
+from firmware_helpers import OTHER_SCAN, RECORD_SIZE, assert_whole, reset
 from lockstep import DEFAULT_SCAN, Rig
 from ohmskin.link import protocol
 
@@ -106,13 +101,8 @@ def test_load_defaults_leaves_the_eeprom_alone(rig: Rig, saved: dict[str, Any]) 
     content = rig.sim.eeprom()
     rig.must("load_defaults")
     hello = rig.hello()
-    assert settings_in(hello) == {
-        "rows": 8,
-        "columns": 8,
-        "rate_asked_mhz": 90_000,
-        "settle_asked_us": 0,
-        "adc_prescaler": "clock_500khz",
-        "unit_id": 0,
-    }
+    asked = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
+    defaults = {asked.get(name, name): value for name, value in DEFAULT_SCAN.items()}
+    assert settings_in(hello) == defaults | {"unit_id": 0}
     assert rig.sim.eeprom() == content
     assert settings_in(reset(rig)) == saved

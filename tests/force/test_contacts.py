@@ -37,10 +37,6 @@ def test_what_adjoins_is_one_contact() -> None:
     assert (second.force_n, second.row, second.column) == (4.0, 3.0, 2.5)
 
 
-def test_nothing_touched_is_no_contact() -> None:
-    assert seen(ContactTracker(), 0, np.zeros((3, 3))) == ()
-
-
 def test_a_touch_without_force_has_a_centre() -> None:
     touched = np.array([[True, True, False]])
     nothing = np.zeros((1, 3))

@@ -313,13 +313,6 @@ def test_voltage_baseline_takes_ghosts_for_forces() -> None:
     assert on_nobody["joint"] < 0.05
 
 
-def test_voltage_level_is_the_voltage_over_the_references() -> None:
-    # 60 kOhm of references, 40 kOhm of skin: 0.3 of Vdd over each reference.
-    assert voltage_level([0.7, 0.3, 0.7, 0.3]) == pytest.approx(0.3)
-    with pytest.raises(ValueError, match=r"^ratio has shape \(3,\), it must end in 4$"):
-        voltage_level([0.7, 0.3, 0.7])
-
-
 GOOD: dict[str, Any] = {
     "cells": [0, 0, 0, 1, 1, 1],
     "rise": [1e-6, 2e-6, 3e-6, 1e-6, 2e-6, 3e-6],

@@ -2,6 +2,7 @@
 """Forces from a board: what open promises with a calibration, tare, and replay bit for bit."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -19,6 +20,7 @@ from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
+Record = Callable[[int, int], str]
 
 
 @pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
@@ -147,27 +149,31 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
     assert live[30].force_n.tobytes() != untared[30].force_n.tobytes()
 
 
-def test_latest_follows_the_same_tares(tmp_path: Path) -> None:
-    path = tmp_path / "skin.mcap"
-    of_skin = of_scene("ghost")
-    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
-        for number, scan in enumerate(islice(board, 20)):
-            if number == 10:
-                recorder.add(Tare(scan.ratio, scan.host_time_s))
-            recorder.add(scan)
-    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as board:
+@pytest.fixture
+def recorded(tmp_path: Path) -> Record:
+    """A function that records so many scans of a ghost, and a tare before one of them."""
+
+    def record(count: int, tare_at: int) -> str:
+        path = tmp_path / "skin.mcap"
+        with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
+            for number, scan in enumerate(islice(board, count)):
+                if number == tare_at:
+                    recorder.add(Tare(scan.ratio, scan.host_time_s))
+                recorder.add(scan)
+        return f"replay://{path}"
+
+    return record
+
+
+def test_latest_follows_the_same_tares(recorded: Record) -> None:
+    port = f"{recorded(20, 10)}?speed=0"
+    with ohmskin.open(port, calibration=of_scene("ghost")) as board:
         contacts = [len(board.latest().contacts) for _ in range(20)]
     assert contacts == 10 * [3] + 10 * [0]
 
 
-def test_latest_does_not_miss_a_tare_whose_scan_it_skips(tmp_path: Path) -> None:
-    path = tmp_path / "skin.mcap"
-    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
-        for number, scan in enumerate(islice(board, 90)):
-            if number == 20:
-                recorder.add(Tare(scan.ratio, scan.host_time_s))
-            recorder.add(scan)
-    with ohmskin.open(f"replay://{path}?speed=1", calibration=of_scene("ghost")) as board:
+def test_latest_does_not_miss_a_tare_whose_scan_it_skips(recorded: Record) -> None:
+    with ohmskin.open(recorded(90, 20), calibration=of_scene("ghost")) as board:
         first = board.latest()
         assert len(first.contacts) == 3
         time.sleep(0.5)
@@ -176,12 +182,9 @@ def test_latest_does_not_miss_a_tare_whose_scan_it_skips(tmp_path: Path) -> None
         assert later.contacts == ()
 
 
-def test_a_tare_at_the_end_of_a_replay_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "skin.mcap"
-    with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
-        for scan in islice(board, 5):
-            recorder.add(scan)
-    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_scene("ghost")) as board:
+def test_a_tare_at_the_end_of_a_replay_says_so(recorded: Record) -> None:
+    port = f"{recorded(5, -1)}?speed=0"
+    with ohmskin.open(port, calibration=of_scene("ghost")) as board:
         assert len(list(board)) == 5
         with pytest.raises(DeviceLost, match="gives no more scans"):
             board.tare()

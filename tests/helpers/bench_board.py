@@ -45,7 +45,6 @@ class Bench(Closing):
             self._messages = [each for each in self._messages if not isinstance(each, Scan)]
             yield from scans
             due_s = self.board.next_scan_s
-            assert due_s is not None
             self.now_s = due_s
             self._take(self.faults)
 

@@ -27,19 +27,16 @@ class XMLElement:
         return self
 
 
+@dataclass
 class StreamInfo:
-    def __init__(
-        self,
-        name: str = "untitled",
-        type: str = "",
-        channel_count: int = 1,
-        nominal_srate: float = 0.0,
-        channel_format: str = "float32",
-        source_id: str | None = None,
-    ) -> None:
-        self.name, self.type, self.channel_count = name, type, channel_count
-        self.nominal_srate, self.channel_format = nominal_srate, channel_format
-        self.source_id = source_id
+    name: str = "untitled"
+    type: str = ""
+    channel_count: int = 1
+    nominal_srate: float = 0.0
+    channel_format: str = "float32"
+    source_id: str | None = None
+
+    def __post_init__(self) -> None:
         self._desc = XMLElement("desc")
 
     def desc(self) -> XMLElement:

@@ -7,142 +7,77 @@ Symbols
 symbol shape    meaning                                                                   unit
 ====== ======== ========================================================================= =====
 N, B            nodes; branches, branch k from node tail[k] to node head[k]
-A      (N, B)   incidence: +1 at a branch's tail, -1 at its head                          1
-r      (B,)     branch resistance: 0 a short, inf an open branch, which is left out       ohm
-L      (N, N)   node Laplacian A diag(1/r) A^T of the branches with 0 < r < inf           S
-S      (N, B0)  columns of A of the branches of zero ohm                                  1
-v      (N,)     node potentials, known at the nodes k with a source, else unknown (u)     V
-i      (B,)     branch currents, from tail to head                                        A
-i0     (B0,)    those of the branches of zero ohm                                         A
+r      (B,)     branch resistance: 0 a short, inf an open branch                          ohm
+P               points: each is a node, or several that shorts join
+L      (P, P)   Laplacian of the points, by the branches with 0 < r < inf                 S
+v      (P,)     potentials, known at the points k with a source, else unknown (u)         V
 ====== ======== ========================================================================= =====
 
-Equations. Kirchhoff's current law at every node without a source, and no voltage across a short:
-
-    L_uu v_u + S_u i0 = -L_uk v_k ,     S_u^T v_u = -S_k^T v_k .
-
-This is modified nodal analysis [Ho1975]; without shorts, the textbook's node Laplacian. `circuit`
-eliminates the wire nodes on paper, never forms L, and takes all four readings from one port
-resistance; here every reading is a node of its own circuit, reference resistors included. That
-costs 2RC factorisations, and beside a wire of w ohm a resistor of R ohm loses R/w * 1e-16 of itself
-in the diagonal of L: `circuit` is the one to compute with.
-
-[Ho1975] C.-W. Ho, A. E. Ruehli, P. A. Brennan, "The modified nodal approach to network analysis",
-IEEE Transactions on Circuits and Systems 22(6), 504-509.
+Kirchhoff's current law at every point without a source: L_uu v_u = -L_uk v_k. `circuit` eliminates
+the wire nodes on paper, never forms L, and takes all four readings from one port resistance; here
+every reading is a point of its own circuit, reference resistors included. That costs 2RC
+factorisations, and beside a wire of w ohm a resistor of R ohm loses R/w * 1e-16 of itself in the
+diagonal of L: `circuit` is the one to compute with.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL, Skin
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Node potentials v [V], shape (N,), and branch currents i [A], tail to head, shape (B,).
-
-    A node that no conducting path joins to a source has no potential: nan, and no current there.
-    """
-
-    node_v: Float
-    branch_a: Float
-
-
-@dataclass(frozen=True, eq=False)
-class Network:
-    """N nodes, 0 to N-1, and B resistors [ohm] between them: tail, head, branch_ohm, shape (B,).
-
-    Zero ohm is a short, inf an open branch, both exactly. Arrays are copied.
-    Raises ValueError for other shapes, nodes that do not exist, resistances below 0 or nan.
-    """
+class Network(NamedTuple):
+    """N nodes, 0 to N-1, and B resistors [ohm] between them: tail, head, branch_ohm, shape (B,)."""
 
     nodes: int
     tail: NDArray[np.intp]
     head: NDArray[np.intp]
     branch_ohm: Float
 
-    def __post_init__(self) -> None:
-        for name, dtype in (("tail", np.intp), ("head", np.intp), ("branch_ohm", np.float64)):
-            object.__setattr__(self, name, np.array(getattr(self, name), dtype=dtype))
-        shapes = {self.tail.shape, self.head.shape, self.branch_ohm.shape}
-        if len(shapes) != 1 or self.tail.ndim != 1:
-            raise ValueError(f"tail, head and branch_ohm must be (branches,), not {shapes}")
-        ends = np.concatenate([self.tail, self.head])
-        if not np.all((ends >= 0) & (ends < self.nodes)):
-            raise ValueError(f"branches must join nodes 0 to {self.nodes - 1}")
-        if not np.all(self.branch_ohm >= 0):
-            raise ValueError("branch_ohm must be numbers and not negative")
+    def node_v(self, source_v: Mapping[int, float]) -> Float:
+        """Potentials [V], (N,), with an ideal source from ground to each node of `source_v` [V].
 
-    def solve(self, source_v: Mapping[int, float]) -> Solution:
-        """v and i (see above) with an ideal source from ground to each node of `source_v` [V].
-
-        Raises ValueError for a source at no node or not finite, and where shorts make a loop or
-        join two sources: nothing tells what current flows there.
+        A node that no conducting path joins to a source has none: nan.
         """
-        known = np.zeros(self.nodes, dtype=bool)
-        node_v = np.full(self.nodes, np.nan)
-        for node, volt in source_v.items():
-            if not (0 <= node < self.nodes and np.isfinite(volt)):
-                raise ValueError(f"no source can hold node {node} of {self.nodes} at {volt} V")
-            known[node], node_v[node] = True, volt
+        point = _parts(self.nodes, self.tail, self.head, self.branch_ohm == 0)
+        points = int(point.max()) + 1
+        resistive = (self.branch_ohm > 0) & np.isfinite(self.branch_ohm)
+        one, other = point[self.tail[resistive]], point[self.head[resistive]]
+        siemens = 1 / self.branch_ohm[resistive]
+        laplacian = np.zeros((points, points))
+        for first, second in ((one, other), (other, one)):
+            np.add.at(laplacian, (first, first), siemens)
+            np.add.at(laplacian, (first, second), -siemens)
+        point_v = np.full(points, np.nan)
+        point_v[point[list(source_v)]] = list(source_v.values())
+        known = np.isfinite(point_v)
+        part = _parts(points, one, other, np.full(one.size, True))
+        unknown = np.isin(part, part[known]) & ~known
+        from_sources = laplacian[np.ix_(unknown, known)] @ point_v[known]
+        point_v[unknown] = np.linalg.solve(laplacian[np.ix_(unknown, unknown)], -from_sources)
+        return np.asarray(point_v[point])
 
-        part = self._parts(np.isfinite(self.branch_ohm), np.arange(self.nodes))
-        driven = np.isin(part, part[known])
-        unknown = driven & ~known
-        live = np.isfinite(self.branch_ohm) & driven[self.tail]
-        short = live & (self.branch_ohm == 0)
-        resistive = live & ~short
-        self._refuse_loops(short, known)
 
-        ends = np.concatenate([self.tail, self.head])
-        branch = np.tile(np.arange(self.tail.size), 2)
-        sign = np.repeat([1.0, -1.0], self.tail.size)
-        incidence = sparse.csc_matrix((sign, (ends, branch)), shape=(self.nodes, self.tail.size))
-        across = incidence[:, resistive]
-        siemens = sparse.diags(1 / self.branch_ohm[resistive])
-        laplacian = (across @ siemens @ across.T).tocsr()
-        shorts = incidence[:, short].tocsr()
-
-        branch_a = np.zeros(self.tail.size)
-        if unknown.any():
-            system = sparse.bmat(
-                [[laplacian[unknown][:, unknown], shorts[unknown]], [shorts[unknown].T, None]],
-                format="csc",
-            )
-            from_sources = sparse.vstack([laplacian[unknown][:, known], shorts[known].T])
-            solved = spsolve(system, -(from_sources @ node_v[known]))
-            node_v[unknown], branch_a[short] = np.split(solved, [np.count_nonzero(unknown)])
-        drop = node_v[self.tail] - node_v[self.head]
-        branch_a[resistive] = drop[resistive] / self.branch_ohm[resistive]
-        return Solution(node_v, branch_a)
-
-    def _parts(self, joined: NDArray[np.bool_], name: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Number of the part that holds node k, (N,): branches `joined`, between nodes `name`."""
-        graph = sparse.coo_matrix(
-            (np.ones(np.count_nonzero(joined)), (name[self.tail[joined]], name[self.head[joined]])),
-            shape=(self.nodes, self.nodes),
-        )
-        return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
-
-    def _refuse_loops(self, short: NDArray[np.bool_], known: NDArray[np.bool_]) -> None:
-        """Shorts are a forest, all sources taken for one node, if each leaves one part fewer."""
-        one_source = np.where(known, np.argmax(known), np.arange(self.nodes))
-        if self.nodes - np.unique(self._parts(short, one_source)).size < np.count_nonzero(short):
-            raise ValueError("branches of zero ohm make a loop or join two sources: open one")
+def _parts(
+    nodes: int, tail: NDArray[np.intp], head: NDArray[np.intp], joins: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Number of the part that holds each node, (nodes,), where these branches join nodes."""
+    ends = (tail[joins], head[joins])
+    graph = sparse.coo_matrix((np.ones(ends[0].size), ends), shape=(nodes, nodes))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
 
 def skin_network(skin: Skin) -> Network:
     """The skin alone: N = R + C + 2RC nodes, B = 3RC branches, arrays in row-major order.
 
     Nodes: row electrodes, column electrodes, top nodes T, bottom nodes B. Branches: cells (T to B),
-    top segments (towards T), bottom segments (from B towards the column electrode), so that all
-    currents are positive when rows drive columns.
+    top segments (towards T), bottom segments (from B towards the column electrode).
     """
     rows, columns = skin.shape
     cells = rows * columns
@@ -185,6 +120,6 @@ def laplacian_readings(skin: Skin, joints: Sequence[tuple[int, int]] = ()) -> Fl
                 np.concatenate([alone.head, other, sense]),
                 ohm,
             )
-            ratio[i, j, :2] = network.solve({top_end: 1.0, bottom_end: 0.0}).node_v[sense]
-            ratio[i, j, 2:] = network.solve({top_end: 0.0, bottom_end: 1.0}).node_v[sense[::-1]]
+            ratio[i, j, :2] = network.node_v({top_end: 1.0, bottom_end: 0.0})[sense]
+            ratio[i, j, 2:] = network.node_v({top_end: 0.0, bottom_end: 1.0})[sense[::-1]]
     return ratio

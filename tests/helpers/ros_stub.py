@@ -60,48 +60,31 @@ def is_sequence(value: Any) -> bool:
     return isinstance(value, Sequence) and not isinstance(value, str)
 
 
-class TimeMessage(Message):  # builtin_interfaces/Time
-    FIELDS: ClassVar = {"sec": "int32", "nanosec": "uint32"}
+def message(name: str, /, **fields: Any) -> type[Message]:
+    return type(name, (Message,), {"FIELDS": fields})
 
 
-class Header(Message):
-    FIELDS: ClassVar = {"stamp": TimeMessage, "frame_id": "string"}
+BuiltinTime = message("Time", sec="int32", nanosec="uint32")
+Header = message("Header", stamp=BuiltinTime, frame_id="string")
+MultiArrayDimension = message("MultiArrayDimension", label="string", size="uint32", stride="uint32")
+MultiArrayLayout = message("MultiArrayLayout", dim=[MultiArrayDimension], data_offset="uint32")
+Float32MultiArray = message("Float32MultiArray", layout=MultiArrayLayout, data="float32[]")
 
 
-class MultiArrayDimension(Message):
-    FIELDS: ClassVar = {"label": "string", "size": "uint32", "stride": "uint32"}
-
-
-class MultiArrayLayout(Message):
-    FIELDS: ClassVar = {"dim": [MultiArrayDimension], "data_offset": "uint32"}
-
-
-class Float32MultiArray(Message):
-    FIELDS: ClassVar = {"layout": MultiArrayLayout, "data": "float32[]"}
-
-
-class PointField(Message):
-    FIELDS: ClassVar = {
-        "name": "string",
-        "offset": "uint32",
-        "datatype": "uint8",
-        "count": "uint32",
-    }
+class PointField(
+    message("PointField", name="string", offset="uint32", datatype="uint8", count="uint32")
+):
     INT8, UINT8, INT16, UINT16, INT32, UINT32, FLOAT32, FLOAT64 = range(1, 9)
 
 
-class PointCloud2(Message):
-    FIELDS: ClassVar = {
-        "header": Header,
-        "height": "uint32",
-        "width": "uint32",
-        "fields": [PointField],
-        "is_bigendian": "bool",
-        "point_step": "uint32",
-        "row_step": "uint32",
-        "data": "uint8[]",
-        "is_dense": "bool",
-    }
+PointCloud2 = message(
+    "PointCloud2",
+    header=Header,
+    **dict.fromkeys(("height", "width", "point_step", "row_step"), "uint32"),
+    **dict.fromkeys(("is_bigendian", "is_dense"), "bool"),
+    fields=[PointField],
+    data="uint8[]",
+)
 
 
 class Time:
@@ -110,9 +93,9 @@ class Time:
     def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
         self.nanoseconds = round(seconds * 1e9) + nanoseconds
 
-    def to_msg(self) -> TimeMessage:
+    def to_msg(self) -> BuiltinTime:
         sec, nanosec = divmod(self.nanoseconds, 10**9)
-        return TimeMessage(sec=sec, nanosec=nanosec)
+        return BuiltinTime(sec=sec, nanosec=nanosec)
 
 
 class Parameter:

@@ -18,6 +18,11 @@ from ohmskin.link.messages import BoardDecoder, Hello, Scan
 REST = Scene("rest", 1, 2, seed=1).skin(0.0)
 
 
+def rise(force_n: float | Float) -> Float:
+    """Conductance above rest of a cell that has crept [S]."""
+    return np.asarray(30e-6 * force_n**1.7)
+
+
 class ScriptedSkin(Closing):
     """An emulated 1x2 skin, in place of a `Device`.
 

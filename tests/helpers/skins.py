@@ -1,14 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board would read of a skin, and what is told of the skin, for several test files."""
 
+from dataclasses import replace
+
+import numpy as np
+
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.record.readings import Readings, load_readings
+from places import DATA
 
 
 def ten_bits(ratio: Float) -> Float:
     """Readings as a converter of 10 bits gives them."""
     return ratio_from_codes(quantise(ratio))
+
+
+def reference(name: str, bits: int | None = 10) -> tuple[Readings, dict[str, Float]]:
+    """Readings of a file of tests/data, exact (None) or in 10 bits, and all that the file has."""
+    exact = load_readings(DATA / f"{name}.npz")
+    with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
+        arrays = dict(file)
+    if bits is None:
+        return exact, arrays
+    ratio, rest_ratio = ten_bits(arrays["ratio"]), ten_bits(arrays["rest_ratio"])
+    return replace(exact, ratio=ratio, rest_ratio=rest_ratio, adc_bits=bits), arrays
 
 
 def told(rest_ratio: Float, *, wires: bool = True) -> SkinKnowledge:

@@ -166,12 +166,6 @@ def test_scan_times_bridge_a_pause() -> None:
 # ------------------------------------------------------------------------ the firmware's clock
 
 
-def _starts_s(rig: Rig) -> Float:
-    """When each scan's first reading was held, on the simulator's clock [s]."""
-    holds = rig.holds()
-    return np.asarray(holds["cycle"][first_holds(holds)] / CPU_HZ)
-
-
 @pytest.mark.simavr
 def test_times_are_those_of_the_firmware() -> None:
     """Its scans arrive a little late, at made-up times of a host that began `START_S` earlier."""
@@ -193,7 +187,8 @@ def test_times_are_those_of_the_firmware() -> None:
                 arrived_s = now_s - line_delay_s(found, board)
                 clock.add(found.time_us + 1e6 * scan_s(board), arrived_s)
                 at_s.append(clock.host_s(found.time_us))
-        begun_s = START_S + _starts_s(rig)[: len(at_s)]
+        holds = rig.holds()
+        begun_s = START_S + holds["cycle"][first_holds(holds)][: len(at_s)] / CPU_HZ
     error_s = (np.array(at_s) - begun_s)[90:]
     print(f"error {1e3 * np.median(error_s):.2f} ms, largest {1e3 * np.abs(error_s).max():.2f} ms")
     assert abs(np.median(error_s)) < 1e-3

@@ -40,25 +40,30 @@ def scans(decoder: BoardDecoder, octets: bytes, host_time_s: float = 0.0) -> lis
     return [m for m in decoder.feed(octets, host_time_s) if isinstance(m, Scan)]
 
 
-def test_gaps_are_missed_scans() -> None:
+TOP = (1 << 32) - 1
+# What comes first, the numbers of the scans after it, and how many were missed before each.
+NUMBERS = {
+    "gaps": (hello_wire(), [0, 1, 5, 6, 9], [0, 0, 3, 0, 2]),
+    "lost right after the start": (hello_wire(), [4], [4]),
+    "a board that runs already": (hello_wire(scanning=1), [700, 702], [0, 1]),
+    "the number wraps": (b"", [TOP - 1, TOP, 0, 3], [0, 0, 0, 2]),
+    "a restart that nobody has seen": (b"", [1000, 1001, 1, 2], [0, 0, 1, 0]),
+}
+
+
+@pytest.mark.parametrize("what", NUMBERS)
+def test_numbers_tell_which_scans_are_missed(what: str) -> None:
+    before, numbers, missed = NUMBERS[what]
     decoder = BoardDecoder()
-    found = scans(decoder, hello_wire() + b"".join(map(scan_wire, [0, 1, 5, 6, 9])))
-    assert [s.number for s in found] == [0, 1, 5, 6, 9]
-    assert [s.missed for s in found] == [0, 0, 3, 0, 2]
-    assert decoder.stats.scans == 5
-    assert decoder.stats.missed == 5
+    found = scans(decoder, before + b"".join(map(scan_wire, numbers)))
+    assert [s.number for s in found] == numbers
+    assert [s.missed for s in found] == missed
+    assert (decoder.stats.scans, decoder.stats.missed) == (len(numbers), sum(missed))
 
 
-def test_scans_lost_right_after_the_start_are_missed() -> None:
+def test_what_a_running_board_dropped_before_is_not_missed() -> None:
     decoder = BoardDecoder()
-    assert [s.missed for s in scans(decoder, hello_wire() + scan_wire(4))] == [4]
-    assert decoder.stats.missed == 4
-
-
-def test_nothing_is_missed_before_the_first_scan_of_a_running_board() -> None:
-    decoder = BoardDecoder()
-    found = scans(decoder, hello_wire(scanning=1) + scan_wire(700, dropped=9) + scan_wire(702))
-    assert [s.missed for s in found] == [0, 1]
+    scans(decoder, hello_wire(scanning=1) + scan_wire(700, dropped=9) + scan_wire(702, dropped=9))
     assert decoder.stats.missed == 1
 
 
@@ -71,14 +76,6 @@ def test_a_damaged_scan_is_missed_by_the_next() -> None:
     assert decoder.stats.line.damaged == 1
 
 
-def test_the_scan_number_wraps() -> None:
-    decoder = BoardDecoder()
-    top = (1 << 32) - 1
-    found = scans(decoder, b"".join(map(scan_wire, [top - 1, top, 0, 3])))
-    assert [s.missed for s in found] == [0, 0, 0, 2]
-    assert decoder.stats.missed == 2
-
-
 def test_the_board_time_does_not_wrap() -> None:
     decoder = BoardDecoder()
     stream = b"".join(
@@ -87,11 +84,11 @@ def test_the_board_time_does_not_wrap() -> None:
     assert [s.time_us for s in scans(decoder, stream)] == [n * 20 * MINUTE_US for n in range(12)]
 
 
-def test_the_counter_of_dropped_scans_wraps() -> None:
+def test_the_counters_of_the_board_are_passed_on_and_that_of_dropped_scans_wraps() -> None:
     decoder = BoardDecoder()
-    counts = [65530, 65535, 2, 2]
-    scans(decoder, b"".join(scan_wire(n, dropped=d) for n, d in enumerate(counts)))
-    assert decoder.stats.dropped_by_board == 8
+    for number, (dropped, errors) in enumerate([(65530, 3), (65535, 3), (2, 5), (2, 5)]):
+        scans(decoder, scan_wire(number, dropped=dropped, rx_errors=errors))
+    assert (decoder.stats.dropped_by_board, decoder.stats.board_rx_errors) == (8, 5)
 
 
 def test_the_counter_of_dropped_scans_starts_again_with_the_board() -> None:
@@ -102,12 +99,6 @@ def test_the_counter_of_dropped_scans_starts_again_with_the_board() -> None:
     assert (decoder.stats.dropped_by_board, decoder.stats.missed) == (4, 4)
 
 
-def test_rx_errors_of_the_board_are_passed_on() -> None:
-    decoder = BoardDecoder()
-    scans(decoder, scan_wire(0, rx_errors=3) + scan_wire(1, rx_errors=5))
-    assert decoder.stats.board_rx_errors == 5
-
-
 def test_a_restart_in_between_starts_the_numbers_again() -> None:
     decoder = BoardDecoder()
     stream = hello_wire() + scan_wire(0, time_us=9000) + scan_wire(1, time_us=20_000)
@@ -116,12 +107,6 @@ def test_a_restart_in_between_starts_the_numbers_again() -> None:
     assert [s.missed for s in found] == [0, 0, 2, 0]
     assert [s.time_us for s in found] == [9000, 20_000, 400, 11_500]
     assert decoder.stats.missed == 2
-
-
-def test_numbers_that_go_back_tell_of_a_restart_nobody_has_seen() -> None:
-    decoder = BoardDecoder()
-    found = scans(decoder, b"".join(map(scan_wire, [1000, 1001, 1, 2])))
-    assert [s.missed for s in found] == [0, 0, 1, 0]
 
 
 def test_board_time_goes_on_after_a_stop_later_than_its_first_wrap() -> None:
@@ -160,33 +145,27 @@ def test_hello_of_another_definition() -> None:
     assert messages == [ForeignHello(protocol.LAYOUT_CRC)]
 
 
-@pytest.mark.parametrize("frame_type", [0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89])
-def test_frames_of_unknown_type_are_counted(frame_type: int) -> None:
+PAYLOADS = {
+    "ack": bytes(protocol.FRAMES["ack"].struct.size),
+    "self_test_report": bytes(protocol.FRAMES["self_test_report"].struct.size),
+    "scan": scan_payload(5),
+}
+STRANGE = {
+    **{f"type {kind:#x}": (kind, b"abc") for kind in (0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89)},
+    **{f"short {name}": (protocol.FRAMES[name].id, x[:-1]) for name, x in PAYLOADS.items()},
+    **{f"long {name}": (protocol.FRAMES[name].id, x + b"\0") for name, x in PAYLOADS.items()},
+    "an empty hello": (protocol.FRAMES["hello"].id, b""),
+    "a hello without its layout": (protocol.FRAMES["hello"].id, b"\1"),
+}
+
+
+@pytest.mark.parametrize("what", STRANGE)
+def test_frames_of_unknown_type_or_wrong_length_are_counted(what: str) -> None:
+    frame_type, payload = STRANGE[what]
     decoder = BoardDecoder()
-    assert decoder.feed(framing.encode(frame_type, 0, b"abc"), 0.0) == []
-    assert decoder.stats.unknown == 1
-    assert decoder.stats.line.damaged == 0
+    assert decoder.feed(framing.encode(frame_type, 0, payload), 0.0) == []
+    assert (decoder.stats.unknown, decoder.stats.scans, decoder.stats.line.damaged) == (1, 0, 0)
     assert len(scans(decoder, scan_wire(0))) == 1
-
-
-@pytest.mark.parametrize("name", ["ack", "self_test_report", "scan"])
-@pytest.mark.parametrize("change", [-1, 1])
-def test_payloads_of_the_wrong_length_are_counted(name: str, change: int) -> None:
-    kind = protocol.FRAMES[name]
-    payload = scan_payload(5) if name == "scan" else bytes(kind.struct.size)
-    payload = payload[:change] if change < 0 else payload + b"\0"
-    decoder = BoardDecoder()
-    assert decoder.feed(framing.encode(kind.id, 0, payload), 0.0) == []
-    assert decoder.stats.unknown == 1
-    assert decoder.stats.scans == 0
-
-
-@pytest.mark.parametrize("payload", [b"", b"\x01"])
-def test_a_hello_without_layout_is_counted(payload: bytes) -> None:
-    decoder = BoardDecoder()
-    wire = framing.encode(protocol.FRAMES["hello"].id, 0, payload)
-    assert decoder.feed(wire, 0.0) == []
-    assert decoder.stats.unknown == 1
 
 
 def test_a_scan_of_no_cells_does_no_harm() -> None:

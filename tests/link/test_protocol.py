@@ -3,12 +3,10 @@
 
 import ast
 import importlib.util
-import json
 import shutil
 import subprocess
 import sys
 import tokenize
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_helpers import VECTORS
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import (
     Ack,
@@ -28,8 +27,6 @@ from ohmskin.link.messages import (
     SelfTestReport,
 )
 from places import ROOT
-
-VECTORS = json.loads((ROOT / "protocol" / "vectors.json").read_text(encoding="utf-8"))
 
 each_valid = pytest.mark.parametrize("vector", VECTORS["valid"], ids=lambda v: v["name"])
 each_damaged = pytest.mark.parametrize("vector", VECTORS["damaged"], ids=lambda v: v["name"])
@@ -48,12 +45,14 @@ def python_values(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 @each_valid
-def test_valid_vector_is_decoded(vector: dict[str, Any]) -> None:
-    decoder = framing.Decoder()
-    frames = decoder.feed(bytes.fromhex(vector["wire"]))
+def test_valid_vector_is_decoded_whole_and_byte_by_byte(vector: dict[str, Any]) -> None:
+    whole, single = framing.Decoder(), framing.Decoder()
+    wire = bytes.fromhex(vector["wire"])
+    frames = whole.feed(wire)
     assert frames == [expected_raw(vector)]
-    assert decoder.stats.frames == 1
-    assert decoder.stats.damaged == 0
+    assert [frame for octet in wire for frame in single.feed(bytes([octet]))] == frames
+    assert whole.stats == single.stats
+    assert (whole.stats.frames, whole.stats.damaged) == (1, 0)
     kind = protocol.FRAMES_BY_ID[frames[0].type]
     assert kind.unpack(frames[0].payload) == python_values(vector["fields"])
 
@@ -68,40 +67,6 @@ def test_valid_vector_is_encoded_to_the_same_bytes(vector: dict[str, Any]) -> No
         codes = np.array(vector["codes"], dtype=np.uint16).reshape(columns, rows, -1)
         payload += protocol.pack_codes(codes.transpose(1, 0, 2))
     assert framing.encode(kind.id, content[1], payload).hex() == vector["wire"]
-
-
-@each_valid
-def test_codes_of_a_vector_land_at_their_cell(vector: dict[str, Any]) -> None:
-    for frame in framing.Decoder().feed(bytes.fromhex(vector["wire"])):
-        if "codes" not in vector:
-            continue
-        rows, columns = vector["fields"]["rows"], vector["fields"]["columns"]
-        tail = frame.payload[protocol.FRAMES["scan"].struct.size :]
-        codes = protocol.unpack_codes(tail, rows, columns)
-        assert codes.shape == (rows, columns, 4)
-        for k, code in enumerate(vector["codes"]):
-            cell, reading = divmod(k, 4)
-            column, row = divmod(cell, rows)  # column-major: rows run fastest
-            assert codes[row, column, reading] == code
-
-
-@each_valid
-def test_valid_vector_byte_by_byte(vector: dict[str, Any]) -> None:
-    decoder = framing.Decoder()
-    wire = bytes.fromhex(vector["wire"])
-    frames = [frame for octet in wire for frame in decoder.feed(bytes([octet]))]
-    assert frames == [expected_raw(vector)]
-    assert decoder.stats.damaged == 0
-
-
-@pytest.mark.parametrize("junk", [b"\x07junk", b"\xff" * 40, b"\0\0\0", b"\x01\0\x02\x01\0"])
-@each_valid
-def test_valid_vector_between_junk(vector: dict[str, Any], junk: bytes) -> None:
-    decoder = framing.Decoder()
-    assert decoder.feed(junk + bytes.fromhex(vector["wire"]) + junk) == [expected_raw(vector)]
-    damaged_before = sum(1 for stretch in junk.split(b"\0") if stretch)
-    damaged_after = sum(1 for stretch in junk.split(b"\0")[:-1] if stretch)
-    assert decoder.stats.damaged == damaged_before + damaged_after
 
 
 @each_damaged
@@ -262,8 +227,6 @@ class Tree:
 
     def module(self, name: str, path: str) -> Any:
         spec = importlib.util.spec_from_file_location(name, self.path / path)
-        assert spec is not None
-        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         self._monkeypatch.setitem(sys.modules, name, module)
         spec.loader.exec_module(module)
@@ -271,6 +234,11 @@ class Tree:
 
     def protocol(self) -> Any:
         return self.module("ohmskin.link.protocol", "host/ohmskin/link/protocol.py")
+
+    def layout_crc(self, definition: str) -> int:
+        """What the host computes of the text of a frames.toml."""
+        (self.path / "protocol" / "frames.toml").write_text(definition, encoding="utf-8")
+        return int(self.protocol().LAYOUT_CRC)
 
     def generate(self, *arguments: str) -> int:
         """What protocol/generate.py exits with."""
@@ -281,17 +249,6 @@ class Tree:
 @pytest.fixture
 def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Tree:
     return Tree(tmp_path, monkeypatch)
-
-
-@pytest.fixture
-def layout_crc(tree: Tree) -> Callable[[str], int]:
-    """A function from the text of a frames.toml to the layout CRC that the host computes of it."""
-
-    def crc_of(definition: str) -> int:
-        (tree.path / "protocol" / "frames.toml").write_text(definition, encoding="utf-8")
-        return int(tree.protocol().LAYOUT_CRC)
-
-    return crc_of
 
 
 DEFINITION_TEXT = (ROOT / "protocol" / "frames.toml").read_text(encoding="utf-8")
@@ -329,25 +286,21 @@ def changed(change: tuple[str, str]) -> str:
     return DEFINITION_TEXT.replace(old, new)
 
 
-def test_layout_crc_of_the_definition_itself(layout_crc: Callable[[str], int]) -> None:
-    assert layout_crc(DEFINITION_TEXT) == protocol.LAYOUT_CRC
+def test_layout_crc_of_the_definition_itself(tree: Tree) -> None:
+    assert tree.layout_crc(DEFINITION_TEXT) == protocol.LAYOUT_CRC
 
 
-@pytest.mark.parametrize("what", CHANGES_OF_MEANING)
-def test_layout_crc_changes_with(what: str, layout_crc: Callable[[str], int]) -> None:
-    assert layout_crc(changed(CHANGES_OF_MEANING[what])) != protocol.LAYOUT_CRC
+@pytest.mark.parametrize("what", CHANGES_OF_MEANING | CHANGES_OF_TEXT)
+def test_layout_crc_changes_with_the_meaning_alone(what: str, tree: Tree) -> None:
+    crc = tree.layout_crc(changed((CHANGES_OF_MEANING | CHANGES_OF_TEXT)[what]))
+    assert (crc != protocol.LAYOUT_CRC) == (what in CHANGES_OF_MEANING)
 
 
-@pytest.mark.parametrize("what", CHANGES_OF_TEXT)
-def test_layout_crc_does_not_change_with(what: str, layout_crc: Callable[[str], int]) -> None:
-    assert layout_crc(changed(CHANGES_OF_TEXT[what])) == protocol.LAYOUT_CRC
-
-
-def test_layout_crc_changes_with_the_order_of_fields(layout_crc: Callable[[str], int]) -> None:
+def test_layout_crc_changes_with_the_order_of_fields(tree: Tree) -> None:
     lines = DEFINITION_TEXT.splitlines(keepends=True)
     at = next(i for i, line in enumerate(lines) if 'name = "version_major"' in line)
     lines[at], lines[at + 1] = lines[at + 1], lines[at]
-    assert layout_crc("".join(lines)) != protocol.LAYOUT_CRC
+    assert tree.layout_crc("".join(lines)) != protocol.LAYOUT_CRC
 
 
 def test_generated_files_are_up_to_date(tree: Tree) -> None:

@@ -4,7 +4,7 @@
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,31 +14,19 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from ohmskin import opening
-from ohmskin.emulate.board import CLOCK_HZ, PtyServer
+from ohmskin.emulate.board import CLOCK_HZ
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import framing, protocol, session
 from ohmskin.link.messages import BoardDecoder, Scan
-from ohmskin.link.serial_port import SerialPort
 from ohmskin.opening import Boards, BoardScan
+from ports import Attach, Serve
 
-Serve = Callable[[str], PtyServer]
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 
 def units(*numbers: int, rest: str = "") -> list[str]:
     return [f"emulator://8x8?unit={number}{rest}" for number in numbers]
-
-
-@pytest.fixture
-def attach(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """A function that says which ports this machine has: path and board of each."""
-
-    def say(*ports: tuple[str, str]) -> None:
-        found = [SerialPort(path, "", board) for path, board in ports]
-        monkeypatch.setattr(opening, "serial_ports", lambda: found)
-
-    return say
 
 
 def test_boards_are_named_by_their_skins() -> None:
@@ -169,7 +157,7 @@ def test_a_board_that_vanishes_ends_the_scans_and_is_named() -> None:
 # ------------------------------------------------------------------------------------- opening
 
 
-def test_the_boards_of_this_machine(pty_board: Serve, attach: Callable[..., None]) -> None:
+def test_the_boards_of_this_machine(pty_board: Serve, attach: Attach) -> None:
     one, two = (pty_board(f"emulator://8x8?unit={unit}").path for unit in (1, 2))
     attach((one, "uno"), ("/dev/ttyS0", ""), (two, "megaatmega2560"))
     with ohmskin.open_all() as skins:
@@ -177,7 +165,7 @@ def test_the_boards_of_this_machine(pty_board: Serve, attach: Callable[..., None
 
 
 def test_what_is_no_skin_is_skipped_in_a_search(
-    pty_board: Serve, attach: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    pty_board: Serve, attach: Attach, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
     other, skin = (pty_board(f"emulator://8x8?{what}").path for what in ("silent=1", "unit=5"))
@@ -192,7 +180,7 @@ def test_what_is_no_skin_is_skipped_in_a_search(
 
 
 def test_a_skin_that_cannot_be_used_is_an_error_of_a_search(
-    pty_board: Serve, attach: Callable[..., None]
+    pty_board: Serve, attach: Attach
 ) -> None:
     old, skin = (pty_board(f"emulator://8x8?{what}").path for what in ("foreign=1", "unit=5"))
     attach((old, "uno"), (skin, "uno"))
@@ -204,7 +192,7 @@ def test_a_skin_that_cannot_be_used_is_an_error_of_a_search(
 
 
 @pytest.mark.parametrize("urls", [None, []])
-def test_no_board_is_an_error(urls: list[str] | None, attach: Callable[..., None]) -> None:
+def test_no_board_is_an_error(urls: list[str] | None, attach: Attach) -> None:
     attach(("/dev/ttyS0", ""))
     with pytest.raises(PortError, match="no skin board found: 'ohmskin ports'"):
         ohmskin.open_all(urls)

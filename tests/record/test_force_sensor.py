@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -20,7 +19,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.cli.record import PressDisplay
 from ohmskin.errors import DeviceLost, PortError
@@ -30,15 +29,11 @@ from ohmskin.link.messages import Scan
 from ohmskin.record.force_sensor import QUEUE_SAMPLES, ForceLineDecoder, ForceSensor
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import ForceSample, load_recording
-from scripted_skin import REST, ScriptedSkin
+from scripted_skin import REST, ScriptedSkin, rise
 from waiting import until
 
 tty = pytest.importorskip("tty")
 pytestmark = pytest.mark.usefixtures("nothing_left")
-
-Run = Callable[..., Done]
-# Longest time that a test waits for another thread [s].
-PATIENCE_S = 20.0
 
 
 # --------------------------------------------------------------------------------------- lines
@@ -144,10 +139,7 @@ def sketch() -> Iterator[PtySensor]:
 
 def taken(sensor: ForceSensor, count: int) -> list[ForceSample]:
     samples: list[ForceSample] = []
-    end_s = time.monotonic() + PATIENCE_S
-    while len(samples) < count and time.monotonic() < end_s:
-        samples += sensor.take()
-        time.sleep(0.01)
+    until(lambda: samples.extend(sensor.take()) or len(samples) >= count)
     assert len(samples) == count
     return samples
 
@@ -155,14 +147,9 @@ def taken(sensor: ForceSensor, count: int) -> list[ForceSample]:
 def until_lost(sensor: ForceSensor) -> list[ForceSample]:
     """What can be taken before it raises that the sensor is lost."""
     samples: list[ForceSample] = []
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s:
-        try:
-            samples += sensor.take()
-        except DeviceLost:
-            return samples
-        time.sleep(0.01)
-    pytest.fail("the sensor is never lost")
+    with pytest.raises(DeviceLost):
+        until(lambda: samples.extend(sensor.take()))
+    return samples
 
 
 def test_numbers_are_forces_at_their_time(sketch: PtySensor) -> None:
@@ -210,9 +197,8 @@ def test_a_silent_sensor(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> 
         with pytest.raises(DeviceLost, match=r"has said nothing for 0.2 s: is it the force"):
             sensor.wait()
         sketch.print(b"\n1\n")
-        end_s = time.monotonic() + PATIENCE_S
         samples: list[ForceSample] = []
-        while not samples and time.monotonic() < end_s:
+        while not samples:
             with suppress(DeviceLost):
                 samples = sensor.take()
         assert len(samples) == 1
@@ -297,11 +283,6 @@ def pressed(time_s: float) -> tuple[int, float]:
     return 0, 0.0
 
 
-def rise(force_n: float) -> float:
-    """Conductance above rest [S]."""
-    return 30e-6 * force_n**1.7
-
-
 def finger(time_s: float) -> Float:
     """Conductances above rest (1, 2) [S]."""
     column, force_n = pressed(time_s)
@@ -349,8 +330,7 @@ def test_a_recorded_force_sensor_calibrates(
     monkeypatch.setattr(ohmskin, "open", lambda url, start: skin)
     monkeypatch.setattr("ohmskin.cli.record.ForceSensor", ScriptedSensor(skin).opened)
     force = ("--force-port", "scale", "--force-baud", "57600", "--force-scale", "2")
-    done = run("record", "fast", str(file), *force, "--tare", "1.5", "--seconds", "16.5")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("record", "fast", str(file), *force, "--tare", "1.5", "--seconds", "16.5"))
     assert "touch nothing for 1.5 s" in done.out
     counts = r"presses\.mcap: 66\d scans, missed 0, \d+ bytes, 66\d forces, 2 lines that are no num"
     assert re.search(counts, done.out)
@@ -362,8 +342,7 @@ def test_a_recorded_force_sensor_calibrates(
     assert max(sample.force_n for sample in recording.forces) == pytest.approx(7.03, abs=0.1)
     assert {sample.source for sample in recording.forces} == {"scale"}
 
-    done = run("calibrate", "recording", str(file), str(out), "--indenter-mm2", "100")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("calibrate", "recording", str(file), str(out), "--indenter-mm2", "100"))
     assert "zero of the force sensor +0.029 N" in done.out
     calibration = load_calibration(out)
     for force_n in (2.0, 5.0):
@@ -419,12 +398,9 @@ def once_scans_are_in(recording: Path, act: Callable[[], None]) -> Iterator[None
     """Act when scans are in a recording: its file has grown beyond the board's hello."""
 
     def work() -> None:
-        sizes: set[int] = set()
-        end_s = time.monotonic() + PATIENCE_S
-        while len(sizes) < 2 and time.monotonic() < end_s:
-            time.sleep(0.02)
-            if recording.exists() and recording.stat().st_size:
-                sizes.add(recording.stat().st_size)
+        until(recording.exists)
+        empty = until(lambda: recording.stat().st_size)
+        until(lambda: recording.stat().st_size > empty)
         act()
 
     thread = threading.Thread(target=work)
@@ -439,15 +415,12 @@ def test_whatever_ends_a_recording_with_forces_it_is_whole(
 ) -> None:
     file = tmp_path / "own.mcap"
     arguments = ("record", "emulator://2x2", str(file), "--force-port", sketch.path)
-    stop = {
-        "sensor": sketch.vanish,
-        "SIGTERM": lambda: os.kill(os.getpid(), signal.SIGTERM),
-    }
+    stop = {"sensor": sketch.vanish, "SIGTERM": lambda: os.kill(os.getpid(), signal.SIGTERM)}
     with once_scans_are_in(file, stop[end]), speaking(sketch, lambda: b"0.1\n"):
         done = run(*arguments)
     if end == "sensor":
         gone = f"{sketch.path} is gone: is the force sensor still plugged in? (what came before is"
-        assert_one_line(replace(done, out=""), gone, "own.mcap")
+        assert_one_line(done._replace(out=""), gone, "own.mcap")
     else:
         assert (done.code, done.err) == (0, "")
     given = load_recording(file)

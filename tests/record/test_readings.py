@@ -13,18 +13,10 @@ from ohmskin.record import readings as readings_module
 from ohmskin.record.readings import Readings, estimate_file, load_readings, save_arrays
 from places import DATA
 
+SIEMENS = ("cell_siemens", "cell_siemens_std")
 OUT_SHAPES = {
-    "cell_ohm": 3,
-    "cell_siemens": 3,
-    "cell_siemens_std": 3,
-    "touched": 3,
-    "top_wire_ohm": 3,
-    "bottom_wire_ohm": 3,
-    "converged": 1,
-    "message": 1,
-    "chi2": 1,
-    "iterations": 1,
-    "seconds": 1,
+    **dict.fromkeys(("cell_ohm", *SIEMENS, "touched", "top_wire_ohm", "bottom_wire_ohm"), 3),
+    **dict.fromkeys(("converged", "message", "chi2", "iterations", "seconds"), 1),
 }
 
 
@@ -105,14 +97,6 @@ def test_an_unknown_method_is_refused() -> None:
         estimate_file(Readings(np.full((1, 2, 2, 4), 0.5)), "magic")
 
 
-def refusal_of(path: Path) -> str:
-    try:
-        load_readings(path)
-    except ValueError as error:
-        return str(error)
-    return ""
-
-
 GOOD = np.full((2, 3, 4, 4), 0.5)
 
 
@@ -181,13 +165,15 @@ def test_every_truncation_and_many_damages_are_refused_or_read(tmp_path: Path) -
         path.write_bytes(packed[:length])
         with pytest.raises(ValueError, match=r"damaged.npz: "):
             load_readings(path)
-    refused = 0
+    refusals = []
     for position in range(len(packed)):
         path.write_bytes(packed[:position] + b"\xff" + packed[position + 1 :])
-        message = refusal_of(path)
-        assert "\n" not in message
-        refused += message != ""
-    assert refused > len(packed) / 2
+        try:
+            load_readings(path)
+        except ValueError as error:
+            refusals.append(str(error))
+    assert "\n" not in "".join(refusals)
+    assert len(refusals) > len(packed) / 2
 
 
 def test_an_array_over_the_limit_is_not_unpacked(
@@ -226,12 +212,7 @@ def test_saved_arrays_come_back_and_nothing_else_is_left(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_failed_save_leaves_the_older_file_as_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "out.npz"
-    path.write_bytes(b"an older file")
+def test_objects_are_not_saved(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cell_ohm holds Python objects"):
-        save_arrays(path, {"cell_ohm": np.array([object()])})
-    assert path.read_bytes() == b"an older file"
-    assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(ValueError, match=r"cannot be written: No such file"):
-        save_arrays(tmp_path / "nowhere" / "out.npz", {})
+        save_arrays(tmp_path / "out.npz", {"cell_ohm": np.array([object()])})
+    assert list(tmp_path.iterdir()) == []

@@ -10,8 +10,7 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -25,7 +24,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 import ohmskin
-from command_line import Done, assert_one_line
+from command_line import Command, Done, Run, assert_one_line, finish, well
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
@@ -45,7 +44,6 @@ from waiting import until
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 URL = "emulator://3x4?scene=multi&seed=3&rate=400"
-Command = Callable[..., "subprocess.Popen[str]"]
 # Scans reach the file within half a second; on a busy machine, within this [s].
 LATE_S = 3.0
 
@@ -54,6 +52,12 @@ LATE_S = 3.0
 def hello() -> Hello:
     with ohmskin.open(URL, start=False) as skin:
         return skin.info
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where a recording is written."""
+    return tmp_path / "a.mcap"
 
 
 def scan(number: int, rows: int = 3, columns: int = 4, at_s: float | None = None) -> Scan:
@@ -85,8 +89,7 @@ def replayed(path: Path, speed: float = 0) -> list[Scan]:
 # ----------------------------------------------------------------------------- write and read
 
 
-def test_everything_is_read_again(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_everything_is_read_again(path: Path, hello: Hello) -> None:
     with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
         scans = list(itertools.islice(skin, 50))
         for each in scans:
@@ -103,21 +106,17 @@ def test_everything_is_read_again(tmp_path: Path, hello: Hello) -> None:
     assert [*found.marks, *found.forces] == others
 
 
-def test_other_programs_read_it(tmp_path: Path, hello: Hello) -> None:
+def test_other_programs_read_it(path: Path, hello: Hello) -> None:
     """The library's seeking reader, with the index; each message fits its schema's properties."""
-    path = tmp_path / "a.mcap"
     before_ns = time.time_ns()
     write(path, hello, [scan(n, at_s=time.monotonic()) for n in range(20)])
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
         assert summary.statistics.message_count == 21
         topics = {channel.topic for channel in summary.channels.values()}
         assert topics == {f"/skin/{name}" for name in ("hello", "scan", "tare", "mark", "force")}
         for schema, channel, message in reader.iter_messages():
-            assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             definition, content = json.loads(schema.data), json.loads(message.data)
             assert definition["type"] == "object"
@@ -131,9 +130,8 @@ def test_other_programs_read_it(tmp_path: Path, hello: Hello) -> None:
                 assert content["codes"] == expected.codes.reshape(-1).tolist()
 
 
-def test_size_on_disk(tmp_path: Path, hello: Hello) -> None:
+def test_size_on_disk(path: Path, hello: Hello) -> None:
     """At most 40 kB/s for 8x8 at 90 Hz, half a second in each chunk."""
-    path = tmp_path / "a.mcap"
     board, _, _ = emulated("emulator://8x8?scene=moving&noise=1")
     with Recorder(path, hello) as recorder:
         for number in range(450):
@@ -143,8 +141,7 @@ def test_size_on_disk(tmp_path: Path, hello: Hello) -> None:
     assert path.stat().st_size < 5 * 40_000
 
 
-def test_an_existing_file_is_left_alone(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_an_existing_file_is_left_alone(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_text("mine")
     with pytest.raises(RecordingError, match="there already"):
         Recorder(path, hello)
@@ -198,8 +195,7 @@ def test_a_closed_recording_takes_no_more(tmp_path: Path, hello: Hello) -> None:
         recorder.add(scan(0))
 
 
-def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_silent_board_s_last_scans_reach_the_file(path: Path, hello: Hello) -> None:
     with Recorder(path, hello) as recorder:
         recorder.add(scan(0))
         until(lambda: load_recording(path).scans, LATE_S)
@@ -211,8 +207,7 @@ def test_a_silent_board_s_last_scans_reach_the_file(tmp_path: Path, hello: Hello
 # ------------------------------------------------------------------------------ what ends badly
 
 
-def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
-    path = tmp_path / "a.mcap"
+def test_killed_at_any_moment(path: Path, command: Command) -> None:
     process = command("record", URL, str(path))
     until(lambda: path.exists() and path.stat().st_size > 20_000)
     time.sleep(0.77)
@@ -229,13 +224,11 @@ def test_killed_at_any_moment(tmp_path: Path, command: Command) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_properly(tmp_path: Path, command: Command, number: signal.Signals) -> None:
-    path = tmp_path / "a.mcap"
+def test_signals_end_it_properly(path: Path, command: Command, number: signal.Signals) -> None:
     process = command("record", URL, str(path))
     until(lambda: path.exists() and path.stat().st_size > 10_000)
     process.send_signal(number)
-    out, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, "")
+    out = well(finish(process)).out
     found = load_recording(path)
     assert not found.cut_off
     assert f"{len(found.scans)} scans" in out
@@ -285,8 +278,7 @@ def test_cut_off_at_any_byte(tmp_path: Path, hello: Hello) -> None:
     assert set(counts) == set(range(7))
 
 
-def test_damage_is_named(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_damage_is_named(path: Path, hello: Hello) -> None:
     write(path, hello, [scan(n) for n in range(5)])
     octets = bytearray(path.read_bytes())
     outcomes = set()
@@ -319,8 +311,7 @@ def test_an_old_recording_does_not_say_how_long_a_slot_is(tmp_path: Path, hello:
         assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
 
 
-def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_bytes(b"")
     with pytest.raises(RecordingError, match="cut off"):
         load_recording(path)
@@ -347,6 +338,32 @@ def test_foreign_files(tmp_path: Path, hello: Hello) -> None:
         assert str(refusal.value).startswith(str(path))
 
 
+class AddedMeanwhile(io.FileIO):
+    """While its second write goes on, the first after the board's hello, another thread adds."""
+
+    writes = 0
+    other: threading.Thread
+    is_kept_waiting = False
+
+    def write(self, octets: object) -> int:
+        self.writes += 1
+        if self.writes == 2:
+            self.other.start()
+            self.other.join(0.2)  # an `add` that waits for nobody takes less
+            self.is_kept_waiting = self.other.is_alive()
+        return super().write(octets)  # type: ignore[arg-type]
+
+
+def test_one_thread_writes_at_a_time(path: Path, hello: Hello) -> None:
+    file = AddedMeanwhile(path, "wb")
+    with Recorder(path, hello, file=file) as recorder:
+        file.other = threading.Thread(target=recorder.add, args=(scan(1),))
+        recorder.add(scan(0))
+        until(lambda: recorder.scans == 2)
+    assert file.is_kept_waiting
+    assert_same(load_recording(path).scans, [scan(0), scan(1)])
+
+
 class FullDisk(io.FileIO):
     """A file that takes `room` bytes and no more, the last write in part."""
 
@@ -361,9 +378,8 @@ class FullDisk(io.FileIO):
 
 
 def test_a_full_disk_ends_the_recording(
-    tmp_path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
+    path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "a.mcap"
     file = FullDisk(path, "wb")
     file.room = 20_000
     monkeypatch.setattr(Path, "open", lambda path, mode: io.BufferedWriter(file))
@@ -384,25 +400,20 @@ def test_a_full_disk_ends_the_recording(
     assert 15_000 < path.stat().st_size <= 20_000
 
 
-def test_a_file_that_may_not_grow_ends_the_command(tmp_path: Path, command: Command) -> None:
+def test_a_file_that_may_not_grow_ends_the_command(path: Path, command: Command) -> None:
     resource = pytest.importorskip("resource")
-    path = tmp_path / "a.mcap"
     process = command("record", URL, str(path))
     if not hasattr(resource, "prlimit"):
         pytest.skip("needs prlimit")
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, out) == (2, "")
-    assert err.count("\n") == 1
-    assert "recording ended after" in err
+    assert_one_line(finish(process), "recording ended after")
     assert load_recording(path).scans
 
 
 # -------------------------------------------------------------------------------------- replay
 
 
-def test_replay_is_the_recording_bit_for_bit(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_replay_is_the_recording_bit_for_bit(path: Path, hello: Hello) -> None:
     with ohmskin.open(f"{URL}&drop=0.05") as skin:
         scans = list(itertools.islice(skin, 300))
     assert any(each.missed for each in scans)
@@ -411,8 +422,7 @@ def test_replay_is_the_recording_bit_for_bit(tmp_path: Path, hello: Hello) -> No
     assert_same(replayed(path, speed=4), scans, host_time=False)
 
 
-def test_a_slow_reader_of_a_fast_replay_loses_nothing(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_slow_reader_of_a_fast_replay_loses_nothing(path: Path, hello: Hello) -> None:
     scans = [scan(n, rows=1, columns=1) for n in range(3000)]
     write(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
@@ -425,8 +435,7 @@ def test_a_slow_reader_of_a_fast_replay_loses_nothing(tmp_path: Path, hello: Hel
     assert_same(first, scans, host_time=False)
 
 
-def test_latest_of_a_fast_replay_gives_each(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_latest_of_a_fast_replay_gives_each(path: Path, hello: Hello) -> None:
     scans = [scan(n) for n in range(40)]
     write(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
@@ -438,8 +447,7 @@ def test_latest_of_a_fast_replay_gives_each(tmp_path: Path, hello: Hello) -> Non
             skin.stop()
 
 
-def test_replay_takes_the_recorded_time(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_replay_takes_the_recorded_time(path: Path, hello: Hello) -> None:
     write(path, hello, [scan(n, at_s=7 + n / 10) for n in range(6)])
     begin_s = time.monotonic()
     found = replayed(path, speed=1)
@@ -448,18 +456,16 @@ def test_replay_takes_the_recorded_time(tmp_path: Path, hello: Hello) -> None:
 
 
 def test_replay_shortens_long_pauses(
-    tmp_path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
+    path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ohmskin.record.replay.LONGEST_PAUSE_S", 0.1)
-    path = tmp_path / "a.mcap"
     write(path, hello, [scan(0, at_s=0), scan(1, at_s=3600), scan(2, at_s=10)])
     begin_s = time.monotonic()
     assert len(replayed(path, speed=1)) == 3
     assert time.monotonic() - begin_s < 5
 
 
-def test_a_recording_stays_as_it_is(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
     scans = [scan(n) for n in range(30)]
     write(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
@@ -484,8 +490,7 @@ def test_a_recording_stays_as_it_is(tmp_path: Path, hello: Hello) -> None:
     assert numbers[-1] == 29
 
 
-def test_a_change_of_size_is_replayed(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path) -> None:
     with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
         scans = list(itertools.islice(skin, 5))
         for each in scans:
@@ -502,8 +507,7 @@ def test_a_change_of_size_is_replayed(tmp_path: Path) -> None:
         export(load_recording(path), tmp_path / "a.npz")
 
 
-def test_wrong_replays(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
     write(path, hello, [scan(0)])
     for query in ("speed=-1", "speed=nan", "speed=fast", "baud=9600"):
         with pytest.raises(PortError, match="speed"):
@@ -518,14 +522,12 @@ def test_wrong_replays(tmp_path: Path, hello: Hello) -> None:
         replayed(path)
 
 
-def test_a_skin_larger_than_any_board_is_replayed(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_a_skin_larger_than_any_board_is_replayed(path: Path, hello: Hello) -> None:
     write(path, hello, [scan(0, rows=20)])
     assert replayed(path)[0].codes.shape == (20, 4, 4)
 
 
-def test_scans_carry_the_tare_in_force(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "a.mcap"
+def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
     tares = [Tare(np.full((3, 4, 4), ratio), 1.0) for ratio in (0.25, 0.75)]
     with Recorder(path, hello) as recorder:
         for message in (scan(0), tares[0], scan(1), scan(2), tares[1], scan(3)):
@@ -534,7 +536,6 @@ def test_scans_carry_the_tare_in_force(tmp_path: Path, hello: Hello) -> None:
     assert rests[0] is None
     assert rests[1] is rests[2]
     for found, tare in ((rests[2], tares[0]), (rests[3], tares[1])):
-        assert found is not None
         np.testing.assert_array_equal(found, tare.rest_ratio)
 
 
@@ -595,17 +596,9 @@ def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     assert not list(tmp_path.glob("b*"))
 
 
-def test_typed_lines_become_marks(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
+def test_typed_lines_become_marks(path: Path, command: Command) -> None:
     far, near = os.openpty()
-    host = str(Path(ohmskin.__file__).parents[1])
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ohmskin", "record", URL, str(path)],
-        stdin=near,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env={**os.environ, "PYTHONPATH": host},
-    )
+    process = command("record", URL, str(path), stdin=near)
     os.close(near)
     with os.fdopen(far, "wb", buffering=0) as keyboard:
         until(path.exists)
@@ -614,20 +607,17 @@ def test_typed_lines_become_marks(tmp_path: Path) -> None:
         keyboard.write(b" hand\n")
         until(lambda: len(load_recording(path).marks) == 2)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
-    assert process.returncode == 0
+        assert finish(process).code == 0
     assert [mark.text for mark in load_recording(path).marks] == ["left hand", "right hand"]
 
 
-def test_the_commands(tmp_path: Path, command: Command, run: Callable[..., Done]) -> None:
+def test_the_commands(tmp_path: Path, command: Command, run: Run) -> None:
     path, out = tmp_path / "a.mcap", tmp_path / "a.npz"
     quiet = "emulator://3x4?scene=rest"
     process = command(
         "record", quiet, str(path), "--scans", "60", "--tare", "0.2", "--mark", "left hand"
     )
-    text, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (0, "")
-    assert text.startswith(f"{path}: 60 scans, missed 0, ")
+    assert well(finish(process)).out.startswith(f"{path}: 60 scans, missed 0, ")
     assert [mark.text for mark in load_recording(path).marks] == ["left hand"]
     assert sum(isinstance(message, Tare) for message in messages(path)) == 1
     assert run("export", str(path), str(out)) == Done(0, f"{out}: 60 scans\n", "")

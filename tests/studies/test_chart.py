@@ -6,26 +6,25 @@ import io
 import json
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from command_line import Command, Run, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.cli import main as cli
 from ohmskin.estimate.methods import METHODS
-from places import DATA, ROOT
-from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published
-from studies.__main__ import app
+from places import ROOT
+from skins import reference
+from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published, stability
 from studies.chart import Plan, Row, Size, pareto_front
-from studies.commands import save_whole
 from waiting import until
 
 TINY = Plan(
@@ -85,11 +84,7 @@ def test_all_methods_get_the_same_frames(rows: list[Row]) -> None:
         assert len({row.pressed_cells for row in measured}) == 1
         for row in measured:
             assert row.pressed_cells
-            assert row.ms is not None
-            assert row.ms_p90 is not None
             assert 0 < row.ms <= row.ms_p90
-            assert row.error_percent is not None
-            assert row.error_p90_percent is not None
             assert 0 <= row.error_percent <= row.error_p90_percent
 
 
@@ -105,12 +100,7 @@ def test_limits_are_ordered(rows: list[Row]) -> None:
     """What is known more exactly leaves less: wires, and readings."""
     exact, rounded = (of(rows, scene="random", bits=bits)[0] for bits in (None, 10))
     for row in (exact, rounded):
-        assert row.limit_std_percent is not None
-        assert row.limit_percent is not None
-        assert row.limit_told_percent is not None
         assert row.limit_told_percent < row.limit_percent < row.limit_std_percent
-    assert exact.limit_std_percent is not None
-    assert rounded.limit_std_percent is not None
     assert exact.limit_std_percent < rounded.limit_std_percent
 
 
@@ -131,11 +121,11 @@ def test_the_papers_methods_run_on_small_skins_alone() -> None:
 @pytest.mark.parametrize("name", ["cell_sweep", "wire_sweep"])
 def test_sweeps_are_the_papers(name: str) -> None:
     """Readings of ngspice, made for the same conditions."""
-    with np.load(DATA / f"{name}_3x3.npz") as file:
-        expected, at_rest = file["ratio"], file["rest_ratio"]
-    pairs = published.sweep(name)
-    np.testing.assert_allclose([readings(pressed) for pressed, _ in pairs], expected, atol=1e-7)
-    np.testing.assert_allclose([readings(rest) for _, rest in pairs], at_rest, atol=1e-7)
+    expected, _ = reference(f"{name}_3x3", bits=None)
+    skins = zip(*published.sweep(name), strict=True)
+    pressed, rest = ([readings(skin) for skin in each] for each in skins)
+    np.testing.assert_allclose(pressed, expected.ratio, atol=1e-7)
+    np.testing.assert_allclose(rest, expected.rest_ratio, atol=1e-7)
 
 
 # --------------------------------------------------------------------------- NumPy against CasADi
@@ -178,8 +168,6 @@ def test_evaluations_of_numpy_and_casadi_are_in_the_table(rows: list[Row]) -> No
     assert [row.method for row in measured] == ["numpy", "casadi", "casadi_c"]
     for row in measured:
         assert (row.rows, row.columns, row.source, row.on_front) == (2, 2, "measured", False)
-        assert row.ms is not None
-        assert row.ms_p90 is not None
         assert 0 < row.ms <= row.ms_p90
 
 
@@ -243,29 +231,14 @@ def test_frames_without_touches_have_a_row_and_a_picture() -> None:
 
 
 @pytest.fixture
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
+def draw(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
     """A function that runs ``python -m studies chart ARGUMENTS`` with a tiny plan."""
     monkeypatch.setattr(chart, "QUICK", TINY)
-    monkeypatch.setenv("COLUMNS", "120")
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["studies", "chart", "--quick", *arguments])
-        code = 0
-        try:
-            cli.run(app, "studies")
-        except SystemExit as end:
-            code = int(end.code or 0)
-        return code, *capsys.readouterr()
-
-    return call
+    return partial(run, "chart", "--quick", program="studies")
 
 
-def test_chart_writes_picture_and_table(
-    run: Callable[..., tuple[int, str, str]], tmp_path: Path, rows: list[Row]
-) -> None:
-    code, out, err = run("--out", str(tmp_path / "new"))
+def test_chart_writes_picture_and_table(draw: Run, tmp_path: Path, rows: list[Row]) -> None:
+    code, out, err = draw("--out", str(tmp_path / "new"))
     assert code == 0
     answer = json.loads(out)
     assert answer["quick"]
@@ -284,84 +257,60 @@ def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatc
     assert commands.default_folder() == Path()
 
 
+@pytest.mark.parametrize("study", [chart, stability])
 def test_without_matplotlib_nothing_is_measured(
-    run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, study: ModuleType
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setattr(chart, "measure", lambda *_: pytest.fail("measured in vain"))
-    code, out, err = run("--out", str(tmp_path))
+    monkeypatch.setattr(study, "measure", lambda *_, **__: pytest.fail("measured in vain"))
+    command = study.__name__.rpartition(".")[2]
+    code, out, err = run(command, "--quick", "--out", str(tmp_path), program="studies")
     assert (code, out) == (2, "")
     assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
 
 
-@pytest.mark.parametrize("where", ["measure", "picture"])
+# As CasADi may turn it, with it as the cause or in the text.
+FROM_CASADI = SystemError("returned a result with an exception set")
+FROM_CASADI.__cause__ = KeyboardInterrupt()
+
+
+@pytest.mark.parametrize(
+    ("where", "error"),
+    [
+        ("chart.measure", KeyboardInterrupt()),
+        ("chart_figure.picture", KeyboardInterrupt()),
+        ("chart.measure", FROM_CASADI),
+        ("chart.measure", SystemError("KeyboardInterrupt")),
+    ],
+)
 def test_ctrl_c_leaves_the_old_files(
-    run: Callable[..., tuple[int, str, str]],
+    draw: Run,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
-    where: str,
     rows: list[Row],
+    where: str,
+    error: BaseException,
 ) -> None:
     def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
+        raise error
 
     monkeypatch.setattr(chart, "measure", lambda *_: rows)
-    monkeypatch.setattr(chart if where == "measure" else chart_figure, where, interrupt)
+    monkeypatch.setattr(f"studies.{where}", interrupt)
     (tmp_path / "speed-accuracy.csv").write_text("old")
-    code, out, err = run("--out", str(tmp_path))
+    code, out, err = draw("--out", str(tmp_path))
     assert (code, out) == (130, "")
     assert "Traceback" not in err
-    assert [path.name for path in tmp_path.iterdir()] == ["speed-accuracy.csv"]
-    assert (tmp_path / "speed-accuracy.csv").read_text() == "old"
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
 
 
-def test_ctrl_c_is_not_lost_in_ipopt(
-    command: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_ctrl_c_is_not_lost_in_ipopt(command: Command, tmp_path: Path) -> None:
     """CasADi takes the signal; the frame once was just not converged, and the run went on."""
     folder = tmp_path / "new"
     process = command("chart", "--out", str(folder), module="studies")
     until(folder.exists)
     time.sleep(1.5)  # by then nearly all time goes into Ipopt, and so for two minutes
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=20)
-    assert (process.returncode, out) == (130, "")
-    assert "Traceback" not in err
-    assert list(folder.iterdir()) == []
-
-
-@pytest.mark.parametrize("text", ["returned a result with an exception set", "KeyboardInterrupt"])
-def test_ctrl_c_is_told_from_what_casadi_makes_of_it(
-    run: Callable[..., tuple[int, str, str]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    text: str,
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise SystemError(text) from (KeyboardInterrupt() if "result" in text else None)
-
-    monkeypatch.setattr(chart, "measure", interrupt)
-    code, out, err = run("--out", str(tmp_path))
+    code, out, err = finish(process)
     assert (code, out) == (130, "")
     assert "Traceback" not in err
-
-
-def test_ctrl_c_while_saving_leaves_the_old_files(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    first.write_text("old")
-
-    def interrupted(descriptor: int) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("os.fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        save_whole({first: b"new", second: b"new"})
-    assert list(tmp_path.iterdir()) == [first]
-    assert first.read_text() == "old"
-
-
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no/place: cannot be written: No such file"):
-        save_whole({tmp_path / "no" / "place": b""})
+    assert list(folder.iterdir()) == []

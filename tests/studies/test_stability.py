@@ -6,22 +6,19 @@ import io
 import json
 import os
 import signal
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from command_line import Command, Run, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
-from ohmskin.cli import main as cli
 from ohmskin.estimate.matrix import MatrixEstimator
 from ohmskin.estimate.methods import METHODS
 from studies import conditions, stability, stability_figure
-from studies.__main__ import app
 from studies.conditions import SWEEPS, Case
 from studies.stability import Plan, Row, Task, Verdict, verdict
 from waiting import until
@@ -123,7 +120,6 @@ def build(sweep: str, x: float | str, frames: int = 3, seed: int = 1) -> Case:
 def test_every_condition_gives_readings_of_a_converter(sweep: str, x: float | str) -> None:
     case, again = build(sweep, x), build(sweep, x)
     assert case.knowledge.adc_bits == 10
-    assert case.knowledge.rest_ratio is not None
     judged = [frame for frame in case.frames if frame.cell_siemens is not None]
     assert len(judged) == 3
     ratios = [case.knowledge.rest_ratio, *(frame.ratio for frame in case.frames)]
@@ -144,7 +140,6 @@ def test_faults_since_rest_are_in_the_rest_readings() -> None:
     }
     low, high = 0.5 / 1024, 1023.5 / 1024
     for fault, ratio in rest.items():
-        assert ratio is not None
         match fault:
             case "cell at 0 since rest":
                 assert (ratio == low).all(axis=2).sum() == 1
@@ -245,30 +240,15 @@ def test_picture_of_all_sweeps() -> None:
 # ---------------------------------------------------------------------------------- command line
 
 
-Run = Callable[..., tuple[int, str, str]]
-
-
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+def sweep(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
     """A function that runs ``python -m studies stability ARGUMENTS``, a tiny plan, here."""
     monkeypatch.setattr(stability, "QUICK", replace(TINY, skins=1, frames=1, shape=(2, 2)))
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        command = ["studies", "stability", "--quick", "--jobs", "1", *arguments]
-        monkeypatch.setattr(sys, "argv", command)
-        code = 0
-        try:
-            cli.run(app, "studies")
-        except SystemExit as end:
-            code = int(end.code or 0)
-        return code, *capsys.readouterr()
-
-    return call
+    return partial(run, "stability", "--quick", "--jobs", "1", program="studies")
 
 
-def test_stability_writes_picture_and_table(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("--out", str(tmp_path / "new"))
+def test_stability_writes_picture_and_table(sweep: Run, tmp_path: Path) -> None:
+    code, out, err = sweep("--out", str(tmp_path / "new"))
     assert code == 0
     answer = json.loads(out.splitlines()[-1])
     assert answer["quick"]
@@ -280,19 +260,7 @@ def test_stability_writes_picture_and_table(run: Run, tmp_path: Path) -> None:
     assert "wrong and not flagged" in err
 
 
-def test_without_matplotlib_nothing_is_measured(
-    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setattr(stability, "measure", lambda *_, **__: pytest.fail("measured in vain"))
-    code, out, err = run("--out", str(tmp_path))
-    assert (code, out) == (2, "")
-    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
-
-
-def test_ctrl_c_leaves_the_old_files_and_no_process(
-    command: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_ctrl_c_leaves_the_old_files_and_no_process(command: Command, tmp_path: Path) -> None:
     (tmp_path / "stability.csv").write_text("old")
     process = command("stability", "--jobs", "2", "--out", str(tmp_path), module="studies")
     until(lambda: len(children(process.pid)) >= 2)
@@ -300,8 +268,8 @@ def test_ctrl_c_leaves_the_old_files_and_no_process(
     until(lambda: max(map(processor_s, children(process.pid))) > 1.5)
     workers = children(process.pid)
     process.send_signal(signal.SIGINT)  # to it alone: the terminal would tell its workers as well
-    out, err = process.communicate(timeout=20)
-    assert process.returncode == 130, err
+    code, out, err = finish(process)
+    assert code == 130, err
     assert "picture" not in out
     assert [path.name for path in tmp_path.iterdir()] == ["stability.csv"]
     assert (tmp_path / "stability.csv").read_text() == "old"
@@ -309,16 +277,8 @@ def test_ctrl_c_leaves_the_old_files_and_no_process(
 
 
 def children(parent: int) -> list[int]:
-    """Processes that `parent` has started."""
-    found = []
-    for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = status.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[1]) == parent:
-            found.append(int(status.parent.name))
-    return found
+    """Processes that the one thread of `parent` has started."""
+    return list(map(int, Path(f"/proc/{parent}/task/{parent}/children").read_text().split()))
 
 
 def processor_s(process: int) -> float:
@@ -328,7 +288,3 @@ def processor_s(process: int) -> float:
     except OSError:
         return 0.0
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def test_this_process_is_a_child() -> None:
-    assert os.getpid() in children(os.getppid())

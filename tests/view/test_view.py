@@ -6,8 +6,6 @@ import os
 import re
 import signal
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -22,8 +20,7 @@ from starlette.websockets import WebSocketDisconnect
 
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
-from command_line import Done, assert_one_line
-from ohmskin.emulate.board import PtyServer
+from command_line import Command, Done, Run, assert_one_line, finish, python
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.record.recorder import Recorder
@@ -31,6 +28,7 @@ from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards, server
 from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
 from ohmskin.view.server import make_app
+from ports import Serve
 from waiting import until
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
@@ -97,6 +95,13 @@ class Page:
         self.say(**message)
         return self.until(lambda answer: answer["kind"] == "notice")
 
+    def refused(self, words: str, **message: object) -> Message:
+        """The answer to a command that is refused with these words."""
+        answer = self.command(**message)
+        assert not answer["good"]
+        assert words in answer["text"]
+        return answer
+
 
 def decode(octets: bytes) -> Message:
     """As the page does it: see `ohmskin.view.boards.Shown`."""
@@ -124,6 +129,11 @@ def panel(client: TestClient, number: int = 0, **headers: str) -> Iterator[Page]
     given = {"host": HOST, "origin": ORIGIN, **headers}
     with client.websocket_connect(f"/boards/{number}", headers=given) as socket:
         yield Page(socket)
+
+
+def assert_refused(client: TestClient, path: str = "/boards/0", **headers: str) -> None:
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect(path, headers=headers):
+        pass
 
 
 # --------------------------------------------------------------------------------------- scans
@@ -232,9 +242,7 @@ def test_a_method_is_switched_and_back() -> None:
         assert "force" not in scan
         assert scan["touched"].sum() > 3
         assert page.state["method"] == "ohm"
-        answer = page.command(do="method", method="magic")
-        assert not answer["good"]
-        assert "joint" in answer["text"]
+        page.refused("joint", do="method", method="magic")
         assert page.command(do="method", method="touch")["good"]
         assert "force" in page.scan(lambda scan: scan["method"] == "touch")
 
@@ -244,10 +252,8 @@ def test_tare_is_refused_while_something_touches_the_skin(calibrated: bool) -> N
     known = [of_scene("ghost")] if calibrated else []
     with served(GHOST, calibrations=known) as client, panel(client) as page:
         page.scan()
-        answer = page.command(do="tare", force=False)
-        assert not answer["good"]
-        assert answer["refused"] == "tare"
-        assert "cells (2, 2), (2, 5), (5, 2) are touched" in answer["text"]
+        words = "cells (2, 2), (2, 5), (5, 2) are touched"
+        assert page.refused(words, do="tare", force=False)["refused"] == "tare"
         assert not page.state["tared"]
         assert page.command(do="tare", force=True)["good"]
         page.until_state(lambda state: state["tared"])
@@ -255,9 +261,7 @@ def test_tare_is_refused_while_something_touches_the_skin(calibrated: bool) -> N
         assert page.command(do="undo")["good"]
         page.scan(lambda scan: scan["touched"].sum() == 3)
         assert not page.state["tared"]
-        answer = page.command(do="undo")
-        assert not answer["good"]
-        assert "no tare" in answer["text"]
+        page.refused("no tare", do="undo")
 
 
 def test_a_tare_makes_a_conductance_certain() -> None:
@@ -275,19 +279,16 @@ def test_one_thing_at_a_time() -> None:
     with served(REST) as client, panel(client) as page, panel(client) as other:
         page.scan()
         page.say(do="tare", force=False)
-        refused = page.command(do="record")
-        assert not refused["good"]
-        assert "one thing at a time" in refused["text"]
-        refused = other.command(do="tare", force=False)
-        assert "one thing at a time" in refused["text"]
+        page.refused("one thing at a time", do="record")
+        other.refused("one thing at a time", do="tare", force=False)
         assert page.until(lambda message: message["kind"] == "notice")["good"]
 
 
 def test_a_recording_holds_every_scan_tare_and_mark(tmp_path: Path) -> None:
     with served(REST, folder=tmp_path) as client, panel(client) as page:
         page.scan()
-        assert "start one first" in page.command(do="mark", text="too soon")["text"]
-        assert "nothing" in page.command(do="stop")["text"]
+        page.refused("start one first", do="mark", text="too soon")
+        page.refused("nothing", do="stop")
         assert page.command(do="record")["good"]
         assert "already" in page.command(do="record")["text"]
         path = Path(page.state["recording"])
@@ -322,9 +323,7 @@ def test_a_recording_holds_every_scan_tare_and_mark(tmp_path: Path) -> None:
 def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     with served(REST, folder=tmp_path / "none") as client, panel(client) as page:
         page.scan()
-        answer = page.command(do="record")
-        assert not answer["good"]
-        assert "cannot be written" in answer["text"]
+        page.refused("cannot be written", do="record")
         assert not page.state["recording"]
         page.scan()
 
@@ -333,7 +332,7 @@ def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 
 
 def test_a_board_that_is_pulled_out_comes_back_by_itself(
-    pty_board: Callable[[str], PtyServer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pty_board: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(boards, "AGAIN_S", 0.1)
     port = tmp_path / "skin"
@@ -362,6 +361,9 @@ def test_a_board_that_is_pulled_out_comes_back_by_itself(
         assert page.scan()["method"] == "matrix"
 
 
+BAD_PORTS = ("", "[]", "{", '{"port": 3}', '{"port": " "}', '{"port": "a\\u0000"}', "[" * 5000)
+
+
 def test_a_port_is_opened_and_closed_from_the_page() -> None:
     with served() as client:
         assert client.get("/boards").json() == []
@@ -369,15 +371,7 @@ def test_a_port_is_opened_and_closed_from_the_page() -> None:
             {"path", "description", "board"} == set(port) for port in client.get("/ports").json()
         )
         own = {"origin": ORIGIN}
-        for body in (
-            "",
-            "[]",
-            "{",
-            '{"port": 3}',
-            '{"port": " "}',
-            '{"port": "a\\u0000"}',
-            "[" * 5000,
-        ):
+        for body in BAD_PORTS:
             answer = client.post("/boards", content=body, headers=own)
             assert answer.status_code == 400, body
             assert answer.json()["error"]
@@ -393,8 +387,7 @@ def test_a_port_is_opened_and_closed_from_the_page() -> None:
             assert closed.value.code == 4001
         assert client.get("/boards").json() == []
         assert client.post("/boards", json={"port": REST}, headers=own).json()["number"] == 1
-        with pytest.raises(WebSocketDisconnect), panel(client, 0):
-            pass
+        assert_refused(client, host=HOST, origin=ORIGIN)
 
 
 def test_there_is_a_limit_of_boards(tmp_path: Path) -> None:
@@ -440,10 +433,10 @@ def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> No
             if recorder.scans == 30:
                 break
     with served(f"replay://{path}") as client, panel(client) as page:
+        assert page.scan()["touched"].sum() == 3
         state = page.until_state(lambda state: state["status"] == "ended")
         assert "played to its end" in state["text"]
         assert state["tared"]
-        assert page.scan()["touched"].sum() == 3
 
 
 def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Path) -> None:
@@ -491,11 +484,7 @@ def test_a_foreign_name_is_refused(host: str) -> None:
     with served() as client:
         for path in ("/", "/boards", "/ports", "/page.js"):
             assert client.get(path, headers={"host": host}).status_code == 403
-        with (
-            pytest.raises(WebSocketDisconnect),
-            panel(client, 0, host=host, origin=f"http://{host}"),
-        ):
-            pass
+        assert_refused(client, host=host, origin=f"http://{host}")
 
 
 @pytest.mark.parametrize("name", ["localhost:8765", "127.0.0.1:9000", "[::1]:8765", "LOCALHOST"])
@@ -511,8 +500,7 @@ def test_names_of_this_machine_are_known_at_any_port(name: str) -> None:
 )
 def test_another_page_is_refused(origin: str) -> None:
     with served(REST) as client:
-        with pytest.raises(WebSocketDisconnect), panel(client, 0, origin=origin):
-            pass
+        assert_refused(client, host=HOST, origin=origin)
         headers = {"origin": origin}
         assert client.get("/boards", headers=headers).status_code == 403
         assert client.post("/boards", json={"port": GHOST}, headers=headers).status_code == 403
@@ -523,11 +511,7 @@ def test_another_page_is_refused(origin: str) -> None:
 def test_nobody_commands_without_saying_who_asks() -> None:
     with served(REST) as client:
         assert client.post("/boards", json={"port": GHOST}).status_code == 403
-        with (
-            pytest.raises(WebSocketDisconnect),
-            client.websocket_connect("/boards/0", headers={"host": HOST}),
-        ):
-            pass
+        assert_refused(client, host=HOST)
 
 
 def test_beyond_loopback_the_token_is_asked_for() -> None:
@@ -542,17 +526,8 @@ def test_beyond_loopback_the_token_is_asked_for() -> None:
             assert client.get(f"{path}?token=secret").status_code == 200
         assert client.get("/page.js").status_code == 200  # the page asks for it without
         for wrong in ("", "?token=", "?token=%C3%A9"):
-            with (
-                pytest.raises(WebSocketDisconnect),
-                client.websocket_connect(f"/boards/0{wrong}", headers=headers),
-            ):
-                pass
-        foreign = {**headers, "origin": "http://evil.example"}
-        with (
-            pytest.raises(WebSocketDisconnect),
-            client.websocket_connect("/boards/0?token=secret", headers=foreign),
-        ):
-            pass
+            assert_refused(client, f"/boards/0{wrong}", **headers)
+        assert_refused(client, "/boards/0?token=secret", host=host, origin="http://evil.example")
         with client.websocket_connect("/boards/0?token=secret", headers=headers) as socket:
             Page(socket).scan()
 
@@ -577,11 +552,8 @@ def test_the_page_is_small_and_asks_no_other_host() -> None:
 # ---------------------------------------------------------------------------- the command itself
 
 
-def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(
-    command: Callable[..., subprocess.Popen[str]],
-) -> None:
+def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) -> None:
     process = command("view", REST, "--http-port", "0", "--no-browser")
-    assert process.stdout is not None
     url = process.stdout.readline().strip()
     port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)/", url)[1])  # type: ignore[index]
     if Path("/proc/net/tcp").exists():
@@ -589,8 +561,7 @@ def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(
     with urlopen(url) as page:
         assert page.status == 200
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, out, err) == (0, "", "")
+    assert finish(process) == Done(0, "", "")
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
@@ -607,7 +578,7 @@ def listening(pid: int) -> set[tuple[str, int]]:
     return found
 
 
-def test_a_port_that_is_taken(run: Callable[..., Done]) -> None:
+def test_a_port_that_is_taken(run: Run) -> None:
     import socket
 
     with ExitStack() as stack:
@@ -620,11 +591,4 @@ def test_a_port_that_is_taken(run: Callable[..., Done]) -> None:
 
 def test_without_the_extra_it_says_what_to_install() -> None:
     program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__"
-    host = str(Path(ohmskin.__file__).parents[1])
-    done = subprocess.run(
-        [sys.executable, "-c", program, "view"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": host},
-    )
-    assert_one_line(Done(done.returncode, done.stdout, done.stderr), "pip install 'ohmskin[view]'")
+    assert_one_line(python("-c", program, "view"), "pip install 'ohmskin[view]'")

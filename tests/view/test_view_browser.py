@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 import uvicorn
 
-import ohmskin
 from calibrations import of_scene
-from ohmskin.emulate.board import PtyServer
+from command_line import ENVIRONMENT
 from ohmskin.record.recording import load_recording
 from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.server import make_app
+from ports import Serve
 
 pytestmark = pytest.mark.browser
 
@@ -37,7 +37,6 @@ class Server:
     """``ohmskin view`` as a process; without boards until a page opens one."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
-        host = str(Path(ohmskin.__file__).parents[1])
         self.folder = folder
         self.process = subprocess.Popen(
             [
@@ -45,12 +44,11 @@ class Server:
                 *("--http-port", "0", "--no-browser", *arguments),
             ],
             cwd=folder,
-            env={**os.environ, "PYTHONPATH": host},
+            env=ENVIRONMENT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
 
     def end(self) -> tuple[int, str]:
@@ -247,7 +245,7 @@ def test_a_recording_is_made_and_marked(page: Any, server: Server) -> None:
 
 
 def test_a_board_that_is_pulled_out_is_said_and_comes_back(
-    page: Any, pty_board: Callable[[str], PtyServer], tmp_path: Path
+    page: Any, pty_board: Serve, tmp_path: Path
 ) -> None:
     port = tmp_path / "skin"
     first = pty_board(GHOST)

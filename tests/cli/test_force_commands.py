@@ -2,7 +2,6 @@
 """Forces on the command line: ``stream --calibration`` and ``tare``."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +9,11 @@ import numpy as np
 import pytest
 
 from calibrations import of_scene
-from command_line import Done, assert_one_line
+from command_line import Run, assert_one_line, well
 from ohmskin.force.calibration import load_calibration
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?seed=1"
-
-GHOST = "emulator://8x8?scene=ghost&seed=1"
 
 
 @pytest.fixture
@@ -26,9 +23,8 @@ def skin(tmp_path: Path) -> Path:
     return path
 
 
-def test_stream_json_has_forces(run: Callable[..., Done], skin: Path) -> None:
-    done = run("stream", GHOST, "--calibration", str(skin), "--scans", "3", "--json")
-    assert (done.code, done.err) == (0, "")
+def test_stream_json_has_forces(run: Run, skin: Path) -> None:
+    done = well(run("stream", GHOST, "--calibration", str(skin), "--scans", "3", "--json"))
     scans = [json.loads(line) for line in done.out.splitlines()]
     assert len(scans) == 3
     for scan in scans:
@@ -40,31 +36,29 @@ def test_stream_json_has_forces(run: Callable[..., Done], skin: Path) -> None:
         assert (first["row"], first["column"]) == (2.0, 2.0)
 
 
-def test_stream_shows_newtons_and_contacts(run: Callable[..., Done], skin: Path) -> None:
-    done = run("stream", GHOST, "--calibration", str(skin), "--scans", "30")
-    assert (done.code, done.err) == (0, "")
+def test_stream_shows_newtons_and_contacts(run: Run, skin: Path) -> None:
+    done = well(run("stream", GHOST, "--calibration", str(skin), "--scans", "30"))
     assert "force by 'touch' [N]" in done.out
     assert "contact 1: 1.6" in done.out
     assert "at (5.0, 2.0)" in done.out
 
 
-def test_stream_tares(run: Callable[..., Done], skin: Path) -> None:
+def test_stream_tares(run: Run, skin: Path) -> None:
     arguments = ("stream", "--calibration", str(skin), "--tare", "0.1", "--scans", "20")
     assert "no contact" in run(*arguments, REST).out
     assert_one_line(run(*arguments, GHOST), "cells (2, 2), (2, 5), (5, 2) are touched")
     assert load_calibration(skin).tare is None
 
 
-def test_stream_without_a_calibration_can_be_told_rest(run: Callable[..., Done]) -> None:
+def test_stream_without_a_calibration_can_be_told_rest(run: Run) -> None:
     stds = []
     for rest in ((), ("--tare", "0.2")):
-        done = run("stream", REST, "--scans", "1", "--json", *rest)
-        assert (done.code, done.err) == (0, "")
+        done = well(run("stream", REST, "--scans", "1", "--json", *rest))
         stds.append(np.median(json.loads(done.out)["cell_siemens_std"]))
     assert stds[1] < 0.8 * stds[0]
 
 
-def test_wrong_streams(run: Callable[..., Done], skin: Path) -> None:
+def test_wrong_streams(run: Run, skin: Path) -> None:
     calibrated = ("--calibration", str(skin))
     for arguments, words in (
         ((GHOST, "--method", "joint", *calibrated), ["either --method or --calibration"]),
@@ -73,30 +67,24 @@ def test_wrong_streams(run: Callable[..., Done], skin: Path) -> None:
         ((GHOST, "--calibration", "none.json"), ["none.json: cannot be read"]),
     ):
         assert_one_line(run("stream", "--scans", "1", *arguments), *words)
-    done = run("stream", "--scans", "1", "emulator://8x8?unit=5", *calibrated, "--force")
-    assert (done.code, done.err) == (0, "")
+    well(run("stream", "--scans", "1", "emulator://8x8?unit=5", *calibrated, "--force"))
 
 
-def test_tare_lasts_and_is_undone(run: Callable[..., Done], skin: Path) -> None:
+def test_tare_lasts_and_is_undone(run: Run, skin: Path) -> None:
     before = load_calibration(skin)
     lower = replace(before, rest=replace(before.rest, level=0.9 * before.rest.level))
     lower.save(skin)
-    done = run("tare", REST, str(skin), "--seconds", "0.3")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("tare", REST, str(skin), "--seconds", "0.3"))
     assert "skin.json: tared, largest force before it 0.00" in done.out
     tared = load_calibration(skin).tare
-    assert tared is not None
     # The same skin as was calibrated.
     np.testing.assert_allclose(tared.level, before.rest.level, rtol=0.05, atol=5e-8)
-    done = run("tare", REST, str(skin), "--undo")
-    assert (done.code, done.err) == (0, "")
+    done = well(run("tare", REST, str(skin), "--undo"))
     assert load_calibration(skin).tare is None
     assert_one_line(run("tare", REST, str(skin), "--undo"), "there is no tare to undo")
 
 
-def test_tare_is_refused_while_something_touches_the_skin(
-    run: Callable[..., Done], skin: Path
-) -> None:
+def test_tare_is_refused_while_something_touches_the_skin(run: Run, skin: Path) -> None:
     before = skin.read_bytes()
     arguments = ("tare", GHOST, str(skin), "--seconds", "0.1")
     assert_one_line(run(*arguments), "cells (2, 2), (2, 5), (5, 2) are touched")

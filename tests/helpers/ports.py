@@ -1,0 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Types of the fixtures in conftest.py that give ports, and how Arduino's boards are known."""
+
+from collections.abc import Callable
+
+from ohmskin.emulate.board import PtyServer
+
+Serve = Callable[..., PtyServer]
+Attach = Callable[..., None]
+# Vendor and product of USB bridges, as in boards.txt of Arduino's AVR core.
+USB_IDS = {"uno": (0x2341, 0x0043), "megaatmega2560": (0x2341, 0x0042), "": (None, None)}

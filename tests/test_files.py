@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever is saved: the file is whole, or the old one."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrations import of_scene
+from ohmskin.calibrate.tables import PRESS, save_press_table
+from ohmskin.record.readings import save_arrays
+from studies.commands import save_whole
+
+SAVERS: dict[str, Callable[[Path], object]] = {
+    "bytes": lambda path: save_whole({path: b"new", path.with_name("second"): b"new"}),
+    "calibration": lambda path: of_scene("rest").save(path),
+    "presses": lambda path: save_press_table(path, np.zeros(3, PRESS)),
+    "readings": lambda path: save_arrays(path, {"chi2": np.zeros(3)}),
+}
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("what", SAVERS)
+def test_a_file_that_cannot_be_written_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str, error: BaseException
+) -> None:
+    path = tmp_path / "file"
+    path.write_text("old")
+
+    def fail(_: int) -> None:
+        raise error
+
+    monkeypatch.setattr("os.fsync", fail)
+    said = {OSError: ": cannot be written: No space left on device"}.get(type(error))
+    with pytest.raises(ValueError if said else type(error), match=said):
+        SAVERS[what](path)
+    assert [each.read_text() for each in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize("what", SAVERS)
+def test_a_place_that_is_not_there_is_named(tmp_path: Path, what: str) -> None:
+    with pytest.raises(ValueError, match="no/file: cannot be written: No such file or directory"):
+        SAVERS[what](tmp_path / "no" / "file")
