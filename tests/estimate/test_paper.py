@@ -111,13 +111,13 @@ def test_every_state_of_a_solution_is_a_circuit_that_gives_its_reading() -> None
 
 
 def test_the_start_is_a_simulated_circuit() -> None:
-    """A cell of 20.3 kOhm, and wires of 100 ohm: the potentials are those of the circuit."""
+    """A cell of 20.3 kOhm: the potentials are those of the circuit without wires."""
     x = initial_states(np.array([[0.0203]]), (0.03, 0.03), 1e-4)
     logarithms, potentials = x[:, :3], x[:, 3:]
     np.testing.assert_allclose(np.exp(logarithms[:, :2]), 1e-4)
     np.testing.assert_allclose(np.exp(logarithms[:, 2]), 0.0203)
-    current = 1 / (0.06 + 0.0205)
-    high, low = 1 - current * 0.0301, current * 0.0301
+    current = 1 / (0.06 + 0.0203)
+    high, low = 1 - current * 0.03, current * 0.03
     expected = [(high, low) if top_high else (low, high) for top_high in TOP_IS_HIGH]
     np.testing.assert_allclose(potentials, expected, rtol=1e-9)
     np.testing.assert_array_equal(TOP_IS_HIGH, [True, True, False, False])

@@ -52,20 +52,17 @@ NEARLY: Final = 3.0
 HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
 CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
-LESSON: Final = 0.25  # share of the noise's variance: wires learn from what they move by more
-MAX_LESSON: Final = 32  # readings that wires learn from, the best
 _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
 
 
 @dataclass(frozen=True, eq=False)
 class _Slopes:
-    """h and J at one state, over the noise. by_cell: (RC, RC), times the cells' deviations.
+    """The residual y - h, and J, at one state. by_cell: (RC, RC), times the cells' deviations.
 
     centre, cell_std: the normal that stands for the prior of the cells there. heavy: (m,), the
     ports that wires matter to; by_wires: (m, 2RC).
     """
 
-    modelled: Float
     residual: Float
     centre: Float
     cell_std: Float
@@ -130,7 +127,7 @@ class FullFit:
         by_wires = circuit.by_wires(heavy)
         by_wires *= slope[heavy, None]
         residual = (self._current - modelled) * self._weight
-        self._here = _Slopes(modelled, residual, centre, cell_std, by_cell, heavy, by_wires)
+        self._here = _Slopes(residual, centre, cell_std, by_cell, heavy, by_wires)
         self._cost = float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
 
     def _minimise(self) -> None:
@@ -234,10 +231,7 @@ class FullFit:
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings that wires matter to, for the belief."""
         here = self._here
-        seen = self._belief.variance(here.by_wires)
-        kept = np.argsort(seen)[-MAX_LESSON:]
-        kept = kept[seen[kept] > LESSON]
-        ports, slopes = here.heavy[kept], here.by_wires[kept]
+        ports, slopes = here.heavy, here.by_wires
         residual = here.residual[ports] + slopes @ (self.wires - self._belief.mean)
         # A touched cell is noise without limit; one at rest is known to its drift.
         unknown = self._hidden | (np.abs(self._prior.rise(self.cell)) > TOUCHED)

@@ -57,11 +57,12 @@ from ohmskin.circuit.skin import (
     READINGS_PER_CELL,
     Skin,
     current_from_ratio,
+    port_potential,
     ratio_from_current,
     readings,
 )
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
-from ohmskin.estimate.matrix import CellFit
+from ohmskin.estimate.matrix import CellFit, solve_ports
 from ohmskin.estimate.port_readings import PortReadings
 
 OHM_PER_MEGOHM: Final = 1e6
@@ -292,40 +293,27 @@ def initial_states(
     wire = np.full(cells, wire_megohm)
     states = np.empty((cells, READINGS_PER_CELL, 5 * cells))
     states[..., : 3 * cells] = np.log(np.concatenate([wire, wire, cell.T.ravel()]))
-    high_top = _potentials(cell, reference_megohm, wire_megohm)
+    high_top = _potentials(cell, reference_megohm)
     # Exchanging high and low mirrors every potential.
     for k in range(READINGS_PER_CELL):
         states[:, k, 3 * cells :] = high_top if TOP_IS_HIGH[k] else 1.0 - high_top
     return states.reshape(READINGS_PER_CELL * cells, 5 * cells)
 
 
-def _potentials(cell: Float, reference_megohm: tuple[float, float], wire_megohm: float) -> Float:
+def _potentials(cell_megohm: Float, reference_megohm: tuple[float, float]) -> Float:
     """Node potentials V^t, V^b with the top pin high, shape (N, 2N), cells in column-major order.
 
-    Solves the 2N-node Laplacian [microsiemens] once for each selected cell.
+    Without wires, the nodes of a stripe have the potential of its electrode.
     """
-    rows, columns = cell.shape
-    cells = rows * columns
-    node = np.arange(2 * cells).reshape(2, columns, rows)
-    laplacian = np.zeros((2 * cells, 2 * cells))
-    for one, other, megohm in (
-        (node[0], node[1], cell.T),
-        (node[0, 1:], node[0, :-1], wire_megohm),
-        (node[1, :, 1:], node[1, :, :-1], wire_megohm),
-    ):
-        for first, second in ((one, other), (other, one)):
-            laplacian[first, first] += 1.0 / megohm
-            laplacian[first, second] -= 1.0 / megohm
-    system = np.repeat(laplacian[None], cells, axis=0)
-    injected = np.zeros((cells, 2 * cells, 1))
-    selected = np.arange(cells)
-    column, row = np.divmod(selected, rows)
-    by_top, by_bottom = (1.0 / (wire_megohm + ohm) for ohm in reference_megohm)
-    at_top, at_bottom = node[0, 0, row], node[1, column, 0]
-    system[selected, at_top, at_top] += by_top
-    system[selected, at_bottom, at_bottom] += by_bottom
-    injected[selected, at_top, 0] = by_top
-    return np.asarray(np.linalg.solve(system, injected)[..., 0], dtype=np.float64)
+    rows, columns = cell_megohm.shape
+    selected = np.arange(cell_megohm.size).reshape(rows, columns).T.ravel()
+    port_megohm, impedance = solve_ports(1.0 / cell_megohm)
+    current = 1.0 / (port_megohm.ravel() + sum(reference_megohm))
+    potential = (port_potential(impedance, rows) * current).T
+    ground = potential[np.arange(len(potential)), rows + np.arange(len(potential)) % columns]
+    potential += (reference_megohm[1] * current - ground)[:, None]
+    top, bottom = potential[selected, :rows], potential[selected, rows:]
+    return np.hstack([np.tile(top, columns), np.repeat(bottom, rows, axis=1)])
 
 
 # -------------------------------------------------------------------------------- the program
