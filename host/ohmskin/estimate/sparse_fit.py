@@ -64,11 +64,7 @@ MAX_ROUNDS: Final = 8  # of adding cells
 MAX_STEPS: Final = 8  # in a round
 MAX_STEP: Final = 1.5  # of a log conductance
 CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
-# Wires matter to a reading that they may move by the share HEAVY of its noise. The next ones, down
-# to the share LIGHT and up to MAX_HEAVY in all, tell a bend together that none tells alone.
-HEAVY: Final = 0.5
-LIGHT: Final = 0.03
-MAX_HEAVY: Final = 24
+HEAVY: Final = 0.1  # share of a reading's noise: wires matter to it if they may move it by more
 REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
 CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
@@ -344,8 +340,7 @@ class _Frame:
         skin = self._skin
         move = (self._current**2 - skin.current**2) * skin.path_ohm * skin.wire_std
         weight = move / self._std
-        least = np.partition(weight, -MAX_HEAVY)[-MAX_HEAVY] if weight.size > MAX_HEAVY else 0.0
-        heavy: NDArray[np.bool_] = weight > np.clip(least, LIGHT, HEAVY)
+        heavy: NDArray[np.bool_] = weight > HEAVY
         heavy[self.cells] = True
         return heavy
 
