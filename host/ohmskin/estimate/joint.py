@@ -32,7 +32,6 @@ from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
     REST_STD,
     TAIL,
-    TOUCHED,
     UNKNOWN_REST_STD,
     UNTOUCHED_OHM,
     UNTOUCHED_STD,
@@ -49,7 +48,6 @@ MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the 
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
-CLEAR: Final = 12.0  # deviations of the prior: a cell beyond them is touched beyond doubt
 FEW_TOUCHED: Final = 0.2  # share of the cells up to which `touch` is enough
 WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
 
@@ -85,7 +83,7 @@ class JointEstimator(Estimator):
         fit = self._fit(prior, ports, self._start(prior, ports, found))
         message = self._doubt(prior, fit)
         if not (ports.fault or message or fit.is_crowded):
-            self._learn(prior, fit.cell, fit.lesson)
+            self._learn(fit.cell, fit.lesson)
         return self._solution(
             ports,
             (fit.cell, fit.cell_std),
@@ -104,7 +102,7 @@ class JointEstimator(Estimator):
         cell, std = prior.expected.copy(), prior.std.copy()
         cell[found.cells], std[found.cells] = -found.log_siemens, found.log_std
         if found.cells.size > 1 and not ports.fault:
-            self._learn(prior, cell, lambda: found.lesson)
+            self._learn(cell, lambda: found.lesson)
         return self._solution(ports, (cell, std), self._belief.mean, found.current, found.steps)
 
     def _solution(
@@ -175,27 +173,12 @@ class JointEstimator(Estimator):
         """Whether few touched cells explain the frame."""
         return not found.contradicted and found.cells.size <= MOST_PER_LINE * sum(self._shape)
 
-    def _learn(self, prior: CellPrior, cell: Float, lesson: Callable[[], Lesson]) -> None:
-        """Let the wires learn from a plain frame that is not like the last one learned from."""
+    def _learn(self, cell: Float, lesson: Callable[[], Lesson]) -> None:
+        """Let the wires learn from a frame that is not like the last one learned from."""
         before = self._learned_from
-        if not self._is_plain(prior.rise(cell).reshape(self._shape)):
-            return
-        if before is not None and np.abs(cell - before).max() < NEWS:
-            return
-        self._learned_from = cell
-        self._belief.learn(*lesson())
-
-    @staticmethod
-    def _is_plain(rise: Float) -> bool:
-        """Whether cells (R, C) are at rest or touched beyond doubt, and no finger covers several.
-
-        Around a finger that covers several cells others are pressed so lightly that they pass for
-        rest, all of them in the same direction: the wires would have to explain it.
-        """
-        touched = rise > TOUCHED
-        light = touched & (rise < CLEAR)
-        beside = np.sum(touched[1:] & touched[:-1]) + np.sum(touched[:, 1:] & touched[:, :-1])
-        return not light.any() and bool(beside <= 1)
+        if before is None or np.abs(cell - before).max() >= NEWS:
+            self._learned_from = cell
+            self._belief.learn(*lesson())
 
     def _prior_of(self, current: Float) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.
