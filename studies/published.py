@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.circuit.skin import Skin
+from studies.trials import uniform_skin
 
 # [ms] a frame, 2x2, on an AMD 7940HS: 40 for step 3, and 50 more for step 4.
 TIME_2X2_MS: Final = {"lsq": 40.0, "regularized": 90.0}
@@ -70,7 +71,7 @@ def sweep(name: str) -> list[tuple[Skin, Skin]]:
     for condition_ohm in 1e6 * np.array(CONDITIONS_MEGOHM[name]):
         pressed_ohm = condition_ohm if name == "cell_sweep" else _PRESSED_OHM
         wire_ohm = _WIRE_OHM if name == "cell_sweep" else condition_ohm
-        rest = Skin.uniform(3, 3, rest_ohm=1e6, top_wire_ohm=wire_ohm, bottom_wire_ohm=wire_ohm)
+        rest = uniform_skin((3, 3), 1e-6, (wire_ohm, wire_ohm))
         cell_siemens = rest.cell_siemens.copy()
         cell_siemens[_PRESSED] = 1 / pressed_ohm
         pairs.append((Skin(cell_siemens, rest.top_wire_ohm, rest.bottom_wire_ohm), rest))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The forward model against files of ngspice and hand arithmetic."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from places import DATA
+from studies.trials import uniform_skin
 
 REFERENCE_FILES = sorted(DATA.glob("*_[0-9]x[0-9].npz"))
 
@@ -31,7 +33,7 @@ def random_skin(rows: int, columns: int, seed: int) -> Skin:
 
 
 def test_all_reference_files_are_there() -> None:
-    assert len(REFERENCE_FILES) == 7
+    assert len(REFERENCE_FILES) == 8
 
 
 @pytest.mark.parametrize("path", REFERENCE_FILES, ids=lambda path: path.stem)
@@ -50,9 +52,7 @@ def test_readings_agree_with_ngspice(path: Path) -> None:
 
 
 def test_one_cell_is_a_series_circuit() -> None:
-    skin = Skin.uniform(
-        1, 1, rest_ohm=39_700, top_wire_ohm=100, bottom_wire_ohm=200, ref_bottom_ohm=20_000
-    )
+    skin = replace(uniform_skin((1, 1), 1 / 39_700, (100, 200)), ref_bottom_ohm=20_000)
     assert port_resistance_ohm(skin) == pytest.approx(40_000)
     # 1 V over 30 + 40 + 20 kOhm.
     np.testing.assert_allclose(readings(skin)[0, 0], [6 / 9, 2 / 9, 7 / 9, 3 / 9], rtol=1e-12)
@@ -77,7 +77,7 @@ def test_one_row_adds_the_segments_up_to_the_cell() -> None:
 
 
 def test_open_cells_give_inf_ports_and_readings_at_the_rails() -> None:
-    skin = Skin.uniform(3, 2, rest_ohm=np.inf)
+    skin = uniform_skin((3, 2), 0.0)
     assert np.all(np.isinf(port_resistance_ohm(skin)))
     np.testing.assert_array_equal(readings(skin), np.broadcast_to([1, 0, 1, 0], (3, 2, 4)))
 

@@ -339,24 +339,27 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
 
 
 class AddedMeanwhile(io.FileIO):
-    """While its second write goes on, the first after the board's hello, another thread adds."""
+    """While its next write goes on, another thread adds."""
 
-    writes = 0
-    other: threading.Thread
+    other: threading.Thread | None = None
     is_kept_waiting = False
 
     def write(self, octets: object) -> int:
-        self.writes += 1
-        if self.writes == 2:
+        if self.other is not None and self.other.ident is None:
             self.other.start()
             self.other.join(0.2)  # an `add` that waits for nobody takes less
             self.is_kept_waiting = self.other.is_alive()
         return super().write(octets)  # type: ignore[arg-type]
 
 
-def test_one_thread_writes_at_a_time(path: Path, hello: Hello) -> None:
+def test_one_thread_writes_at_a_time(
+    path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = AddedMeanwhile(path, "wb")
-    with Recorder(path, hello, file=file) as recorder:
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", lambda path, mode: io.BufferedWriter(file))
+        recorder = Recorder(path, hello)
+    with recorder:
         file.other = threading.Thread(target=recorder.add, args=(scan(1),))
         recorder.add(scan(0))
         until(lambda: recorder.scans == 2)

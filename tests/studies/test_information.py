@@ -16,6 +16,7 @@ from ohmskin.estimate.prior import (
     UNKNOWN_REST_STD,
 )
 from studies.information import PRESSED_STD, information_limit
+from studies.trials import uniform_skin
 
 NOMINAL = {"nominal_wire_ohm": WireOhm(100.0, 200.0)}
 
@@ -97,9 +98,9 @@ def test_pressed_cells_are_found_by_their_conductance() -> None:
 @pytest.mark.parametrize(
     ("skin", "pressed", "words"),
     [
-        (Skin.uniform(2, 3), None, "another size"),
-        (Skin.uniform(2, 2, rest_ohm=np.inf), None, "open"),
-        (Skin.uniform(2, 2), np.zeros((3, 3), bool), "pressed has shape"),
+        (uniform_skin((2, 3)), None, "another size"),
+        (uniform_skin((2, 2), 0.0), None, "open"),
+        (uniform_skin((2, 2)), np.zeros((3, 3), bool), "pressed has shape"),
     ],
 )
 def test_wrong_arguments(skin: Skin, pressed: NDArray[np.bool_] | None, words: str) -> None:

@@ -31,7 +31,7 @@ Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g),
 """
 
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,27 +80,6 @@ class Skin:
                 raise ValueError(f"{name} must be finite and not negative")
             resistances.setflags(write=False)
             object.__setattr__(self, name, resistances)
-
-    @classmethod
-    def uniform(
-        cls,
-        rows: int,
-        columns: int,
-        *,
-        rest_ohm: float = 1e6,
-        top_wire_ohm: float = 100.0,
-        bottom_wire_ohm: float = 200.0,
-        ref_top_ohm: float = DEFAULT_REF_OHM,
-        ref_bottom_ohm: float = DEFAULT_REF_OHM,
-    ) -> Self:
-        """An untouched skin: all cells `rest_ohm` (inf: open), all segments of a layer alike."""
-        if rows < 1 or columns < 1:
-            raise ValueError(f"a skin has at least 1 row and 1 column, not {rows}x{columns}")
-        if not rest_ohm > 0:
-            raise ValueError(f"rest_ohm must be positive, not {rest_ohm}")
-        layers = (1.0 / rest_ohm, top_wire_ohm, bottom_wire_ohm)
-        cell, top, bottom = (np.full((rows, columns), each) for each in layers)
-        return cls(cell, top, bottom, ref_top_ohm, ref_bottom_ohm)
 
     @property
     def shape(self) -> tuple[int, int]:
