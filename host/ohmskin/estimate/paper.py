@@ -51,12 +51,10 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
-    CONFIGURATIONS,
     READING_OFFSET,
     READING_SENSES_TOP,
     READINGS_PER_CELL,
     Skin,
-    current_from_ratio,
     port_potential,
     ratio_from_current,
     readings,
@@ -188,19 +186,18 @@ class PaperEstimator(Estimator):
 
     def _solve(self, ports: PortReadings) -> Solution:
         known = self.knowledge
+        current, message = self._feasible(ports.current)
         # The four readings of a cell as its one current gives them. The paper's states have no
         # noise: where four readings disagree, by a fraction of a code, no circuit gives them all.
-        consistent = ratio_from_current(ports.current, known.ref_top_ohm, known.ref_bottom_ohm)
-        feasible, message = self._feasible(consistent)
+        ratio = ratio_from_current(current, known.ref_top_ohm, known.ref_bottom_ohm)
         before, answers = self._previous, []
-        if before is not None and np.abs(feasible - before.ratio).max() < _JUMP_RATIO:
-            answers.append(self._answer(feasible, before.optima))
+        if before is not None and np.abs(ratio - before.ratio).max() < _JUMP_RATIO:
+            answers.append(self._answer(ratio, before.optima))
         if not answers or not answers[0].is_good_start:
-            current = current_from_ratio(feasible, known.ref_top_ohm, known.ref_bottom_ohm)
-            answers.append(self._answer(feasible, (), 1.0 / current - known.ref_ohm))
+            answers.append(self._answer(ratio, (), 1.0 / current - known.ref_ohm))
             if not answers[-1].is_good_start:
                 fit = CellFit(replace(ports, current=current), known.ref_ohm, None)
-                answers.append(self._answer(feasible, (), 1.0 / fit.cell))
+                answers.append(self._answer(ratio, (), 1.0 / fit.cell))
         # The best is the one whose readings are nearest to those that were read.
         answer = min(answers, key=lambda each: (not each.is_good_start, each.misfit_ratio))
         self._previous = answer if answer.is_good_start else None
@@ -246,25 +243,20 @@ class PaperEstimator(Estimator):
         skin = Skin(1.0 / cell, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
         return _Answer(ratio, tuple(optima), skin, readings(skin))
 
-    def _feasible(self, ratio: Float) -> tuple[Float, str]:
-        """The readings within what some circuit within the bounds allows; what was wrong, if."""
+    def _feasible(self, current: Float) -> tuple[Float, str]:
+        """The currents (R, C) [S] within what some circuit allows; which one was not, if any."""
         known = self.knowledge
-        cells = known.rows * known.columns
         # The port of a skin whose cells are all alike and whose wires are zero.
-        most_megohm = _MOST_CELL_MEGOHM * (known.rows + known.columns - 1) / cells
-        ports_ohm = OHM_PER_MEGOHM * np.array([_LEAST_PORT_MEGOHM, most_megohm])
-        limits = ratio_from_current(
-            1.0 / (ports_ohm + known.ref_ohm), known.ref_top_ohm, known.ref_bottom_ohm
-        )
-        feasible = np.clip(ratio, limits.min(axis=0), limits.max(axis=0))
-        excess = np.abs(ratio - feasible)
-        if excess.max() <= _FAULT_STDS * known.ratio_std:
+        share = (known.rows + known.columns - 1) / (known.rows * known.columns)
+        ports_ohm = OHM_PER_MEGOHM * np.array([_MOST_CELL_MEGOHM * share, _LEAST_PORT_MEGOHM])
+        feasible = np.clip(current, *1.0 / (ports_ohm + known.ref_ohm))
+        excess = np.abs(current - feasible)
+        if excess.max() <= _FAULT_STDS * known.current_std:
             return feasible, ""
-        row, column, k = (int(n) for n in np.unravel_index(int(np.argmax(excess)), excess.shape))
-        return feasible, (
-            f"reading {CONFIGURATIONS[k]} of cell ({row}, {column}) is none of a port from "
-            f"{ports_ohm[0]:.0f} ohm to {most_megohm:.3g} megohm"
-        )
+        row, column = np.unravel_index(int(excess.argmax()), excess.shape)
+        most, least = ports_ohm
+        said = f"is none of a port from {least:.0f} to {most:.3g} ohm"
+        return feasible, f"the current of cell ({row}, {column}) {said}"
 
 
 class LsqEstimator(PaperEstimator):
