@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
+from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

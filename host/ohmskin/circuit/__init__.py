@@ -2,8 +2,8 @@
 """From resistances to readings: the skin as a network of resistors.
 
 Takes the conductances of all cells and the resistances of all wire segments (`skin`), gives port
-resistances, their derivatives, and the four readings of every cell. `cholesky` and `blas` are how
-small matrices are solved fast.
+resistances, their derivatives, and the four readings of every cell. `small` solves matrices of
+this size fast.
 
 May import: `ohmskin.link` and what is below it.
 """

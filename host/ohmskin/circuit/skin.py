@@ -37,8 +37,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.blas import one_blas_thread
-from ohmskin.circuit.cholesky import cholesky, solve_lower
+from ohmskin.circuit.small import cholesky, one_blas_thread, solve_lower
 from ohmskin.link.protocol import ENUMS
 
 CONFIGURATIONS: Final = tuple(name.upper() for name in ENUMS["reading"].values)

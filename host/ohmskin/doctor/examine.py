@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from ohmskin.circuit.blas import one_blas_thread
+from ohmskin.circuit.small import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
 from ohmskin.doctor.findings import Diagnosis, Kind, Place
 from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.blas import one_blas_thread
 from ohmskin.circuit.skin import (
     CONFIGURATIONS,
     DEFAULT_REF_OHM,
@@ -24,6 +23,7 @@ from ohmskin.circuit.skin import (
     current_std,
     ratio_from_current,
 )
+from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello

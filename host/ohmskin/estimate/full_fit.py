@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.cholesky import cholesky, gram, solve, solve_lower
 from ohmskin.circuit.skin import port_sensitivity
+from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIDDEN,

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.cholesky import cholesky, gram, solve
+from ohmskin.circuit.small import cholesky, gram, solve
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read

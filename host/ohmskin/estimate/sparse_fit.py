@@ -43,8 +43,8 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.cholesky import cholesky, solve, solve_lower
 from ohmskin.circuit.skin import admittance_of, by_wires, factorised, impedance_of, port_potential
+from ohmskin.circuit.small import cholesky, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
