@@ -95,7 +95,7 @@ def test_everything_is_read_again(path: Path, hello: Hello) -> None:
         for each in scans:
             recorder.add(each)
         tare = Tare(np.mean([each.ratio for each in scans], axis=0), time.monotonic())
-        others = [Mark("pressed \u00fc", 1.5), ForceSample(0.25, 2.5, 1, 2, "scale")]
+        others = [Mark("pressed \u00fc", 1.5), ForceSample(0.25, 2.5, "scale")]
         for other in (tare, *others):
             recorder.add(other)
     found = load_recording(path)

@@ -45,10 +45,7 @@ from ohmskin.estimate.prior import (
 MAX_ITERATIONS: Final = 40
 MAX_HALVINGS: Final = 8  # of a step that goes too far
 MAX_STEP: Final = 1.5  # of a log resistance
-# A step that moves no reading and no cell by more than this share of its deviation is the last. So
-# is one of up to NEARLY deviations if it can be foreseen that the next will be such a step.
-CLOSE: Final = 0.3
-NEARLY: Final = 3.0
+CLOSE: Final = 1.0  # deviation of a reading or cell: a step that moves none by more is the last
 HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
 CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
@@ -133,7 +130,6 @@ class FullFit:
     def _minimise(self) -> None:
         # a of wires - mean = P a, which saves an inverse of P in the cost
         self._wire_pull = np.zeros_like(self.wires)
-        self._moved = 0.0
         self._evaluate()
         for _ in range(MAX_ITERATIONS):
             self.iterations += 1
@@ -189,9 +185,6 @@ class FullFit:
             float(np.abs(here.residual - left).max()),
             float(np.abs(cell_step / here.cell_std).max()),
         )
-        # Steps shrink faster than by a constant factor: the next one is at most this.
-        next_one = moved * moved / self._moved if self._moved else moved
-        self._moved = moved
         # What would leave its limits goes there, and holds up nothing else.
         cell_step = np.clip(self.cell + cell_step, *_LOG_CELL_LIMITS) - self.cell
         wire_step = np.clip(self.wires + wire_step, *LOG_LIMITS) - self.wires
@@ -201,7 +194,7 @@ class FullFit:
         self.wires = self.wires + share * wire_step
         self._wire_pull = self._wire_pull + share * (pull - self._wire_pull)
         self._residual = left if share == 1.0 else here.residual
-        return moved < CLOSE or (moved < NEARLY and next_one < CLOSE)
+        return moved < CLOSE
 
     def _conclude(self) -> None:
         """cell_std, from the last factor that was made.

@@ -41,21 +41,21 @@ from ohmskin.estimate.prior import (
     rest_level,
     siemens_std,
 )
-from ohmskin.estimate.sparse_fit import MOST_PER_LINE, SparseFit, Touched
+from ohmskin.estimate.sparse_fit import SparseFit, Touched
 
 LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
 MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
 NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
-FEW_TOUCHED: Final = 0.2  # share of the cells up to which `touch` is enough
-WIDEST_LOG_STD: Final = 0.3  # of a touched cell: beyond it the circuit is far from linear
 
 
 class JointEstimator(Estimator):
     """Gauss-Newton on all 3RC log resistances; learns the wires from frame to frame."""
 
     name: ClassVar[str] = "joint"
+    # The few touches that explain a frame are the answer, if they are known to this [log S].
+    widest_log_std: ClassVar[float] = -1.0
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
@@ -78,7 +78,8 @@ class JointEstimator(Estimator):
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
         prior = self._prior_of(current)
         found = self._finder.find(current, current_std) if self._finder is not None else None
-        if found is not None and self.knowledge.rest_ratio is not None and self._is_enough(found):
+        known = self.knowledge.rest_ratio is not None
+        if found is not None and known and found.log_std.max(initial=0.0) <= self.widest_log_std:
             return self._simple_solution(prior, found, ports)
         fit = self._fit(prior, ports, self._start(prior, ports, found))
         message = self._doubt(prior, fit)
@@ -93,10 +94,6 @@ class JointEstimator(Estimator):
             message,
             max(1.0, fit.misfit) ** 0.5,
         )
-
-    def _is_enough(self, found: Touched) -> bool:
-        """Whether the touched cells alone are the answer."""
-        return False
 
     def _simple_solution(self, prior: CellPrior, found: Touched, ports: PortReadings) -> Solution:
         cell, std = prior.expected.copy(), prior.std.copy()
@@ -160,7 +157,7 @@ class JointEstimator(Estimator):
         `matrix` finds: without wires, cells come out a little too soft, and from there a fit does
         not reach the distant answer of one hard touch behind long wires.
         """
-        if found is not None and self._explains(found):
+        if found is not None:
             start = prior.expected.copy()
             start[found.cells] = -found.log_siemens
             return start
@@ -168,10 +165,6 @@ class JointEstimator(Estimator):
         self._without_wires = None if fit.message else fit.cell
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
-
-    def _explains(self, found: Touched) -> bool:
-        """Whether few touched cells explain the frame."""
-        return not found.contradicted and found.cells.size <= MOST_PER_LINE * sum(self._shape)
 
     def _learn(self, cell: Float, lesson: Callable[[], Lesson]) -> None:
         """Let the wires learn from a frame that is not like the last one learned from."""
@@ -214,8 +207,4 @@ class TouchEstimator(JointEstimator):
     """The simplest model that explains a frame. Cells at rest are reported as at rest."""
 
     name: ClassVar[str] = "touch"
-
-    def _is_enough(self, found: Touched) -> bool:
-        known = found.log_std.max(initial=0.0) <= WIDEST_LOG_STD
-        few = found.cells.size <= FEW_TOUCHED * found.current.size
-        return few and known and self._explains(found)
+    widest_log_std: ClassVar[float] = 0.3  # beyond it the circuit is far from linear

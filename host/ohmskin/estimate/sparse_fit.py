@@ -143,16 +143,14 @@ class TouchedNetwork:
 class Touched:
     """What was found: cells (k,), their log conductance and its standard deviation (k,).
 
-    current: what the model predicts, wires corrected (RC,) [S]. contradicted: no touches explain
-    the readings. lesson: what the wires can learn from: Jw, r and N of the m ports, the touched
-    cells in N as noise without limit.
+    current: what the model predicts, wires corrected (RC,) [S]. lesson: what the wires can learn
+    from: Jw, r and N of the m ports, the touched cells in N as noise without limit.
     """
 
     cells: Cells
     log_siemens: Float
     log_std: Float
     current: Float
-    contradicted: bool
     steps: int
     lesson: Lesson
 
@@ -181,9 +179,8 @@ class SparseFit:
         self.wire_std = float(belief.std().max())
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
-        """The touched cells of one frame, (RC,) [S] both; None if no touches explain it."""
-        path_change = np.abs(self.belief.path_ohm(self.belief.mean) / self.path_ohm - 1.0)
-        if path_change.max() > REBUILD:
+        """The touched cells of one frame, (RC,) [S] both; None if no few touches explain it."""
+        if np.abs(self.belief.mean - self.log_wires).max() > REBUILD:
             self._solve_rest()
         frame = _Frame(self, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
@@ -191,7 +188,8 @@ class SparseFit:
         for _ in range(MAX_ROUNDS):
             asked, rise = frame.asked_for()
             if not asked.size:
-                return frame.finish()
+                few = frame.cells.size <= MOST_PER_LINE * sum(self.net.shape)
+                return frame.finish() if few else None
             cells = np.concatenate([frame.cells, asked])
             # Ghosts among them may leave again.
             if cells.size > 2 * MOST_PER_LINE * sum(self.net.shape):
@@ -287,14 +285,14 @@ class _Frame:
         asked = np.flatnonzero((map_ > 0) & (map_ >= SHARE * rival))
         return asked, rise[asked]
 
-    def finish(self) -> Touched:
-        """The last steps, with wires known to their covariance only, and what they leave."""
+    def finish(self) -> Touched | None:
+        """The last steps, with wires known to their covariance only; None if they contradict."""
         skin, cells = self._skin, self.cells
         if not cells.size:
             none = np.zeros(0)
             lesson = np.zeros((0, 2 * skin.current.size)), none, np.zeros((0, 0))
-            less = bool(self._residual.min() < -DEMAND)
-            return Touched(cells, none, none, self._current, less, 0, lesson)
+            less = self._residual.min() < -DEMAND
+            return None if less else Touched(cells, none, none, self._current, 0, lesson)
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
@@ -317,6 +315,10 @@ class _Frame:
         residual = self._residual[ports] - offset
         left = solve(factor, residual)
         spare = ports.size - cells.size  # degrees of freedom
+        if residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1):
+            return None
+        if self._residual[light].min(initial=0.0) < -DEMAND:
+            return None
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
         of_touches = slopes[:, ports]
@@ -327,10 +329,6 @@ class _Frame:
             log_siemens=self.log_siemens,
             log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
             current=current,
-            contradicted=bool(
-                residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1)
-                or self._residual[light].min(initial=0.0) < -DEMAND
-            ),
             steps=self.steps,
             lesson=(wires, residual, noise),
         )

@@ -83,12 +83,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class ForceSample:
-    """A reference force [N]; `row`, `column`: the cell it acts on, -1 where that is not known."""
+    """A reference force [N], and what measured it."""
 
     force_n: float
     host_time_s: float
-    row: int = -1
-    column: int = -1
     source: str = ""
 
 
@@ -107,7 +105,6 @@ _OF_TYPE: Final[dict[object, dict[str, Any]]] = {
     tuple[str, ...]: {"type": "array", "items": _TEXT},
 }
 _HOST_TIME: Final = _is("number", "host's monotonic clock [s]")
-_CELL: Final = _is("integer", "of the cell it acts on; -1: not known", minimum=-1)
 _SIZE: Final = {key: {"type": "integer", "minimum": 1} for key in ("rows", "columns")}
 _ORDER: Final = "row by row, in it column by column, A B C D of each cell"
 # By what follows `TOPIC`: the properties of its messages, in the words of JSON Schema.
@@ -130,8 +127,6 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     "force": {
         "host_time_s": _HOST_TIME,
         "force_n": _is("number", "reference force [N]"),
-        "row": _CELL,
-        "column": _CELL,
         "source": _is("string", "what measured it"),
     },
 }
