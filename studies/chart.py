@@ -179,10 +179,13 @@ class _Count:
     def __init__(self, progress: Progress | None, frames: int) -> None:
         self._progress, self._frames, self._done = progress, frames, 0
 
-    def frame(self, *_: int) -> None:
-        self._done += 1
-        if self._progress is not None:
-            self._progress(self._done, self._frames)
+    def watch(self, frames: Float) -> Iterator[Float]:
+        """Pass frames on, and count those that are done."""
+        for frame in frames:
+            yield frame
+            self._done += 1
+            if self._progress is not None:
+                self._progress(self._done, self._frames)
 
 
 @dataclass
@@ -245,7 +248,7 @@ def _random_rows(
     for trial in trials:
         readings = trial.rounded(bits)
         for method in plan.methods_for(size):
-            answers = estimate_file(readings, method, progress=count.frame)
+            answers = estimate_file(readings, method, watch=count.watch)
             tallies[method].add(answers, trial, plan.warm_up)
     limits = _limits(trials, bits, plan.warm_up)
     return [
@@ -289,7 +292,7 @@ def _sweep_rows(name: str, plan: Plan, count: _Count) -> list[Row]:
         wire_ohm = (float(rest.top_wire_ohm[0, 0]), float(rest.bottom_wire_ohm[0, 0]))
         trial = trial_of(rest, [pressed] * (plan.repeats + 1), wire_ohm)
         for method in plan.methods:
-            answers = estimate_file(trial.readings, method, cold=True, progress=count.frame)
+            answers = estimate_file(trial.readings, method, cold=True, watch=count.watch)
             tallies[method].add(answers, trial, 1)
     return [
         tally.row(scene=name, rows=3, columns=3, bits=None, method=method)

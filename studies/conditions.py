@@ -28,7 +28,8 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.emulate.faults import cut, joined_readings
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
-from ohmskin.link.codes import DEFAULT_ADC_BITS, quantise, ratio_from_codes
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.protocol import ADC_BITS
 from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest, touch
 
 Random = np.random.Generator
@@ -86,8 +87,8 @@ class Sweep:
 def converted(exact: Float, random: Random | None = None, noise_lsb: float = 0.0) -> Float:
     """10-bit readings, with this much normal noise before the converter."""
     if random is not None and noise_lsb:
-        exact = exact + noise_lsb / 2**DEFAULT_ADC_BITS * random.standard_normal(exact.shape)
-    return ratio_from_codes(quantise(exact, DEFAULT_ADC_BITS), DEFAULT_ADC_BITS)
+        exact = exact + noise_lsb / 2**ADC_BITS * random.standard_normal(exact.shape)
+    return ratio_from_codes(quantise(exact, ADC_BITS), ADC_BITS)
 
 
 def shorted_readings(skin: Skin, first: int, second: int) -> Float:
@@ -105,7 +106,7 @@ def _case(
         SkinKnowledge(
             rows,
             columns,
-            adc_bits=DEFAULT_ADC_BITS,
+            adc_bits=ADC_BITS,
             rest_ratio=rest_ratio,
             nominal_wire_ohm=WireOhm(wire_ohm[0], wire_ohm[1]),
         ),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ohmskin.estimate.methods import METHODS
 from ohmskin.record import readings as readings_module
@@ -59,8 +60,8 @@ def test_ratio_alone_is_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["random_2x2", "cell_sweep_3x3"])
 def test_estimates_have_the_arrays_of_the_format(method: str, name: str) -> None:
     readings = load_readings(DATA / f"{name}.npz")
-    seen: list[tuple[int, int]] = []
-    out = estimate_file(readings, method, progress=lambda done, of: seen.append((done, of)))
+    seen: list[NDArray[np.float64]] = []
+    out = estimate_file(readings, method, watch=lambda each: (seen.append(f) or f for f in each))
     frames, rows, columns, _ = readings.ratio.shape
     assert {name: array.shape for name, array in out.items()} == {
         name: (frames, rows, columns)[:ndim] for name, ndim in OUT_SHAPES.items()
@@ -70,7 +71,7 @@ def test_estimates_have_the_arrays_of_the_format(method: str, name: str) -> None
     assert out["converged"].mean() >= 0.8
     assert np.isnan(out["top_wire_ohm"]).all() == (method in ("ohm", "matrix"))
     np.testing.assert_allclose(out["cell_ohm"] * out["cell_siemens"], 1)
-    assert seen == [(frame + 1, frames) for frame in range(frames)]
+    assert len(seen) == frames
 
 
 def test_cold_frames_do_not_depend_on_their_order() -> None:

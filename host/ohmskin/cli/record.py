@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
@@ -16,7 +17,7 @@ import numpy as np
 import typer
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import Progress
+from rich.progress import track
 from rich.text import Text
 
 import ohmskin
@@ -205,8 +206,6 @@ def export(
     ] = 0.0,
 ) -> None:
     """Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as a table (.csv)."""
-    if out.suffix not in FORMATS:
-        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
     given = load_recording(recording)
     try:
         scans = export_recording(given, out, begin_s, end_s)
@@ -226,11 +225,9 @@ def estimate(
     """Estimate every cell of every frame of a readings file."""
     given = load_readings(readings)
     errors = Console(stderr=True)
-    with Progress(console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task(method, total=len(given.ratio))
-        answers = estimate_file(
-            given, method, cold=cold, progress=lambda done, _: progress.update(task, completed=done)
-        )
+    hidden = not errors.is_terminal
+    bar = partial(track, description=method, console=errors, transient=True, disable=hidden)
+    answers = estimate_file(given, method, cold=cold, watch=bar)
     save_arrays(out, answers)
     frames = len(answers["converged"])
     _out.print(

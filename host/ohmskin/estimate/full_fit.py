@@ -84,10 +84,7 @@ class _Slopes:
 
 
 class FullFit:
-    """One frame's fit. cell (RC,), wires (2RC,): log resistances.
-
-    cell_std: standard deviation of the cells' log resistances.
-    """
+    """One frame's fit: log resistances of cell (RC,), their cell_std, and of wires (2RC,)."""
 
     def __init__(
         self,
@@ -101,8 +98,7 @@ class FullFit:
         """Minimise from these cells (RC,); `message` says if that did not converge."""
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
         self._current, self._weight = current, 1.0 / current_std
-        self.iterations = 0
-        self.message = ""
+        self.iterations, self.message = 0, ""
         self.cell: Float = start
         self.wires = belief.mean
         self._minimise()
@@ -125,7 +121,8 @@ class FullFit:
         by_wires *= slope[heavy, None]
         residual = (self._current - modelled) * self._weight
         self._here = _Slopes(residual, centre, cell_std, by_cell, heavy, by_wires)
-        self._cost = float(residual @ residual) + self.wire_chi2 + self._prior.cost(self.cell)
+        wire_chi2 = float(self._wire_pull @ (self.wires - self._belief.mean))
+        self._cost = float(residual @ residual) + wire_chi2 + self._prior.cost(self.cell)
 
     def _minimise(self) -> None:
         # a of wires - mean = P a, which saves an inverse of P in the cost
@@ -157,11 +154,6 @@ class FullFit:
     def misfit(self) -> float:
         """Chi-square per port of what is left."""
         return float(self._residual @ self._residual) / self._residual.size
-
-    @property
-    def wire_chi2(self) -> float:
-        """(w - mean)^T P^-1 (w - mean)."""
-        return float(self._wire_pull @ (self.wires - self._belief.mean))
 
     @property
     def is_crowded(self) -> bool:

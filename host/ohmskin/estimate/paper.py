@@ -173,10 +173,9 @@ class PaperEstimator(Estimator):
             )
         # Built here, not in the first frame's time.
         self._program = program_for(knowledge.rows, knowledge.columns)
-        self._reference_megohm = (
-            knowledge.ref_top_ohm / OHM_PER_MEGOHM,
-            knowledge.ref_bottom_ohm / OHM_PER_MEGOHM,
-        )
+        references_ohm = (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
+        top, bottom = (ohm / OHM_PER_MEGOHM for ohm in references_ohm)
+        self._reference_megohm = top, bottom
         self._previous: _Answer | None = None
 
     def reset(self) -> None:
@@ -279,33 +278,28 @@ class RegularizedEstimator(PaperEstimator):
 def initial_states(
     cell_megohm: Float, reference_megohm: tuple[float, float], wire_megohm: float
 ) -> Float:
-    """Step 2: the states (4N, 5N) of wires all alike and these cells (R, C), simulated."""
-    cells = cell_megohm.size
-    cell = np.clip(cell_megohm, *_START_CELL_MEGOHM)
-    wire = np.full(cells, wire_megohm)
-    states = np.empty((cells, READINGS_PER_CELL, 5 * cells))
-    states[..., : 3 * cells] = np.log(np.concatenate([wire, wire, cell.T.ravel()]))
-    high_top = _potentials(cell, reference_megohm)
-    # Exchanging high and low mirrors every potential.
-    for k in range(READINGS_PER_CELL):
-        states[:, k, 3 * cells :] = high_top if TOP_IS_HIGH[k] else 1.0 - high_top
-    return states.reshape(READINGS_PER_CELL * cells, 5 * cells)
-
-
-def _potentials(cell_megohm: Float, reference_megohm: tuple[float, float]) -> Float:
-    """Node potentials V^t, V^b with the top pin high, shape (N, 2N), cells in column-major order.
+    """Step 2: the states (4N, 5N) of wires all alike and these cells (R, C), simulated.
 
     Without wires, the nodes of a stripe have the potential of its electrode.
     """
-    rows, columns = cell_megohm.shape
-    selected = np.arange(cell_megohm.size).reshape(rows, columns).T.ravel()
-    port_megohm, impedance = solve_ports(1.0 / cell_megohm)
+    cell = np.clip(cell_megohm, *_START_CELL_MEGOHM)
+    rows, columns = cell.shape
+    ports = np.arange(cell.size)
+    port_megohm, impedance = solve_ports(1.0 / cell)
     current = 1.0 / (port_megohm.ravel() + sum(reference_megohm))
     potential = (port_potential(impedance, rows) * current).T
-    ground = potential[np.arange(len(potential)), rows + np.arange(len(potential)) % columns]
+    ground = potential[ports, rows + ports % columns]
     potential += (reference_megohm[1] * current - ground)[:, None]
-    top, bottom = potential[selected, :rows], potential[selected, rows:]
-    return np.hstack([np.tile(top, columns), np.repeat(bottom, rows, axis=1)])
+    potential = potential[ports.reshape(rows, columns).T.ravel()]  # by column-major selected cell
+    top, bottom = np.hsplit(potential, [rows])
+    high_top = np.hstack([np.tile(top, columns), np.repeat(bottom, rows, axis=1)])
+    wire = np.full(cell.size, wire_megohm)
+    states = np.empty((cell.size, READINGS_PER_CELL, 5 * cell.size))
+    states[..., : 3 * cell.size] = np.log(np.concatenate([wire, wire, cell.T.ravel()]))
+    # Exchanging high and low mirrors every potential.
+    for k in range(READINGS_PER_CELL):
+        states[:, k, 3 * cell.size :] = high_top if TOP_IS_HIGH[k] else 1.0 - high_top
+    return states.reshape(READINGS_PER_CELL * cell.size, 5 * cell.size)
 
 
 # -------------------------------------------------------------------------------- the program

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from ohmskin.arrays import Float
 from ohmskin.link.protocol import ADC_BITS
 
-DEFAULT_ADC_BITS: Final = ADC_BITS
 # Standard deviation of a ratio that is called exact [V/Vdd]: a circuit solver or an average gives
 # nine digits.
 EXACT_RATIO_STD: Final = 1e-9
@@ -22,7 +21,7 @@ def check_adc_bits(bits: int) -> int:
     return int(bits)
 
 
-def quantise(ratio: ArrayLike, bits: int = DEFAULT_ADC_BITS) -> NDArray[np.uint16]:
+def quantise(ratio: ArrayLike, bits: int = ADC_BITS) -> NDArray[np.uint16]:
     """ADC codes min(2^bits - 1, floor(ratio 2^bits)), same shape; a ratio below 0 gives 0.
 
     Raises ValueError for a ratio that is not a number.
@@ -34,7 +33,7 @@ def quantise(ratio: ArrayLike, bits: int = DEFAULT_ADC_BITS) -> NDArray[np.uint1
     return np.clip(np.floor(ratios * full_scale), 0, full_scale - 1).astype(np.uint16)
 
 
-def ratio_from_codes(codes: ArrayLike, bits: int = DEFAULT_ADC_BITS) -> Float:
+def ratio_from_codes(codes: ArrayLike, bits: int = ADC_BITS) -> Float:
     """Ratio in the middle of each code's interval, (code + 0.5) / 2^bits, same shape."""
     full_scale = 1 << check_adc_bits(bits)
     return np.asarray((np.asarray(codes, dtype=np.float64) + 0.5) / full_scale, dtype=np.float64)

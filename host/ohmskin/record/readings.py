@@ -24,7 +24,7 @@ iterations (F), seconds (F).
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -165,25 +165,22 @@ def estimate_file(
     method: str,
     *,
     cold: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Float], Iterable[Float]] = iter,
 ) -> dict[str, NDArray[Any]]:
     """Estimate all frames in order; the Out arrays of the module's table, by name.
 
     Each frame starts from the one before, unless `cold`, or unless rest or wires are given per
-    frame: then each frame is a skin of its own. `progress(done, frames)` is called after each.
+    frame: then each frame is a skin of its own. watch: a progress bar that passes the frames on.
     Raises ValueError for an unknown method.
     """
-    frames = len(readings.ratio)
     estimator = make_estimator(method, readings.knowledge(0))
     estimates: list[Estimate] = []
-    for frame, ratio in enumerate(readings.ratio):
+    for frame, ratio in enumerate(watch(readings.ratio)):
         if frame and readings.one_skin_per_frame:
             estimator = make_estimator(method, readings.knowledge(frame))
         elif cold:
             estimator.reset()
         estimates.append(estimator.estimate(ratio))
-        if progress is not None:
-            progress(frame + 1, frames)
     names = (
         *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched"),
         *("top_wire_ohm", "bottom_wire_ohm", "converged", "message", "chi2", "iterations"),
