@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT / "host"))
 
 from ohmskin.circuit.skin import current_std  # noqa: E402
 from ohmskin.link import framing, protocol  # noqa: E402
-from ohmskin.link.codes import DEFAULT_ADC_BITS, ratio_std  # noqa: E402
+from ohmskin.link.codes import ADC_BITS, ratio_std  # noqa: E402
 
 CLOCK_HZ = 16_000_000
 CELLS_OHM = (1e3, 1e4, 1e5, 1e6)
@@ -49,7 +49,7 @@ def _constant(path: str, pattern: str) -> int:
 def relative_std(cell_ohm: np.ndarray | float, ref_ohm: np.ndarray | float) -> Any:
     """std(g) / g = (1 + g R)^2 std(I) / g, R both references: one cell alone, without wires."""
     siemens, loop_ohm = 1.0 / np.asarray(cell_ohm), 2.0 * np.asarray(ref_ohm)
-    std = np.vectorize(lambda ref: current_std(ratio_std(DEFAULT_ADC_BITS), ref, ref))(ref_ohm)
+    std = np.vectorize(lambda ref: current_std(ratio_std(ADC_BITS), ref, ref))(ref_ohm)
     return (1.0 + siemens * loop_ohm) ** 2 * std / siemens
 
 
