@@ -172,11 +172,10 @@ class PortReader:
         risen = found.current > RISE_SHARE * rest.current
         for axis, line in enumerate(("row", "column")):
             up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
-            if found.current.shape[1 - axis] < 3 or np.count_nonzero(up) < 2:
-                self._alike_frames[axis] = np.asarray(0)
+            if found.current.shape[1 - axis] < 3:
                 continue
             differed = self._rest_apart[axis] > 2 * SAME_STDS
-            apart = np.where(differed & up & up[:, None], _apart(found, axis), np.inf)
+            apart = np.where(differed, _apart(found, axis), np.inf)
             frames = np.where(apart < SAME_STDS, self._alike_frames[axis] + 1, 0)
             self._alike_frames[axis] = frames
             apart[frames < ALIKE_FRAMES] = np.inf
