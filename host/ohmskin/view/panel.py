@@ -52,7 +52,7 @@ class Panel:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send)
                 tasks.start_soon(self._receive, tasks)
-        except* WebSocketDisconnect:
+        except* (WebSocketDisconnect, RuntimeError):  # the latter if the server has closed it
             pass
         finally:
             self._board.watchers.discard(wake)
