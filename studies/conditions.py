@@ -261,14 +261,14 @@ def _stick(ratio: Float, fault: str, place: tuple[int, int], random: Random) -> 
 
 def _lines(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     """x: which electrodes or stripes are cut or joined; which one is drawn anew for each frame,
-    but for faults since rest."""
+    but for faults since rest. A fault does not come and go with frames: each is read afresh."""
     rest = skin_at_rest(*shape, random)
     fixed = _place(shape, random) if _since_rest(x) else None
     rest_ratio = _with_line_fault(rest, str(x), fixed) if fixed else readings(rest)
     judged = []
     for skin in _touched_frames(rest, frames, random):
         ratio = _with_line_fault(skin, str(x), fixed or _place(shape, random))
-        judged.append(Frame(converted(ratio), skin.cell_siemens))
+        judged.append(Frame(converted(ratio), skin.cell_siemens, afresh=fixed is None))
     return _case(judged, converted(rest_ratio))
 
 

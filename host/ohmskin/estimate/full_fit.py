@@ -45,7 +45,7 @@ from ohmskin.estimate.prior import (
 MAX_ITERATIONS: Final = 40
 MAX_HALVINGS: Final = 8  # of a step that goes too far
 MAX_STEP: Final = 1.5  # of a log resistance
-CLOSE: Final = 1.0  # deviation of a reading or cell: a step that moves none by more is the last
+CLOSE: Final = 0.3  # deviations of a reading or cell: a step that moves none by more is the last
 HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
 CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have

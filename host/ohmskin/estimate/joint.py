@@ -98,7 +98,10 @@ class JointEstimator(Estimator):
     def _simple_solution(self, prior: CellPrior, found: Touched, ports: PortReadings) -> Solution:
         cell, std = prior.expected.copy(), prior.std.copy()
         cell[found.cells], std[found.cells] = -found.log_siemens, found.log_std
-        if found.cells.size > 1 and not ports.fault:
+        places = np.array(np.unravel_index(found.cells, self._shape))
+        beside = np.abs(places[:, :, None] - places[:, None]).sum(axis=0) == 1
+        # Around a finger, cells are pressed so lightly that they would pass for rest here.
+        if found.cells.size > 1 and beside.sum() <= 2 and not ports.fault:
             self._learn(cell, lambda: found.lesson)
         return self._solution(ports, (cell, std), self._belief.mean, found.current, found.steps)
 

@@ -173,9 +173,8 @@ class PaperEstimator(Estimator):
             )
         # Built here, not in the first frame's time.
         self._program = program_for(knowledge.rows, knowledge.columns)
-        references_ohm = (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
-        top, bottom = (ohm / OHM_PER_MEGOHM for ohm in references_ohm)
-        self._reference_megohm = top, bottom
+        top_ohm, bottom_ohm = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
+        self._reference_megohm = top_ohm / OHM_PER_MEGOHM, bottom_ohm / OHM_PER_MEGOHM
         self._previous: _Answer | None = None
 
     def reset(self) -> None:
@@ -253,8 +252,7 @@ class PaperEstimator(Estimator):
         if excess.max() <= _FAULT_STDS * known.current_std:
             return feasible, ""
         row, column = np.unravel_index(int(excess.argmax()), excess.shape)
-        most, least = ports_ohm
-        said = f"is none of a port from {least:.0f} to {most:.3g} ohm"
+        said = f"is none of a port from {ports_ohm[1]:.0f} to {ports_ohm[0]:.3g} ohm"
         return feasible, f"the current of cell ({row}, {column}) {said}"
 
 

@@ -176,7 +176,8 @@ class PortReader:
                 continue
             differed = self._rest_apart[axis] > 2 * SAME_STDS
             apart = np.where(differed, _apart(found, axis), np.inf)
-            frames = np.where(apart < SAME_STDS, self._alike_frames[axis] + 1, 0)
+            # Between one and two times the limit, noise may be what differs.
+            frames = np.where(apart > 2 * SAME_STDS, 0, self._alike_frames[axis] + 1)
             self._alike_frames[axis] = frames
             apart[frames < ALIKE_FRAMES] = np.inf
             if pair := _alike(apart, up, line):
