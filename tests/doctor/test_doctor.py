@@ -45,6 +45,14 @@ def test_a_sound_skin_has_no_finding(rows: int, columns: int) -> None:
         assert diagnosis.measured["noise_lsb"] < 0.8
 
 
+@pytest.mark.parametrize(
+    ("fault", "ratio"), [("ref_top=33000", 1.1), ("ref_bottom=33000", 1 / 1.1)]
+)
+def test_the_reference_ratio_is_top_over_bottom(fault: str, ratio: float) -> None:
+    diagnosis = examine(evidence(f"emulator://8x8?{fault}"))
+    assert diagnosis.measured["reference_ratio"] == pytest.approx(ratio, abs=0.03)
+
+
 @pytest.mark.parametrize("rate", [1, 3, 25, 50, 60, 100, 0])
 def test_a_sound_skin_has_no_finding_at_any_rate(rate: int) -> None:
     for size in ("2x3", "8x8"):
