@@ -30,7 +30,7 @@ Run = Callable[..., Done]
 Command = Callable[..., "subprocess.Popen[str]"]
 
 
-def finish(process: "subprocess.Popen[str]", limit_s: float = 30.0) -> Done:
+def finish(process: "subprocess.Popen[str]", limit_s: float = 60.0) -> Done:
     out, err = process.communicate(timeout=limit_s)
     return Done(process.returncode, out, err)
 

@@ -6,27 +6,32 @@ import os
 import re
 import signal
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.request import urlopen
 
+import anyio
 import numpy as np
 import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
-from starlette.websockets import WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python
+from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
+from ohmskin.link.device import Device
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards, server
 from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
+from ohmskin.view.panel import Panel
 from ohmskin.view.server import make_app
 from ports import Serve
 from waiting import until
@@ -36,7 +41,7 @@ REST = "emulator://8x8?scene=rest&seed=1"
 HOST = "127.0.0.1:8765"
 ORIGIN = f"http://{HOST}"
 PAGE = Path(server.__file__).parent / "page"
-LIMIT_S = 20.0
+LIMIT_S = 60.0  # a server that says nothing for so long hangs, on a busy machine too
 TARE_S = 0.3
 
 Message = dict[str, Any]
@@ -275,12 +280,20 @@ def test_a_tare_makes_a_conductance_certain() -> None:
     assert after["touched"].sum() == after["raw_touched"].sum() == 0
 
 
-def test_one_thing_at_a_time() -> None:
+def test_one_thing_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    told, mean_ratio = threading.Event(), Device.mean_ratio
+
+    def mean_ratio_when_told(skin: Device, seconds: float) -> Float:
+        told.wait(LIMIT_S)
+        return mean_ratio(skin, seconds)
+
+    monkeypatch.setattr(Device, "mean_ratio", mean_ratio_when_told)
     with served(REST) as client, panel(client) as page, panel(client) as other:
         page.scan()
         page.say(do="tare", force=False)
         page.refused("one thing at a time", do="record")
         other.refused("one thing at a time", do="tare", force=False)
+        told.set()
         assert page.until(lambda message: message["kind"] == "notice")["good"]
 
 
@@ -592,3 +605,32 @@ def test_a_port_that_is_taken(run: Run) -> None:
 def test_without_the_extra_it_says_what_to_install() -> None:
     program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__"
     assert_one_line(python("-c", program, "view"), "pip install 'ohmskin[view]'")
+
+
+class GoneSocket:
+    """The server's end of a websocket that can be written to no more."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    async def accept(self) -> None:
+        pass
+
+    async def send_text(self, text: str) -> None:
+        raise self.error
+
+    async def receive(self) -> Message:
+        await anyio.sleep_forever()
+        return {}
+
+
+@pytest.mark.parametrize("error", [WebSocketDisconnect(), WebSocketDisconnected("gone")])
+def test_a_page_that_is_gone_ends_its_panel_and_hides_no_fault(
+    tmp_path: Path, error: Exception
+) -> None:
+    with ViewedBoards([GHOST], folder=tmp_path) as boards:
+        board = boards.get(0)
+        assert board is not None
+        anyio.run(Panel(board, cast("WebSocket", GoneSocket(error))).serve)
+        with pytest.raises(ExceptionGroup):
+            anyio.run(Panel(board, cast("WebSocket", GoneSocket(RuntimeError("a fault")))).serve)

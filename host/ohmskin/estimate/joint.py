@@ -54,8 +54,8 @@ class JointEstimator(Estimator):
     """Gauss-Newton on all 3RC log resistances; learns the wires from frame to frame."""
 
     name: ClassVar[str] = "joint"
-    # The few touches that explain a frame are the answer, if they are known to this [log S].
-    widest_log_std: ClassVar[float] = -1.0
+    # The few touches that explain a frame are the answer if they are known to this [log S]: never.
+    widest_log_std: ClassVar[float] = -np.inf
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)

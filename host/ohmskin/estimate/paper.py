@@ -196,7 +196,7 @@ class PaperEstimator(Estimator):
             if not answers[-1].is_good_start:
                 fit = CellFit(replace(ports, current=current), known.ref_ohm, None)
                 answers.append(self._answer(ratio, (), 1.0 / fit.cell))
-        # The best is the one whose readings are nearest to those that were read.
+        # A good one if there is any; of several, the one that gives the readings best.
         answer = min(answers, key=lambda each: (not each.is_good_start, each.misfit_ratio))
         self._previous = answer if answer.is_good_start else None
         last = answer.optima[-1]

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import anyio
 from anyio.abc import TaskGroup
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from ohmskin.errors import OhmskinError, TareRefused
 from ohmskin.view.boards import Shown, ViewedBoard
@@ -52,7 +52,7 @@ class Panel:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send)
                 tasks.start_soon(self._receive, tasks)
-        except* (WebSocketDisconnect, RuntimeError):  # the latter if the server has closed it
+        except* (WebSocketDisconnect, WebSocketDisconnected):  # seen, or seen by the other task
             pass
         finally:
             self._board.watchers.discard(wake)
