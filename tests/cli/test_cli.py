@@ -123,7 +123,7 @@ def test_stream_shows_a_table(run: Run, method: str) -> None:
 
 
 def test_stream_says_what_was_lost(run: Run) -> None:
-    done = run("stream", f"{EMULATED}&drop=0.3&rate=100", "--json", "--scans", "80")
+    done = run("stream", f"{EMULATED}&drop=0.06&rate=100", "--json", "--scans", "200")
     assert done.code == 0
     lines = [json.loads(line) for line in done.out.splitlines()]
     assert sum(line["missed"] for line in lines) > 0

@@ -201,9 +201,9 @@ class Sensitivity:
         current = self.cell_current
         return (current * current / self.cell_siemens).reshape(len(current), -1)
 
-    def by_wires(self, ports: slice | NDArray[np.intp] = slice(None)) -> Float:
-        """d rho / d log r of the wires, top ones then bottom ones, shape (ports, 2RC) [ohm]."""
-        return by_wires(self.cell_current[ports], self.top_wire_ohm, self.bottom_wire_ohm)
+    def by_wires(self) -> Float:
+        """d rho / d log r of the wires, top ones then bottom ones, shape (RC, 2RC) [ohm]."""
+        return by_wires(self.cell_current, self.top_wire_ohm, self.bottom_wire_ohm)
 
 
 def by_wires(cell_current: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:

@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import port_sensitivity
@@ -46,7 +45,6 @@ MAX_ITERATIONS: Final = 40
 MAX_HALVINGS: Final = 8  # of a step that goes too far
 MAX_STEP: Final = 1.5  # of a log resistance
 CLOSE: Final = 0.3  # deviations of a reading or cell: a step that moves none by more is the last
-HEAVY: Final = 0.01  # share of the noise: wires are in the model for readings they can move by it
 CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
 _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
@@ -56,24 +54,18 @@ _LOG_CELL_LIMITS: Final = (-np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS))
 class _Slopes:
     """The residual y - h, and J, at one state. by_cell: (RC, RC), times the cells' deviations.
 
-    centre, cell_std: the normal that stands for the prior of the cells there. heavy: (m,), the
-    ports that wires matter to; by_wires: (m, 2RC).
+    centre, cell_std: the normal that stands for the prior of the cells there. by_wires: (RC, 2RC).
     """
 
     residual: Float
     centre: Float
     cell_std: Float
     by_cell: Float
-    heavy: NDArray[np.intp]
     by_wires: Float
 
     def factor(self, belief: WireBelief) -> Float:
         """Cholesky factor of J P J^T + 1, (RC, RC)."""
-        seen = gram(self.by_cell)
-        if self.heavy.size == len(seen):
-            seen = belief.seen(self.by_wires, seen)
-        elif self.heavy.size:
-            seen[np.ix_(self.heavy, self.heavy)] += belief.seen(self.by_wires)
+        seen = belief.seen(self.by_wires, gram(self.by_cell))
         np.einsum("ii->i", seen)[:] += 1.0
         return cholesky(seen)
 
@@ -115,12 +107,10 @@ class FullFit:
         by_cell = circuit.by_cell
         by_cell *= slope[:, None]
         by_cell *= cell_std
-        # All wires in series with a port bound what they can do to it.
-        heavy = np.flatnonzero(self._belief.path_ohm(self.wires) * slope < -HEAVY)
-        by_wires = circuit.by_wires(heavy)
-        by_wires *= slope[heavy, None]
+        by_wires = circuit.by_wires()
+        by_wires *= slope[:, None]
         residual = (self._current - modelled) * self._weight
-        self._here = _Slopes(residual, centre, cell_std, by_cell, heavy, by_wires)
+        self._here = _Slopes(residual, centre, cell_std, by_cell, by_wires)
         wire_chi2 = float(self._wire_pull @ (self.wires - self._belief.mean))
         self._cost = float(residual @ residual) + wire_chi2 + self._prior.cost(self.cell)
 
@@ -138,9 +128,9 @@ class FullFit:
                 if self._cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
                     break
                 # Too far: back half the way. What is lost is one factorisation.
-                self.cell = 0.5 * (self.cell + before[0])
-                self.wires = 0.5 * (self.wires + before[1])
-                self._wire_pull = 0.5 * (self._wire_pull + before[2])
+                now = self.cell, self.wires, self._wire_pull
+                halves = (0.5 * (here + there) for here, there in zip(now, before, strict=True))
+                self.cell, self.wires, self._wire_pull = halves
                 self.iterations += 1
                 self._evaluate()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
@@ -162,15 +152,14 @@ class FullFit:
 
     def _step(self) -> bool:
         """One step; True when the next would not matter."""
-        here, heavy = self._here, self._here.heavy
+        here = self._here
         away = self.cell - here.centre
         off = self.wires - self._belief.mean
-        wanted = here.residual + here.by_cell @ (away / here.cell_std)
-        wanted[heavy] += here.by_wires @ off
+        wanted = here.residual + here.by_cell @ (away / here.cell_std) + here.by_wires @ off
         self._factored, self._factor = here, here.factor(self._belief)
         left = solve(self._factor, wanted)
         cell_step = here.cell_std * (left @ here.by_cell) - away
-        pull = left[heavy] @ here.by_wires
+        pull = left @ here.by_wires
         wire_step = self._belief.times(pull) - off
         # After this step the linearised residual is `left`.
         moved = max(
@@ -214,14 +203,13 @@ class FullFit:
         self.cell_std: Float = at.cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     def lesson(self) -> Lesson:
-        """Slopes, residual and noise of the readings that wires matter to, for the belief."""
+        """Slopes, residual and noise of the readings, for the belief."""
         here = self._here
-        ports, slopes = here.heavy, here.by_wires
-        residual = here.residual[ports] + slopes @ (self.wires - self._belief.mean)
+        residual = here.residual + here.by_wires @ (self.wires - self._belief.mean)
         # A touched cell is noise without limit; one at rest is known to its drift.
         unknown = self._hidden | (np.abs(self._prior.rise(self.cell)) > TOUCHED)
         std = np.where(unknown, UNLIMITED_STD, self._prior.std)
-        by_cell = here.by_cell[ports] * (std / here.cell_std)
+        by_cell = here.by_cell * (std / here.cell_std)
         noise = by_cell @ by_cell.T
-        noise.ravel()[:: ports.size + 1] += 1.0
-        return slopes, residual, noise
+        noise.ravel()[:: residual.size + 1] += 1.0
+        return here.by_wires, residual, noise

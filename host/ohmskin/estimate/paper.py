@@ -42,8 +42,13 @@ were taken and why, and what can be expected of the answers.
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from types import FrameType
 from typing import Any, ClassVar, Final, NamedTuple
 
 import casadi
@@ -106,9 +111,6 @@ _FROM_BEFORE: Final[Options] = (
     ("warm_start_init_point", "yes"),
     ("warm_start_mult_bound_push", 1e-6),
 )
-# What Ipopt ends with on Ctrl-C, which CasADi takes for itself. Nothing else throws in a program
-# without callbacks: numbers that are none end as Invalid_Number_Detected.
-_INTERRUPTED: Final = ("User_Requested_Stop", "NonIpopt_Exception_Thrown")
 
 
 class Step(NamedTuple):
@@ -383,13 +385,12 @@ class Program:
         solver = self._solvers[step.options if previous is None else _FROM_BEFORE]
         # Column-major: rows run fastest, then columns.
         y = ratio.transpose(1, 0, 2).ravel()
-        found = solver(
-            x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
-        )
-        report = solver.stats()
-        if report["return_status"] in _INTERRUPTED:
-            raise KeyboardInterrupt
-        states = np.array(found["x"]).reshape(x.shape)
+        with _ctrl_c_kept():
+            found = solver(
+                x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
+            )
+            report = solver.stats()
+            states = np.array(found["x"]).reshape(x.shape)
         is_finite = bool(np.isfinite(states).all())
         return Optimum(
             x=states if is_finite else x,
@@ -399,6 +400,30 @@ class Program:
             status=str(report["return_status"]) or "Invalid_Number_Detected",
             success=bool(report["success"]) and is_finite,
         )
+
+
+@contextmanager
+def _ctrl_c_kept() -> Iterator[None]:
+    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and its wrappers swallow it."""
+    before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield  # nothing is raised here
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        try:
+            before(number, frame)
+        except BaseException as exc:
+            raised.append(exc)
+            raise  # this ends Ipopt
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if raised:
+            raise raised[0]
 
 
 @lru_cache(maxsize=4)

@@ -139,9 +139,7 @@ class WireBelief:
 
     def variance(self, slopes: Float) -> Float:
         """Diagonal of J P J^T, (m,)."""
-        common = self._by_layer(slopes) @ np.linalg.cholesky(self._covariance)
-        own = SEGMENT_STD**2 * np.einsum("ij,ij->i", slopes, slopes)
-        return np.asarray(own + np.einsum("ij,ij->i", common, common))
+        return np.asarray(np.einsum("ij,ji->i", slopes, self.times(slopes)))
 
     def std(self) -> Float:
         """Standard deviation of each log resistance, (2RC,)."""
