@@ -54,7 +54,7 @@ def evaluations(rows: int, columns: int) -> dict[str, Evaluation]:
     def numpy(log_ohm: Float) -> list[Float]:
         cell, top, bottom = np.exp(log_ohm).reshape(3, rows, columns)
         found = port_sensitivity(1 / cell, top, bottom)
-        return [found.port_ohm, found.by_cell, found.by_wires()]
+        return [found.port_ohm, found.by_cell, found.by_wires]
 
     found: dict[str, Evaluation] = {NUMPY: numpy, MACHINE: _ThroughBuffers(function)}
     compiled = _compiled(function)

@@ -85,7 +85,7 @@ def information_limit(
     circuit = port_sensitivity(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm)
     current = 1.0 / (circuit.port_ohm + knowledge.ref_ohm)
     slope = (current**2 / knowledge.current_std)[:, None]
-    by_cell, by_wire = slope * circuit.by_cell, slope * circuit.by_wires()
+    by_cell, by_wire = slope * circuit.by_cell, slope * circuit.by_wires
     at_rest = rest_std * by_cell[:, ~free]
     layers = layer_std * by_wire.reshape(free.size, 2, free.size).sum(axis=2)
     others = np.hstack([at_rest, SEGMENT_STD * by_wire, layers])

@@ -155,16 +155,18 @@ def test_the_lsl_outlet_pushes_forces_at_their_times(
     infos: list[StreamInfo] = []
     monkeypatch.setitem(sys.modules, "pylsl", pylsl_module(samples, infos))
     begin_s = time.monotonic()
-    example("lsl_outlet").main(GHOST, skin_json, 0.5)
+    with pytest.raises(KeyboardInterrupt):
+        example("lsl_outlet").main(GHOST, skin_json)
     (info,) = infos
     assert (info.name, info.type, info.channel_count) == ("ohmskin", "Force", 64)
     assert info.nominal_srate == pytest.approx(90, rel=1e-3)
     assert info.source_id == "ohmskin-unit-0"
     assert info.get_channel("label") == LABELS
     assert info.get_channel("unit") == ["newtons"] * 64
-    assert len(samples) > 5
     times_s = np.array([timestamp for _, timestamp in samples])
-    assert np.diff(times_s) == pytest.approx(1 / 90, abs=3e-3)
+    periods = np.rint(90 * np.diff(times_s))  # a busy computer misses scans
+    assert periods.min() >= 1
+    assert np.diff(times_s) == pytest.approx(periods / 90, abs=3e-3)
     host_s = times_s - CLOCK_OFFSET_S
     assert begin_s < host_s[0] < host_s[-1] < time.monotonic() + 0.1
     assert np.count_nonzero(np.array(samples[-1][0]) > 0.1) == 3

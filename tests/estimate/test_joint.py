@@ -48,7 +48,7 @@ def test_sensitivity_agrees_with_finite_differences(size: tuple[int, int]) -> No
     circuit = port_sensitivity(np.exp(-logs[0]), np.exp(logs[1]), np.exp(logs[2]))
     np.testing.assert_allclose(circuit.port_ohm, port_ohm(*logs), rtol=1e-9)
     step = 1e-5
-    by_top, by_bottom = np.split(circuit.by_wires(), 2, axis=1)
+    by_top, by_bottom = np.split(circuit.by_wires, 2, axis=1)
     for kind, derivative in enumerate((circuit.by_cell, by_top, by_bottom)):
         for resistor in range(logs[0].size):
             ends = []
@@ -67,7 +67,7 @@ def test_derivatives_sum_to_the_resistance() -> None:
     random = np.random.default_rng(6)
     cell, top, bottom = (np.exp(random.normal(size=(5, 4))) for _ in range(3))
     circuit = port_sensitivity(cell, top, bottom)
-    total = circuit.by_cell.sum(1) + circuit.by_wires().sum(1)
+    total = circuit.by_cell.sum(1) + circuit.by_wires.sum(1)
     np.testing.assert_allclose(total, circuit.port_ohm, rtol=1e-10)
 
 

@@ -11,7 +11,7 @@ from studies.trials import uniform_skin
 REST = np.log([1e6])
 
 
-@pytest.mark.parametrize("tail", [TAIL, 3.0, np.inf])
+@pytest.mark.parametrize("tail", [TAIL, 3.0, 1e9])
 def test_the_stand_in_normal_has_the_slope_of_the_prior(tail: float) -> None:
     prior = CellPrior(REST, np.full(1, 0.05), tail)
     for away in (-4.0, -0.3, -0.051, -0.02, 0.0, 0.03, 0.2, -9.5):

@@ -188,25 +188,28 @@ def test_a_fingertip_on_a_skin_whose_wires_nobody_knows(method: str) -> None:
 
 
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
-    """Against the textbook's covariance form, two lessons, with what fades between them."""
+    """Against the textbook's covariance form, two lessons, with what fades after each."""
     random = np.random.default_rng(8)
     belief = WireBelief(2, 3, 100.0, 200.0)
     layers, own = np.kron(np.eye(2), np.ones((6, 1))), SEGMENT_STD**2 * np.eye(12)
     mean, covariance = np.log([100.0, 200.0]), LAYER_STD**2 * np.eye(2)
     for _ in range(2):
-        covariance += FADE * (LAYER_STD**2 * np.eye(2) - covariance)
         slopes, residual = random.normal(size=(4, 12)), random.normal(size=4)
         noise = np.diag(random.uniform(1, 2, 4))
         whole = layers @ covariance @ layers.T + own
         gain = covariance @ layers.T @ slopes.T @ np.linalg.inv(slopes @ whole @ slopes.T + noise)
         mean = mean + gain @ residual
         covariance = covariance - gain @ slopes @ layers @ covariance
-        belief.learn(slopes, residual, noise)
+        covariance += FADE * (LAYER_STD**2 * np.eye(2) - covariance)
+        belief.learn(belief.root(slopes), residual, noise)
     whole = layers @ covariance @ layers.T + own
     np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
-    np.testing.assert_allclose(belief.times(np.eye(12)), whole, atol=1e-12)
-    np.testing.assert_allclose(belief.std(), np.sqrt(np.diagonal(whole)), rtol=1e-9)
+    root = belief.root(np.eye(12))
+    np.testing.assert_allclose(root @ root.T, whole, atol=1e-12)
+    np.testing.assert_allclose(belief.std() ** 2, np.diagonal(whole)[::6], rtol=1e-9)
+    away = random.normal(size=14)
+    np.testing.assert_allclose(belief.log_wires(away), belief.mean + root @ away, rtol=1e-9)
     some = random.normal(size=(3, 12))
-    seen = some @ belief.times(some)
-    np.testing.assert_allclose(np.tril(belief.seen(some)), np.tril(seen), rtol=1e-9)
-    np.testing.assert_allclose(belief.variance(some), np.diagonal(seen), rtol=1e-9)
+    moved = some @ (belief.mean - layers @ np.log([100.0, 200.0]))
+    before = np.log([100.0, 200.0])
+    np.testing.assert_allclose(belief.moved(belief.root(some), before), moved, rtol=1e-9)

@@ -52,6 +52,9 @@ class StreamInfo:
         ]
 
 
+ENOUGH = 12  # samples, then somebody presses Ctrl-C
+
+
 def pylsl_module(samples: list[tuple[list[float], float]], infos: list[StreamInfo]) -> ModuleType:
     """`pylsl` whose outlets append to `samples` (values, timestamp) and `infos`."""
 
@@ -63,6 +66,8 @@ def pylsl_module(samples: list[tuple[list[float], float]], infos: list[StreamInf
         def push_sample(self, x: list[float], timestamp: float = 0.0) -> None:
             assert len(x) == self.info.channel_count
             samples.append((x, timestamp))
+            if len(samples) == ENOUGH:
+                raise KeyboardInterrupt
 
     made = ModuleType("pylsl")
     vars(made).update(

@@ -31,7 +31,8 @@ Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g),
 """
 
 from dataclasses import dataclass
-from typing import Final
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,17 +95,22 @@ def check_references(ref_top_ohm: float, ref_bottom_ohm: float) -> None:
             raise ValueError(f"{name} must be positive and finite, not {ohm}")
 
 
+@lru_cache(maxsize=8)
+def _incidence(rows: int, columns: int) -> Float:
+    """E^T, (RC, R+C): a cell's voltage is the potential of its row less that of its column."""
+    by_row = np.kron(np.eye(rows), np.ones((columns, 1)))
+    return np.hstack([by_row, -np.tile(np.eye(columns), (rows, 1))])
+
+
 def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
     """K [ohm], shape (RC, RC): K[e, f] is the wire shared by the paths to cells e and f."""
     rows, columns = top_wire_ohm.shape
     i, j = np.arange(rows), np.arange(columns)
-    top_to_cell = np.cumsum(top_wire_ohm, axis=1)
-    bottom_to_cell = np.cumsum(bottom_wire_ohm, axis=0)
     coupling = np.zeros((rows, columns, rows, columns))
     same_row = np.einsum("ijik->ijk", coupling)
-    same_row += top_to_cell[:, np.minimum(j[:, None], j[None, :])]
+    same_row += np.cumsum(top_wire_ohm, axis=1)[:, np.minimum.outer(j, j)]
     same_column = np.einsum("ijkj->ikj", coupling)
-    same_column += bottom_to_cell[np.minimum(i[:, None], i[None, :]), :]
+    same_column += np.cumsum(bottom_wire_ohm, axis=0)[np.minimum.outer(i, i)]
     return coupling.reshape(rows * columns, rows * columns)
 
 
@@ -113,16 +119,12 @@ def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tupl
 
     The second gives Y = half^T half.
     """
-    rows, columns = root.shape
     system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm)
     system *= root.reshape(-1, 1)
     system *= root.reshape(1, -1)
-    system[np.diag_indices_from(system)] += 1.0
+    system.ravel()[:: len(system) + 1] += 1.0
     factor = cholesky(system)
-    driven = np.zeros((rows, columns, rows + columns))
-    driven[np.arange(rows), :, np.arange(rows)] = root
-    driven[:, np.arange(columns), rows + np.arange(columns)] = -root
-    return factor, solve_lower(factor, driven.reshape(rows * columns, -1))
+    return factor, solve_lower(factor, _incidence(*root.shape) * root.reshape(-1, 1))
 
 
 def admittance_of(half: Float) -> Float:
@@ -181,51 +183,40 @@ def port_potential(impedance: Float, rows: int) -> Float:
     return (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(len(impedance), -1)
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivity:
-    """Port resistances and how each resistance of the skin moves them.
+class Sensitivity(NamedTuple):
+    """Port resistances (RC,), ports in row-major order, and d rho / d log r of each resistance.
 
-    port_ohm: rho, shape (RC,), ports in row-major order. cell_current: shape (RC, R, C), current
-    through each cell per port current. d rho / d log r_e = r_e i_e^2 [ohm], i_e the current in e.
+    by_cell: (RC, RC). by_wires: (RC, 2RC), top wires, then bottom ones. All in ohm.
     """
 
-    cell_siemens: Float
-    top_wire_ohm: Float
-    bottom_wire_ohm: Float
     port_ohm: Float
-    cell_current: Float
-
-    @property
-    def by_cell(self) -> Float:
-        """d rho / d log r of the cells, port by cell, shape (RC, RC) [ohm]."""
-        current = self.cell_current
-        return (current * current / self.cell_siemens).reshape(len(current), -1)
-
-    def by_wires(self) -> Float:
-        """d rho / d log r of the wires, top ones then bottom ones, shape (RC, 2RC) [ohm]."""
-        return by_wires(self.cell_current, self.top_wire_ohm, self.bottom_wire_ohm)
+    by_cell: Float
+    by_wires: Float
 
 
-def by_wires(cell_current: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
-    """d rho / d log r of all wires [ohm], (ports, 2RC), from cell currents (ports, R, C)."""
-    ports, rows, columns = cell_current.shape
-    slopes = np.empty((ports, 2, rows, columns))
-    # A wire segment carries what the cells behind it draw: sums as products, which is faster.
-    np.matmul(cell_current, np.tri(columns), out=slopes[:, 0])
-    np.matmul(np.tri(rows).T, cell_current, out=slopes[:, 1])
-    slopes *= slopes
-    slopes *= np.stack([top_wire_ohm, bottom_wire_ohm])
-    return slopes.reshape(ports, 2 * rows * columns)
+def wire_current(cell_current: Float) -> Float:
+    """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
+
+    A wire segment carries what the cells behind it draw: sums as products, which is faster.
+    """
+    _, rows, columns = cell_current.shape
+    current = np.empty((len(cell_current), 2, rows, columns))
+    current[:, 0] = (cell_current.reshape(-1, columns) @ np.tri(columns)).reshape(
+        cell_current.shape
+    )
+    np.matmul(np.tri(rows).T, cell_current, out=current[:, 1])
+    return current
 
 
 def port_sensitivity(
     cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float
 ) -> Sensitivity:
-    """rho of every port and the cell currents that give all its derivatives.
+    """rho of every port and its slopes, d rho / d log r_e = r_e i_e^2, i_e the current through e.
 
     The adjoint of a resistive network is the network itself (Tellegen): the currents that give rho
     give its derivative as well, so one factorisation of RC unknowns and R+C right-hand sides are
-    enough for all RC x 3RC derivatives. Cells must conduct (g > 0): (R, C) [S]; wires (R, C) [ohm].
+    enough for all RC x 3RC derivatives: a port's currents are those of its row less those of its
+    column. Cells must conduct (g > 0): (R, C) [S]; wires (R, C) [ohm].
     """
     rows, columns = cell_siemens.shape
     root = np.sqrt(cell_siemens)
@@ -233,8 +224,13 @@ def port_sensitivity(
     impedance, port_ohm = impedance_of(admittance_of(half), rows)
     per_potential = solve_lower(factor, half, transposed=True)
     per_potential *= root.reshape(-1, 1)
-    current = (port_potential(impedance, rows).T @ per_potential.T).reshape(-1, rows, columns)
-    return Sensitivity(cell_siemens, top_wire_ohm, bottom_wire_ohm, port_ohm.ravel(), current)
+    cells = (impedance @ per_potential.T).reshape(-1, rows, columns)
+    lines = np.concatenate([cells[:, None], wire_current(cells)], axis=1).reshape(len(cells), -1)
+    slopes = (lines[:rows, None] - lines[None, rows:]).reshape(port_ohm.size, -1)
+    slopes *= slopes
+    slopes *= np.concatenate([1.0 / cell_siemens, top_wire_ohm, bottom_wire_ohm]).ravel()
+    by_cell, by_wires = np.split(slopes, [port_ohm.size], axis=1)
+    return Sensitivity(port_ohm.ravel(), by_cell, by_wires)
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

@@ -229,10 +229,10 @@ def _pressed_fit(
         )
         at_rest = np.linalg.inv(before.by_cell)
         through = now.by_cell @ at_rest  # B1 B0^-1
-        by_rest_wires = before.by_wires()
+        by_rest_wires = before.by_wires
         off_rest = rest_ohm - before.port_ohm
         residual = port_ohm - now.port_ohm - through @ off_rest  # r
-        by_segment = now.by_wires() - through @ by_rest_wires  # W
+        by_segment = now.by_wires - through @ by_rest_wires  # W
         slopes = by_segment.sum(axis=1)  # w
         spread = now.by_cell * variance
         covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T

@@ -63,13 +63,14 @@ class JointEstimator(Estimator):
         self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
-        self._without_wires: Float | None = None
-        self._learned_from: Float | None = None
+        self.reset()
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
         super().reset()
-        self._learned_from = self._without_wires = None
+        self._learned_from: Float | None = None
+        self._without_wires: Float | None = None
+        self._touches = 0  # of the last fit
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
@@ -77,11 +78,15 @@ class JointEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         current, current_std = ports.current.ravel(), ports.current_std.ravel()
         prior = self._prior_of(current)
-        found = self._finder.find(current, current_std) if self._finder is not None else None
+        found = None
+        # Under a finger that stays, few touches explain no frame: trying costs half the time.
+        if self._finder is not None and self._touches <= self._finder.most:
+            found = self._finder.find(current, current_std)
         known = self.knowledge.rest_ratio is not None
         if found is not None and known and found.log_std.max(initial=0.0) <= self.widest_log_std:
             return self._simple_solution(prior, found, ports)
         fit = self._fit(prior, ports, self._start(prior, ports, found))
+        self._touches = fit.touches
         message = self._doubt(prior, fit)
         if not (ports.fault or message or fit.is_crowded):
             self._learn(fit.cell, fit.lesson)
@@ -121,7 +126,7 @@ class JointEstimator(Estimator):
         """
         cell, cell_std = cells
         path_ohm = self._belief.path_ohm(wires)
-        path_std = self._belief.std().reshape(2, -1).mean(axis=0)
+        path_std = np.full(path_ohm.size, self._belief.std().mean())
         std, std_down = siemens_std(-cell, cell_std, path_ohm, path_std, self.knowledge.ref_ohm)
         top, bottom = self._belief.layers(wires)
         return Solution(
@@ -164,7 +169,9 @@ class JointEstimator(Estimator):
             start = prior.expected.copy()
             start[found.cells] = -found.log_siemens
             return start
-        fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires)
+        # To start from, a deviation of every reading is near enough.
+        near = float(ports.current.size)
+        fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires, near)
         self._without_wires = None if fit.message else fit.cell
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
@@ -201,7 +208,7 @@ class JointEstimator(Estimator):
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
         """Log resistances of the untouched cells, and how well they are known: the same fit."""
         expected = np.full(ports.current.size, np.log(UNTOUCHED_OHM))
-        wide = CellPrior(expected, np.full(expected.size, UNTOUCHED_STD), np.inf)
+        wide = CellPrior(expected, np.full(expected.size, UNTOUCHED_STD), 1e9)
         fit = self._fit(wide, ports, self._start(wide, ports, None))
         return fit.cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
 

@@ -126,12 +126,19 @@ class CellFit:
     """One frame's minimisation. cell (R, C) [S]; message: why it did not converge, or empty.
 
     It starts from the cells of the frame `before`, or from those of `ohm` if they are nearer.
+    It ends where a step lowers the chi-square by less than `tolerance`.
     """
 
-    def __init__(self, ports: PortReadings, ref_ohm: float, before: Float | None) -> None:
+    def __init__(
+        self,
+        ports: PortReadings,
+        ref_ohm: float,
+        before: Float | None,
+        tolerance: float = CHI2_TOLERANCE,
+    ) -> None:
         self._target = ports.current.ravel()
         self._current_std = ports.current_std.ravel()
-        self._ref_ohm = ref_ohm
+        self._ref_ohm, self._tolerance = ref_ohm, tolerance
         # 1 / (1 + G_read R), of a current that the most conductive cell allows.
         feasible = np.minimum(self._target, port_current(MAX_CELL_SIEMENS, ref_ohm))
         self._target_share = 1.0 - feasible * ref_ohm
@@ -182,7 +189,9 @@ class CellFit:
             cell = self._stepped(gradient, damping, 1 if far else _BOUND_ROUNDS)
             if cell is not None:
                 promised = float((cell - self.cell).ravel() / self.scale @ self.gradient)
-                settled = abs(promised) < self._tolerance() and damping <= _LIGHT_DAMPING
+                # Rounding of the chi-square counts where no cells explain the readings.
+                tolerance = max(self._tolerance, 1e-9 * self.cost)
+                settled = abs(promised) < tolerance and damping <= _LIGHT_DAMPING
                 if settled and not far:
                     return ""
                 trial = self._evaluate(cell)
@@ -198,10 +207,6 @@ class CellFit:
                 if damping > _LARGEST_DAMPING:
                     return "no step lowers the chi-square"
         return f"not converged after {MAX_ITERATIONS} iterations"
-
-    def _tolerance(self) -> float:
-        # The chi-square itself carries rounding, which counts where no cells explain the readings.
-        return max(CHI2_TOLERANCE, 1e-9 * self.cost)
 
     def _stepped(self, gradient: Float, damping: float, rounds: int) -> Float | None:
         """Minimum of the quadratic model within the bounds, shape (R, C) [S].

@@ -172,13 +172,15 @@ class PortReader:
         risen = found.current > RISE_SHARE * rest.current
         for axis, line in enumerate(("row", "column")):
             up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
-            if found.current.shape[1 - axis] < 3:
+            frames = self._alike_frames[axis]
+            # Lines once shown apart matter again where two conduct more in all their ports.
+            known = frames.max() < ALIKE_FRAMES and np.count_nonzero(up) < 2
+            if known or found.current.shape[1 - axis] < 3:
                 continue
             differed = self._rest_apart[axis] > 2 * SAME_STDS
             apart = np.where(differed, _apart(found, axis), np.inf)
             # Between one and two times the limit, noise may be what differs.
-            frames = np.where(apart > 2 * SAME_STDS, 0, self._alike_frames[axis] + 1)
-            self._alike_frames[axis] = frames
+            self._alike_frames[axis] = frames = np.where(apart > 2 * SAME_STDS, 0, frames + 1)
             apart[frames < ALIKE_FRAMES] = np.inf
             if pair := _alike(apart, up, line):
                 return f"{pair} read alike as they did not at rest: shorted?"

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.small import cholesky, gram, solve
+from ohmskin.circuit.small import cholesky, solve
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
@@ -54,7 +54,7 @@ SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
 LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 
-Lesson = tuple[Float, Float, Float]  # what wires learn from: J, z and N
+Lesson = tuple[Float, Float, Float]  # what wires learn from: J P^1/2, z and N
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class CellPrior:
     with the same slope as tail (1 + log(d^2 / tail)): the density falls as d^-tail. Cells at rest
     are a quadratic problem, which costs no iterations; being touched is unlikely, but how hard,
     once a cell is, costs little.
-    expected, std: (RC,) [log ohm]. tail: inf for a normal.
+    expected, std: (RC,) [log ohm]. tail: 1e9 for what is as good as normal.
     """
 
     expected: Float
@@ -79,8 +79,6 @@ class CellPrior:
     def cost(self, log_ohm: Float) -> float:
         """-2 log p, up to a constant."""
         square = ((log_ohm - self.expected) / self.std) ** 2
-        if self.tail == np.inf:
-            return float(square.sum())
         beyond = np.maximum(square / self.tail, 1.0)
         return float((np.minimum(square, self.tail) + self.tail * np.log(beyond)).sum())
 
@@ -101,7 +99,6 @@ class WireBelief:
         self, rows: int, columns: int, nominal_top: float | None, nominal_bottom: float | None
     ) -> None:
         self.shape = (rows, columns)
-        self._cells = rows * columns
         told = nominal_top is not None and nominal_bottom is not None
         self._prior_covariance = (LAYER_STD if told else UNKNOWN_LAYER_STD) ** 2 * np.eye(2)
         nominal = [
@@ -113,37 +110,32 @@ class WireBelief:
 
     def reset(self) -> None:
         """Back to the nominal wires."""
-        self._layers, self._covariance = self._nominal, self._prior_covariance
+        self.log_layers, self._root = self._nominal, np.linalg.cholesky(self._prior_covariance)
 
     @property
     def mean(self) -> Float:
         """Expected log resistances, (2RC,)."""
-        return np.repeat(self._layers, self._cells)
+        return np.repeat(self.log_layers, self.shape[0] * self.shape[1])
 
-    def _by_layer(self, slopes: Float) -> Float:
-        """J L^T, (m, 2), or L a (2,) for a vector (2RC,)."""
-        return np.asarray(slopes.reshape(*slopes.shape[:-1], 2, self._cells).sum(axis=-1))
+    def root(self, slopes: Float) -> Float:
+        """J P^1/2, (m, 2RC + 2), from J (m, 2RC): what each segment has, and what layers share."""
+        by_layer = slopes.reshape(len(slopes), 2, -1).sum(axis=2)
+        return np.hstack([SEGMENT_STD * slopes, by_layer @ self._root])
 
-    def times(self, slopes: Float) -> Float:
-        """P J^T, shape (2RC, m), or P a for a vector (2RC,)."""
-        common = self._by_layer(slopes) @ self._covariance
-        return np.asarray((SEGMENT_STD**2 * slopes + np.repeat(common, self._cells, axis=-1)).T)
+    def log_wires(self, away: Float) -> Float:
+        """Log resistances (2RC,) that are m + P^1/2 away, from what is normal (2RC + 2,)."""
+        common = self.log_layers + self._root @ away[-2:]
+        own = SEGMENT_STD * away[:-2].reshape(2, -1)
+        wires = np.minimum(np.maximum(own + common[:, None], LOG_LIMITS[0]), LOG_LIMITS[1])
+        return np.asarray(wires.ravel())
 
-    def seen(self, slopes: Float, onto: Float | None = None) -> Float:
-        """J P J^T, what the wires' uncertainty does to m readings: lower triangle (m, m).
-
-        Added onto a matrix that is overwritten, if there is one.
-        """
-        common = self._by_layer(slopes) @ np.linalg.cholesky(self._covariance)
-        return gram(common, 1.0, gram(slopes, SEGMENT_STD**2, onto))
-
-    def variance(self, slopes: Float) -> Float:
-        """Diagonal of J P J^T, (m,)."""
-        return np.asarray(np.einsum("ij,ji->i", slopes, self.times(slopes)))
+    def moved(self, root: Float, log_layers: Float) -> Float:
+        """J (m - m'), (m,): change of readings since m' (2,), log_layers then. root: J P^1/2."""
+        return np.asarray(root[:, -2:] @ np.linalg.solve(self._root, self.log_layers - log_layers))
 
     def std(self) -> Float:
-        """Standard deviation of each log resistance, (2RC,)."""
-        return np.repeat(np.sqrt(SEGMENT_STD**2 + np.diagonal(self._covariance)), self._cells)
+        """Standard deviation of a log resistance of each layer, (2,)."""
+        return np.asarray(np.hypot(SEGMENT_STD, np.linalg.norm(self._root, axis=1)))
 
     def layers(self, log_wires: Float) -> tuple[Float, Float]:
         """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
@@ -155,15 +147,17 @@ class WireBelief:
         top, bottom = self.layers(log_wires)
         return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
 
-    def learn(self, slopes: Float, residual: Float, noise: Float) -> None:
-        """One Kalman step. slopes: J (m, 2RC); residual: z (m,) at the mean; noise: N (m, m)."""
+    def learn(self, root: Float, residual: Float, noise: Float) -> None:
+        """One Kalman step. root: J P^1/2; residual: z (m,) at the mean; noise: N (m, m)."""
         if len(residual) < 2:
             return
-        self._covariance = (1 - FADE) * self._covariance + FADE * self._prior_covariance
-        spread = self._by_layer(slopes) @ self._covariance
-        gain = solve(cholesky(noise + slopes @ self.times(slopes)), spread).T
-        self._layers = np.clip(self._layers + gain @ residual, *LOG_LIMITS)
-        self._covariance = self._covariance - gain @ spread
+        by_layer = root[:, -2:]
+        gain = solve(cholesky(noise + root @ root.T), by_layer).T
+        log_layers = self.log_layers + self._root @ (gain @ residual)
+        self.log_layers = np.clip(log_layers, *LOG_LIMITS)
+        covariance = self._root @ (np.eye(2) - gain @ by_layer) @ self._root.T
+        covariance += FADE * (self._prior_covariance - covariance)
+        self._root = np.linalg.cholesky(covariance)
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

@@ -18,8 +18,8 @@ I      (RC,)    port currents per Vdd                                           
 s      (RC,)    their noise: of the readings, of cells at rest and wires           S
 r      (RC,)    residual (I_read - I) / s                                          1
 J      (k, RC)  dI / dx / s                                                        1
-Jw     (m, 2RC) dI / dw / s, w the log wire resistances, at the m ports they matter
-N      (m, m)   1 + Jw P Jw^T, P the covariance of w                               1
+Jw     (m, W)   dI / dw / s P^1/2, w the log wire resistances, at the ports they matter
+N      (m, m)   1 + Jw Jw^T; P is the covariance of w, W = 2RC + 2                           1
 ====== ======== ================================================================== ==========
 
 The untouched skin is solved once. Added conductances are a change of rank k (Woodbury):
@@ -43,8 +43,14 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import admittance_of, by_wires, factorised, impedance_of, port_potential
-from ohmskin.circuit.small import cholesky, solve, solve_lower
+from ohmskin.circuit.skin import (
+    admittance_of,
+    factorised,
+    impedance_of,
+    port_potential,
+    wire_current,
+)
+from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
@@ -56,7 +62,7 @@ from ohmskin.estimate.prior import (
 
 Cells = NDArray[np.intp]
 
-MOST_PER_LINE: Final = 1.0  # touches a row and column, on average; with more, they are not few
+MOST_PER_LINE: Final = 1.0  # touches a row and column, on average
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
 LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
@@ -99,8 +105,10 @@ class RestNetwork:
 
     def by_wires(self, cell_current: Float) -> Float:
         """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents (m, RC)."""
-        current = cell_current.reshape(-1, *self.shape)
-        return by_wires(current, self.top_wire_ohm, self.bottom_wire_ohm)
+        slopes = wire_current(cell_current.reshape(-1, *self.shape))
+        slopes *= slopes
+        slopes *= np.stack([self.top_wire_ohm, self.bottom_wire_ohm])
+        return slopes.reshape(len(cell_current), -1)
 
 
 class TouchedNetwork:
@@ -160,13 +168,14 @@ class SparseFit:
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
+        self.most = MOST_PER_LINE * sum(belief.shape)  # with more touches, they are not few
         self.least_log = -prior.expected + LEAST_RISE * prior.std
         self._solve_rest()
 
     def _solve_rest(self) -> None:
         """The untouched skin, with wires as they are believed now."""
         prior, belief = self.prior, self.belief
-        self.log_wires = belief.mean
+        self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
         self.net = net = RestNetwork(rest_siemens, *belief.layers(belief.mean))
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
@@ -174,13 +183,14 @@ class SparseFit:
         wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
-        self.slack += belief.variance(wires * (self.current**2)[:, None])
+        root = belief.root(wires * (self.current**2)[:, None])
+        self.slack += np.einsum("ij,ij->i", root, root)
         self.path_ohm = belief.path_ohm(belief.mean)
         self.wire_std = float(belief.std().max())
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
         """The touched cells of one frame, (RC,) [S] both; None if no few touches explain it."""
-        if np.abs(self.belief.mean - self.log_wires).max() > REBUILD:
+        if np.abs(self.belief.log_layers - self.log_layers).max() > REBUILD:
             self._solve_rest()
         frame = _Frame(self, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
@@ -188,11 +198,10 @@ class SparseFit:
         for _ in range(MAX_ROUNDS):
             asked, rise = frame.asked_for()
             if not asked.size:
-                few = frame.cells.size <= MOST_PER_LINE * sum(self.net.shape)
-                return frame.finish() if few else None
+                return frame.finish() if frame.cells.size <= self.most else None
             cells = np.concatenate([frame.cells, asked])
             # Ghosts among them may leave again.
-            if cells.size > 2 * MOST_PER_LINE * sum(self.net.shape):
+            if cells.size > 2 * self.most:
                 return None
             added = np.log(self.net.cell_siemens[asked] + rise)
             frame.settle(cells, np.concatenate([frame.log_siemens, added]))
@@ -290,16 +299,16 @@ class _Frame:
         skin, cells = self._skin, self.cells
         if not cells.size:
             none = np.zeros(0)
-            lesson = np.zeros((0, 2 * skin.current.size)), none, np.zeros((0, 0))
+            lesson = np.zeros((0, 2 * skin.current.size + 2)), none, np.zeros((0, 0))
             less = self._residual.min() < -DEMAND
             return None if less else Touched(cells, none, none, self._current, 0, lesson)
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
-        covariance = skin.belief.seen(wires)
+        covariance = gram(wires)
         np.einsum("ii->i", covariance)[:] += 1.0
         factor = cholesky(covariance)
-        offset = wires @ (skin.belief.mean - skin.log_wires)
+        offset = skin.belief.moved(wires, skin.log_layers)
         for _ in range(2):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
@@ -343,7 +352,7 @@ class _Frame:
         return heavy
 
     def _sharpened(self, ports: Cells) -> Float:
-        """Jw (m, 2RC); takes the drift of cells at rest from the touched network at these ports."""
+        """Jw; takes the drift of cells at rest from the touched network at these ports."""
         assert self._touched is not None
         skin, net = self._skin, self._skin.net
         currents = self._touched.cell_current(ports)
@@ -356,4 +365,4 @@ class _Frame:
         self._place(self.cells, self.log_siemens)
         wires = net.by_wires(currents)
         wires *= -(square / self._std[ports])[:, None]
-        return wires
+        return skin.belief.root(wires)
