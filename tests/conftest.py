@@ -61,7 +61,7 @@ def nothing_left() -> Iterator[None]:
     threads, files = set(threading.enumerate()), _open_files()
     yield
     assert set(threading.enumerate()) <= threads
-    assert _open_files() == files
+    assert _open_files() <= files  # fewer, where a file of a test before was closed late
 
 
 def _open_files() -> int:
