@@ -30,16 +30,26 @@ def test_the_further_from_rest_the_less_a_step_costs() -> None:
 
 def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:
     log_siemens, log_std = np.log([1e-6, 1e-5, 1e-4]), np.full(3, 0.001)
-    up, down = siemens_std(log_siemens, log_std, np.full(3, 1.0), np.full(3, 0.1), 6e4)
+    up, down = siemens_std(log_siemens, log_std, np.zeros(3), 0.1, np.full(3, 6e4))
     np.testing.assert_allclose(up, 0.001 * np.exp(log_siemens), rtol=0.03)
     np.testing.assert_allclose(down, 0.001 * np.exp(log_siemens), rtol=0.03)
 
 
 def test_a_cell_behind_unknown_wires_may_be_a_short() -> None:
-    """1 kOhm +- 50 % behind 10 kOhm of wire: four deviations down are below nothing."""
-    up, down = siemens_std(np.log([1e-3]), np.array([0.5]), np.array([1e4]), np.array([0.05]), 6e4)
-    assert 1e-3 + 4 * up[0] == pytest.approx(HIGHEST_TOUCH_SIEMENS)
-    assert 0 < down[0] < 0.25e-3
+    """1 kOhm +- 50 % behind 10 kOhm of wire: two deviations down are nearly nothing."""
+    half, series_ohm = np.array([0.5]), np.array([7e4])
+    up, down = siemens_std(np.log([1e-3]), half, half, 0.05, series_ohm)
+    assert 1e-3 + 2 * up[0] == pytest.approx(HIGHEST_TOUCH_SIEMENS)
+    assert 0 < down[0] < 0.5e-3
+
+
+def test_wires_of_unknown_length_make_a_cell_uncertain_upwards() -> None:
+    """A layer known to a factor of two: two of its deviations up are a factor of four."""
+    up, down = siemens_std(
+        np.log([1e-5]), np.array([0.01]), np.array([0.01]), np.log(2.0), np.array([6e4])
+    )
+    assert up[0] == pytest.approx(1e-5 * 0.01 * 3 / np.log(4.0), rel=0.02)
+    assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
 
 
 def test_the_level_of_an_untouched_skin_is_found_and_touches_raise_it_little() -> None:

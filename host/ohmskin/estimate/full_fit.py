@@ -149,20 +149,22 @@ class FullFit:
         self._left = left if share == 1.0 else residual
         return bool(moved < CLOSE)
 
-    def _learned(self, factor: Float, cell_std: Float) -> Float:
-        """Share of each cell's prior variance that the readings take away, (RC,)."""
+    def _deviations(self, factor: Float, cell_std: Float) -> tuple[Float, Float]:
+        """Share of each cell's prior variance that readings take away; what layers do to cells."""
         own = solve_lower(factor, self._by_cell * cell_std)
-        return np.asarray(np.einsum("ij,ij->j", own, own))
+        by_layers = own.T @ solve_lower(factor, self._by_wires[:, -2:])
+        share = np.einsum("ij,ij->j", own, own)
+        return np.asarray(share), cell_std * np.linalg.norm(by_layers, axis=1)
 
     def _conclude(self) -> None:
-        """cell_std, from the last factor that was made.
+        """cell_std, and what the uncertain layers have in it, from the last factor that was made.
 
         A cell is called untouched when the readings ask for less than the prior asks against it.
         Where that may be a touch all the same, small for the readings but not for the cell, it is
         counted as uncertain by so much, and so is what depends on it.
         """
         prior, cell_std = self._prior, self._cell_std
-        learned = self._learned(self._factor, cell_std)
+        learned, self.by_layers = self._deviations(self._factor, cell_std)
         distance = prior.expected - self.cell
         at_rest = distance**2 < prior.tail * prior.std**2
         # What the readings alone say of a cell: rise of its conductance over rest, and deviation.
@@ -175,9 +177,11 @@ class FullFit:
         self._hidden = hidden
         if hidden.any() or self.is_crowded:
             cell_std = np.where(hidden, rise + rise_std, cell_std)
-            learned = self._learned(self._factorised(cell_std)[1], cell_std)
+            _, factor = self._factorised(cell_std)
+            learned, self.by_layers = self._deviations(factor, cell_std)
         self.cell_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
+    @property
     def lesson(self) -> Lesson:
         """Slopes, residual and noise of the readings, for the belief."""
         residual = self._residual + self._by_wires @ self._off_wires

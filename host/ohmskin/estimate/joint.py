@@ -18,10 +18,10 @@ few touches. Where they do not explain the frame, its answer is that of `joint`.
 readings no cell is known to be untouched, so every frame is for `joint`.
 """
 
-from collections.abc import Callable
 from typing import ClassVar, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
@@ -36,7 +36,6 @@ from ohmskin.estimate.prior import (
     UNTOUCHED_OHM,
     UNTOUCHED_STD,
     CellPrior,
-    Lesson,
     WireBelief,
     rest_level,
     siemens_std,
@@ -83,58 +82,37 @@ class JointEstimator(Estimator):
         if self._finder is not None and self._touches <= self._finder.most:
             found = self._finder.find(current, current_std)
         known = self.knowledge.rest_ratio is not None
-        if found is not None and known and found.log_std.max(initial=0.0) <= self.widest_log_std:
-            return self._simple_solution(prior, found, ports)
+        if found is not None and known and self._is_sure(found):
+            # Around a finger, cells are pressed so lightly that they would pass for rest here.
+            if not ports.fault and self._adjoining(found.cells) <= 1 < found.cells.size:
+                self._learn(found)
+            return self._solution(ports, found)
         fit = self._fit(prior, ports, self._start(prior, ports, found))
         self._touches = fit.touches
         message = self._doubt(prior, fit)
         if not (ports.fault or message or fit.is_crowded):
-            self._learn(fit.cell, fit.lesson)
-        return self._solution(
-            ports,
-            (fit.cell, fit.cell_std),
-            fit.wires,
-            fit.modelled,
-            fit.iterations,
-            message,
-            max(1.0, fit.misfit) ** 0.5,
-        )
+            self._learn(fit)
+        return self._solution(ports, fit, message)
 
-    def _simple_solution(self, prior: CellPrior, found: Touched, ports: PortReadings) -> Solution:
-        cell, std = prior.expected.copy(), prior.std.copy()
-        cell[found.cells], std[found.cells] = -found.log_siemens, found.log_std
-        places = np.array(np.unravel_index(found.cells, self._shape))
-        beside = np.abs(places[:, :, None] - places[:, None]).sum(axis=0) == 1
-        # Around a finger, cells are pressed so lightly that they would pass for rest here.
-        if found.cells.size > 1 and beside.sum() <= 2 and not ports.fault:
-            self._learn(cell, lambda: found.lesson)
-        return self._solution(ports, (cell, std), self._belief.mean, found.current, found.steps)
+    def _is_sure(self, found: Touched) -> bool:
+        return bool(found.cell_std[found.cells].max(initial=0.0) <= self.widest_log_std)
 
-    def _solution(
-        self,
-        ports: PortReadings,
-        cells: tuple[Float, Float],
-        wires: Float,
-        current: Float,
-        iterations: int,
-        message: str = "",
-        wider: float = 1.0,
-    ) -> Solution:
-        """From log resistances of cells, with their deviations, and of wires.
+    def _adjoining(self, cells: NDArray[np.intp]) -> int:
+        """How many pairs of these cells are side by side."""
+        places = np.array(np.unravel_index(cells, self._shape))
+        return int((np.abs(places[:, :, None] - places[:, None]).sum(axis=0) == 1).sum()) // 2
 
-        current: what they predict (RC,) [S]. wider: what the deviations are multiplied with.
-        """
-        cell, cell_std = cells
-        path_ohm = self._belief.path_ohm(wires)
-        path_std = np.full(path_ohm.size, self._belief.std().mean())
-        std, std_down = siemens_std(-cell, cell_std, path_ohm, path_std, self.knowledge.ref_ohm)
-        top, bottom = self._belief.layers(wires)
+    def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
+        series_ohm = self._belief.path_ohm(fit.wires) + self.knowledge.ref_ohm
+        layer_std, wider = self._belief.std(), max(1.0, fit.misfit) ** 0.5
+        std, down = siemens_std(-fit.cell, fit.cell_std, fit.by_layers, layer_std, series_ohm)
+        top, bottom = self._belief.layers(fit.wires)
         return Solution(
-            cell_siemens=np.exp(-cell).reshape(self._shape),
+            cell_siemens=np.exp(-fit.cell).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
-            cell_siemens_std_down=wider * std_down.reshape(self._shape),
-            chi2=self._chi2(ports.ratio, current.reshape(self._shape)),
-            iterations=iterations,
+            cell_siemens_std_down=wider * down.reshape(self._shape),
+            chi2=self._chi2(ports.ratio, fit.modelled.reshape(self._shape)),
+            iterations=fit.iterations,
             message=message,
             top_wire_ohm=top,
             bottom_wire_ohm=bottom,
@@ -166,9 +144,7 @@ class JointEstimator(Estimator):
         not reach the distant answer of one hard touch behind long wires.
         """
         if found is not None:
-            start = prior.expected.copy()
-            start[found.cells] = -found.log_siemens
-            return start
+            return found.cell
         # To start from, a deviation of every reading is near enough.
         near = float(ports.current.size)
         fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires, near)
@@ -176,12 +152,12 @@ class JointEstimator(Estimator):
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
 
-    def _learn(self, cell: Float, lesson: Callable[[], Lesson]) -> None:
+    def _learn(self, fit: FullFit | Touched) -> None:
         """Let the wires learn from a frame that is not like the last one learned from."""
         before = self._learned_from
-        if before is None or np.abs(cell - before).max() >= NEWS:
-            self._learned_from = cell
-            self._belief.learn(*lesson())
+        if before is None or np.abs(fit.cell - before).max() >= NEWS:
+            self._learned_from = fit.cell
+            self._belief.learn(*fit.lesson)
 
     def _prior_of(self, current: Float) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.

@@ -4,8 +4,12 @@
 Symbols: y (R, C, 4) readings, s their standard deviation; I, I_rest (R, C) port currents per Vdd,
 of this frame and of the rest readings, and s_I theirs [S].
 
-    chi2_cell = sum_k (y_k - y_k(I))^2 / s^2          three degrees of freedom: one current, four
-    s_I grows with the root of chi2_cell / 3, or of the median cell's if that is larger
+    v_cell = sum_k (y_k - y_k(I))^2 / 3       one current, four readings; v is the usual cell's
+    s_I^2 = max(v_cell, v) / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2
+
+Without noise, the four readings of a cell round alike: they agree, and their mean is no better than
+one. Noise makes them disagree and round differently. Where v is the variance s^2 of rounding twice,
+their errors are independent. (Exact at both ends; between them, s_I is 1.0 to 1.2 times too large.)
 
 A frame is at fault, and its answer not to be relied on, where
 
@@ -47,7 +51,8 @@ if TYPE_CHECKING:
     from ohmskin.estimate.base import SkinKnowledge
 
 _DEGREES: Final = READINGS_PER_CELL - 1
-_MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
+# Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
+_MOST_USUAL: Final = 9.0
 # Disagreement of a cell's readings, root of its mean square, ratio to Vdd: of most cells, of one.
 DISAGREE_ALL: Final = 0.016
 DISAGREE_ONE: Final = 0.03
@@ -55,9 +60,8 @@ DISAGREE_OVER_NOISE: Final = 6.0
 AGREE: Final = 4.0  # deviations of a reading: three that disagree by less agree
 DROP_SHARE: Final = 0.85  # of the current at rest, below which drift is no explanation
 CLEAR_STDS: Final = 5.0  # deviations that are more than noise
-# Joined electrodes give the same code, or differ by what the readings disagree within a cell; one
-# code is 3.5 deviations of rounding.
-SAME_STDS: Final = 2.5
+# Joined electrodes give the same code, or differ by noise; one code is 3.5 deviations of rounding.
+SAME_STDS: Final = 3.4
 RISE_SHARE: Final = 1.15  # of the current at rest: shorted lines draw more, all of them
 ALIKE_FRAMES: Final = 270  # three seconds at 90 Hz: a finger does not lie that evenly for longer
 PAIR_SHARE: Final = 1.15  # of the median line's current: lines that were shorted at rest draw more
@@ -81,6 +85,7 @@ class PortReader:
         shape = (known.rows, known.columns)
         self._ref_ohm = (known.ref_top_ohm, known.ref_bottom_ohm)
         self._ratio_std, self._current_std = known.ratio_std, known.current_std
+        self._ref_square = float(np.sum(reference_ohm(*self._ref_ohm) ** 2))
         self._highest_current: Float = np.full(shape, np.inf)
         if known.nominal_wire_ohm.both is not None:
             top, bottom = (np.full(shape, WIRE_SHARE * ohm) for ohm in known.nominal_wire_ohm.both)
@@ -91,7 +96,7 @@ class PortReader:
         self.reset()
         if known.rest_ratio is not None:
             self._rest = rest = self.read(known.rest_ratio)
-            self._rest_apart = [_apart(rest, axis) for axis in (0, 1)]
+            self._rest_apart = [self._apart(rest, axis) for axis in (0, 1)]
             self._rest_fault = self._fault_at_rest(rest)
 
     def reset(self) -> None:
@@ -105,9 +110,11 @@ class PortReader:
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
-        variance = self._ratio_std**2
-        common = max(1.0, typical / (_MEDIAN_CHI2 * variance))
-        std = self._current_std * np.sqrt(np.maximum(common, square / (_DEGREES * variance)))
+        own, rounding = square / _DEGREES, self._ratio_std**2
+        most = _MOST_USUAL * max(rounding, typical / _DEGREES)
+        usual = float(np.mean(own[own <= most]))
+        alike = max(0.0, 1.0 - usual / (2.0 * rounding)) * self._current_std**2
+        std = np.sqrt(np.maximum(own, usual) / self._ref_square + alike)
         fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
         found = PortReadings(ratio, current, std)
         if not fault:
@@ -178,13 +185,25 @@ class PortReader:
             if known or found.current.shape[1 - axis] < 3:
                 continue
             differed = self._rest_apart[axis] > 2 * SAME_STDS
-            apart = np.where(differed, _apart(found, axis), np.inf)
+            apart = np.where(differed, self._apart(found, axis), np.inf)
             # Between one and two times the limit, noise may be what differs.
             self._alike_frames[axis] = frames = np.where(apart > 2 * SAME_STDS, 0, frames + 1)
             apart[frames < ALIKE_FRAMES] = np.inf
             if pair := _alike(apart, up, line):
                 return f"{pair} read alike as they did not at rest: shorted?"
         return ""
+
+    def _apart(self, ports: PortReadings, axis: int) -> Float:
+        """Largest difference between the currents of two rows (axis 0) or columns, (lines, lines).
+
+        Over its deviation, or that of rounding if it is larger.
+        """
+        current, std = ports.current, np.maximum(ports.current_std, self._current_std)
+        if axis:
+            current, std = current.T, std.T
+        difference = np.abs(current[:, None, :] - current[None, :, :])
+        difference /= np.maximum(std[:, None, :], std[None, :, :])
+        return np.asarray(difference.max(axis=2))
 
     def _fault_at_rest(self, rest: PortReadings) -> str:
         clear = rest.current / rest.current_std
@@ -201,19 +220,6 @@ class PortReader:
             if pair := _alike(self._rest_apart[axis], up, line):
                 return f"{pair} conducted alike at rest, and more than others"
         return ""
-
-
-def _apart(ports: PortReadings, axis: int) -> Float:
-    """Largest difference between the currents of two rows (axis 0) or columns, over its deviation.
-
-    Square, lines by lines.
-    """
-    current, std = ports.current, ports.current_std
-    if axis:
-        current, std = current.T, std.T
-    difference = np.abs(current[:, None, :] - current[None, :, :])
-    difference /= np.maximum(std[:, None, :], std[None, :, :])
-    return np.asarray(difference.max(axis=2))
 
 
 def _alike(apart: Float, up: NDArray[np.bool_], line: str) -> str:

@@ -54,6 +54,8 @@ SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
 LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 
+REACH: Final = 2.0  # deviations of what is normal that make as many deviations of a conductance
+
 Lesson = tuple[Float, Float, Float]  # what wires learn from: J P^1/2, z and N
 
 
@@ -133,9 +135,9 @@ class WireBelief:
         """J (m - m'), (m,): change of readings since m' (2,), log_layers then. root: J P^1/2."""
         return np.asarray(root[:, -2:] @ np.linalg.solve(self._root, self.log_layers - log_layers))
 
-    def std(self) -> Float:
-        """Standard deviation of a log resistance of each layer, (2,)."""
-        return np.asarray(np.hypot(SEGMENT_STD, np.linalg.norm(self._root, axis=1)))
+    def std(self) -> float:
+        """Standard deviation of the log of the layer that is known less."""
+        return float(np.linalg.norm(self._root, axis=1).max())
 
     def layers(self, log_wires: Float) -> tuple[Float, Float]:
         """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
@@ -174,25 +176,23 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
 
 
 def siemens_std(
-    log_siemens: Float, log_std: Float, path_ohm: Float, wire_std: Float, ref_ohm: float
+    log_siemens: Float, log_std: Float, by_layers: Float, layer_std: float, series_ohm: Float
 ) -> tuple[Float, Float]:
-    """Standard deviations of conductances, upwards and downwards [S]: quarters of four deviations.
+    """Standard deviations of conductances, upwards and downwards [S]: halves of two deviations.
 
-    log_std: of the log conductance, to first order. path_ohm, wire_std: wires between each cell and
-    its electrodes, and the deviation of their log. ref_ohm: both references. All (RC,).
+    log_std: of the log conductance, to first order; by_layers: what the layers' wires have in it;
+    layer_std: the deviation of their log. series_ohm: wires to the cell and references. All (RC,).
     Errors are normal in the current u = 1 / (r + series), not in g = 1 / r, and the wires' in their
     log: upwards, behind much series resistance, a cell may be anything that a touch makes of it.
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
-    by_wires = np.minimum(path_ohm * wire_std * siemens, log_std)
-    wider = np.expm1(4.0 * wire_std) / (4.0 * wire_std)
-    up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * by_wires**2)
-    series_ohm = path_ohm + ref_ohm
+    wider = np.expm1(REACH * layer_std) / (REACH * layer_std)
+    up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * by_layers**2)
     loop_ohm = cell_ohm + series_ohm
-    share = cell_ohm / loop_ohm
-    lowest_ohm = loop_ohm / (1.0 + 4.0 * up_std * share) - series_ohm
-    highest_ohm = loop_ohm / np.maximum(1.0 - 4.0 * log_std * share, 1e-6) - series_ohm
+    share = REACH * cell_ohm / loop_ohm
+    lowest_ohm = loop_ohm / (1.0 + up_std * share) - series_ohm
+    highest_ohm = loop_ohm / np.maximum(1.0 - log_std * share, 1e-6) - series_ohm
     highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
-    up = np.maximum(siemens * log_std, 0.25 * (highest - siemens))
-    return np.asarray(up), np.asarray(0.25 * (siemens - 1.0 / highest_ohm))
+    up = np.maximum(siemens * log_std, (highest - siemens) / REACH)
+    return np.asarray(up), np.asarray((siemens - 1.0 / highest_ohm) / REACH)

@@ -54,6 +54,7 @@ from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
+    SEGMENT_STD,
     UNLIMITED_STD,
     CellPrior,
     Lesson,
@@ -149,18 +150,21 @@ class TouchedNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """What was found: cells (k,), their log conductance and its standard deviation (k,).
+    """What was found: cells (k,), and what a `FullFit` says as well.
 
-    current: what the model predicts, wires corrected (RC,) [S]. lesson: what the wires can learn
-    from: Jw, r and N of the m ports, the touched cells in N as noise without limit.
+    lesson: what the wires can learn from: Jw, r and N of the m ports, the touched cells in N as
+    noise without limit.
     """
 
     cells: Cells
-    log_siemens: Float
-    log_std: Float
-    current: Float
-    steps: int
+    cell: Float
+    cell_std: Float
+    by_layers: Float
+    wires: Float
+    modelled: Float
+    iterations: int
     lesson: Lesson
+    misfit: float = 0.0
 
 
 class SparseFit:
@@ -186,7 +190,7 @@ class SparseFit:
         root = belief.root(wires * (self.current**2)[:, None])
         self.slack += np.einsum("ij,ij->i", root, root)
         self.path_ohm = belief.path_ohm(belief.mean)
-        self.wire_std = float(belief.std().max())
+        self.wire_std = float(np.hypot(belief.std(), SEGMENT_STD))
 
     def find(self, current: Float, current_std: Float) -> Touched | None:
         """The touched cells of one frame, (RC,) [S] both; None if no few touches explain it."""
@@ -298,10 +302,9 @@ class _Frame:
         """The last steps, with wires known to their covariance only; None if they contradict."""
         skin, cells = self._skin, self.cells
         if not cells.size:
-            none = np.zeros(0)
-            lesson = np.zeros((0, 2 * skin.current.size + 2)), none, np.zeros((0, 0))
+            nothing = (np.zeros((0, 2 * skin.current.size + 2)), np.zeros(0), np.zeros((0, 0)))
             less = self._residual.min() < -DEMAND
-            return None if less else Touched(cells, none, none, self._current, 0, lesson)
+            return None if less else self._answer(np.zeros((0, 0)), 0.0, self._current, nothing)
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
@@ -331,16 +334,22 @@ class _Frame:
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
         of_touches = slopes[:, ports]
+        of_cells = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        of_layers = of_cells @ own.T @ solve_lower(factor, wires[:, -2:])
         noise = UNLIMITED_STD**2 * (of_touches.T @ of_touches)
         noise.ravel()[:: ports.size + 1] += 1.0
-        return Touched(
-            cells=cells,
-            log_siemens=self.log_siemens,
-            log_std=np.sqrt(np.diagonal(np.linalg.inv(normal))),
-            current=current,
-            steps=self.steps,
-            lesson=(wires, residual, noise),
-        )
+        by_layers = np.linalg.norm(of_layers, axis=1)
+        return self._answer(of_cells, by_layers, current, (wires, residual, noise))
+
+    def _answer(
+        self, covariance: Float, by_layers: Float | float, current: Float, lesson: Lesson
+    ) -> Touched:
+        prior, cells = self._skin.prior, self.cells
+        cell, std, by_all = prior.expected.copy(), prior.std.copy(), np.zeros(current.size)
+        cell[cells], std[cells] = -self.log_siemens, np.sqrt(np.diagonal(covariance))
+        by_all[cells] = by_layers
+        wires = self._skin.belief.mean
+        return Touched(cells, cell, std, by_all, wires, current, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
