@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print the contacts of a calibrated skin: python forces.py PORT CALIBRATION
 
+A line is "1.23 +- 0.10 N at (2.0, 5.0)", with the standard deviation of the force. Where that is
+larger than the force, the line is "uncertain at (2.0, 5.0)".
+
 Without hardware, with a calibration from presses that are made up:
 
     ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json --indenter-mm2 80
@@ -14,4 +17,4 @@ import ohmskin
 with ohmskin.open(sys.argv[1], calibration=sys.argv[2]) as skin:
     for scan in skin:
         for each in scan.contacts:
-            print(f"{each.force_n:.2f} N at ({each.row:.1f}, {each.column:.1f})", flush=True)
+            print(f"{each.force_text} at ({each.row:.1f}, {each.column:.1f})", flush=True)

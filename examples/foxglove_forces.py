@@ -24,7 +24,9 @@ PITCH_M = 0.01
 GRID = {"type": "object", "properties": {"data": {"type": "string", "contentEncoding": "base64"}}}
 CELLS = {
     "type": "object",
-    "properties": {"force_n": {"type": "array", "items": {"type": "number"}}},
+    "properties": {
+        name: {"type": "array", "items": {"type": "number"}} for name in ("force_n", "force_n_std")
+    },
 }
 ORIGIN = {
     "position": {"x": 0.0, "y": 0.0, "z": 0.0},
@@ -70,7 +72,14 @@ def main(recording: str, calibration: str, out: str) -> None:
         for told, scan in zip(recorded, skin, strict=True):
             time_ns = since_1970_ns + round(1e9 * told.host_time_s)
             force_n = np.nan_to_num(scan.force_n)
-            messages = (grid(force_n, time_ns), {"force_n": force_n.flatten().round(4).tolist()})
+            cells = {"force_n": force_n, "force_n_std": scan.force_n_std}
+            # JSON has no NaN: what the method does not tell is left out.
+            content = {
+                name: values.flatten().round(4).tolist()
+                for name, values in cells.items()
+                if not np.isnan(values).any()
+            }
+            messages = (grid(force_n, time_ns), content)
             for channel, message in zip(channels, messages, strict=True):
                 writer.add_message(channel, time_ns, json.dumps(message).encode(), time_ns)
         writer.finish()

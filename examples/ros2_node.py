@@ -2,7 +2,8 @@
 """A ROS 2 node that publishes the forces of a skin, each scan at the time of its middle.
 
 ~/forces  std_msgs/Float32MultiArray   normal force of each cell, rows x columns [N]
-~/taxels  sensor_msgs/PointCloud2      x along columns, y along rows, z [m], force [N]
+~/taxels  sensor_msgs/PointCloud2      x along columns, y along rows, z [m], force [N] and its
+                                       standard deviation, force_std [N]
 
 Parameters: port, calibration, pitch_m (from cell to cell), frame_id. In a shell with ROS 2, with an
 emulated skin and made-up presses:
@@ -26,7 +27,7 @@ from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension, MultiAr
 
 import ohmskin
 
-FIELDS = ("x", "y", "z", "force")
+FIELDS = ("x", "y", "z", "force", "force_std")
 
 
 class SkinNode(Node):
@@ -39,13 +40,13 @@ class SkinNode(Node):
         self.forces = self.create_publisher(Float32MultiArray, "~/forces", 10)
         self.taxels = self.create_publisher(PointCloud2, "~/taxels", 10)
 
-    def publish(self, force_n: np.ndarray, time_s: float) -> None:
-        """force_n (rows, columns) [N]; time_s on time.monotonic() [s]."""
+    def publish(self, scan: ohmskin.ForceScan, time_s: float) -> None:
+        """time_s: of the scan's middle, on time.monotonic() [s]."""
         age_ns = round(1e9 * (time.monotonic() - time_s))
         stamp = Time(nanoseconds=self.get_clock().now().nanoseconds - age_ns)
-        self.forces.publish(multi_array(force_n))
+        self.forces.publish(multi_array(scan.force_n))
         header = Header(stamp=stamp.to_msg(), frame_id=self.frame_id)
-        self.taxels.publish(point_cloud(force_n, self.pitch_m, header))
+        self.taxels.publish(point_cloud(scan, self.pitch_m, header))
 
 
 def multi_array(force_n: np.ndarray) -> Float32MultiArray:
@@ -58,12 +59,13 @@ def multi_array(force_n: np.ndarray) -> Float32MultiArray:
     return Float32MultiArray(layout=MultiArrayLayout(dim=dim), data=array("f", octets))
 
 
-def point_cloud(force_n: np.ndarray, pitch_m: float, header: Header) -> PointCloud2:
-    rows, columns = force_n.shape
+def point_cloud(scan: ohmskin.ForceScan, pitch_m: float, header: Header) -> PointCloud2:
+    rows, columns = scan.force_n.shape
     points = np.zeros((rows, columns, len(FIELDS)), dtype="<f4")
     points[:, :, 0] = pitch_m * np.arange(columns)
     points[:, :, 1] = pitch_m * np.arange(rows)[:, None]
-    points[:, :, 3] = force_n
+    points[:, :, 3] = scan.force_n
+    points[:, :, 4] = scan.force_n_std
     return PointCloud2(
         header=header,
         height=rows,
@@ -76,7 +78,7 @@ def point_cloud(force_n: np.ndarray, pitch_m: float, header: Header) -> PointClo
         point_step=4 * len(FIELDS),
         row_step=4 * len(FIELDS) * columns,
         data=array("B", points.tobytes()),
-        is_dense=bool(np.isfinite(force_n).all()),
+        is_dense=bool(np.isfinite(points).all()),
     )
 
 
@@ -90,7 +92,7 @@ def main() -> None:
         for each in skins.scans():
             if not rclpy.ok():
                 break
-            node.publish(each.scan.force_n, each.time_s)
+            node.publish(each.scan, each.time_s)
             rclpy.spin_once(node, timeout_sec=0)
     node.destroy_node()
     rclpy.try_shutdown()

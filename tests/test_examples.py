@@ -20,7 +20,7 @@ import pytest
 from mcap.reader import make_reader
 
 import ohmskin
-from calibrations import of_scene
+from calibrations import half_doubtful, of_scene
 from command_line import Run, python, well
 from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
 from ohmskin.record.recorder import Recorder
@@ -76,9 +76,19 @@ def test_estimate_prints_the_moving_finger() -> None:
 
 def test_forces_prints_contacts(skin_json: str) -> None:
     lines = first_lines(6, str(EXAMPLES / "forces.py"), GHOST, skin_json)
-    found = [re.fullmatch(r"([\d.]+) N at \((\d\.\d), (\d\.\d)\)\n", line) for line in lines]
+    pattern = r"[\d.]+ \+- [\d.]+ N at \((\d\.\d), (\d\.\d)\)\n"
+    found = [re.fullmatch(pattern, line) for line in lines]
     assert all(found)
-    assert len({each.groups()[1:] for each in found if each}) == 3  # the ghost is none
+    assert len({each.groups() for each in found if each}) == 3  # the ghost is none
+
+
+def test_forces_says_where_a_force_is_uncertain(tmp_path: Path) -> None:
+    path = tmp_path / "skin.json"
+    half_doubtful("ghost").save(path)
+    first, second, third = first_lines(3, str(EXAMPLES / "forces.py"), GHOST, str(path))
+    assert first == "uncertain at (2.0, 2.0)\n"
+    assert re.fullmatch(r"1\.2\d \+- 0\.0\d N at \(2\.0, 5\.0\)\n", second)
+    assert third == "uncertain at (5.0, 2.0)\n"
 
 
 def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> None:
@@ -131,14 +141,16 @@ def test_the_ros_node_publishes_forces_and_taxels(
     touched = set(zip(*np.nonzero(force_n > 0.1), strict=True))
     assert len(touched) == 3
 
-    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (8, 8, 16, 128)
+    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (8, 8, 20, 160)
     assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
         (name, 4 * index, PointField.FLOAT32, 1) for index, name in enumerate("xyz")
-    ] + [("force", 12, 7, 1)]
+    ] + [("force", 12, 7, 1), ("force_std", 16, 7, 1)]
     assert cloud.is_dense
-    points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(8, 8, 4)
+    points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(8, 8, 5)
     assert points[3, 5, :3] == pytest.approx([0.10, 0.06, 0])
     np.testing.assert_array_equal(points[:, :, 3], force_n)
+    assert np.all(points[:, :, 4] > 0)
+    assert np.all(points[:, :, 4][force_n > 0.1] < force_n[force_n > 0.1])
     stamps_s = [each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec for each in clouds]
     assert cloud.header.frame_id == "skin"
     assert np.diff(stamps_s) == pytest.approx(1 / 90, abs=3e-3)
@@ -249,6 +261,9 @@ def test_foxglove_forces_writes_a_grid(recorded: Path, skin_json: str, tmp_path:
     assert grid["fields"] == [{"name": "force", "offset": 0, "type": 7}]
     assert np.count_nonzero(force_n > 0.1) == 3
     assert cells[-1][-1]["force_n"] == pytest.approx(force_n.flatten(), abs=1e-4)
+    with ohmskin.open(f"replay://{recorded}?speed=0", calibration=skin_json) as skin:
+        *_, last = skin
+    assert cells[-1][-1]["force_n_std"] == pytest.approx(last.force_n_std.flatten(), abs=1e-4)
 
 
 def test_every_example_is_run_here() -> None:

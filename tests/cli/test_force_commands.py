@@ -2,13 +2,14 @@
 """Forces on the command line: ``stream --calibration`` and ``tare``."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibrations import of_scene
+from calibrations import half_doubtful, of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.force.calibration import load_calibration
 
@@ -39,8 +40,24 @@ def test_stream_json_has_forces(run: Run, skin: Path) -> None:
 def test_stream_shows_newtons_and_contacts(run: Run, skin: Path) -> None:
     done = well(run("stream", GHOST, "--calibration", str(skin), "--scans", "30"))
     assert "force by 'touch' [N]" in done.out
-    assert "contact 1: 1.6" in done.out
+    assert re.search(r"contact 1: 1\.6\d \+- 0\.\d\d N at \(2\.0, 2\.0\)", done.out)
     assert "at (5.0, 2.0)" in done.out
+    cells = done.out.partition("uncertain\n")[2].partition("contact")[0]
+    assert "1.7" in cells
+    assert "?" not in cells  # forces of untouched cells are known, too
+
+
+def test_stream_says_which_forces_are_uncertain(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "doubtful.json"
+    half_doubtful("ghost").save(path)
+    arguments = ("stream", GHOST, "--calibration", str(path), "--scans")
+    done = well(run(*arguments, "30"))
+    assert "contact 1: uncertain at (2.0, 2.0)" in done.out
+    assert re.search(r"contact 2: 1\.2\d \+- 0\.0\d N at \(2\.0, 5\.0\)", done.out)
+    cells = done.out.partition("uncertain\n")[2].partition("contact")[0]
+    assert cells.count("?") == cells.count(".") == 32
+    scan = json.loads(well(run(*arguments, "1", "--json")).out)  # programs get numbers
+    assert scan["contacts"][0]["force_n"] == scan["force_n"][2][2] > 1
 
 
 def test_stream_tares(run: Run, skin: Path) -> None:

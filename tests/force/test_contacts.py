@@ -33,8 +33,32 @@ def test_what_adjoins_is_one_contact() -> None:
     first, second = contacts
     np.testing.assert_array_equal(first.cells, skin("1000 0100 0000 0000") > 0)
     assert (first.force_n, first.row, first.column) == (4.0, 0.75, 0.75)
-    assert first.force_n_std == pytest.approx(0.1 * np.sqrt(2))
     assert (second.force_n, second.row, second.column) == (4.0, 3.0, 2.5)
+
+
+def test_cells_that_share_wires_may_err_alike() -> None:
+    """Wires that are taken for too short lower the force of every cell behind them."""
+    force_n, std_n = skin("1300 0020"), skin("1200 0040") / 10
+    (contact,) = ContactTracker().update(0, force_n > 0, force_n, std_n)
+    for sign in (1, -1):
+        error_n = (force_n + sign * std_n)[force_n > 0].sum() - contact.force_n
+        assert abs(error_n) == pytest.approx(contact.force_n_std)
+
+
+@pytest.mark.parametrize(
+    ("force_n", "std_n", "text"),
+    [
+        (1.234, 0.1, "1.23 +- 0.10 N"),
+        (0.5, 0.5, "0.50 +- 0.50 N"),
+        (0.5, 0.51, "uncertain"),
+        (0.0, 0.0, "0.00 +- 0.00 N"),
+    ],
+)
+def test_a_force_is_written_with_its_deviation(force_n: float, std_n: float, text: str) -> None:
+    (contact,) = ContactTracker().update(
+        0, np.array([[True]]), np.array([[force_n]]), np.array([[std_n]])
+    )
+    assert contact.force_text == text
 
 
 def test_a_touch_without_force_has_a_centre() -> None:

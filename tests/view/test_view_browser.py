@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import uvicorn
 
-from calibrations import of_scene
+from calibrations import half_doubtful, of_scene
 from command_line import ENVIRONMENT
 from ohmskin.record.recording import load_recording
 from ohmskin.view.boards import ViewedBoards
@@ -66,7 +66,8 @@ class Server:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("view")
     of_scene("ghost").save(folder / "skin.json")
-    running = Server(folder, "--calibration", "skin.json")
+    half_doubtful("ghost", unit_id=7).save(folder / "doubtful.json")
+    running = Server(folder, "--calibration", "skin.json", "--calibration", "doubtful.json")
     try:
         yield running
         assert running.end() == (0, "")
@@ -159,6 +160,22 @@ def colour(panel: Panel, name: str, row: int, column: int) -> tuple[int, ...]:
     return tuple(found)
 
 
+def ink(panel: Panel, row: int, column: int) -> int:
+    """How many colours a cell of the estimate's heat map has."""
+    found = panel.locator(".estimate .cells").evaluate(
+        """(canvas, [row, column]) => {
+            const ratio = canvas.width / canvas.clientWidth;
+            const side = Math.floor((canvas.clientHeight - 20) / 8);
+            const at = (index) => (20 + index * side + 4) * ratio;
+            const length = (side - 8) * ratio;
+            const image = canvas.getContext("2d").getImageData(at(column), at(row), length, length);
+            return new Set(new Uint32Array(image.data.buffer)).size;
+        }""",
+        [row, column],
+    )
+    return int(found)
+
+
 def test_the_ghost_is_in_the_raw_reading_and_not_in_the_estimate(page: Any) -> None:
     panel = open_board(page, GHOST)
     has_text(panel, ".estimate .count", "by ‘touch’: 3 cells touched")
@@ -215,6 +232,26 @@ def test_cells_are_chosen_by_keyboard_and_read_as_a_table(page: Any) -> None:
     table = panel.locator(".values tbody tr")
     assert table.count() == 8
     assert re.match(r"1\.2\d ± 0\.0\d N", table.nth(2).locator("td").nth(5).inner_text())
+
+
+def test_a_force_below_its_deviation_is_a_word(page: Any) -> None:
+    panel = open_board(page, f"{GHOST}&unit=7")
+    has_text(panel, ".estimate .count", "3 cells touched")
+    rows = panel.locator(".contacts tbody tr").all_inner_texts()
+    amounts = {line.split("\t")[1]: line.split("\t")[2] for line in rows}
+    assert amounts["2.0, 2.0"] == amounts["5.0, 2.0"] == "uncertain"
+    assert re.fullmatch(r"1\.2\d ± 0\.0\d", amounts["2.0, 5.0"])
+    has_text(panel, ".chosen", r"\(2, 2\)")
+    has_text(panel, ".value", "^uncertain$")
+    panel.get_by_text("Values as a table").press("Enter")
+    has_text(panel, ".values caption", r"force \[N\]")
+    cells = panel.locator(".values tbody tr").nth(2).locator("td").all_inner_texts()
+    assert cells[:4] == 4 * ["uncertain"]
+    assert all(re.fullmatch(r"[\d.]+ ± 0\.\d\d N", cell) for cell in cells[4:])
+    # Untouched, of no force either way: the uncertain one is hatched.
+    assert ink(panel, 0, 0) > ink(panel, 0, 7) == 1
+    panel.get_by_label("Show").select_option("siemens")
+    has_text(panel, ".value", r"\d ± [\d.]+ µS")
 
 
 def test_every_control_has_a_name(page: Any) -> None:

@@ -31,6 +31,8 @@ _out = Console()
 FULL_SCALE_US: Final = 200.0
 # Force at which a table's colours end [N].
 FULL_SCALE_N: Final = 10.0
+# An untouched cell's force counts as known up to this deviation [N], as on the page.
+KNOWN_N: Final = 0.1
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 # Time between two pictures in a terminal [s]; every scan is counted all the same.
 _DISPLAY_EVERY_S: Final = 0.1
@@ -125,10 +127,8 @@ def _print_scans(skin: Device, reader: SkinReader | None, count: int, seconds: f
 
 def _numbers(values: ArrayLike) -> Any:
     """As JSON has them, which knows no NaN: null."""
-    array = np.asarray(values)
-    objects = array.astype(object)
-    objects[np.isnan(array)] = None
-    return objects.tolist()
+    array: Any = np.asarray(values)
+    return np.where(np.isnan(array), None, array).tolist()
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
@@ -153,8 +153,10 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     if not found.estimate.converged:
         caption += f"  not converged: {found.estimate.message}"
     if reader.has_forces:
-        title = f"{skin.name}: force by '{reader.method}' [N]"
-        table = _coloured(found.force_n, FULL_SCALE_N)
+        title = f"{skin.name}: force by '{reader.method}' [N], ?: uncertain"
+        least_n = np.where(found.estimate.touched, 0.0, KNOWN_N)
+        uncertain = found.force_n_std > np.maximum(found.force_n, least_n)
+        table = _coloured(np.where(uncertain, np.nan, found.force_n), FULL_SCALE_N)
         caption = f"{_contact_line(found)}\n{caption}"
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
@@ -163,13 +165,11 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
 
 
 def _contact_line(scan: ForceScan) -> str:
-    if not scan.contacts:
-        return "no contact"
-    return "   ".join(
-        f"contact {each.identity}: {each.force_n:.2f} +- {each.force_n_std:.2f} N "
-        f"at ({each.row:.1f}, {each.column:.1f})"
+    texts = (
+        f"contact {each.identity}: {each.force_text} at ({each.row:.1f}, {each.column:.1f})"
         for each in scan.contacts
     )
+    return "   ".join(texts) or "no contact"
 
 
 def conductances(cell_siemens: Float, title: str = "") -> Table:

@@ -28,7 +28,8 @@ class Contact:
 
     identity: the same number for as long as the contact lasts, from 1. row, column: the centre,
     sum of F_e position_e / sum of F_e over its cells e, in cell units (0: centre of the first).
-    force_n: sum of F_e [N]; force_n_std: its standard deviation, supposing independent cells.
+    force_n: sum of F_e [N]; force_n_std: the sum of the cells' standard deviations. These cells
+    share wires, and their errors may all have one sign: no deviation of force_n can be larger.
     cells: shape (R, C), which cells it covers.
     """
 
@@ -38,6 +39,13 @@ class Contact:
     force_n: float
     force_n_std: float
     cells: NDArray[np.bool_]
+
+    @property
+    def force_text(self) -> str:
+        """Its newtons for people: "1.23 +- 0.10 N"; "uncertain" where the deviation is larger."""
+        if self.force_n_std > self.force_n:
+            return "uncertain"
+        return f"{self.force_n:.2f} +- {self.force_n_std:.2f} N"
 
 
 class ContactTracker:
@@ -98,9 +106,8 @@ def _found(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> li
     contacts = []
     for number in range(1, count + 1):
         cells = labels == number
-        total_n = float(force_n[cells].sum())
+        total_n, std_n = (float(each[cells].sum()) for each in (force_n, force_n_std))
         # Where it is too light for its curve, all cells count alike.
         row, column = center_of_mass(force_n if total_n > 0 else cells, cells)
-        std_n = float(np.sqrt(np.sum(force_n_std[cells] ** 2)))
         contacts.append(Contact(0, float(row), float(column), total_n, std_n, cells))
     return contacts

@@ -194,11 +194,10 @@ class SkinReader:
         found = self.estimate(scan.ratio)
         rise = self.rise(found)
         force_n = force_n_std = np.full(rise.shape, np.nan)
-        weight, weight_std = np.maximum(rise, 0.0), found.level_std
+        weights = np.maximum(rise, 0.0), found.level_std
         if self._calibration is not None and self.has_forces:
-            force_n, force_n_std = self._calibration.model.predict(rise, found.level_std)
-            weight, weight_std = force_n, force_n_std
-        contacts = self._tracker.update(scan.time_us, found.touched, weight, weight_std)
+            weights = force_n, force_n_std = self._calibration.model.predict(rise, found.level_std)
+        contacts = self._tracker.update(scan.time_us, found.touched, *weights)
         seen = {"force_n": force_n, "force_n_std": force_n_std}
         return ForceScan(**(vars(scan) | seen | {"contacts": contacts, "estimate": found}))
 

@@ -370,11 +370,9 @@ class ViewedBoard(Closing):
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""
         self.closing.set()
-        skin, recording = self._skin, self._recording
-        if skin is not None:
-            skin.close()
-        if recording is not None:
-            recording.close()
+        for each in (self._skin, self._recording):
+            if each is not None:
+                each.close()
         self._thread.join(_CLOSE_S)
         self._changed()
 

@@ -86,9 +86,11 @@ class Panel:
 
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
-            text = (await self._next()) or ""
+            received = await self._socket.receive()
+            if received["type"] == "websocket.disconnect":
+                raise WebSocketDisconnect(received.get("code", 1000))
             try:
-                message = json.loads(text)
+                message = json.loads(received.get("text") or "")
             except (ValueError, RecursionError):
                 message = None
             match message:
@@ -107,13 +109,6 @@ class Panel:
                     else:
                         self._is_busy = True
                         tasks.start_soon(self._run, *command)
-
-    async def _next(self) -> str | None:
-        message = await self._socket.receive()
-        if message["type"] == "websocket.disconnect":
-            raise WebSocketDisconnect(message.get("code", 1000))
-        text = message.get("text")
-        return text if isinstance(text, str) else None
 
     def _asked(self, message: object) -> tuple[str, _Command] | None:
         board = self._board

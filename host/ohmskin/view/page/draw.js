@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The heat map, its bar and the curve, on canvases that keep to the screen's own pixels.
 
-import { colourAt, inkAt, isUncertain, written } from "./scale.js";
+import { colourAt, inkAt, isHatched, isUncertain, written } from "./scale.js";
 
 const EDGE = 20; // px, for the numbers of rows and columns
 const TALLEST = 480;
@@ -62,7 +62,7 @@ export class HeatMap {
       const position = known ? scale.position(values[cell]) : 0;
       context.fillStyle = known ? colourAt(position) : styleOf("--grid");
       context.fillRect(x, y, size - 1, size - 1);
-      if (!known || (std && isUncertain(scale, values[cell], std[cell]))) {
+      if (!known || (std && isHatched(scale, values[cell], std[cell], touched[cell]))) {
         this.hatch(context, x, y, inkAt(position));
       }
       if (touched[cell]) {
@@ -114,10 +114,17 @@ export class HeatMap {
     for (let cell = 0; cell < values.length; cell++) {
       const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
       const middle = x + (size - 1) / 2;
-      const withStd = std && size >= 42 &&
-        (touched[cell] || isUncertain(scale, values[cell], std[cell]));
+      const shown = std && [scale, values[cell], std[cell], touched[cell]];
+      const withStd = shown && size >= 42 && (touched[cell] || isHatched(...shown));
       context.fillStyle = inkAt(scale.position(values[cell]) || 0);
       context.globalAlpha = touched[cell] ? 1 : 0.6;
+      if (shown && isUncertain(...shown)) {
+        context.font = `10px ${FONT}`;
+        const fits = context.measureText("uncertain").width < size - 2;
+        context.fillText(fits ? "uncertain" : "?", middle, y + size * 0.5);
+        context.globalAlpha = 1;
+        continue;
+      }
       context.font = `${size >= 42 ? 13 : 10}px ${FONT}`;
       context.fillText(written(scale.show(values[cell])), middle, y + size * (withStd ? 0.4 : 0.5));
       if (withStd) {

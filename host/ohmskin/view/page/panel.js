@@ -2,7 +2,7 @@
 // One board: its controls, its maps, and what is said of it.
 
 import { drawBar, HeatMap, History } from "./draw.js";
-import { scaleOf, TOPS_N, written } from "./scale.js";
+import { scaleOf, TOPS_N, withStd, written } from "./scale.js";
 import { Connection } from "./wire.js";
 
 const DIGITS_EVERY_MS = 200;
@@ -226,7 +226,7 @@ export class Panel {
   value(cell = this.chosen) {
     const scale = this.shownScale();
     const [value, std] = [this.scan[scale.plane][cell], this.scan[`${scale.plane}_std`][cell]];
-    return `${written(scale.show(value))} ± ${written(scale.std(value, std))} ${scale.unit}`;
+    return withStd(scale, value, std, this.scan.touched[cell]);
   }
 
   // Called for each frame of the screen.
@@ -310,7 +310,7 @@ export class Panel {
     const rows = scan.contacts.map(([identity, row, column, amount, std]) => {
       const [value, spread] = force ? [amount, std] : [1e6 * amount, 1e6 * std];
       return [identity, `${row.toFixed(1)}, ${column.toFixed(1)}`,
-        `${written(value)} ± ${written(spread)}`];
+        force && std > amount ? "uncertain" : `${written(value)} ± ${written(spread)}`];
     });
     fill(this.find(".contacts tbody"), rows.length ? rows : [["–", "no contact", ""]]);
     this.sayFile();

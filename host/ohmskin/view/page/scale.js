@@ -65,4 +65,15 @@ export function scaleOf(quantity, topN) {
   return quantity === "newtons" ? newtons(topN) : quantity === "ohms" ? ohms : siemens;
 }
 
-export const isUncertain = (scale, value, std) => !(std <= Math.max(scale.floor, value / 4));
+// A force that may be none: its deviation is larger. It has a word in place of a number. Cells that
+// nothing touches have none anyway, and it is known well enough below the floor.
+export const isUncertain = (scale, value, std, touched) =>
+  scale.plane === "force" && std > (touched ? value : Math.max(value, scale.floor));
+
+export const isHatched = (scale, value, std, touched) =>
+  !(std <= Math.max(scale.floor, value / 4)) || isUncertain(scale, value, std, touched);
+
+export function withStd(scale, value, std, touched) {
+  if (isUncertain(scale, value, std, touched)) return "uncertain";
+  return `${written(scale.show(value))} ± ${written(scale.std(value, std))} ${scale.unit}`;
+}
