@@ -208,9 +208,10 @@ def tare(
             skin.undo_tare()
             done = f"rest of {skin.calibration.rest.date}"
         else:
-            largest_n = abs(skin.latest().force_n).max()
+            scan = skin.latest()
+            largest_n, std_n = max(zip(scan.force_n.flat, scan.force_n_std.flat, strict=True))
             skin.tare(seconds, force=force)
-            done = f"tared, largest force before it {largest_n:.3f} N"
+            done = f"tared, largest force before it {largest_n:.3f} +- {std_n:.3f} N"
         skin.calibration.save(calibration)
     _out.print(f"{calibration}: {done}", markup=False)
 

@@ -127,8 +127,7 @@ def _print_scans(skin: Device, reader: SkinReader | None, count: int, seconds: f
 
 def _numbers(values: ArrayLike) -> Any:
     """As JSON has them, which knows no NaN: null."""
-    array: Any = np.asarray(values)
-    return np.where(np.isnan(array), None, array).tolist()
+    return np.where(np.isnan(values), np.array(None), values).tolist()
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
