@@ -115,18 +115,13 @@ export class HeatMap {
       const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
       const middle = x + (size - 1) / 2;
       const shown = std && [scale, values[cell], std[cell], touched[cell]];
-      const withStd = shown && size >= 42 && (touched[cell] || isHatched(...shown));
+      const uncertain = shown && isUncertain(...shown);
+      const withStd = shown && size >= 42 && !uncertain && (touched[cell] || isHatched(...shown));
       context.fillStyle = inkAt(scale.position(values[cell]) || 0);
       context.globalAlpha = touched[cell] ? 1 : 0.6;
-      if (shown && isUncertain(...shown)) {
-        context.font = `10px ${FONT}`;
-        const fits = context.measureText("uncertain").width < size - 2;
-        context.fillText(fits ? "uncertain" : "?", middle, y + size * 0.5);
-        context.globalAlpha = 1;
-        continue;
-      }
       context.font = `${size >= 42 ? 13 : 10}px ${FONT}`;
-      context.fillText(written(scale.show(values[cell])), middle, y + size * (withStd ? 0.4 : 0.5));
+      const text = uncertain ? "?" : written(scale.show(values[cell]));
+      context.fillText(text, middle, y + size * (withStd ? 0.4 : 0.5));
       if (withStd) {
         context.font = `10px ${FONT}`;
         context.fillText(`±${written(scale.std(values[cell], std[cell]))}`, middle, y + size * 0.72);
