@@ -79,7 +79,7 @@ class JointEstimator(Estimator):
         prior = self._prior_of(current)
         found = None
         # Under a finger that stays, few touches explain no frame: trying costs half the time.
-        if self._finder is not None and self._touches <= self._finder.most:
+        if self._finder is not None and self._touches <= 2 * self._finder.most:
             found = self._finder.find(current, current_std)
         known = self.knowledge.rest_ratio is not None
         if found is not None and known and self._is_sure(found):
@@ -129,6 +129,10 @@ class JointEstimator(Estimator):
             return fit.message
         if fit.misfit > MISFIT:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
+        hardest = int(fit.cell.argmin())
+        if fit.cell[hardest] < -np.log(HIGHEST_TOUCH_SIEMENS):
+            row, column = divmod(hardest, self._shape[1])
+            return f"cell ({row}, {column}): conducts more than any touch, is it a short?"
         loss = fit.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
         worst = int(loss.argmax())
         if self.knowledge.rest_ratio is not None and loss[worst] > 0:

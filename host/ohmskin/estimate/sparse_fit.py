@@ -63,7 +63,7 @@ from ohmskin.estimate.prior import (
 
 Cells = NDArray[np.intp]
 
-MOST_PER_LINE: Final = 1.0  # touches a row and column, on average
+MOST_PER_LINE: Final = 0.5  # touches a row and column, on average; a fingertip covers more
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
 LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
