@@ -127,7 +127,7 @@ class Constant:
 
 
 def constants() -> list[Constant]:
-    """All there are, in the order of `MODULES` and of their lines."""
+    """Those of `MODULES`, in the order of their lines."""
     return [
         Constant(module.__name__.rpartition(".")[2], name, value)
         for module in MODULES

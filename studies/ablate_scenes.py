@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames that constants are tried on, of ngspice and simulated, and what a method does with them.
 
-All readings have 10 bits. Simulated readings have noise of 0.3 LSB before the converter; those under
-the conditions of `stability` have what these say.
+All readings have 10 bits. Simulated readings have noise of 0.3 LSB before the converter; those of
+conditions of `stability` have what these say.
 """
 
 from __future__ import annotations
@@ -46,9 +46,10 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Frames in order and what is told of their skin; pieces: how many of them count as a skin.
+    """Frames in order, and what is told of their skin.
 
-    rest_siemens: (R, C) [S]; None: only the verdict is of interest.
+    rest_siemens: (R, C) [S]; None: only the verdict is of interest. pieces: how many parts the
+    frames have that count as a skin each.
     """
 
     knowledge: SkinKnowledge
