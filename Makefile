@@ -26,7 +26,7 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware test-firmware check-firmware sim \
-        test-host chart stability experiments bench-firmware bench-import bench-host bench-estimators bench-force bench-view \
+        test-host chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-force bench-view \
         bench-boards clean distclean
 
 help: ## list the targets
@@ -87,6 +87,9 @@ chart: setup ## time a frame against error, all methods, simulated: docs/speed-a
 
 stability: setup ## where methods fail, and whether they say so, simulated: docs/stability.png
 	$(STUDY) stability
+
+ablate: setup ## what each number in joint and touch earns, ngspice and simulated: docs/ablate.csv
+	$(STUDY) ablate
 
 experiments: setup ## the paper's experiments with force, simulated: docs/force-*.png
 	for each in flat curved timeseries minimum; do $(STUDY) experiment $$each || exit 1; done

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m studies``: chart, stability and the paper's experiments with force, as commands."""
+"""``python -m studies``: chart, stability, ablate and the paper's experiments, as commands."""
 
 from __future__ import annotations
 
 import typer
 
 from ohmskin.cli.main import run
-from studies.commands import chart, stability
+from studies.commands import ablate, chart, stability
 from studies.force_commands import experiment
 
 app = typer.Typer(
@@ -17,6 +17,7 @@ app = typer.Typer(
 )
 app.command()(chart)
 app.command()(stability)
+app.command()(ablate)
 app.add_typer(experiment, name="experiment")
 
 if __name__ == "__main__":

@@ -16,9 +16,11 @@ from rich.console import Console
 from rich.progress import Progress
 
 from ohmskin.files import whole_file
+from studies import ablate as constants_tried
 from studies import chart as speed_accuracy
 from studies import chart_figure, chart_table, stability_figure
 from studies import stability as verdicts
+from studies.ablate_scenes import Plan
 
 
 def _machine() -> str:
@@ -132,5 +134,53 @@ def stability(
         "quick": quick,
         "seconds": round(time.monotonic() - started_s, 1),
         "methods": verdicts.shares(rows),
+    }
+    print(json.dumps(answer))  # noqa: T201
+
+
+def ablate(
+    out: Annotated[
+        Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
+    ] = None,
+    skins: Annotated[int, typer.Option(min=2, help="simulated skins of a kind")] = Plan.skins,
+    frames: Annotated[int, typer.Option(min=2, help="frames of each")] = Plan.frames,
+    only: Annotated[
+        str, typer.Option(metavar="NAME,...", help="constants: NAME, or MODULE.NAME")
+    ] = "",
+    jobs: Annotated[int, typer.Option(min=0, help="processes; 0: one a core")] = 0,
+) -> None:
+    """Halve, double and put off each number in joint and touch, and count what it earns: a CSV.
+
+    Takes half an hour on two cores. Frames of ngspice and simulated ones. The last line printed is
+    one JSON object.
+    """
+    tried = constants_tried.constants()
+    if only:
+        names = set(only.split(","))
+        known = {name for each in tried for name in (each.name, each.label)}
+        if names - known:
+            raise typer.BadParameter(f"no constant {', '.join(sorted(names - known))}")
+        tried = [each for each in tried if names & {each.name, each.label}]
+    folder = default_folder() if out is None else out
+    folder.mkdir(parents=True, exist_ok=True)
+    started_s = time.monotonic()
+    messages = Console(stderr=True)
+    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as progress:
+        task = progress.add_task("constants on sets of frames", total=None)
+
+        def show_progress(done: int, tasks: int) -> None:
+            progress.update(task, completed=done, total=tasks)
+
+        plan = Plan(skins, frames)
+        rows = constants_tried.measure(tried, plan, jobs=jobs or -1, progress=show_progress)
+    table = folder / "ablate.csv"
+    save_whole({table: constants_tried.csv_text(rows).encode()})
+    messages.print(constants_tried.summary(rows, tried))
+    answer = {
+        "table": str(table),
+        "skins": skins,
+        "frames": frames,
+        "seconds": round(time.monotonic() - started_s, 1),
+        "moved": constants_tried.moved(rows, tried),
     }
     print(json.dumps(answer))  # noqa: T201

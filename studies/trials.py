@@ -25,6 +25,11 @@ SPREAD: Final = 0.1  # of the log of rest resistances and wires
 TOUCH_OHM: Final = (1e3, 1e5)
 # A cell counts as pressed from here on, as a multiple of its conductance at rest.
 PRESSED: Final = 1.5
+# A fingertip: radius of its pressure, range of its peaks, frames of its way round a circle.
+FINGER_CELLS: Final = 0.7
+FINGER_SIEMENS: Final = (5e-5, 5e-4)
+FINGER_FRAMES: Final = 40
+JUMP: Final = 1.5  # of all wires
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,3 +138,37 @@ def bent_trial(rows: int, columns: int, touches: int, frames: int, seed: int) ->
     )
     counts = random.integers(0, touches + 1, frames)
     return trial_of(rest, [touch(bent, int(count), random) for count in counts])
+
+
+def jump_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
+    """As `random_trial`, but from the middle frame on all wires have 1.5 times their resistance."""
+    trial = random_trial(rows, columns, touches, frames, seed)
+    wires = [JUMP if number >= frames // 2 else 1.0 for number in range(frames)]
+    jumped = [
+        replace(
+            skin,
+            top_wire_ohm=factor * skin.top_wire_ohm,
+            bottom_wire_ohm=factor * skin.bottom_wire_ohm,
+        )
+        for skin, factor in zip(trial.frames, wires, strict=True)
+    ]
+    return trial_of(trial.rest, jumped)
+
+
+def finger_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
+    """Soft fingertips that move in circles: one on skins of an even seed, else two."""
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(rows, columns, random)
+    row, column = np.indices((rows, columns))
+    cells = np.repeat(rest.cell_siemens[None], frames, axis=0)
+    for _ in range(1 + seed % 2):
+        peak = np.exp(random.uniform(*np.log(FINGER_SIEMENS)))
+        middle = random.uniform(0.3, 0.7, 2) * (rows - 1, columns - 1)
+        radius = random.uniform(0.1, 0.3) * (min(rows, columns) - 1)
+        start = random.uniform(0, 2 * np.pi)
+        for number, cell in enumerate(cells):
+            angle = start + 2 * np.pi * number / FINGER_FRAMES
+            away = (row - middle[0] - radius * np.cos(angle)) ** 2
+            away = away + (column - middle[1] - radius * np.sin(angle)) ** 2
+            cell += peak * np.exp(-away / (2 * FINGER_CELLS**2))
+    return trial_of(rest, [replace(rest, cell_siemens=cell) for cell in cells])

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make ablate`: which constants there are, that each is put back, what the figures say."""
+
+import csv
+import io
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command_line import Run
+from ohmskin.estimate import full_fit, joint, port_readings, prior, sparse_fit
+from ohmskin.estimate.methods import METHODS
+from studies import ablate
+from studies.ablate import OFF, Constant, Row
+from studies.ablate_scenes import SCENES, Plan, observe
+
+TINY = Plan(skins=3, frames=4)
+SCENE = "ngspice_random"
+MODULES = (full_fit, joint, port_readings, prior, sparse_fit)
+BY_LABEL = {constant.label: constant for constant in ablate.constants()}
+TRIED = [BY_LABEL["prior.SEGMENT_STD"], BY_LABEL["sparse_fit.SHARE"]]
+
+
+def test_every_number_is_tried() -> None:
+    """Those that share a name are two; what is no number, private or another's is none."""
+    assert BY_LABEL["full_fit.CLOSE"].value == full_fit.CLOSE
+    assert BY_LABEL["sparse_fit.CLOSE"].value == sparse_fit.CLOSE
+    assert BY_LABEL["sparse_fit.MAX_STEPS"].variants == {"off": 100, "halved": 4, "doubled": 16}
+    assert not {"prior.LOG_LIMITS", "sparse_fit._HIGHEST_LOG", "joint.TAIL"} & set(BY_LABEL)
+    assert set(OFF) <= set(BY_LABEL)
+
+
+@pytest.mark.parametrize("constant", BY_LABEL.values(), ids=lambda constant: constant.label)
+def test_a_constant_is_changed_wherever_it_is_read_and_put_back(constant: Constant) -> None:
+    before = [dict(vars(module)) for module in MODULES]
+
+    def fail_inside() -> None:
+        with ablate.changed(constant, 1.25):
+            for module, own in zip(MODULES, before, strict=True):
+                is_home = module.__name__.endswith(f".{constant.module}")
+                has_its_own = not is_home and constant.name in module.__annotations__
+                if constant.name in own:
+                    expected = own[constant.name] if has_its_own else 1.25
+                    assert getattr(module, constant.name) == expected
+            raise KeyError("from inside")
+
+    with pytest.raises(KeyError, match="from inside"):
+        fail_inside()
+    assert [dict(vars(module)) for module in MODULES] == before
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return ablate.measure(TRIED, TINY, scenes=[SCENE], jobs=1)
+
+
+def test_constants_that_matter_move_figures(rows: list[Row]) -> None:
+    figures = [row for row in rows if row.figure not in ablate.INFORMATIVE]
+    for constant in TRIED:
+        assert any(row.constant == constant.label for row in figures)
+    # Without the rule against ghosts, a frame of many touches is one of ghosts.
+    off = [row for row in figures if (row.constant, row.variant) == ("sparse_fit.SHARE", "off")]
+    assert any(abs(row.ratio - 1) > ablate.LEAST_CHANGE for row in off)
+    assert all(row.low <= row.high for row in rows)
+
+
+def test_nothing_is_left_changed(rows: list[Row]) -> None:
+    """What follows reads as what went before: the same figures, and the values of the sources."""
+    assert rows
+    assert {each.label: each for each in ablate.constants()} == BY_LABEL
+    runs = SCENES[SCENE].build(TINY)
+    first = observe(runs, "joint")
+    ablate.compare(SCENE, "joint", TRIED[0], TINY)
+    again = observe(runs, "joint")
+    for kind in set(first.values) - {"ms"}:
+        assert np.array_equal(first.values[kind], again.values[kind])
+
+
+def test_a_resample_is_that_of_the_values_of_its_skins() -> None:
+    """Against numpy's quantile and mean of the values that were drawn, written out."""
+    random = np.random.default_rng(3)
+    skins = random.integers(0, 5, 60)
+    values = random.standard_normal(60)
+    draws = np.random.default_rng(5).multinomial(5, np.full(5, 0.2), ablate.RESAMPLES)
+    found = {of: ablate.resampled(values, skins, of) for of in (None, 0.5, 0.9)}
+    for number, times in enumerate([np.ones(5, dtype=int), *draws[:20]]):
+        drawn = np.repeat(values, times[skins])
+        assert found[None][number] == pytest.approx(drawn.mean())
+        for of in (0.5, 0.9):
+            expected = np.quantile(drawn, of, method="inverted_cdf")
+            assert found[of][number] == pytest.approx(expected)
+
+
+def test_a_method_that_raises_counts_as_one_that_sees_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(*_: object) -> None:
+        raise FloatingPointError
+
+    runs = SCENES[SCENE].build(TINY)
+    monkeypatch.setattr(joint.JointEstimator, "_solve", fails)
+    sample = observe(runs, "joint")
+    assert sample.values["alarm"].all()
+    assert sample.values["error"].min() > 0.3
+    assert sample.values["sum"].min() == 1.0
+
+
+def test_every_scene_has_frames() -> None:
+    for name, scene in SCENES.items():
+        assert set(scene.methods) <= set(METHODS)
+        if "32" not in name:
+            runs = scene.build(Plan(skins=2, frames=2))
+            assert sum(len(run.frames) for run in runs) >= 2
+
+
+def test_the_summary_and_the_table(rows: list[Row]) -> None:
+    lines = list(csv.DictReader(io.StringIO(ablate.csv_text(rows))))
+    assert [line["constant"] for line in lines] == [row.constant for row in rows]
+    assert float(lines[0]["base"]) == pytest.approx(rows[0].base, rel=1e-4)
+    assert ablate.summary(rows, TRIED).row_count == 2
+    assert sum(ablate.moved(rows, TRIED).values()) == sum(row.significant for row in rows)
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
+    """A function that runs ``python -m studies ablate ARGUMENTS`` on one scene, here."""
+    monkeypatch.setattr(ablate, "measure", partial(ablate.measure, scenes=[SCENE]))
+    size = ("--skins", "3", "--frames", "4", "--jobs", "1")
+    return partial(run, "ablate", *size, program="studies")
+
+
+def test_ablate_writes_a_table(command: Run, tmp_path: Path) -> None:
+    code, out, err = command("--only", "SHARE,prior.SEGMENT_STD", "--out", str(tmp_path / "new"))
+    assert code == 0
+    answer = json.loads(out.splitlines()[-1])
+    assert list(answer["moved"]) == ["prior.SEGMENT_STD", "sparse_fit.SHARE"]
+    table = Path(answer["table"])
+    assert list((tmp_path / "new").iterdir()) == [table]
+    assert table.read_text().startswith("constant,value,variant,tried,scene,method,figure,base,")
+    assert "worst loss" in err
+
+
+def test_a_constant_that_there_is_not_is_named(command: Run, tmp_path: Path) -> None:
+    code, out, err = command("--only", "SHARE,NONSENSE", "--out", str(tmp_path))
+    assert code == 2
+    assert out == ""
+    assert "no constant NONSENSE" in err
