@@ -39,11 +39,14 @@ class SkinNode(Node):
         self.frame_id = self.declare_parameter("frame_id", "skin").value
         self.forces = self.create_publisher(Float32MultiArray, "~/forces", 10)
         self.taxels = self.create_publisher(PointCloud2, "~/taxels", 10)
+        # ROS's clock less time.monotonic(). An interruption between them only makes it larger.
+        self.offset_ns = min(
+            -time.monotonic_ns() + self.get_clock().now().nanoseconds for _ in range(5)
+        )
 
     def publish(self, scan: ohmskin.ForceScan, time_s: float) -> None:
         """time_s: of the scan's middle, on time.monotonic() [s]."""
-        age_ns = round(1e9 * (time.monotonic() - time_s))
-        stamp = Time(nanoseconds=self.get_clock().now().nanoseconds - age_ns)
+        stamp = Time(nanoseconds=round(1e9 * time_s) + self.offset_ns)
         self.forces.publish(multi_array(scan.force_n))
         header = Header(stamp=stamp.to_msg(), frame_id=self.frame_id)
         self.taxels.publish(point_cloud(scan, self.pitch_m, header))

@@ -122,27 +122,27 @@ def test_a_skin_that_bends_is_followed(method: str) -> None:
     assert np.mean(out["top_wire_ohm"][-1]) == pytest.approx(bent.top_wire_ohm.mean(), rel=0.15)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "known"), [(0, True), (1, True), (0, False), (2, False)])
 @pytest.mark.parametrize("method", ["joint", "touch"])
-def test_a_finger_over_several_cells_is_followed_and_teaches_no_wires(
-    method: str, seed: int
-) -> None:
-    """Two seconds of a fingertip with soft edges, once around half the skin."""
+def test_a_finger_over_several_cells_is_followed(method: str, seed: int, known: bool) -> None:
+    """Two seconds of a fingertip with soft edges, once around half the skin. known: the wires."""
     scene = Scene("moving", 8, 8, seed=seed)
     rest = scene.skin(0.0).top_wire_ohm, scene.skin(0.0).bottom_wire_ohm
-    estimator = make_estimator(method, told(scene.rest_ratio))
-    errors, away, converged = [], [], []
+    estimator = make_estimator(method, told(scene.rest_ratio, wires=known))
+    errors, away, converged, shares = [], [], [], []
     for frame in range(180):
         found = estimator.estimate(ten_bits(scene.ratio(frame / 90)))
         error = np.abs(found.cell_siemens - scene.skin(frame / 90).cell_siemens)
         errors.append((error / scene.skin(frame / 90).cell_siemens)[scene.touched(frame / 90)])
         away.append(error / found.cell_siemens_std)
         converged.append(found.converged)
-    assert np.median(np.concatenate(errors)) < 0.03
+        shares.append(found.cell_siemens.sum() / scene.skin(frame / 90).cell_siemens.sum())
+    assert np.median(np.concatenate(errors)) < (0.03 if known else 0.06)
     assert np.mean(np.array(away) < 4) > 0.99
     assert np.mean(converged) > 0.97
+    assert np.abs(np.array(shares) - 1).max() < (0.1 if known else 0.25)
     for believed, true in zip((found.top_wire_ohm, found.bottom_wire_ohm), rest, strict=True):
-        assert np.mean(believed) == pytest.approx(np.mean(true), rel=0.3)
+        assert not known or np.mean(believed) == pytest.approx(np.mean(true), rel=0.3)
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])

@@ -46,7 +46,8 @@ LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows re
 MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
-NEWS: Final = 0.5  # change of a log resistance that makes a frame news of the wires
+# Change of a log resistance that makes a frame news of the wires: frames alike have alike errors.
+NEWS: Final = 1.5
 
 
 class JointEstimator(Estimator):
