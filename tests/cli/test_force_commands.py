@@ -70,7 +70,7 @@ def test_stream_tares(run: Run, skin: Path) -> None:
 def test_stream_without_a_calibration_can_be_told_rest(run: Run) -> None:
     stds = []
     for rest in ((), ("--tare", "0.2")):
-        done = well(run("stream", REST, "--scans", "20", "--json", *rest))
+        done = well(run("stream", f"{REST}&noise=2", "--scans", "20", "--json", *rest))
         lines = [json.loads(line) for line in done.out.splitlines()]
         stds.append(np.median([line["cell_siemens_std"] for line in lines]))
     assert stds[1] < 0.8 * stds[0]
