@@ -14,7 +14,7 @@ from ohmskin.circuit.skin import (
     port_sensitivity,
     readings,
 )
-from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
@@ -60,15 +60,6 @@ def test_sensitivity_agrees_with_finite_differences(size: tuple[int, int]) -> No
             np.testing.assert_allclose(
                 derivative[:, resistor], difference, atol=1e-7 * circuit.port_ohm.max()
             )
-
-
-def test_derivatives_sum_to_the_resistance() -> None:
-    """Euler: all resistances scaled alike scale every port resistance."""
-    random = np.random.default_rng(6)
-    cell, top, bottom = (np.exp(random.normal(size=(5, 4))) for _ in range(3))
-    circuit = port_sensitivity(cell, top, bottom)
-    total = circuit.by_cell.sum(1) + circuit.by_wires.sum(1)
-    np.testing.assert_allclose(total, circuit.port_ohm, rtol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -144,19 +135,6 @@ def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
     error = np.abs(estimate.cell_siemens - truth["siemens"])
     assert (error / truth["siemens"]).max() > 0.3
     assert np.all(error < 4 * estimate.cell_siemens_std)
-
-
-def test_a_frame_seen_before_takes_one_iteration() -> None:
-    readings, _ = reference("presses_8x8")
-    rest, ratio = readings.rest_ratio, readings.ratio[30]
-    estimator = make_estimator("joint", SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest))
-    first, again = estimator.estimate(ratio), estimator.estimate(ratio)
-    assert again.iterations == 1
-    # Close to each other in units of what is uncertain anyway.
-    away = np.abs(again.cell_siemens - first.cell_siemens) / first.cell_siemens_std
-    assert away.max() < 0.2
-    estimator.reset()
-    assert estimator.estimate(ratio).iterations == first.iterations
 
 
 def test_the_answer_is_where_the_posterior_is_highest() -> None:

@@ -269,30 +269,12 @@ def test_without_matplotlib_nothing_is_measured(
     assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
 
 
-# As CasADi may turn it, with it as the cause or in the text.
-FROM_CASADI = SystemError("returned a result with an exception set")
-FROM_CASADI.__cause__ = KeyboardInterrupt()
-
-
-@pytest.mark.parametrize(
-    ("where", "error"),
-    [
-        ("chart.measure", KeyboardInterrupt()),
-        ("chart_figure.picture", KeyboardInterrupt()),
-        ("chart.measure", FROM_CASADI),
-        ("chart.measure", SystemError("KeyboardInterrupt")),
-    ],
-)
+@pytest.mark.parametrize("where", ["chart.measure", "chart_figure.picture"])
 def test_ctrl_c_leaves_the_old_files(
-    draw: Run,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    rows: list[Row],
-    where: str,
-    error: BaseException,
+    draw: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, rows: list[Row], where: str
 ) -> None:
     def interrupt(*_: object) -> None:
-        raise error
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(chart, "measure", lambda *_: rows)
     monkeypatch.setattr(f"studies.{where}", interrupt)
@@ -304,7 +286,7 @@ def test_ctrl_c_leaves_the_old_files(
 
 
 def test_ctrl_c_is_not_lost_in_ipopt(command: Command, tmp_path: Path) -> None:
-    """CasADi takes the signal; the frame once was just not converged, and the run went on."""
+    """CasADi takes the signal: the frame would just not converge, and the run go on."""
     folder = tmp_path / "new"
     process = command("chart", "--out", str(folder), module="studies")
     until(folder.exists)

@@ -91,7 +91,7 @@ def run(commands: Callable[..., Any], program: str) -> None:
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(program, str(exc))
     except (Exception, KeyboardInterrupt) as exc:
-        if isinstance(exc, typer.Abort) or _is_ctrl_c(exc):
+        if isinstance(exc, (typer.Abort, KeyboardInterrupt)):
             sys.exit(130)
         said = getattr(exc, "format_message", None)
         if said is None:
@@ -99,15 +99,6 @@ def run(commands: Callable[..., Any], program: str) -> None:
         if text := said():  # a wrong use of the command line
             _fail(program, text)
         sys.exit(2)  # no command at all: the help is the answer
-
-
-def _is_ctrl_c(exc: BaseException | None) -> bool:
-    """Whether this is what became of Ctrl-C inside CasADi, which makes other errors of it."""
-    while exc is not None:
-        if isinstance(exc, KeyboardInterrupt) or "KeyboardInterrupt" in str(exc):
-            return True
-        exc = exc.__cause__ or exc.__context__
-    return False
 
 
 def _fail(program: str, text: str) -> None:

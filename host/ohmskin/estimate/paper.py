@@ -323,9 +323,34 @@ class Optimum:
         return resistances
 
 
+@contextmanager
+def _ctrl_c_kept() -> Iterator[None]:
+    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and its wrappers swallow it."""
+    before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield  # nothing is raised here
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        try:
+            before(number, frame)
+        except BaseException as exc:
+            raised.append(exc)
+            raise  # this ends Ipopt
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if raised:
+            raise raised[0]
+
+
 class Program:
     """The program for one size of skin; readings, references and weights are its parameters."""
 
+    @_ctrl_c_kept()
     def __init__(self, rows: int, columns: int) -> None:
         cells = rows * columns
         y = casadi.SX.sym("y", READINGS_PER_CELL * cells)
@@ -365,6 +390,7 @@ class Program:
             "ubg": 0.0,
         }
 
+    @_ctrl_c_kept()
     def solve(
         self,
         ratio: Float,
@@ -385,12 +411,11 @@ class Program:
         solver = self._solvers[step.options if previous is None else _FROM_BEFORE]
         # Column-major: rows run fastest, then columns.
         y = ratio.transpose(1, 0, 2).ravel()
-        with _ctrl_c_kept():
-            found = solver(
-                x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
-            )
-            report = solver.stats()
-            states = np.array(found["x"]).reshape(x.shape)
+        found = solver(
+            x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
+        )
+        report = solver.stats()
+        states = np.array(found["x"]).reshape(x.shape)
         is_finite = bool(np.isfinite(states).all())
         return Optimum(
             x=states if is_finite else x,
@@ -400,30 +425,6 @@ class Program:
             status=str(report["return_status"]) or "Invalid_Number_Detected",
             success=bool(report["success"]) and is_finite,
         )
-
-
-@contextmanager
-def _ctrl_c_kept() -> Iterator[None]:
-    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and its wrappers swallow it."""
-    before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
-    if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield  # nothing is raised here
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        try:
-            before(number, frame)
-        except BaseException as exc:
-            raised.append(exc)
-            raise  # this ends Ipopt
-
-    signal.signal(signal.SIGINT, handle)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if raised:
-            raise raised[0]
 
 
 @lru_cache(maxsize=4)
