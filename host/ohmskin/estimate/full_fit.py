@@ -32,6 +32,7 @@ from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIDDEN,
+    MAX_STEP,
     TOUCHED,
     UNLIMITED_STD,
     CellPrior,
@@ -41,7 +42,6 @@ from ohmskin.estimate.prior import (
 
 MAX_ITERATIONS: Final = 40
 MAX_HALVINGS: Final = 8  # of a step that goes too far
-MAX_STEP: Final = 1.5  # of a log resistance
 CLOSE: Final = 0.5  # deviations of a reading or cell: a step that moves none by more is the last
 CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have

@@ -54,6 +54,7 @@ SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
 LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 
+MAX_STEP: Final = 1.5  # of the log of a resistance, in one step of a fit
 REACH: Final = 2.0  # deviations of what is normal that make as many deviations of a conductance
 
 Lesson = tuple[Float, Float, Float]  # what wires learn from: J P^1/2, z and N

@@ -54,7 +54,9 @@ from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
+    MAX_STEP,
     SEGMENT_STD,
+    TOUCHED,
     UNLIMITED_STD,
     CellPrior,
     Lesson,
@@ -66,10 +68,7 @@ Cells = NDArray[np.intp]
 MOST_PER_LINE: Final = 0.5  # touches a row and column, on average; a fingertip covers more
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
-LEAST_RISE: Final = 2.0  # deviations of the prior: a cell that rises by less is at rest
-MAX_ROUNDS: Final = 8  # of adding cells
-MAX_STEPS: Final = 8  # in a round
-MAX_STEP: Final = 1.5  # of a log conductance
+MAX_STEPS: Final = 8  # in a round of adding cells, and as many rounds
 CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
 HEAVY: Final = 0.1  # share of a reading's noise: wires matter to it if they may move it by more
 REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
@@ -173,7 +172,7 @@ class SparseFit:
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
         self.most = MOST_PER_LINE * sum(belief.shape)  # with more touches, they are not few
-        self.least_log = -prior.expected + LEAST_RISE * prior.std
+        self.least_log = -prior.expected + TOUCHED * prior.std
         self._solve_rest()
 
     def _solve_rest(self) -> None:
@@ -199,7 +198,7 @@ class SparseFit:
         frame = _Frame(self, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
         frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
-        for _ in range(MAX_ROUNDS):
+        for _ in range(MAX_STEPS):
             asked, rise = frame.asked_for()
             if not asked.size:
                 return frame.finish() if frame.cells.size <= self.most else None
