@@ -21,8 +21,11 @@ A frame is one step of a Kalman filter: with z the residual at the mean and S = 
     m += C L J^T S^-1 z ,     C -= C L J^T S^-1 J L^T C .
 
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
-cells as noise without limit. Between frames C grows back towards C0: a skin bends. What single
-segments have of their own is not learned: frames say too little of it.
+cells as noise without limit. After it C grows back towards C0: a skin bends. What single segments
+have of their own is not learned: frames say too little of it.
+
+P^1/2 has a column for each segment's own deviation, and two for what the segments of the layers
+share: s and L^T C^1/2.
 """
 
 from dataclasses import dataclass
