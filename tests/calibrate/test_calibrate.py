@@ -21,10 +21,7 @@ from press_recording import HOST_BEGIN_S, SENSOR_ZERO_N, record_presses, sensor_
 SECONDS = 44.0  # two cells of six presses
 SHAPE = (1, 2)
 SENSOR_BEGIN_S = 70_000.0
-TOLD = (
-    *("--indenter-mm2", "80"),
-    *("--top-wire", str(TOP_WIRE_OHM), "--bottom-wire", str(BOTTOM_WIRE_OHM)),
-)
+TOLD = ("--indenter-mm2", "80", "--wires", f"{TOP_WIRE_OHM},{BOTTOM_WIRE_OHM}")
 BY_OHM = ("--rest", "1.5", "--method", "ohm")  # the fastest
 
 
@@ -72,7 +69,7 @@ def test_a_recording_and_its_forces_make_a_calibration(
     found = load_calibration(out)
     assert (found.unit_id, found.method) == (3, "joint")
     assert found.indenter_area_m2 == pytest.approx(80e-6)
-    assert found.nominal_wire_ohm == (100.0, 200.0)
+    assert found.nominal_wire_ohm.both == (100.0, 200.0)
     assert not found.model.pooled.any()
     rest_siemens = scene.skin(0.0).cell_siemens
     np.testing.assert_allclose(found.rest.level, rest_siemens, rtol=0.1)

@@ -184,7 +184,7 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
         ({"--grams": "50", "--repeats": "9"}, ["give two or more in --grams"]),
         ({"--repeats": "0"}, ["--repeats"]),
         ({"--indenter-mm2": "0"}, ["--indenter-mm2 is 0"]),
-        ({"--top-wire": "-1"}, ["top_wire_ohm is -1"]),
+        ({"--wires": "-1,2"}, ["top_wire_ohm is -1"]),
         ({"--cells": "0;1"}, ["'0;1' is no cell: write row,column"]),
         ({"--cells": "0,0 1,0"}, ["cell (1, 0) is not on this 1x2 skin"]),
         ({"--cells": "0,0"}, ["one cell does not tell how much cells differ"]),

@@ -21,6 +21,7 @@ from ohmskin.cli import doctor as doctor_command
 from ohmskin.cli.doctor import gather
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.base import WireOhm
+from ohmskin.force.calibration import load_calibration
 from ohmskin.link import session
 from ohmskin.record.recorder import Recorder
 from ports import Serve
@@ -124,7 +125,7 @@ def test_nobody_presses(run: Run, benches: list[Bench]) -> None:
 def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("doctor", "emulator://8x8?speed=1"), "no option 'speed'")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100"), "two numbers")
-    assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "above 0")
+    assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "-1", ">= 0")
     assert_one_line(run("doctor", "emulator://8x8", "--calibration", "/no/such.json"), "/no/such")
     assert_one_line(run("doctor", "emulator://1x4", "--press"), "1x4", "no rectangle")
     calibration(Scene("rest", 2, 3).rest_ratio).save(tmp_path / "skin.json")
@@ -145,6 +146,10 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
         done = run("doctor", url, "--calibration", str(path), "--press", "--json", *more)
         assert [each["id"] for each in json.loads(done.out)["findings"]] == names
         assert done.code == len(names)
+    assert run("doctor", url, "--wires", "100,200", "--press", "--into", str(path)).code == 1
+    top, bottom, log_std = load_calibration(path).nominal_wire_ohm
+    assert [top, bottom, 0.05] == pytest.approx([150, 300, log_std], rel=0.1, abs=0.045)
+    assert_one_line(run("doctor", url, "--into", str(path)), "--press")
 
 
 @pytest.mark.parametrize("end", [None, KeyboardInterrupt, RuntimeError])

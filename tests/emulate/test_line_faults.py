@@ -53,7 +53,6 @@ def test_bad_line(fault: str, at_a_port: bool, pty_board: Serve) -> None:
         np.testing.assert_array_equal(scan.codes, expected)
     for before, after in itertools.pairwise(found):
         assert after.missed == after.number - before.number - 1
-    print(f"{url}: {stats}")
     assert stats.scans >= 100
     assert stats.restarts == 0
     # What the iterator has seen, and what had come or gone before it began.

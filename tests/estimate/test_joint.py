@@ -155,7 +155,7 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
         off = log_ohm[12:] - nominal
         return float(np.sum(residual**2) + prior.cost(log_ohm[:12]) + off @ inverse @ off)
 
-    belief, std = WireBelief(3, 4, 100.0, 200.0), np.full(12, known.current_std)
+    belief, std = WireBelief(3, 4, (100.0, 200.0, None)), np.full(12, known.current_std)
     found = FullFit(prior, belief, 6e4, current, std, prior.expected)
     assert not found.message
     best = np.concatenate([found.cell, found.wires])

@@ -190,7 +190,7 @@ def test_a_fingertip_on_a_skin_whose_wires_nobody_knows(method: str) -> None:
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     """Against the textbook's covariance form, two lessons, with what fades after each."""
     random = np.random.default_rng(8)
-    belief = WireBelief(2, 3, 100.0, 200.0)
+    belief = WireBelief(2, 3, (100.0, 200.0, None))
     layers, own = np.kron(np.eye(2), np.ones((6, 1))), SEGMENT_STD**2 * np.eye(12)
     mean, covariance = np.log([100.0, 200.0]), LAYER_STD**2 * np.eye(2)
     for _ in range(2):
@@ -210,6 +210,6 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     away = random.normal(size=14)
     np.testing.assert_allclose(belief.log_wires(away), belief.mean + root @ away, rtol=1e-9)
     some = random.normal(size=(3, 12))
-    moved = some @ (belief.mean - layers @ np.log([100.0, 200.0]))
     before = np.log([100.0, 200.0])
+    moved = some @ (belief.mean - layers @ before)
     np.testing.assert_allclose(belief.moved(belief.root(some), before), moved, rtol=1e-9)

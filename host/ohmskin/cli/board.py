@@ -18,6 +18,7 @@ from rich.table import Table
 import ohmskin
 from ohmskin.emulate.simavr import BOARDS
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
+from ohmskin.estimate.base import NO_WIRES, WireOhm
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import SerialPort, serial_ports
@@ -30,6 +31,18 @@ _RETRY_S: Final = 0.2
 _out = Console(soft_wrap=True)
 
 Port = Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")]
+Wires = Annotated[str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
+
+
+def wires_of(text: str) -> WireOhm:
+    """What `--wires` says; nothing: they are not known."""
+    if not text:
+        return NO_WIRES
+    try:
+        top, bottom = map(float, text.split(","))
+    except ValueError:
+        raise ValueError(f"--wires wants two numbers, as 100,200, not '{text}'") from None
+    return WireOhm(top, bottom).check()
 
 
 def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")] = False) -> None:

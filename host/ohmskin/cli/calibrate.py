@@ -24,10 +24,10 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
+from ohmskin.cli.board import Wires, wires_of
 from ohmskin.cli.record import until_stopped
 from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
-from ohmskin.estimate.base import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
@@ -47,14 +47,6 @@ Method = Annotated[str, typer.Option(help=" | ".join(LEVEL_METHODS))]
 Indenter = Annotated[
     float, typer.Option("--indenter-mm2", help="area that the skin is pressed with, in mm2")
 ]
-TopWire = Annotated[
-    float | None, typer.Option("--top-wire", help="one wire segment of a row in ohm, if known")
-]
-BottomWire = Annotated[
-    float | None,
-    typer.Option("--bottom-wire", help="one wire segment of a column in ohm, if known"),
-]
-
 calibrate = typer.Typer(
     no_args_is_help=True,
     help="Learn each cell's force from presses of single cells: a calibration file (.json).",
@@ -80,14 +72,13 @@ def weights(
         Path | None, typer.Option(help="presses so far (.csv); default: OUT with .presses.csv")
     ] = None,
     method: Method = DEFAULT_METHOD,
-    top_wire_ohm: TopWire = None,
-    bottom_wire_ohm: BottomWire = None,
+    wires: Wires = "",
 ) -> None:
     """With weights: says which to put on which cell of the skin at PORT, and when it has read it.
 
     Every press is kept at once: after Ctrl-C the same command goes on.
     """
-    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm, table=True)
+    calibrator_of = _options(out, method, indenter_mm2, wires, table=True)
     forces_n = [1e-3 * mass_g * GRAVITY for mass_g in _grams(grams)]
     kept = _KeptPresses(table or out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
@@ -133,14 +124,13 @@ def recording(
         typer.Option("--rest", help="so long nothing touched the skin at first, in s; 0: its tare"),
     ] = 0.0,
     method: Method = DEFAULT_METHOD,
-    top_wire_ohm: TopWire = None,
-    bottom_wire_ohm: BottomWire = None,
+    wires: Wires = "",
 ) -> None:
     """From a recording of presses, with the forces in it or a force sensor's log of the same time.
 
     The two clocks may differ: they are aligned by what both saw.
     """
-    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm)
+    calibrator_of = _options(out, method, indenter_mm2, wires)
     given = load_recording(recording)
     if not given.scans:
         raise RecordingError(f"{recording}: no scan in it")
@@ -175,11 +165,10 @@ def table(
         float, typer.Option("--rest", help="so long the untouched skin is measured, in s")
     ] = TARE_S,
     method: Method = DEFAULT_METHOD,
-    top_wire_ohm: TopWire = None,
-    bottom_wire_ohm: BottomWire = None,
+    wires: Wires = "",
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
-    calibrator_of = _options(out, method, indenter_mm2, top_wire_ohm, bottom_wire_ohm, table=True)
+    calibrator_of = _options(out, method, indenter_mm2, wires, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
         calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s))
@@ -220,21 +209,14 @@ def tare(
 
 
 def _options(
-    out: Path,
-    method: str,
-    indenter_mm2: float,
-    top_wire_ohm: float | None,
-    bottom_wire_ohm: float | None,
-    *,
-    table: bool = False,
+    out: Path, method: str, indenter_mm2: float, wires: str, *, table: bool = False
 ) -> Callable[[Hello, Float], Calibrator]:
     """Check what all commands are told, before anybody presses cells for an hour.
 
     table: whether presses are in a table. Returns what makes the calibrator of a board and the
     readings (R, C, 4) of its untouched skin.
     """
-    wires = WireOhm(top_wire_ohm, bottom_wire_ohm)
-    wires.check()
+    nominal = wires_of(wires)
     if method not in LEVEL_METHODS:
         raise ValueError(f"no method '{method}': there are {', '.join(LEVEL_METHODS)}")
     if table and method == VOLTAGE:
@@ -243,8 +225,7 @@ def _options(
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     if out.is_dir() or not out.parent.is_dir():
         raise ValueError(f"{out}: cannot be written: say a file in a directory there is")
-    area_m2 = 1e-6 * indenter_mm2
-    return lambda board, rest: Calibrator(board, rest, method, area_m2, wires)
+    return lambda board, rest: Calibrator(board, rest, method, 1e-6 * indenter_mm2, nominal)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
@@ -282,9 +263,7 @@ def _finish(
         if each:
             _out.print(each)
     if calibration.nominal_wire_ohm.both is None:
-        _out.print(
-            "wires are not told (--top-wire, --bottom-wire): forces' standard deviations are wide"
-        )
+        _out.print("wires are not told (--wires): forces' standard deviations are wide")
     _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 
 

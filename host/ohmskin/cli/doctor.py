@@ -4,7 +4,7 @@
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,10 +14,12 @@ from rich.console import Console
 import ohmskin
 from ohmskin import errors
 from ohmskin.cli import doctor_words as words
+from ohmskin.cli.board import Wires, wires_of
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
+from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -46,12 +48,13 @@ def doctor(
             help="calibration file (.json) of this board: --press compares with its wires"
         ),
     ] = None,
-    wires: Annotated[
-        str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")
-    ] = "",
+    wires: Wires = "",
     press: Annotated[
         bool, typer.Option(help="afterwards ask for touches, which show the wires")
     ] = False,
+    into: Annotated[
+        Path | None, typer.Option(help="calibration file (.json) that takes the wires of --press")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what is wrong with the skin board at PORT, and what to do. Touch nothing meanwhile.
@@ -60,10 +63,12 @@ def doctor(
     it says when and where to press. Any rectangle will do: its lines are measured. Exit code 0:
     sound; 1: something is wrong.
     """
+    calibration = calibration or into
     told = None if calibration is None else load_calibration(calibration)
-    wire_ohm = None if told is None else told.nominal_wire_ohm.both
-    if wires:
-        wire_ohm = _wires(wires)
+    nominal = wires_of(wires)
+    wire_ohm = nominal.both or (None if told is None else told.nominal_wire_ohm.both)
+    if into is not None and not (press and wire_ohm):
+        raise ValueError("--into takes what --press measures, and it needs nominal --wires")
     with _terminal() as tell:
         try:
             device = ohmskin.open(port, start=False)
@@ -80,18 +85,20 @@ def doctor(
         print(json.dumps(page, default=asdict))  # noqa: T201
     else:
         _print(page)
+    if into is not None and wire_ohm is not None:
+        _keep_wires(diagnosis, wire_ohm, into)
     if diagnosis.worse:
         raise SystemExit(1)
 
 
-def _wires(text: str) -> tuple[float, float]:
-    try:
-        top, bottom = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"--wires wants two numbers, as 100,200, not '{text}'") from None
-    if not (0 < top < float("inf") and 0 < bottom < float("inf")):
-        raise ValueError(f"--wires must be above 0 ohm, not '{text}'")
-    return top, bottom
+def _keep_wires(diagnosis: Diagnosis, wire_ohm: tuple[float, float], into: Path) -> None:
+    """Write the wires that presses showed into a calibration, with their deviation."""
+    if not (diagnosis.pressed and diagnosis.pressed[0].known):
+        raise ValueError(f"{into} is as it was: the presses do not tell the wires")
+    whole = diagnosis.pressed[0]
+    top, bottom = (whole.share * ohm for ohm in wire_ohm)
+    measured = WireOhm(top, bottom, whole.std / whole.share)
+    replace(load_calibration(into), nominal_wire_ohm=measured).save(into)
 
 
 def _unanswered(port: str, error: errors.OhmskinError) -> Finding:

@@ -37,16 +37,22 @@ TOUCH_STDS: Final = 4.0
 
 
 class WireOhm(NamedTuple):
-    """Nominal resistance of one wire segment of each layer [ohm]; None where it is not known."""
+    """Nominal resistance of one wire segment of each layer [ohm]; None where it is not known.
+
+    log_std: standard deviation of the log of both together, where they were measured.
+    """
 
     top: float | None = None
     bottom: float | None = None
+    log_std: float | None = None
 
-    def check(self) -> None:
-        """Raise ValueError, naming the layer, for a resistance that is not finite or below 0."""
-        for layer, ohm in self._asdict().items():
-            if ohm is not None and not (np.isfinite(ohm) and ohm >= 0):
-                raise ValueError(f"nominal_{layer}_wire_ohm is {ohm}, it must be finite and >= 0")
+    def check(self) -> Self:
+        """Itself. Raises ValueError, naming the field, for what is not finite or below 0."""
+        names = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
+        for name, number in zip(names, self, strict=True):
+            if number is not None and not (np.isfinite(number) and number >= 0):
+                raise ValueError(f"{name} is {number}, it must be finite and >= 0")
+        return self
 
     @property
     def both(self) -> tuple[float, float] | None:

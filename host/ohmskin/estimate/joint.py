@@ -27,7 +27,7 @@ from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
-from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.port_readings import PortReadings, cell_of
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
     REST_STD,
@@ -60,7 +60,7 @@ class JointEstimator(Estimator):
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
         self._shape = (knowledge.rows, knowledge.columns)
-        self._belief = WireBelief(*self._shape, *knowledge.nominal_wire_ohm)
+        self._belief = WireBelief(*self._shape, knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
         self.reset()
@@ -82,8 +82,8 @@ class JointEstimator(Estimator):
         # Under a finger that stays, few touches explain no frame: trying costs half the time.
         if self._finder is not None and self._touches <= 2 * self._finder.most:
             found = self._finder.find(current, current_std)
-        known = self.knowledge.rest_ratio is not None
-        if found is not None and known and self._is_sure(found):
+        knows_rest, widest = self.knowledge.rest_ratio is not None, self.widest_log_std
+        if found and knows_rest and found.cell_std[found.cells].max(initial=0.0) <= widest:
             # Around a finger, cells are pressed so lightly that they would pass for rest here.
             if not ports.fault and self._adjoining(found.cells) <= 1 < found.cells.size:
                 self._learn(found)
@@ -94,9 +94,6 @@ class JointEstimator(Estimator):
         if not (ports.fault or message or fit.is_crowded):
             self._learn(fit)
         return self._solution(ports, fit, message)
-
-    def _is_sure(self, found: Touched) -> bool:
-        return bool(found.cell_std[found.cells].max(initial=0.0) <= self.widest_log_std)
 
     def _adjoining(self, cells: NDArray[np.intp]) -> int:
         """How many pairs of these cells are side by side."""
@@ -130,15 +127,12 @@ class JointEstimator(Estimator):
             return fit.message
         if fit.misfit > MISFIT:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
-        hardest = int(fit.cell.argmin())
-        if fit.cell[hardest] < -np.log(HIGHEST_TOUCH_SIEMENS):
-            row, column = divmod(hardest, self._shape[1])
-            return f"cell ({row}, {column}): conducts more than any touch, is it a short?"
+        cell = fit.cell.reshape(self._shape)
+        if cell.min() < -np.log(HIGHEST_TOUCH_SIEMENS):
+            return f"{cell_of(cell.argmin(), cell)}: conducts more than any touch, is it a short?"
         loss = fit.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
-        worst = int(loss.argmax())
-        if self.knowledge.rest_ratio is not None and loss[worst] > 0:
-            row, column = divmod(worst, self._shape[1])
-            return f"cell ({row}, {column}): conducts less than at rest, is a line open?"
+        if self.knowledge.rest_ratio is not None and loss.max() > 0:
+            return f"{cell_of(loss.argmax(), cell)}: conducts less than at rest, is a line open?"
         return ""
 
     def _start(self, prior: CellPrior, ports: PortReadings, found: Touched | None) -> Float:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, Estimator, Solution
-from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.port_readings import PortReadings, cell_of
 
 # Beyond what any cell could draw by this many standard deviations, a reading is at fault.
 _FAULT_STDS = 5.0
@@ -51,8 +51,7 @@ class OhmEstimator(Estimator):
         excess = current - allowed
         message = ""
         if (excess > 0).any():
-            row, column = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            message = f"cell ({row}, {column}) reads a current that no resistance allows"
+            message = f"{cell_of(excess.argmax(), excess)} has more current than a short allows"
         return Solution(
             cell_siemens=cell,
             cell_siemens_std=(1.0 + cell * ref_ohm) ** 2 * ports.current_std,

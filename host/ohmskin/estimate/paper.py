@@ -66,7 +66,7 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
 from ohmskin.estimate.matrix import CellFit, solve_ports
-from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.port_readings import PortReadings, cell_of
 
 OHM_PER_MEGOHM: Final = 1e6
 # The top pin is high where the sensed electrode is the top one and on the source side, or neither.
@@ -253,9 +253,8 @@ class PaperEstimator(Estimator):
         excess = np.abs(current - feasible)
         if excess.max() <= _FAULT_STDS * known.current_std:
             return feasible, ""
-        row, column = np.unravel_index(int(excess.argmax()), excess.shape)
         said = f"is none of a port from {ports_ohm[1]:.0f} to {ports_ohm[0]:.3g} ohm"
-        return feasible, f"the current of cell ({row}, {column}) {said}"
+        return feasible, f"the current of {cell_of(excess.argmax(), excess)} {said}"
 
 
 class LsqEstimator(PaperEstimator):

@@ -142,7 +142,7 @@ class PortReader:
                 std[cell] = 2.0 * std.min()
             else:
                 by = 100 * float(square[cell] / _DEGREES) ** 0.5
-                fault = f"{_cell(index, square)}: its readings disagree by {by:.0f} % of Vdd"
+                fault = f"{cell_of(index, square)}: its readings disagree by {by:.0f} % of Vdd"
         return fault
 
     def _without_one(self, ratio: Float) -> tuple[float, float]:
@@ -163,7 +163,7 @@ class PortReader:
         worst = excess.argmax()
         if excess.flat[worst] <= 0:
             return ""
-        return f"{_cell(worst, excess)}: less resistance than wires have: row and column shorted?"
+        return f"{cell_of(worst, excess)}: less resistance than wires have: row and column shorted?"
 
     def _change(self, found: PortReadings) -> str:
         """What has changed since rest, and no touch can have."""
@@ -175,7 +175,7 @@ class PortReader:
         if np.mean(drop > 0) > 0.5:
             return "the whole skin conducts less than at rest: take the rest readings anew"
         if drop.flat[worst] > 0:
-            return f"{_cell(worst, drop)}: conducts less than at rest, is a line open?"
+            return f"{cell_of(worst, drop)}: conducts less than at rest, is a line open?"
         risen = found.current > RISE_SHARE * rest.current
         for axis, line in enumerate(("row", "column")):
             up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
@@ -228,6 +228,7 @@ def _alike(apart: Float, up: NDArray[np.bool_], line: str) -> str:
     return f"{line}s {pairs[0][0]} and {pairs[0][1]}" if len(pairs) else ""
 
 
-def _cell(index: np.intp, of: Float) -> str:
-    row, column = np.unravel_index(index, of.shape)
+def cell_of(index: int | np.intp, array: Float) -> str:
+    """The cell of this flat index into an array (R, C), in words."""
+    row, column = np.unravel_index(index, array.shape)
     return f"cell ({row}, {column})"

@@ -102,11 +102,17 @@ class WireBelief:
     """Mean and covariance of the log wire resistances of a skin of rows x columns."""
 
     def __init__(
-        self, rows: int, columns: int, nominal_top: float | None, nominal_bottom: float | None
+        self, rows: int, columns: int, wires: tuple[float | None, float | None, float | None]
     ) -> None:
+        """wires: what is known of them, a `WireOhm`."""
         self.shape = (rows, columns)
+        nominal_top, nominal_bottom, log_std = wires
         told = nominal_top is not None and nominal_bottom is not None
-        self._prior_covariance = (LAYER_STD if told else UNKNOWN_LAYER_STD) ** 2 * np.eye(2)
+        layer_std = LAYER_STD if told else UNKNOWN_LAYER_STD
+        # Both together, and what differs between them: a measurement tells their sum.
+        apart = 0.5 * layer_std**2
+        both = apart if log_std is None else log_std**2
+        self._prior_covariance = both + apart * np.array([[1.0, -1.0], [-1.0, 1.0]])
         nominal = [
             max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3)
             for ohm in (nominal_top, nominal_bottom)

@@ -11,6 +11,7 @@ method                                     the estimator that told the cells, or
 rows, columns                              R, C
 nominal_top_wire_ohm                       one wire segment of each layer [ohm], null: not told
 nominal_bottom_wire_ohm
+wire_log_std                               deviation of the log of both, null: not measured
 indenter_area_m2                           what the skin was pressed with [m^2]
 rest.date                                  ISO 8601
 rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
@@ -54,7 +55,7 @@ MAX_UNIT_ID: Final = 2**32 - 1
 MAX_NUMBER: Final = 1e60
 _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 _RESTS: Final = ("rest", "tare")
-_WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm")
+_WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
 _PLAIN: Final = {"unit_id": int, "date": str, "method": str, "indenter_area_m2": float}
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
 
@@ -212,6 +213,7 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
     if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
+    content.setdefault("wire_log_std", None)  # files of before have none
     known = {"format", "schema", "rows", "columns", *_PLAIN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
     _require_fields(content, known)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
