@@ -69,7 +69,6 @@ def test_limit_agrees_with_the_dense_formula(
     # The differences have eight digits; of exact readings, cells at rest need more than these.
     compared = where if bits is None else np.full(size, True)
     np.testing.assert_allclose(found[compared], expected[compared], rtol=1e-3)
-    print(f"{size}, {pressed} pressed, {bits} bit: largest deviation {found.max():.3g}")
 
 
 def test_what_is_not_known_widens_the_limit() -> None:
