@@ -78,9 +78,8 @@ def information_limit(
     free = pressed.ravel()
     if rest_std is None:
         rest_std = UNKNOWN_REST_STD if knowledge.rest_ratio is None else REST_STD
-    nominal = knowledge.nominal_wire_ohm
     if layer_std is None:
-        layer_std = UNKNOWN_LAYER_STD if None in nominal else LAYER_STD
+        layer_std = UNKNOWN_LAYER_STD if knowledge.nominal_wire_ohm.both is None else LAYER_STD
 
     circuit = port_sensitivity(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm)
     current = 1.0 / (circuit.port_ohm + knowledge.ref_ohm)
