@@ -34,7 +34,7 @@ def test_a_reference_file_is_read_whole() -> None:
     knowledge = readings.knowledge(0)
     assert (knowledge.rows, knowledge.columns) == (4, 6)
     assert (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) == (30e3, 30e3)
-    assert knowledge.nominal_wire_ohm == (100, 200)
+    assert knowledge.nominal_wire_ohm.both == (100, 200)
     assert knowledge.adc_bits is None
     assert not readings.one_skin_per_frame
 
