@@ -111,7 +111,7 @@ class WireBelief:
         layer_std = LAYER_STD if told else UNKNOWN_LAYER_STD
         # Both together, and what differs between them: a measurement tells their sum.
         apart = 0.5 * layer_std**2
-        both = apart if log_std is None else log_std**2
+        both = apart if log_std is None else float(np.clip(log_std, 0.01, 1.0)) ** 2
         self._prior_covariance = both + apart * np.array([[1.0, -1.0], [-1.0, 1.0]])
         nominal = [
             max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3)
