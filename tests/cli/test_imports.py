@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is loaded when: the package and its help are light, and methods load what they need."""
 
+import signal
+
 import pytest
 
 import ohmskin
 from command_line import python
-from ohmskin.cli.main import app
+from ohmskin.cli.main import app, run
+from ohmskin.errors import ctrl_c_kept
 
 # What takes long to load, and only some commands or methods need.
 HEAVY = {
@@ -60,3 +63,16 @@ def test_the_list_of_commands_says_what_a_command_says_of_itself(name: str) -> N
     listed = app.commands[name]
     own = listed.load().help.split("\n\n")[0]
     assert listed.help == " ".join(own.split())
+
+
+def test_ctrl_c_during_an_import_is_ctrl_c_and_no_error_of_the_import() -> None:
+    def import_something(**_: object) -> None:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as exc:
+            raise ImportError("initialization failed") from exc
+
+    with pytest.raises(KeyboardInterrupt), ctrl_c_kept():
+        import_something()
+    with pytest.raises(SystemExit, match="130"):
+        run(import_something, "ohmskin")

@@ -91,7 +91,8 @@ def run(commands: Callable[..., Any], program: str) -> None:
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(program, str(exc))
     except (Exception, KeyboardInterrupt) as exc:
-        if isinstance(exc, (typer.Abort, KeyboardInterrupt)):
+        # Of an import that Ctrl-C ends may come an ImportError.
+        if isinstance(exc.__cause__ or exc, (typer.Abort, KeyboardInterrupt)):
             sys.exit(130)
         said = getattr(exc, "format_message", None)
         if said is None:

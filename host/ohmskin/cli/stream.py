@@ -20,6 +20,7 @@ from rich.text import Text
 
 import ohmskin
 from ohmskin.arrays import Float
+from ohmskin.errors import ctrl_c_kept
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import ForceScan, SkinReader
@@ -75,7 +76,7 @@ def stream(
         reader = None if method == "none" else SkinReader(board, told, method=method)
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
-        with suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt), ctrl_c_kept():
             if as_json:
                 _print_scans(skin, reader, scans, seconds)
             else:

@@ -21,6 +21,7 @@ import select
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -362,7 +363,6 @@ class PtyServer(_Running, Closing):
     """Serves a running board at `path`, for as long as `serve` runs.
 
     Bytes that no program takes are thrown away, as a serial port does that nobody has open.
-    `dropped_bytes` counts them.
 
     :raises PortError: this system has no pseudo-terminals.
     """
@@ -377,7 +377,6 @@ class PtyServer(_Running, Closing):
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
-        self.dropped_bytes = 0
 
     def serve(self, seconds: float = float("inf")) -> None:
         """Serve for `seconds`, or until the faults let the board vanish."""
@@ -390,10 +389,8 @@ class PtyServer(_Running, Closing):
                 self._board.receive(os.read(self._master, _READ_SIZE))
 
     def _write(self, octets: bytes) -> None:
-        try:
-            self.dropped_bytes += len(octets) - (os.write(self._master, octets) if octets else 0)
-        except BlockingIOError:
-            self.dropped_bytes += len(octets)
+        with suppress(BlockingIOError):
+            os.write(self._master, octets)
 
     def close(self) -> None:
         """Take the pseudo-terminal away."""

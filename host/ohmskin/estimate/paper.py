@@ -42,13 +42,8 @@ were taken and why, and what can be expected of the answers.
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import FrameType
 from typing import Any, ClassVar, Final, NamedTuple
 
 import casadi
@@ -64,6 +59,7 @@ from ohmskin.circuit.skin import (
     ratio_from_current,
     readings,
 )
+from ohmskin.errors import ctrl_c_kept
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
 from ohmskin.estimate.matrix import CellFit, solve_ports
 from ohmskin.estimate.port_readings import PortReadings, cell_of
@@ -322,34 +318,10 @@ class Optimum:
         return resistances
 
 
-@contextmanager
-def _ctrl_c_kept() -> Iterator[None]:
-    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and its wrappers swallow it."""
-    before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
-    if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield  # nothing is raised here
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        try:
-            before(number, frame)
-        except BaseException as exc:
-            raised.append(exc)
-            raise  # this ends Ipopt
-
-    signal.signal(signal.SIGINT, handle)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if raised:
-            raise raised[0]
-
-
 class Program:
     """The program for one size of skin; readings, references and weights are its parameters."""
 
-    @_ctrl_c_kept()
+    @ctrl_c_kept()
     def __init__(self, rows: int, columns: int) -> None:
         cells = rows * columns
         y = casadi.SX.sym("y", READINGS_PER_CELL * cells)
@@ -389,7 +361,7 @@ class Program:
             "ubg": 0.0,
         }
 
-    @_ctrl_c_kept()
+    @ctrl_c_kept()
     def solve(
         self,
         ratio: Float,
