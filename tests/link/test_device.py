@@ -8,6 +8,8 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -385,6 +387,22 @@ def test_latest_waits_as_long_as_told() -> None:
             skin.latest(timeout_s=0.1)
         link.run(0.2)
         assert skin.latest(timeout_s=10).number == 0
+
+
+def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    skin = ohmskin.open("emulator://1x1")
+    assert isinstance(skin, Session)
+    both, closed = threading.Barrier(2), list[str]()
+    monkeypatch.setattr(skin._link, "close", lambda: closed.append("once"))
+
+    def send(_: str) -> None:
+        with suppress(threading.BrokenBarrierError):
+            both.wait(0.3)
+
+    monkeypatch.setattr(skin, "_send", send)
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda _: skin.close(), range(2)))
+    assert closed == ["once"]
 
 
 def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:

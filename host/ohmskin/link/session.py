@@ -45,7 +45,7 @@ class Session(Device):
         self._decoder = BoardDecoder()
         super().__init__(link.name, self._decoder.stats)
         self._acks: dict[int, Ack] = {}
-        self._closing = False
+        self._closing, self._ends = False, threading.Lock()
         self._sequence = 0
         self._thread = threading.Thread(target=self._read, name=f"read {link.name}", daemon=True)
         self._thread.start()
@@ -83,14 +83,15 @@ class Session(Device):
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
-        if self._closing:
-            return
-        if self._want_scans and self._failure is None:
-            with suppress(OhmskinError):  # it may be gone already
-                self._send("stop")
-        self._closing = True
-        self._thread.join()
-        self._link.close()
+        with self._ends:  # threads may close at the same time
+            if self._closing:
+                return
+            if self._want_scans and self._failure is None:
+                with suppress(OhmskinError):  # it may be gone already
+                    self._send("stop")
+            self._closing = True
+            self._thread.join()
+            self._link.close()
         self._want_scans = False
         super().close()
 
