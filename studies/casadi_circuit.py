@@ -30,7 +30,7 @@ import casadi
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import port_sensitivity
+from ohmskin.circuit.skin import PortCircuit
 
 NUMPY: Final = "numpy"
 MACHINE: Final = "casadi"  # its virtual machine
@@ -53,8 +53,8 @@ def evaluations(rows: int, columns: int) -> dict[str, Evaluation]:
 
     def numpy(log_ohm: Float) -> list[Float]:
         cell, top, bottom = np.exp(log_ohm).reshape(3, rows, columns)
-        found = port_sensitivity(1 / cell, top, bottom)
-        return [found.port_ohm, found.by_cell, found.by_wires]
+        found = PortCircuit(1 / cell, top, bottom)
+        return [found.port_ohm, found.by_cell(), found.by_wires()]
 
     found: dict[str, Evaluation] = {NUMPY: numpy, MACHINE: _ThroughBuffers(function)}
     compiled = _compiled(function)

@@ -34,7 +34,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, port_sensitivity
+from ohmskin.circuit.skin import PortCircuit, Skin
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.prior import (
     LAYER_STD,
@@ -81,10 +81,10 @@ def information_limit(
     if layer_std is None:
         layer_std = UNKNOWN_LAYER_STD if knowledge.nominal_wire_ohm.both is None else LAYER_STD
 
-    circuit = port_sensitivity(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm)
+    circuit = PortCircuit(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm)
     current = 1.0 / (circuit.port_ohm + knowledge.ref_ohm)
     slope = (current**2 / knowledge.current_std)[:, None]
-    by_cell, by_wire = slope * circuit.by_cell, slope * circuit.by_wires
+    by_cell, by_wire = slope * circuit.by_cell(), slope * circuit.by_wires()
     at_rest = rest_std * by_cell[:, ~free]
     layers = layer_std * by_wire.reshape(free.size, 2, free.size).sum(axis=2)
     others = np.hstack([at_rest, SEGMENT_STD * by_wire, layers])

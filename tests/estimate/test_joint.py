@@ -8,10 +8,10 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
+    PortCircuit,
     Skin,
     current_from_ratio,
     port_resistance_ohm,
-    port_sensitivity,
     readings,
 )
 from ohmskin.estimate.base import Estimate
@@ -45,11 +45,13 @@ def test_sensitivity_agrees_with_finite_differences(size: tuple[int, int]) -> No
     def port_ohm(cell: Float, top: Float, bottom: Float) -> Float:
         return port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom))).ravel()
 
-    circuit = port_sensitivity(np.exp(-logs[0]), np.exp(logs[1]), np.exp(logs[2]))
+    circuit = PortCircuit(np.exp(-logs[0]), np.exp(logs[1]), np.exp(logs[2]))
     np.testing.assert_allclose(circuit.port_ohm, port_ohm(*logs), rtol=1e-9)
     step = 1e-5
-    by_top, by_bottom = np.split(circuit.by_wires, 2, axis=1)
-    for kind, derivative in enumerate((circuit.by_cell, by_top, by_bottom)):
+    by_top, by_bottom = np.split(circuit.by_wires(), 2, axis=1)
+    by_layers = np.transpose([by_top.sum(axis=1), by_bottom.sum(axis=1)])
+    np.testing.assert_allclose(circuit.by_layers(), by_layers, rtol=1e-9)
+    for kind, derivative in enumerate((circuit.by_cell(), by_top, by_bottom)):
         for resistor in range(logs[0].size):
             ends = []
             for sign in (-1, 1):

@@ -201,15 +201,18 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
         mean = mean + gain @ residual
         covariance = covariance - gain @ slopes @ layers @ covariance
         covariance += FADE * (LAYER_STD**2 * np.eye(2) - covariance)
-        belief.learn(belief.root(slopes), residual, noise)
+        by_layers = belief.by_layers(slopes @ layers)
+        belief.learn(by_layers, residual, np.linalg.cholesky(slopes @ (whole @ slopes.T) + noise))
     whole = layers @ covariance @ layers.T + own
     np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
     root = belief.root(np.eye(12))
     np.testing.assert_allclose(root @ root.T, whole, atol=1e-12)
+    np.testing.assert_allclose(root[:, -2:], belief.by_layers(layers), atol=1e-12)
     assert belief.std() == pytest.approx(np.sqrt(covariance.diagonal().max()))
     away = random.normal(size=14)
-    np.testing.assert_allclose(belief.log_wires(away), belief.mean + root @ away, rtol=1e-9)
+    wires = belief.log_wires(away[-2:], away[:-2])
+    np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=1e-9)
     some = random.normal(size=(3, 12))
     before = np.log([100.0, 200.0])
-    moved = some @ (belief.mean - layers @ before)
-    np.testing.assert_allclose(belief.moved(belief.root(some), before), moved, rtol=1e-9)
+    moved = belief.moved(belief.by_layers(some @ layers), before)
+    np.testing.assert_allclose(moved, some @ (belief.mean - layers @ before), rtol=1e-9)

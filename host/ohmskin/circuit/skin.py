@@ -31,8 +31,8 @@ Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g),
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Final, NamedTuple
+from functools import cached_property, lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,15 +102,20 @@ def _incidence(rows: int, columns: int) -> Float:
     return np.hstack([by_row, -np.tile(np.eye(columns), (rows, 1))])
 
 
+@lru_cache(maxsize=16)
+def _nearer(cells: int) -> NDArray[np.intp]:
+    """The nearer of two cells of a chain, (cells, cells)."""
+    return np.minimum.outer(np.arange(cells), np.arange(cells))
+
+
 def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
     """K [ohm], shape (RC, RC): K[e, f] is the wire shared by the paths to cells e and f."""
     rows, columns = top_wire_ohm.shape
-    i, j = np.arange(rows), np.arange(columns)
     coupling = np.zeros((rows, columns, rows, columns))
-    same_row = np.einsum("ijik->ijk", coupling)
-    same_row += np.cumsum(top_wire_ohm, axis=1)[:, np.minimum.outer(j, j)]
-    same_column = np.einsum("ijkj->ikj", coupling)
-    same_column += np.cumsum(bottom_wire_ohm, axis=0)[np.minimum.outer(i, i)]
+    same_row = np.cumsum(top_wire_ohm, axis=1)[:, _nearer(columns)]
+    same_column = np.cumsum(bottom_wire_ohm, axis=0)[_nearer(rows)]
+    np.einsum("ijik->ijk", coupling)[:] = same_row
+    np.einsum("ijkj->ikj", coupling)[:] += same_column
     return coupling.reshape(rows * columns, rows * columns)
 
 
@@ -132,8 +137,9 @@ def admittance_of(half: Float) -> Float:
     conductances that rounding of the large ones would drown.
     """
     admittance: Float = half.T @ half
-    np.fill_diagonal(admittance, 0.0)
-    np.fill_diagonal(admittance, -admittance.sum(axis=1))
+    diagonal = np.einsum("ii->i", admittance)
+    diagonal[:] = 0.0
+    diagonal[:] = -admittance.sum(axis=1)
     return admittance
 
 
@@ -183,17 +189,6 @@ def port_potential(impedance: Float, rows: int) -> Float:
     return (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(len(impedance), -1)
 
 
-class Sensitivity(NamedTuple):
-    """Port resistances (RC,), ports in row-major order, and d rho / d log r of each resistance.
-
-    by_cell: (RC, RC). by_wires: (RC, 2RC), top wires, then bottom ones. All in ohm.
-    """
-
-    port_ohm: Float
-    by_cell: Float
-    by_wires: Float
-
-
 def wire_current(cell_current: Float) -> Float:
     """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
 
@@ -208,29 +203,59 @@ def wire_current(cell_current: Float) -> Float:
     return current
 
 
-def port_sensitivity(
-    cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float
-) -> Sensitivity:
-    """rho of every port and its slopes, d rho / d log r_e = r_e i_e^2, i_e the current through e.
+class PortCircuit:
+    """Ports of a skin whose cells conduct (g > 0), in row-major order, and what moves them.
 
-    The adjoint of a resistive network is the network itself (Tellegen): the currents that give rho
-    give its derivative as well, so one factorisation of RC unknowns and R+C right-hand sides are
-    enough for all RC x 3RC derivatives: a port's currents are those of its row less those of its
-    column. Cells must conduct (g > 0): (R, C) [S]; wires (R, C) [ohm].
+    port_ohm: rho (RC,). The others are slopes, d rho / d log r_e = r_e i_e^2 [ohm], i_e the current
+    through resistance e. The adjoint of a resistive network is the network itself (Tellegen): the
+    currents that give rho give its derivative as well, so one factorisation of RC unknowns and R+C
+    right-hand sides are enough for all RC x 3RC derivatives: a port's currents are those of its row
+    less those of its column. Cells (R, C) [S], wires (R, C) [ohm].
     """
-    rows, columns = cell_siemens.shape
-    root = np.sqrt(cell_siemens)
-    factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
-    impedance, port_ohm = impedance_of(admittance_of(half), rows)
-    per_potential = solve_lower(factor, half, transposed=True)
-    per_potential *= root.reshape(-1, 1)
-    cells = (impedance @ per_potential.T).reshape(-1, rows, columns)
-    lines = np.concatenate([cells[:, None], wire_current(cells)], axis=1).reshape(len(cells), -1)
-    slopes = (lines[:rows, None] - lines[None, rows:]).reshape(port_ohm.size, -1)
-    slopes *= slopes
-    slopes *= np.concatenate([1.0 / cell_siemens, top_wire_ohm, bottom_wire_ohm]).ravel()
-    by_cell, by_wires = np.split(slopes, [port_ohm.size], axis=1)
-    return Sensitivity(port_ohm.ravel(), by_cell, by_wires)
+
+    def __init__(self, cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> None:
+        self._cell_siemens, self._rows = cell_siemens, len(cell_siemens)
+        self._wire_ohm = np.stack([top_wire_ohm, bottom_wire_ohm])
+        self._root = np.sqrt(cell_siemens)
+        self._factor, self._half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
+        self._impedance, port_ohm = impedance_of(admittance_of(self._half), self._rows)
+        self.port_ohm: Float = port_ohm.ravel()
+
+    @cached_property
+    def _cell_current(self) -> Float:
+        """Through all cells, per current into each electrode, (R+C, R, C)."""
+        per_potential = solve_lower(self._factor, self._half, transposed=True)
+        per_potential *= self._root.reshape(-1, 1)
+        return (self._impedance @ per_potential.T).reshape(-1, *self._root.shape)
+
+    @cached_property
+    def _wire_current(self) -> Float:
+        """The same through all wires, (R+C, 2, R, C)."""
+        return wire_current(self._cell_current)
+
+    def _slopes(self, current: Float, ohm: Float) -> Float:
+        lines = current.reshape(len(current), -1)
+        slopes = (lines[: self._rows, None] - lines[None, self._rows :]).reshape(-1, ohm.size)
+        slopes *= slopes
+        slopes *= ohm.ravel()
+        return slopes
+
+    def by_cell(self) -> Float:
+        """Slopes by the cells, (RC, RC)."""
+        return self._slopes(self._cell_current, 1.0 / self._cell_siemens)
+
+    def by_wires(self) -> Float:
+        """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
+        return self._slopes(self._wire_current, self._wire_ohm)
+
+    def by_layers(self) -> Float:
+        """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""
+        rows = self._rows
+        current = self._wire_current.transpose(1, 0, 2, 3).reshape(2, len(self._impedance), -1)
+        power = (current * self._wire_ohm.reshape(2, 1, -1)) @ current.transpose(0, 2, 1)
+        own = np.einsum("kii->ki", power)
+        ports = own[:, :rows, None] + own[:, None, rows:] - 2.0 * power[:, :rows, rows:]
+        return np.asarray(ports.reshape(2, -1).T)
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

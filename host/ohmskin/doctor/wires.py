@@ -48,7 +48,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import current_from_ratio, current_std, port_sensitivity
+from ohmskin.circuit.skin import PortCircuit, current_from_ratio, current_std
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
 from ohmskin.doctor.signal import Rest, rounding_std_lsb
 from ohmskin.estimate.base import Estimator, SkinKnowledge
@@ -224,18 +224,19 @@ def _pressed_fit(
     for _ in range(MOST_STEPS):
         top, bottom = (np.full(shape, ohm * np.exp(log_share)) for ohm in wire_ohm)
         before, now = (
-            port_sensitivity(np.exp(-cell).reshape(shape), top, bottom)
+            PortCircuit(np.exp(-cell).reshape(shape), top, bottom)
             for cell in (untouched, untouched + lift)
         )
-        at_rest = np.linalg.inv(before.by_cell)
-        through = now.by_cell @ at_rest  # B1 B0^-1
-        by_rest_wires = before.by_wires
+        at_rest = np.linalg.inv(before.by_cell())
+        by_cell = now.by_cell()
+        through = by_cell @ at_rest  # B1 B0^-1
+        by_rest_wires = before.by_wires()
         off_rest = rest_ohm - before.port_ohm
         residual = port_ohm - now.port_ohm - through @ off_rest  # r
-        by_segment = now.by_wires - through @ by_rest_wires  # W
+        by_segment = now.by_wires() - through @ by_rest_wires  # W
         slopes = by_segment.sum(axis=1)  # w
-        spread = now.by_cell * variance
-        covariance = spread @ now.by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
+        spread = by_cell * variance
+        covariance = spread @ by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
         covariance += (through * rest_std**2) @ through.T + np.diag(port_std**2)
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
         known = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2

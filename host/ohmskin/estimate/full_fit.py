@@ -3,23 +3,28 @@
 
 Symbols
 
-====== ============= ============================================================ ==========
-symbol shape         meaning                                                      unit
-====== ============= ============================================================ ==========
-x      (3RC,)        log resistances: cells, top wires, bottom wires              log ohm
-m      (3RC,)        what the prior expects of x                                  log ohm
-P      (3RC, 3RC)    covariance of the prior
-u      (3RC + 2,)    what is off: x = m + P^1/2 u; the wires' layers have two     1
-y, h   (RC,)         measured and modelled port currents per Vdd, over noise      1
-J      (RC, 3RC + 2) dh / du                                                      1
-====== ============= ============================================================ ==========
+====== ============ ============================================================= ==========
+symbol shape        meaning                                                       unit
+====== ============ ============================================================= ==========
+x      (RC + 2,)    log resistances: cells, mean segments of both layers          log ohm
+m      (RC + 2,)    what the prior expects of x                                   log ohm
+P      (RC+2, RC+2) covariance of the prior
+u      (RC + 2,)    what is off: x = m + P^1/2 u                                  1
+y, h   (RC,)        measured and modelled port currents per Vdd, over noise       1
+J      (RC, RC + 2) dh / du                                                       1
+W      (RC, 2RC)    dh / dw s, w the log segments, s what each has of its own     1
+N      (RC, RC)     covariance of y: of its noise and of what is not in x         1
+====== ============ ============================================================= ==========
 
-Minimised is |y - h|^2 + |u|^2, P of the cells re-weighted for the tails of their prior at every
-step. The steps are Gauss-Newton's in the space of the readings (Tarantola 2005, eq. 3.51),
+Minimised is (y - h)^T N^-1 (y - h) + |u|^2, P of the cells re-weighted for the tails of their prior
+at every step. What segments have of their own is small: it is noise, N = 1 + W W^T, from where the
+fit begins, and W^T (y - h) of what is left is what it has been. The steps are Gauss-Newton's in the
+space of the readings (Tarantola 2005, eq. 3.51),
 
-    u' = J^T (J J^T + 1)^-1 (y - h(u) + J u),
+    u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 
-and the posterior covariance of u is 1 - J^T (J J^T + 1)^-1 J.
+and the posterior covariance of u is 1 - J^T S^-1 J. S and J are made anew only where those of the
+step before, used once more, would still move something.
 """
 
 from typing import Final
@@ -27,12 +32,13 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import port_sensitivity
+from ohmskin.circuit.skin import PortCircuit
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
     HIDDEN,
     MAX_STEP,
+    SEGMENT_STD,
     TOUCHED,
     UNLIMITED_STD,
     CellPrior,
@@ -65,42 +71,93 @@ class FullFit:
         self._current, self._weight = current, 1.0 / current_std
         self.iterations, self.message = 0, ""
         self.cell: Float = start
-        self._off_wires = np.zeros(2 * start.size + 2)  # u of the wires
+        self._off_layers = np.zeros(2)  # u of the layers
+        self._evaluate()
+        self._by_segment = SEGMENT_STD * self._weighted(self._circuit.by_wires())
+        self._noise = gram(self._by_segment)
+        np.einsum("ii->i", self._noise)[:] += 1.0
+        self._noise_factor = cholesky(self._noise)
         self._minimise()
         self._conclude()
 
     def _evaluate(self) -> None:
-        """Slopes and cost at the present state."""
-        self.wires = self._belief.log_wires(self._off_wires)
+        """The circuit at the present state."""
         cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
-        circuit = port_sensitivity(cell_siemens, *self._belief.layers(self.wires))
-        modelled = 1.0 / (circuit.port_ohm + self._ref_ohm)
-        slope = (-self._weight * modelled**2)[:, None]
-        residual = (self._current - modelled) * self._weight
-        centre, variance = self._prior.normal(self.cell)
-        self._by_cell = circuit.by_cell * slope  # per log ohm
-        self._by_wires = self._belief.root(circuit.by_wires * slope)
-        self._residual, self._centre, self._cell_std = residual, centre, np.sqrt(variance)
-        chi2 = float(residual @ residual + self._off_wires @ self._off_wires)
-        self._cost = chi2 + self._prior.cost(self.cell)
+        wires = self._belief.log_wires(self._off_layers)
+        self._circuit = PortCircuit(cell_siemens, *self._belief.layers(wires))
+        self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
+        self._residual = (self._current - self._modelled) * self._weight
+        self._centre, self._variance = self._prior.normal(self.cell)
+
+    def _weighted(self, slopes: Float) -> Float:
+        """Slopes of h from those of rho, (RC, ...)."""
+        return slopes * (-self._weight * self._modelled**2)[:, None]
+
+    def _cost(self) -> float:
+        explained = self._residual @ solve(self._noise_factor, self._residual)
+        own = self._off_layers @ self._off_layers
+        return float(explained + own) + self._prior.cost(self.cell)
+
+    def _linearise(self) -> None:
+        """Slopes and S at the present state."""
+        self._by_cell = self._weighted(self._circuit.by_cell())
+        self._by_layers = self._belief.by_layers(self._weighted(self._circuit.by_layers()))
+        self._cell_std = np.sqrt(self._variance)
+        self._slopes, self._factor = self._factorised(self._cell_std)
+
+    def _factorised(self, cell_std: Float) -> tuple[Float, Float]:
+        """J for cells of these deviations, and the factor of S."""
+        slopes = np.hstack([self._by_cell * cell_std, self._by_layers])
+        return slopes, cholesky(gram(slopes, onto=self._noise.copy(order="F")))
 
     def _minimise(self) -> None:
-        self._evaluate()
+        self._linearise()
+        cost = self._cost()
         for _ in range(MAX_ITERATIONS):
             self.iterations += 1
-            cell_before, off_before, cost_before = self.cell, self._off_wires, self._cost
-            if self._step():
+            step, moved = self._step()
+            if moved >= CLOSE and self.iterations > 1:
+                self._linearise()
+                step, moved = self._step()
+            cell_before, off_before, cost_before = self.cell, self._off_layers, cost
+            self._move(step)
+            if moved < CLOSE:
                 return
             self._evaluate()
+            cost = self._cost()
             for _ in range(MAX_HALVINGS):
-                if self._cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
+                if cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
                     break
-                # Too far: back half the way. What is lost is one factorisation.
+                # Too far: back half the way. What is lost is one circuit.
                 self.cell = 0.5 * (self.cell + cell_before)
-                self._off_wires = 0.5 * (self._off_wires + off_before)
+                self._off_layers = 0.5 * (self._off_layers + off_before)
                 self.iterations += 1
                 self._evaluate()
+                cost = self._cost()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
+
+    def _step(self) -> tuple[Float, float]:
+        """Step of u by the slopes there are; the most that it moves of a reading, or of a cell."""
+        from_rest = (self.cell - self._centre) * self._cell_std / self._variance
+        off = np.concatenate([from_rest, self._off_layers])
+        self._left = solve(self._factor, self._residual + self._slopes @ off)
+        step = self._left @ self._slopes - off
+        read = self._slopes @ step
+        return step, float(max(np.abs(read).max(), np.abs(step[:-2]).max()))
+
+    def _move(self, step: Float) -> None:
+        # What would leave its limits goes there, and holds up nothing else.
+        cell = self.cell + self._cell_std * step[:-2]
+        cell_step = np.minimum(np.maximum(cell, _LEAST_LOG), _MOST_LOG) - self.cell
+        layers_step = self._belief.log_layers_of(step[-2:])
+        share = min(1.0, MAX_STEP / max(np.abs(cell_step).max(), np.abs(layers_step).max(), 1e-9))
+        self.cell = self.cell + share * cell_step
+        self._off_layers = self._off_layers + share * step[-2:]
+
+    @property
+    def wires(self) -> Float:
+        """Log resistances of the segments, (2RC,): their layer's, and their own share."""
+        return self._belief.log_wires(self._off_layers, self._left @ self._by_segment)
 
     @property
     def modelled(self) -> Float:
@@ -122,37 +179,10 @@ class FullFit:
         """Whether so many cells are touched that rest is no more likely than a touch."""
         return self.touches > CROWDED * self.cell.size
 
-    def _factorised(self, cell_std: Float) -> tuple[Float, Float]:
-        """J for cells of these deviations, (RC, 3RC + 2), and the factor of J J^T + 1."""
-        slopes = np.hstack([self._by_cell * cell_std, self._by_wires])
-        seen = gram(slopes)
-        np.einsum("ii->i", seen)[:] += 1.0
-        return slopes, cholesky(seen)
-
-    def _step(self) -> bool:
-        """One step; True when the next would not matter."""
-        residual, cell_std = self._residual, self._cell_std
-        off = np.concatenate([(self.cell - self._centre) / cell_std, self._off_wires])
-        slopes, self._factor = self._factorised(cell_std)
-        left = solve(self._factor, residual + slopes @ off)
-        cell_step, wire_step = np.split(left @ slopes - off, [len(left)])
-        # After this step the linearised residual is `left`.
-        moved = max(np.abs(residual - left).max(), np.abs(cell_step).max())
-        # What would leave its limits goes there, and holds up nothing else.
-        cell = np.minimum(np.maximum(self.cell + cell_std * cell_step, _LEAST_LOG), _MOST_LOG)
-        wires = self._belief.log_wires(self._off_wires + wire_step)
-        longest = max(np.abs(cell - self.cell).max(), np.abs(wires - self.wires).max())
-        share = min(1.0, MAX_STEP / max(longest, MAX_STEP))
-        self.cell = self.cell + share * (cell - self.cell)
-        self._off_wires = self._off_wires + share * wire_step
-        self.wires = self._belief.log_wires(self._off_wires)
-        self._left = left if share == 1.0 else residual
-        return bool(moved < CLOSE)
-
     def _deviations(self, factor: Float, cell_std: Float) -> tuple[Float, Float]:
         """Share of each cell's prior variance that readings take away; what layers do to cells."""
         own = solve_lower(factor, self._by_cell * cell_std)
-        by_layers = own.T @ solve_lower(factor, self._by_wires[:, -2:])
+        by_layers = own.T @ solve_lower(factor, self._by_layers)
         share = np.einsum("ij,ij->j", own, own)
         return np.asarray(share), cell_std * np.linalg.norm(by_layers, axis=1)
 
@@ -183,12 +213,9 @@ class FullFit:
 
     @property
     def lesson(self) -> Lesson:
-        """Slopes, residual and noise of the readings, for the belief."""
-        residual = self._residual + self._by_wires @ self._off_wires
+        """What the readings say of the layers."""
+        residual = self._residual + self._by_layers @ self._off_layers
         # A touched cell is noise without limit; one at rest is known to its drift.
         unknown = self._hidden | (np.abs(self._prior.rise(self.cell)) > TOUCHED)
-        std = np.where(unknown, UNLIMITED_STD, self._prior.std)
-        by_cell = self._by_cell * std
-        noise = by_cell @ by_cell.T
-        noise.ravel()[:: residual.size + 1] += 1.0
-        return self._by_wires, residual, noise
+        _, factor = self._factorised(np.where(unknown, UNLIMITED_STD, self._prior.std))
+        return self._by_layers, residual, factor

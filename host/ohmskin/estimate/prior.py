@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.small import cholesky, solve
+from ohmskin.circuit.small import solve
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
@@ -60,7 +60,7 @@ LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 MAX_STEP: Final = 1.5  # of the log of a resistance, in one step of a fit
 REACH: Final = 2.0  # deviations of what is normal that make as many deviations of a conductance
 
-Lesson = tuple[Float, Float, Float]  # what wires learn from: J P^1/2, z and N
+Lesson = tuple[Float, Float, Float]  # what wires learn from: J L^T C^1/2, z and the factor of S
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,21 +129,28 @@ class WireBelief:
         """Expected log resistances, (2RC,)."""
         return np.repeat(self.log_layers, self.shape[0] * self.shape[1])
 
+    def by_layers(self, slopes: Float) -> Float:
+        """J L^T C^1/2, (m, 2), from slopes by the layers' logs (m, 2)."""
+        return slopes @ self._root
+
     def root(self, slopes: Float) -> Float:
         """J P^1/2, (m, 2RC + 2), from J (m, 2RC): what each segment has, and what layers share."""
         by_layer = slopes.reshape(len(slopes), 2, -1).sum(axis=2)
-        return np.hstack([SEGMENT_STD * slopes, by_layer @ self._root])
+        return np.hstack([SEGMENT_STD * slopes, self.by_layers(by_layer)])
 
-    def log_wires(self, away: Float) -> Float:
-        """Log resistances (2RC,) that are m + P^1/2 away, from what is normal (2RC + 2,)."""
-        common = self.log_layers + self._root @ away[-2:]
-        own = SEGMENT_STD * away[:-2].reshape(2, -1)
-        wires = np.minimum(np.maximum(own + common[:, None], LOG_LIMITS[0]), LOG_LIMITS[1])
-        return np.asarray(wires.ravel())
+    def log_layers_of(self, away: Float) -> Float:
+        """C^1/2 of what is normal, (2,)."""
+        return self._root @ away
 
-    def moved(self, root: Float, log_layers: Float) -> Float:
-        """J (m - m'), (m,): change of readings since m' (2,), log_layers then. root: J P^1/2."""
-        return np.asarray(root[:, -2:] @ np.linalg.solve(self._root, self.log_layers - log_layers))
+    def log_wires(self, layers: Float, segments: Float | None = None) -> Float:
+        """Log resistances (2RC,) from what is normal: of layers (2,), of segments (2RC,)."""
+        common = np.repeat(self.log_layers + self._root @ layers, self.shape[0] * self.shape[1])
+        wires = common if segments is None else common + SEGMENT_STD * segments
+        return np.minimum(np.maximum(wires, LOG_LIMITS[0]), LOG_LIMITS[1])
+
+    def moved(self, by_layers: Float, log_layers: Float) -> Float:
+        """J (m - m'), (m,): change of readings since m' (2,), log_layers then."""
+        return np.asarray(by_layers @ np.linalg.solve(self._root, self.log_layers - log_layers))
 
     def std(self) -> float:
         """Standard deviation of the log of the layer that is known less."""
@@ -159,15 +166,14 @@ class WireBelief:
         top, bottom = self.layers(log_wires)
         return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
 
-    def learn(self, root: Float, residual: Float, noise: Float) -> None:
-        """One Kalman step. root: J P^1/2; residual: z (m,) at the mean; noise: N (m, m)."""
+    def learn(self, by_layers: Float, residual: Float, factor: Float) -> None:
+        """One Kalman step from a `Lesson`. residual: z (m,) at the mean; factor: of S (m, m)."""
         if len(residual) < 2:
             return
-        by_layer = root[:, -2:]
-        gain = solve(cholesky(noise + root @ root.T), by_layer).T
+        gain = solve(factor, by_layers).T
         log_layers = self.log_layers + self._root @ (gain @ residual)
         self.log_layers = np.clip(log_layers, *LOG_LIMITS)
-        covariance = self._root @ (np.eye(2) - gain @ by_layer) @ self._root.T
+        covariance = self._root @ (np.eye(2) - gain @ by_layers) @ self._root.T
         covariance += FADE * (self._prior_covariance - covariance)
         self._root = np.linalg.cholesky(covariance)
 

@@ -151,8 +151,8 @@ class TouchedNetwork:
 class Touched:
     """What was found: cells (k,), and what a `FullFit` says as well.
 
-    lesson: what the wires can learn from: Jw, r and N of the m ports, the touched cells in N as
-    noise without limit.
+    lesson: what the wires can learn from: slopes of the m ports by the layers, r, and the factor of
+    N, the touched cells in it as noise without limit.
     """
 
     cells: Cells
@@ -301,7 +301,7 @@ class _Frame:
         """The last steps, with wires known to their covariance only; None if they contradict."""
         skin, cells = self._skin, self.cells
         if not cells.size:
-            nothing = (np.zeros((0, 2 * skin.current.size + 2)), np.zeros(0), np.zeros((0, 0)))
+            nothing = (np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0)))
             less = self._residual.min() < -DEMAND
             return None if less else self._answer(np.zeros((0, 0)), 0.0, self._current, nothing)
         heavy = self._moved_by_wires()
@@ -310,7 +310,7 @@ class _Frame:
         covariance = gram(wires)
         np.einsum("ii->i", covariance)[:] += 1.0
         factor = cholesky(covariance)
-        offset = skin.belief.moved(wires, skin.log_layers)
+        offset = skin.belief.moved(wires[:, -2:], skin.log_layers)
         for _ in range(2):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
@@ -335,10 +335,9 @@ class _Frame:
         of_touches = slopes[:, ports]
         of_cells = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         of_layers = of_cells @ own.T @ solve_lower(factor, wires[:, -2:])
-        noise = UNLIMITED_STD**2 * (of_touches.T @ of_touches)
-        noise.ravel()[:: ports.size + 1] += 1.0
+        unlimited = cholesky(gram(UNLIMITED_STD * of_touches.T, onto=covariance))
         by_layers = np.linalg.norm(of_layers, axis=1)
-        return self._answer(of_cells, by_layers, current, (wires, residual, noise))
+        return self._answer(of_cells, by_layers, current, (wires[:, -2:], residual, unlimited))
 
     def _answer(
         self, covariance: Float, by_layers: Float | float, current: Float, lesson: Lesson
