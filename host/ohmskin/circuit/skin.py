@@ -38,8 +38,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.small import cholesky, one_blas_thread, solve_lower
+from ohmskin.circuit.small import cholesky, one_blas_thread, solve, solve_lower
 from ohmskin.link.protocol import ENUMS
+
+Wire = float | Float  # segments of a layer: one number for all of them, or (R, C)
 
 CONFIGURATIONS: Final = tuple(name.upper() for name in ENUMS["reading"].values)
 READINGS_PER_CELL: Final = len(CONFIGURATIONS)
@@ -102,29 +104,36 @@ def _incidence(rows: int, columns: int) -> Float:
     return np.hstack([by_row, -np.tile(np.eye(columns), (rows, 1))])
 
 
-@lru_cache(maxsize=16)
-def _nearer(cells: int) -> NDArray[np.intp]:
-    """The nearer of two cells of a chain, (cells, cells)."""
-    return np.minimum.outer(np.arange(cells), np.arange(cells))
+@lru_cache(maxsize=8)
+def _unit_coupling(rows: int, columns: int) -> tuple[Float, Float]:
+    """K of top wires, and of bottom wires, of 1 ohm a segment."""
+    in_row, in_column = (
+        np.minimum.outer(n, n) + 1.0 for n in (np.arange(columns), np.arange(rows))
+    )
+    return np.kron(np.eye(rows), in_row), np.kron(in_column, np.eye(columns))  # type: ignore[return-value]
 
 
-def wire_coupling_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
+def wire_coupling_ohm(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
     """K [ohm], shape (RC, RC): K[e, f] is the wire shared by the paths to cells e and f."""
-    rows, columns = top_wire_ohm.shape
+    rows, columns = shape
+    if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
+        by_top, by_bottom = _unit_coupling(rows, columns)
+        return np.asarray(top_wire_ohm * by_top + bottom_wire_ohm * by_bottom)
+    i, j = np.arange(rows), np.arange(columns)
     coupling = np.zeros((rows, columns, rows, columns))
-    same_row = np.cumsum(top_wire_ohm, axis=1)[:, _nearer(columns)]
-    same_column = np.cumsum(bottom_wire_ohm, axis=0)[_nearer(rows)]
-    np.einsum("ijik->ijk", coupling)[:] = same_row
-    np.einsum("ijkj->ikj", coupling)[:] += same_column
+    same_row = np.einsum("ijik->ijk", coupling)
+    same_row += np.cumsum(top_wire_ohm, axis=1)[:, np.minimum.outer(j, j)]
+    same_column = np.einsum("ijkj->ikj", coupling)
+    same_column += np.cumsum(bottom_wire_ohm, axis=0)[np.minimum.outer(i, i)]
     return coupling.reshape(rows * columns, rows * columns)
 
 
-def factorised(root: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> tuple[Float, Float]:
+def factorised(root: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire) -> tuple[Float, Float]:
     """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
 
     The second gives Y = half^T half.
     """
-    system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm)
+    system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm, root.shape)
     system *= root.reshape(-1, 1)
     system *= root.reshape(1, -1)
     system.ravel()[:: len(system) + 1] += 1.0
@@ -172,14 +181,14 @@ def impedance_of(
     Grounding any one electrode of a connected part changes no resistance within it. The best
     connected one costs the least precision.
     """
-    parts = [np.arange(len(admittance))]
+    diagonal = admittance.diagonal()
+    grounds = [diagonal.argmax()]
     if part is not None:
-        parts = [np.flatnonzero(part == number) for number in np.unique(part)]
-    for members in parts:
-        ground = members[np.argmax(np.diagonal(admittance)[members])]
+        grounds = [np.where(part == one, diagonal, -1.0).argmax() for one in np.unique(part)]
+    for ground in grounds:
         admittance[ground, ground] = 2 * admittance[ground, ground] or 1.0
-    impedance = np.linalg.inv(admittance)
-    diagonal = np.diagonal(impedance)
+    impedance = solve(cholesky(admittance), np.eye(len(admittance)))
+    diagonal = impedance.diagonal()
     port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
     return np.asarray(impedance), np.asarray(port_ohm)
 
@@ -210,12 +219,13 @@ class PortCircuit:
     through resistance e. The adjoint of a resistive network is the network itself (Tellegen): the
     currents that give rho give its derivative as well, so one factorisation of RC unknowns and R+C
     right-hand sides are enough for all RC x 3RC derivatives: a port's currents are those of its row
-    less those of its column. Cells (R, C) [S], wires (R, C) [ohm].
+    less those of its column. Cells (R, C) [S], wires (R, C) [ohm], or one number where all segments
+    of their layer are alike.
     """
 
-    def __init__(self, cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> None:
+    def __init__(self, cell_siemens: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire) -> None:
         self._cell_siemens, self._rows = cell_siemens, len(cell_siemens)
-        self._wire_ohm = np.stack([top_wire_ohm, bottom_wire_ohm])
+        self._wire_ohm = top_wire_ohm, bottom_wire_ohm
         self._root = np.sqrt(cell_siemens)
         self._factor, self._half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
         self._impedance, port_ohm = impedance_of(admittance_of(self._half), self._rows)
@@ -246,16 +256,18 @@ class PortCircuit:
 
     def by_wires(self) -> Float:
         """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
-        return self._slopes(self._wire_current, self._wire_ohm)
+        ohm = [np.broadcast_to(layer, self._root.shape) for layer in self._wire_ohm]
+        return self._slopes(self._wire_current, np.stack(ohm))
 
     def by_layers(self) -> Float:
         """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""
-        rows = self._rows
-        current = self._wire_current.transpose(1, 0, 2, 3).reshape(2, len(self._impedance), -1)
-        power = (current * self._wire_ohm.reshape(2, 1, -1)) @ current.transpose(0, 2, 1)
-        own = np.einsum("kii->ki", power)
-        ports = own[:, :rows, None] + own[:, None, rows:] - 2.0 * power[:, :rows, rows:]
-        return np.asarray(ports.reshape(2, -1).T)
+        rows, found = self._rows, []
+        for layer, ohm in enumerate(self._wire_ohm):
+            current = self._wire_current[:, layer].reshape(len(self._impedance), -1)
+            power = (current * np.ravel(ohm)) @ current.T
+            own = power.diagonal()
+            found.append((own[:rows, None] + own[rows:] - 2.0 * power[:rows, rows:]).ravel())
+        return np.transpose(found)
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

@@ -27,6 +27,7 @@ and the posterior covariance of u is 1 - J^T S^-1 J. S and J are made anew only 
 step before, used once more, would still move something.
 """
 
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -83,8 +84,8 @@ class FullFit:
     def _evaluate(self) -> None:
         """The circuit at the present state."""
         cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
-        wires = self._belief.log_wires(self._off_layers)
-        self._circuit = PortCircuit(cell_siemens, *self._belief.layers(wires))
+        wires = np.exp(self._belief.away(self._off_layers))
+        self._circuit = PortCircuit(cell_siemens, *wires)
         self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
         self._residual = (self._current - self._modelled) * self._weight
         self._centre, self._variance = self._prior.normal(self.cell)
@@ -93,10 +94,9 @@ class FullFit:
         """Slopes of h from those of rho, (RC, ...)."""
         return slopes * (-self._weight * self._modelled**2)[:, None]
 
-    def _cost(self) -> float:
-        explained = self._residual @ solve(self._noise_factor, self._residual)
-        own = self._off_layers @ self._off_layers
-        return float(explained + own) + self._prior.cost(self.cell)
+    def _cost(self, cell: Float, off_layers: Float, residual: Float) -> float:
+        explained = residual @ solve(self._noise_factor, residual)
+        return float(explained + off_layers @ off_layers) + self._prior.cost(cell)
 
     def _linearise(self) -> None:
         """Slopes and S at the present state."""
@@ -107,34 +107,42 @@ class FullFit:
 
     def _factorised(self, cell_std: Float) -> tuple[Float, Float]:
         """J for cells of these deviations, and the factor of S."""
-        slopes = np.hstack([self._by_cell * cell_std, self._by_layers])
+        slopes = np.empty((len(cell_std), len(cell_std) + 2))
+        np.multiply(self._by_cell, cell_std, out=slopes[:, :-2])
+        slopes[:, -2:] = self._by_layers
         return slopes, cholesky(gram(slopes, onto=self._noise.copy(order="F")))
 
     def _minimise(self) -> None:
         self._linearise()
-        cost = self._cost()
+        step, moved = self._step()
         for _ in range(MAX_ITERATIONS):
             self.iterations += 1
-            step, moved = self._step()
-            if moved >= CLOSE and self.iterations > 1:
-                self._linearise()
-                step, moved = self._step()
-            cell_before, off_before, cost_before = self.cell, self._off_layers, cost
+            before = self.cell, self._off_layers, self._residual
             self._move(step)
             if moved < CLOSE:
                 return
             self._evaluate()
-            cost = self._cost()
-            for _ in range(MAX_HALVINGS):
-                if cost <= cost_before + 1e-9 * abs(cost_before) + 1e-3:
-                    break
-                # Too far: back half the way. What is lost is one circuit.
-                self.cell = 0.5 * (self.cell + cell_before)
-                self._off_layers = 0.5 * (self._off_layers + off_before)
-                self.iterations += 1
-                self._evaluate()
-                cost = self._cost()
+            step, moved = self._step()
+            if moved >= CLOSE:
+                self._step_back(*before)
+                self._linearise()
+                step, moved = self._step()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
+
+    def _step_back(self, cell: Float, off_layers: Float, residual: Float) -> None:
+        """Half the way to this state before, as long as the cost has risen: the step went too far.
+
+        What is lost is one circuit.
+        """
+        limit = self._cost(cell, off_layers, residual)
+        limit += 1e-9 * abs(limit) + 1e-3
+        for _ in range(MAX_HALVINGS):
+            if self._cost(self.cell, self._off_layers, self._residual) <= limit:
+                return
+            self.cell = 0.5 * (self.cell + cell)
+            self._off_layers = 0.5 * (self._off_layers + off_layers)
+            self.iterations += 1
+            self._evaluate()
 
     def _step(self) -> tuple[Float, float]:
         """Step of u by the slopes there are; the most that it moves of a reading, or of a cell."""
@@ -149,12 +157,12 @@ class FullFit:
         # What would leave its limits goes there, and holds up nothing else.
         cell = self.cell + self._cell_std * step[:-2]
         cell_step = np.minimum(np.maximum(cell, _LEAST_LOG), _MOST_LOG) - self.cell
-        layers_step = self._belief.log_layers_of(step[-2:])
+        layers_step = self._belief.away(step[-2:]) - self._belief.log_layers
         share = min(1.0, MAX_STEP / max(np.abs(cell_step).max(), np.abs(layers_step).max(), 1e-9))
         self.cell = self.cell + share * cell_step
         self._off_layers = self._off_layers + share * step[-2:]
 
-    @property
+    @cached_property
     def wires(self) -> Float:
         """Log resistances of the segments, (2RC,): their layer's, and their own share."""
         return self._belief.log_wires(self._off_layers, self._left @ self._by_segment)

@@ -37,15 +37,17 @@ from ohmskin.estimate.prior import (
     UNTOUCHED_STD,
     CellPrior,
     WireBelief,
+    path_ohm,
     rest_level,
     siemens_std,
 )
-from ohmskin.estimate.sparse_fit import SparseFit, Touched
+from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 
 LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
 MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
 LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
 LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
+WIDEST: Final = 0.3  # log: touches that are known less are not linear enough for `touch`
 # Change of a log resistance that makes a frame news of the wires: frames alike have alike errors.
 NEWS: Final = 1.5
 
@@ -54,8 +56,6 @@ class JointEstimator(Estimator):
     """Gauss-Newton on all 3RC log resistances; learns the wires from frame to frame."""
 
     name: ClassVar[str] = "joint"
-    # The few touches that explain a frame are the answer if they are known to this [log S]: never.
-    widest_log_std: ClassVar[float] = -np.inf
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
@@ -76,35 +76,29 @@ class JointEstimator(Estimator):
             self._prior = self._finder = None
 
     def _solve(self, ports: PortReadings) -> Solution:
-        current, current_std = ports.current.ravel(), ports.current_std.ravel()
-        prior = self._prior_of(current)
-        found = None
+        prior = self._prior_of(ports.current.ravel())
+        touches = None
         # Under a finger that stays, few touches explain no frame: trying costs half the time.
         if self._finder is not None and self._touches <= 2 * self._finder.most:
-            found = self._finder.find(current, current_std)
-        knows_rest, widest = self.knowledge.rest_ratio is not None, self.widest_log_std
-        if found and knows_rest and found.cell_std[found.cells].max(initial=0.0) <= widest:
-            # Around a finger, cells are pressed so lightly that they would pass for rest here.
-            if not ports.fault and self._adjoining(found.cells) <= 1 < found.cells.size:
-                self._learn(found)
+            touches = self._finder.find(ports.current.ravel(), ports.current_std.ravel())
+        if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)
-        fit = self._fit(prior, ports, self._start(prior, ports, found))
+        fit = self._fit(prior, ports, self._start(prior, ports, touches))
         self._touches = fit.touches
         message = self._doubt(prior, fit)
         if not (ports.fault or message or fit.is_crowded):
             self._learn(fit)
         return self._solution(ports, fit, message)
 
-    def _adjoining(self, cells: NDArray[np.intp]) -> int:
-        """How many pairs of these cells are side by side."""
-        places = np.array(np.unravel_index(cells, self._shape))
-        return int((np.abs(places[:, :, None] - places[:, None]).sum(axis=0) == 1).sum()) // 2
+    def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
+        """The answer, if these few touches are all that the frame shows: never, for `joint`."""
+        return None
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
-        series_ohm = self._belief.path_ohm(fit.wires) + self.knowledge.ref_ohm
+        top, bottom = self._belief.layers(fit.wires)
+        series_ohm = path_ohm(top, bottom) + self.knowledge.ref_ohm
         layer_std, wider = self._belief.std(), max(1.0, fit.misfit) ** 0.5
         std, down = siemens_std(-fit.cell, fit.cell_std, fit.by_layers, layer_std, series_ohm)
-        top, bottom = self._belief.layers(fit.wires)
         return Solution(
             cell_siemens=np.exp(-fit.cell).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
@@ -135,17 +129,17 @@ class JointEstimator(Estimator):
             return f"{cell_of(loss.argmax(), cell)}: conducts less than at rest, is a line open?"
         return ""
 
-    def _start(self, prior: CellPrior, ports: PortReadings, found: Touched | None) -> Float:
+    def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
         """Log resistances of the cells to start from, (RC,).
 
         They are the touched cells that explain the frame. Where these do not, they are what
         `matrix` finds: without wires, cells come out a little too soft, and from there a fit does
         not reach the distant answer of one hard touch behind long wires.
         """
-        if found is not None:
-            return found.cell
-        # To start from, a deviation of every reading is near enough.
-        near = float(ports.current.size)
+        if touches is not None:
+            return touches.cell
+        # To start from, three deviations of every reading are near enough.
+        near = 10.0 * ports.current.size
         fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires, near)
         self._without_wires = None if fit.message else fit.cell
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
@@ -192,4 +186,17 @@ class TouchEstimator(JointEstimator):
     """The simplest model that explains a frame. Cells at rest are reported as at rest."""
 
     name: ClassVar[str] = "touch"
-    widest_log_std: ClassVar[float] = 0.3  # beyond it the circuit is far from linear
+
+    def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
+        found = None if self.knowledge.rest_ratio is None else touches.explain()
+        if found is None or found.cell_std[found.cells].max(initial=0.0) > WIDEST:
+            return None
+        # Around a finger, cells are pressed so lightly that they would pass for rest here.
+        if not ports.fault and self._adjoining(found.cells) <= 1 < found.cells.size:
+            self._learn(found)
+        return found
+
+    def _adjoining(self, cells: NDArray[np.intp]) -> int:
+        """How many pairs of these cells are side by side."""
+        places = np.array(np.unravel_index(cells, self._shape))
+        return int((np.abs(places[:, :, None] - places[:, None]).sum(axis=0) == 1).sum()) // 2

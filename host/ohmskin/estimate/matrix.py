@@ -169,12 +169,19 @@ class CellFit:
     ) -> None:
         self.cell, self.current, self.cost = cell, current, cost
         self.scale = np.maximum(cell.ravel(), SCALE_FLOOR_SIEMENS)
-        jacobian = voltage_squared(impedance, len(cell))
-        jacobian *= (current**2 / self._current_std)[:, None]
+        self._impedance, self._residual, self._is_linearised = impedance, residual, False
+
+    def _linearise(self) -> None:
+        """Slopes at these cells."""
+        if self._is_linearised:
+            return
+        self._is_linearised = True
+        jacobian = voltage_squared(self._impedance, len(self.cell))
+        jacobian *= (self.current**2 / self._current_std)[:, None]
         jacobian *= self.scale[None, :]
-        self.gradient: Float = residual @ jacobian
-        stretch = (1.0 - current * self._ref_ohm) / self._target_share
-        self.far_gradient: Float = (residual * stretch) @ jacobian
+        self.gradient: Float = self._residual @ jacobian
+        stretch = (1.0 - self.current * self._ref_ohm) / self._target_share
+        self.far_gradient: Float = (self._residual * stretch) @ jacobian
         self.normal: Float = jacobian.T @ jacobian
         self.diagonal = np.diagonal(self.normal).copy()
 
@@ -183,7 +190,10 @@ class CellFit:
         damping = 0.0
         far = self._is_far(self.cost)
         while self.iterations < MAX_ITERATIONS:
+            if self.cost < self._tolerance:  # no step lowers it by more
+                return ""
             self.iterations += 1
+            self._linearise()
             gradient = self.far_gradient if far else self.gradient
             # Which bounds hold is worth finding out near the solution only.
             cell = self._stepped(gradient, damping, 1 if far else _BOUND_ROUNDS)
@@ -248,6 +258,7 @@ class CellFit:
 
     def cell_std(self) -> Float:
         """Root of the diagonal of (J^T J + ridge)^-1 [S], shape (R, C)."""
+        self._linearise()
         system = self.normal.copy()
         system.ravel()[:: len(self.diagonal) + 1] += self._ridge()
         factor, failed = lapack.dpotrf(system, lower=1, overwrite_a=1)

@@ -112,7 +112,7 @@ class PortReader:
         typical = float(np.partition(square, middle, axis=None)[middle])
         own, rounding = square / _DEGREES, self._ratio_std**2
         most = _MOST_USUAL * max(rounding, typical / _DEGREES)
-        usual = float(np.mean(own[own <= most]))
+        usual = float(own[own <= most].mean())
         alike = max(0.0, 1.0 - usual / (2.0 * rounding)) * self._current_std**2
         std = np.sqrt(np.maximum(own, usual) / self._ref_square + alike)
         fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
@@ -172,20 +172,20 @@ class PortReader:
         std = np.hypot(found.current_std, rest.current_std)
         drop = DROP_SHARE * rest.current - found.current - CLEAR_STDS * std
         worst = drop.argmax()
-        if np.mean(drop > 0) > 0.5:
-            return "the whole skin conducts less than at rest: take the rest readings anew"
         if drop.flat[worst] > 0:
+            if np.count_nonzero(drop > 0) > 0.5 * drop.size:
+                return "the whole skin conducts less than at rest: take the rest readings anew"
             return f"{cell_of(worst, drop)}: conducts less than at rest, is a line open?"
         risen = found.current > RISE_SHARE * rest.current
         for axis, line in enumerate(("row", "column")):
-            up: NDArray[np.bool_] = np.all(risen, axis=1 - axis)
+            up: NDArray[np.bool_] = risen.all(axis=1 - axis)
             frames = self._alike_frames[axis]
             # Lines once shown apart matter again where two conduct more in all their ports.
             known = frames.max() < ALIKE_FRAMES and np.count_nonzero(up) < 2
             if known or found.current.shape[1 - axis] < 3:
                 continue
-            differed = self._rest_apart[axis] > 2 * SAME_STDS
-            apart = np.where(differed, self._apart(found, axis), np.inf)
+            apart = self._apart(found, axis)
+            apart[self._rest_apart[axis] <= 2 * SAME_STDS] = np.inf  # nobody can tell
             # Between one and two times the limit, noise may be what differs.
             self._alike_frames[axis] = frames = np.where(apart > 2 * SAME_STDS, 0, frames + 1)
             apart[frames < ALIKE_FRAMES] = np.inf
@@ -201,8 +201,8 @@ class PortReader:
         current, std = ports.current, np.maximum(ports.current_std, self._current_std)
         if axis:
             current, std = current.T, std.T
-        difference = np.abs(current[:, None, :] - current[None, :, :])
-        difference /= np.maximum(std[:, None, :], std[None, :, :])
+        difference = np.abs(current[:, None, :] - current)
+        difference /= np.maximum(std[:, None, :], std)
         return np.asarray(difference.max(axis=2))
 
     def _fault_at_rest(self, rest: PortReadings) -> str:
@@ -224,7 +224,10 @@ class PortReader:
 
 def _alike(apart: Float, up: NDArray[np.bool_], line: str) -> str:
     """The first two of the lines `up` that read alike, in words; empty if there are none."""
-    pairs = np.argwhere(np.triu((apart < SAME_STDS) & up & up[:, None], 1))
+    alike = apart < SAME_STDS
+    if not alike.any():
+        return ""
+    pairs = np.argwhere(np.triu(alike & up & up[:, None], 1))
     return f"{line}s {pairs[0][0]} and {pairs[0][1]}" if len(pairs) else ""
 
 

@@ -138,15 +138,16 @@ class WireBelief:
         by_layer = slopes.reshape(len(slopes), 2, -1).sum(axis=2)
         return np.hstack([SEGMENT_STD * slopes, self.by_layers(by_layer)])
 
-    def log_layers_of(self, away: Float) -> Float:
-        """C^1/2 of what is normal, (2,)."""
-        return self._root @ away
+    def away(self, layers: Float) -> Float:
+        """Logs of the layers (2,) that are m + C^1/2 away, from what is normal (2,)."""
+        return np.minimum(
+            np.maximum(self.log_layers + self._root @ layers, LOG_LIMITS[0]), LOG_LIMITS[1]
+        )
 
-    def log_wires(self, layers: Float, segments: Float | None = None) -> Float:
+    def log_wires(self, layers: Float, segments: Float) -> Float:
         """Log resistances (2RC,) from what is normal: of layers (2,), of segments (2RC,)."""
-        common = np.repeat(self.log_layers + self._root @ layers, self.shape[0] * self.shape[1])
-        wires = common if segments is None else common + SEGMENT_STD * segments
-        return np.minimum(np.maximum(wires, LOG_LIMITS[0]), LOG_LIMITS[1])
+        common = np.repeat(self.away(layers), self.shape[0] * self.shape[1])
+        return common + SEGMENT_STD * segments
 
     def moved(self, by_layers: Float, log_layers: Float) -> Float:
         """J (m - m'), (m,): change of readings since m' (2,), log_layers then."""
@@ -161,11 +162,6 @@ class WireBelief:
         top, bottom = np.exp(log_wires).reshape(2, *self.shape)
         return top, bottom
 
-    def path_ohm(self, log_wires: Float) -> Float:
-        """Wire between each cell and its electrodes [ohm], (RC,)."""
-        top, bottom = self.layers(log_wires)
-        return (np.cumsum(top, axis=1) + np.cumsum(bottom, axis=0)).ravel()
-
     def learn(self, by_layers: Float, residual: Float, factor: Float) -> None:
         """One Kalman step from a `Lesson`. residual: z (m,) at the mean; factor: of S (m, m)."""
         if len(residual) < 2:
@@ -176,6 +172,11 @@ class WireBelief:
         covariance = self._root @ (np.eye(2) - gain @ by_layers) @ self._root.T
         covariance += FADE * (self._prior_covariance - covariance)
         self._root = np.linalg.cholesky(covariance)
+
+
+def path_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
+    """Wire between each cell and its electrodes [ohm], (RC,)."""
+    return (np.cumsum(top_wire_ohm, axis=1) + np.cumsum(bottom_wire_ohm, axis=0)).ravel()
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

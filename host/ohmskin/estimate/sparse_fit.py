@@ -35,6 +35,8 @@ rest is taken out. The last steps know that wires are known to P only, and weigh
 N^-1.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Final
 
@@ -61,6 +63,7 @@ from ohmskin.estimate.prior import (
     CellPrior,
     Lesson,
     WireBelief,
+    path_ohm,
 )
 
 Cells = NDArray[np.intp]
@@ -180,7 +183,8 @@ class SparseFit:
         prior, belief = self.prior, self.belief
         self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(rest_siemens, *belief.layers(belief.mean))
+        layers = belief.layers(belief.mean)
+        self.net = net = RestNetwork(rest_siemens, *layers)
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
         wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
@@ -188,20 +192,20 @@ class SparseFit:
         self.slack = prior.std**2 @ (by_cell * by_cell)
         root = belief.root(wires * (self.current**2)[:, None])
         self.slack += np.einsum("ij,ij->i", root, root)
-        self.path_ohm = belief.path_ohm(belief.mean)
+        self.path_ohm = path_ohm(*layers)
         self.wire_std = float(np.hypot(belief.std(), SEGMENT_STD))
 
-    def find(self, current: Float, current_std: Float) -> Touched | None:
-        """The touched cells of one frame, (RC,) [S] both; None if no few touches explain it."""
+    def find(self, current: Float, current_std: Float) -> FewTouches | None:
+        """The touched cells of one frame, (RC,) [S] both; None if they are not few."""
         if np.abs(self.belief.log_layers - self.log_layers).max() > REBUILD:
             self._solve_rest()
-        frame = _Frame(self, current, current_std)
+        frame = FewTouches(self, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
         frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
         for _ in range(MAX_STEPS):
             asked, rise = frame.asked_for()
             if not asked.size:
-                return frame.finish() if frame.cells.size <= self.most else None
+                return frame if frame.cells.size <= self.most else None
             cells = np.concatenate([frame.cells, asked])
             # Ghosts among them may leave again.
             if cells.size > 2 * self.most:
@@ -211,7 +215,7 @@ class SparseFit:
         return None
 
 
-class _Frame:
+class FewTouches:
     """One frame: the cells in the model, and all that follows from them."""
 
     def __init__(self, skin: SparseFit, current: Float, current_std: Float) -> None:
@@ -297,7 +301,14 @@ class _Frame:
         asked = np.flatnonzero((map_ > 0) & (map_ >= SHARE * rival))
         return asked, rise[asked]
 
-    def finish(self) -> Touched | None:
+    @property
+    def cell(self) -> Float:
+        """Log resistances of all cells, (RC,)."""
+        cell = self._skin.prior.expected.copy()
+        cell[self.cells] = -self.log_siemens
+        return cell
+
+    def explain(self) -> Touched | None:
         """The last steps, with wires known to their covariance only; None if they contradict."""
         skin, cells = self._skin, self.cells
         if not cells.size:
@@ -343,11 +354,11 @@ class _Frame:
         self, covariance: Float, by_layers: Float | float, current: Float, lesson: Lesson
     ) -> Touched:
         prior, cells = self._skin.prior, self.cells
-        cell, std, by_all = prior.expected.copy(), prior.std.copy(), np.zeros(current.size)
-        cell[cells], std[cells] = -self.log_siemens, np.sqrt(np.diagonal(covariance))
+        std, by_all = prior.std.copy(), np.zeros(current.size)
+        std[cells] = np.sqrt(np.diagonal(covariance))
         by_all[cells] = by_layers
         wires = self._skin.belief.mean
-        return Touched(cells, cell, std, by_all, wires, current, self.steps, lesson)
+        return Touched(cells, self.cell, std, by_all, wires, current, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
