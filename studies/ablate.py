@@ -51,10 +51,7 @@ from studies.ablate_scenes import SCENES, Plan, Run, Sample, observe
 MODULES: Final = (prior, full_fit, sparse_fit, joint)
 # What makes a constant do nothing, or, of a deviation, what is all but certain: 0 would divide.
 OFF: Final[dict[str, float]] = {
-    "prior.UNTOUCHED_STD": 10.0,
-    "prior.REST_QUANTILE": 0.0,
     "prior.REST_STD": 0.0,
-    "prior.TAIL": 1e9,
     "prior.HIGHEST_TOUCH_SIEMENS": 1.0,
     "prior.TOUCHED": np.inf,
     "prior.UNLIMITED_STD": 0.0,
@@ -64,24 +61,19 @@ OFF: Final[dict[str, float]] = {
     "prior.SEGMENT_STD": 0.0,
     "prior.FADE": 0.0,
     "prior.REACH": 1e-3,
-    "full_fit.MAX_HALVINGS": 0,
-    "full_fit.CLOSE": 1e-3,
+    "prior.CLOSE": 1e-3,
     "full_fit.CROWDED": np.inf,
-    "full_fit.LIGHT_TOUCH": 0.0,
     "sparse_fit.MOST_PER_LINE": np.inf,
     "sparse_fit.DEMAND": 0.0,
     "sparse_fit.SHARE": 0.0,
-    "sparse_fit.MAX_STEPS": 100,
     "prior.MAX_STEP": 1e9,
-    "sparse_fit.CLOSE": 0.0,
     "sparse_fit.HEAVY": 0.0,
     "sparse_fit.REBUILD": 0.0,
-    "sparse_fit.CONTRADICTION": np.inf,
     "joint.LOWER_LEVEL": 0.0,
-    "joint.MISFIT": np.inf,
+    "prior.MISFIT": np.inf,
     "joint.LOSS": 0.0,
-    "joint.LOSS_STDS": 0.0,
     "joint.NEWS": 0.0,
+    "joint.NEAR": 0.0,
 }
 # What is kept of each frame, and the quantile that a figure takes of it; None: the mean.
 FIGURES: Final[dict[str, tuple[str, float | None]]] = {

@@ -42,13 +42,12 @@ from ohmskin.estimate.prior import (
     SEGMENT_STD,
     UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
-    UNTOUCHED_OHM,
 )
 
 # Of a pressed cell's log conductance: nine decades within one deviation either way is no knowledge.
 PRESSED_STD: Final = 10.0
 # Where nobody says which cells are pressed: those that conduct so much more than a usual rest.
-PRESSED_SIEMENS: Final = 1.5 / UNTOUCHED_OHM
+PRESSED_SIEMENS: Final = 1.5e-6
 
 
 def information_limit(

@@ -18,7 +18,7 @@ from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, TAIL, CellPrior, WireBelief
+from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, CellPrior, WireBelief
 from skins import reference, ten_bits, told
 from studies.trials import skin_at_rest, touch
 
@@ -144,7 +144,7 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
     random = np.random.default_rng(8)
     rest = skin_at_rest(3, 4, random)
     known, measured = told(readings(rest)), ten_bits(readings(touch(rest, 3, random)))
-    prior = CellPrior(-np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD), TAIL)
+    prior = CellPrior(-np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD))
     layer = np.kron(np.eye(2), np.ones((12, 12)))
     inverse = np.linalg.inv(LAYER_STD**2 * layer + SEGMENT_STD**2 * np.eye(24))
     nominal = np.log(np.repeat([100.0, 200.0], 12))

@@ -37,7 +37,9 @@ from ohmskin.circuit.skin import PortCircuit
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.prior import (
+    CLOSE,
     HIDDEN,
+    MAX_ITERATIONS,
     MAX_STEP,
     SEGMENT_STD,
     TOUCHED,
@@ -47,11 +49,7 @@ from ohmskin.estimate.prior import (
     WireBelief,
 )
 
-MAX_ITERATIONS: Final = 40
-MAX_HALVINGS: Final = 8  # of a step that goes too far
-CLOSE: Final = 0.5  # deviations of a reading or cell: a step that moves none by more is the last
 CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
-LIGHT_TOUCH: Final = 10.0  # rise over the conductance at rest that such a cell may have
 _LEAST_LOG, _MOST_LOG = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)  # of a cell
 
 
@@ -115,7 +113,7 @@ class FullFit:
     def _minimise(self) -> None:
         self._linearise()
         step, moved = self._step()
-        for _ in range(MAX_ITERATIONS):
+        while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
             before = self.cell, self._off_layers, self._residual
             self._move(step)
@@ -136,8 +134,8 @@ class FullFit:
         """
         limit = self._cost(cell, off_layers, residual)
         limit += 1e-9 * abs(limit) + 1e-3
-        for _ in range(MAX_HALVINGS):
-            if self._cost(self.cell, self._off_layers, self._residual) <= limit:
+        while self._cost(self.cell, self._off_layers, self._residual) > limit:
+            if self.iterations == MAX_ITERATIONS:
                 return
             self.cell = 0.5 * (self.cell + cell)
             self._off_layers = 0.5 * (self._off_layers + off_layers)
@@ -204,14 +202,14 @@ class FullFit:
         prior, cell_std = self._prior, self._cell_std
         learned, self.by_layers = self._deviations(self._factor, cell_std)
         distance = prior.expected - self.cell
-        at_rest = distance**2 < prior.tail * prior.std**2
+        at_rest = np.abs(distance) < prior.std
         # What the readings alone say of a cell: rise of its conductance over rest, and deviation.
         share = np.maximum(learned, 1e-9)
         rise = distance / share
         rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
         hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
         if self.is_crowded:
-            hidden, rise = at_rest, np.maximum(rise, LIGHT_TOUCH)
+            hidden, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
         self._hidden = hidden
         if hidden.any() or self.is_crowded:
             cell_std = np.where(hidden, rise + rise_std, cell_std)

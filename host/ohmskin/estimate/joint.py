@@ -30,11 +30,10 @@ from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings, cell_of
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
+    MISFIT,
     REST_STD,
-    TAIL,
     UNKNOWN_REST_STD,
-    UNTOUCHED_OHM,
-    UNTOUCHED_STD,
+    UNLIMITED_STD,
     CellPrior,
     WireBelief,
     path_ohm,
@@ -44,10 +43,11 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 
 LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
-MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
-LOSS: Final = 0.5  # log: a cell that conducts so much less than at rest is at fault
-LOSS_STDS: Final = 6.0  # the same in deviations of the prior; both must be exceeded
+LOSS: Final = (
+    10.0  # deviations of the prior: a cell that conducts so much less than at rest is at fault
+)
 WIDEST: Final = 0.3  # log: touches that are known less are not linear enough for `touch`
+NEAR: Final = 10.0  # chi-square per port that a start from `matrix` may be away from its minimum
 # Change of a log resistance that makes a frame news of the wires: frames alike have alike errors.
 NEWS: Final = 1.5
 
@@ -124,7 +124,7 @@ class JointEstimator(Estimator):
         cell = fit.cell.reshape(self._shape)
         if cell.min() < -np.log(HIGHEST_TOUCH_SIEMENS):
             return f"{cell_of(cell.argmin(), cell)}: conducts more than any touch, is it a short?"
-        loss = fit.cell - prior.expected - np.maximum(LOSS, LOSS_STDS * prior.std)
+        loss = fit.cell - prior.expected - LOSS * prior.std
         if self.knowledge.rest_ratio is not None and loss.max() > 0:
             return f"{cell_of(loss.argmax(), cell)}: conducts less than at rest, is a line open?"
         return ""
@@ -138,8 +138,7 @@ class JointEstimator(Estimator):
         """
         if touches is not None:
             return touches.cell
-        # To start from, three deviations of every reading are near enough.
-        near = 10.0 * ports.current.size
+        near = NEAR * ports.current.size
         fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires, near)
         self._without_wires = None if fit.message else fit.cell
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
@@ -170,16 +169,17 @@ class JointEstimator(Estimator):
             return self._prior
         else:
             expected, std = self._at_rest(self._reader.read(known.rest_ratio))
-        self._prior = CellPrior(expected, std, TAIL)
+        self._prior = CellPrior(expected, std)
         self._finder = SparseFit(self._prior, self._belief, known.ref_ohm)
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
         """Log resistances of the untouched cells, and how well they are known: the same fit."""
-        expected = np.full(ports.current.size, np.log(UNTOUCHED_OHM))
-        wide = CellPrior(expected, np.full(expected.size, UNTOUCHED_STD), 1e9)
+        level = rest_level(ports.current, self.knowledge.ref_ohm)
+        expected = np.full(ports.current.size, -np.log(level))
+        wide = CellPrior(expected, np.full(expected.size, UNLIMITED_STD))
         fit = self._fit(wide, ports, self._start(wide, ports, None))
-        return fit.cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
+        return fit.cell, np.hypot(fit.cell_std, REST_STD)
 
 
 class TouchEstimator(JointEstimator):

@@ -178,7 +178,7 @@ class PortReader:
             return f"{cell_of(worst, drop)}: conducts less than at rest, is a line open?"
         risen = found.current > RISE_SHARE * rest.current
         for axis, line in enumerate(("row", "column")):
-            up: NDArray[np.bool_] = risen.all(axis=1 - axis)
+            up = np.asarray(risen.all(axis=1 - axis))
             frames = self._alike_frames[axis]
             # Lines once shown apart matter again where two conduct more in all their ports.
             known = frames.max() < ALIKE_FRAMES and np.count_nonzero(up) < 2

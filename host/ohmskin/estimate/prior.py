@@ -38,12 +38,8 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.small import solve
 
 # Deviations (..._STD) are of the log of a resistance.
-UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
-UNTOUCHED_STD: Final = 1.0
 UNKNOWN_REST_STD: Final = 0.3  # of a cell whose rest readings are not known, about all cells' level
-REST_QUANTILE: Final = 0.2  # of the ports, taken for untouched ones where rest is not known
 REST_STD: Final = 0.05  # drift of a cell since the rest readings
-TAIL: Final = 1.0  # exponent of the density of touched cells
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 # A cell that the prior holds at rest may be touched all the same, where readings say little of it.
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
@@ -55,8 +51,10 @@ UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a fac
 LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
-LOG_LIMITS: Final = (np.log(1e-6), np.log(1e7))  # of a wire segment
 
+MAX_ITERATIONS: Final = 40
+CLOSE: Final = 0.5  # deviations: a step that moves no reading or cell by more is the last
+MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
 MAX_STEP: Final = 1.5  # of the log of a resistance, in one step of a fit
 REACH: Final = 2.0  # deviations of what is normal that make as many deviations of a conductance
 
@@ -67,16 +65,15 @@ Lesson = tuple[Float, Float, Float]  # what wires learn from: J L^T C^1/2, z and
 class CellPrior:
     """Log resistance of the cells: normal near rest, heavy-tailed further away.
 
-    With d the distance from `expected` over `std`, -2 log p is d^2 up to d^2 = `tail`, and goes on
-    with the same slope as tail (1 + log(d^2 / tail)): the density falls as d^-tail. Cells at rest
-    are a quadratic problem, which costs no iterations; being touched is unlikely, but how hard,
-    once a cell is, costs little.
-    expected, std: (RC,) [log ohm]. tail: 1e9 for what is as good as normal.
+    With d the distance from `expected` over `std`, -2 log p is d^2 up to d = 1, and goes on with
+    the same slope as 1 + log(d^2): the density falls as 1 / d, the same for all hardnesses of a
+    touch. Cells at rest are a quadratic problem, which costs no iterations; being touched is
+    unlikely, but how hard, once a cell is, costs little.
+    expected, std: (RC,) [log ohm].
     """
 
     expected: Float
     std: Float
-    tail: float
 
     def rise(self, log_ohm: Float) -> Float:
         """How far a cell conducts more than at rest, in deviations."""
@@ -84,9 +81,8 @@ class CellPrior:
 
     def cost(self, log_ohm: Float) -> float:
         """-2 log p, up to a constant."""
-        square = ((log_ohm - self.expected) / self.std) ** 2
-        beyond = np.maximum(square / self.tail, 1.0)
-        return float((np.minimum(square, self.tail) + self.tail * np.log(beyond)).sum())
+        square = self.rise(log_ohm) ** 2
+        return float((np.minimum(square, 1.0) + np.log(np.maximum(square, 1.0))).sum())
 
     def normal(
         self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
@@ -94,8 +90,7 @@ class CellPrior:
         """Mean and variance of the normal that has this prior's slope there."""
         expected = self.expected[cells]
         away = log_ohm - expected
-        variance = np.maximum(self.std[cells] ** 2, away * away / self.tail)
-        return expected, variance
+        return expected, np.maximum(self.std[cells] ** 2, away * away)
 
 
 class WireBelief:
@@ -140,9 +135,7 @@ class WireBelief:
 
     def away(self, layers: Float) -> Float:
         """Logs of the layers (2,) that are m + C^1/2 away, from what is normal (2,)."""
-        return np.minimum(
-            np.maximum(self.log_layers + self._root @ layers, LOG_LIMITS[0]), LOG_LIMITS[1]
-        )
+        return self.log_layers + self._root @ layers
 
     def log_wires(self, layers: Float, segments: Float) -> Float:
         """Log resistances (2RC,) from what is normal: of layers (2,), of segments (2RC,)."""
@@ -167,8 +160,7 @@ class WireBelief:
         if len(residual) < 2:
             return
         gain = solve(factor, by_layers).T
-        log_layers = self.log_layers + self._root @ (gain @ residual)
-        self.log_layers = np.clip(log_layers, *LOG_LIMITS)
+        self.log_layers = self.away(gain @ residual)
         covariance = self._root @ (np.eye(2) - gain @ by_layers) @ self._root.T
         covariance += FADE * (self._prior_covariance - covariance)
         self._root = np.linalg.cholesky(covariance)
@@ -186,10 +178,10 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
     conduct more, so this goes by ports that conduct little.
     """
     rows, columns = current_siemens.shape
-    current = float(np.quantile(current_siemens, REST_QUANTILE))
-    port_ohm = max(1.0 / max(current, 1e-12) - ref_ohm, 1.0)
+    current = float(np.median(current_siemens))
+    port_ohm = max(1.0 / max(current, 1e-9) - ref_ohm, 1.0)
     level = (rows + columns - 1) / (rows * columns * port_ohm)
-    return float(np.clip(level, 0.01 / UNTOUCHED_OHM, 100 / UNTOUCHED_OHM))
+    return float(min(level, HIGHEST_TOUCH_SIEMENS))
 
 
 def siemens_std(

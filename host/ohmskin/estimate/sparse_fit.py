@@ -55,8 +55,11 @@ from ohmskin.circuit.skin import (
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
 from ohmskin.estimate.prior import (
+    CLOSE,
     HIGHEST_TOUCH_SIEMENS,
+    MAX_ITERATIONS,
     MAX_STEP,
+    MISFIT,
     SEGMENT_STD,
     TOUCHED,
     UNLIMITED_STD,
@@ -71,11 +74,8 @@ Cells = NDArray[np.intp]
 MOST_PER_LINE: Final = 0.5  # touches a row and column, on average; a fingertip covers more
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
-MAX_STEPS: Final = 8  # in a round of adding cells, and as many rounds
-CLOSE: Final = 0.1  # share of every deviation: a step below it is the last
 HEAVY: Final = 0.1  # share of a reading's noise: wires matter to it if they may move it by more
 REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
-CONTRADICTION: Final = 3.0  # deviations of a chi-square: above it no touches explain the readings
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
@@ -202,7 +202,7 @@ class SparseFit:
         frame = FewTouches(self, current, current_std)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
         frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
-        for _ in range(MAX_STEPS):
+        for _ in range(MAX_ITERATIONS):
             asked, rise = frame.asked_for()
             if not asked.size:
                 return frame if frame.cells.size <= self.most else None
@@ -245,7 +245,7 @@ class FewTouches:
     def settle(self, cells: Cells, log_siemens: Float) -> None:
         """Steps from here until none matters; cells that fall back to rest leave."""
         self._place(cells, np.maximum(log_siemens, self._skin.least_log[cells]))
-        for _ in range(MAX_STEPS):
+        for _ in range(MAX_ITERATIONS):
             if not self.cells.size:
                 return
             slopes = self._slopes()
@@ -336,8 +336,7 @@ class FewTouches:
                 break
         residual = self._residual[ports] - offset
         left = solve(factor, residual)
-        spare = ports.size - cells.size  # degrees of freedom
-        if residual @ left > spare + CONTRADICTION * np.sqrt(2 * spare + 1):
+        if residual @ left > MISFIT * ports.size:
             return None
         if self._residual[light].min(initial=0.0) < -DEMAND:
             return None
