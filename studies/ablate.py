@@ -69,7 +69,6 @@ OFF: Final[dict[str, float]] = {
     "prior.MAX_STEP": 1e9,
     "sparse_fit.HEAVY": 0.0,
     "sparse_fit.REBUILD": 0.0,
-    "joint.LOWER_LEVEL": 0.0,
     "prior.MISFIT": np.inf,
     "joint.LOSS": 0.0,
     "joint.NEWS": 0.0,

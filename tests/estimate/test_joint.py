@@ -10,7 +10,6 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
     PortCircuit,
     Skin,
-    current_from_ratio,
     port_resistance_ohm,
     readings,
 )
@@ -148,17 +147,18 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
     layer = np.kron(np.eye(2), np.ones((12, 12)))
     inverse = np.linalg.inv(LAYER_STD**2 * layer + SEGMENT_STD**2 * np.eye(24))
     nominal = np.log(np.repeat([100.0, 200.0], 12))
-    current = current_from_ratio(measured, 3e4, 3e4).ravel()
+    ports = PortReader(known).read(measured)
 
     def cost(log_ohm: Float) -> float:
         cell, top, bottom = log_ohm.reshape(3, 3, 4)
         rho = port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom)))
-        residual = (current - 1 / (rho.ravel() + 6e4)) / known.current_std
-        off = log_ohm[12:] - nominal
-        return float(np.sum(residual**2) + prior.cost(log_ohm[:12]) + off @ inverse @ off)
+        residual = (ports.current.ravel() - 1 / (rho.ravel() + 6e4)) / ports.current_std.ravel()
+        off, square = log_ohm[12:] - nominal, prior.rise(log_ohm[:12]) ** 2
+        of_cells = np.where(square < 1, square, 1 + np.log(square))
+        return float(np.sum(residual**2) + of_cells.sum() + off @ inverse @ off)
 
-    belief, std = WireBelief(3, 4, (100.0, 200.0, None)), np.full(12, known.current_std)
-    found = FullFit(prior, belief, 6e4, current, std, prior.expected)
+    belief = WireBelief(3, 4, (100.0, 200.0, None))
+    found = FullFit(prior, belief, 6e4, ports, prior.expected)
     assert not found.message
     best = np.concatenate([found.cell, found.wires])
     lowest = cost(best)

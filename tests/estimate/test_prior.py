@@ -12,19 +12,12 @@ REST = np.log([1e6])
 
 
 def test_the_stand_in_normal_has_the_slope_of_the_prior() -> None:
+    """-2 log p is d^2 up to one deviation, and 1 + log(d^2) beyond."""
     prior = CellPrior(REST, np.full(1, 0.05))
     for away in (-4.0, -0.3, -0.051, -0.02, 0.0, 0.03, 0.2, -9.5):
-        at = REST + away
-        slope = (prior.cost(at + 1e-6) - prior.cost(at - 1e-6)) / 2e-6
-        mean, variance = prior.normal(at)
-        assert slope == pytest.approx(float(2 * (at - mean)[0] / variance[0]), rel=1e-3, abs=1e-3)
-
-
-def test_the_further_from_rest_the_less_a_step_costs() -> None:
-    prior = CellPrior(REST, np.full(1, 0.05))
-    steps = np.diff([prior.cost(REST - away) for away in (0.0, 2.0, 4.0, 6.0, 8.0)])
-    assert np.all(steps > 0)
-    assert np.all(np.diff(steps) < 0)
+        mean, variance = prior.normal(REST + away)
+        slope = 2 * away / 0.05**2 if abs(away) < 0.05 else 2 / away
+        assert float(2 * (REST + away - mean)[0] / variance[0]) == pytest.approx(slope)
 
 
 def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:

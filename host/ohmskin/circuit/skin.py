@@ -121,10 +121,8 @@ def wire_coupling_ohm(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[in
         return np.asarray(top_wire_ohm * by_top + bottom_wire_ohm * by_bottom)
     i, j = np.arange(rows), np.arange(columns)
     coupling = np.zeros((rows, columns, rows, columns))
-    same_row = np.einsum("ijik->ijk", coupling)
-    same_row += np.cumsum(top_wire_ohm, axis=1)[:, np.minimum.outer(j, j)]
-    same_column = np.einsum("ijkj->ikj", coupling)
-    same_column += np.cumsum(bottom_wire_ohm, axis=0)[np.minimum.outer(i, i)]
+    np.einsum("ijik->ijk", coupling)[:] = np.cumsum(top_wire_ohm, 1)[:, np.minimum.outer(j, j)]
+    np.einsum("ijkj->ikj", coupling)[:] += np.cumsum(bottom_wire_ohm, 0)[np.minimum.outer(i, i)]
     return coupling.reshape(rows * columns, rows * columns)
 
 
@@ -193,9 +191,9 @@ def impedance_of(
     return np.asarray(impedance), np.asarray(port_ohm)
 
 
-def port_potential(impedance: Float, rows: int) -> Float:
-    """Potential of every electrode per current through every port, (R+C, RC) [ohm]."""
-    return (impedance[:, :rows, None] - impedance[:, None, rows:]).reshape(len(impedance), -1)
+def port_difference(lines: Float, rows: int) -> Float:
+    """What a port's row has less what its column has, (RC, n), from all lines, (R+C, n)."""
+    return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
 
 
 def wire_current(cell_current: Float) -> Float:
@@ -224,46 +222,45 @@ class PortCircuit:
     """
 
     def __init__(self, cell_siemens: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire) -> None:
-        self._cell_siemens, self._rows = cell_siemens, len(cell_siemens)
-        self._wire_ohm = top_wire_ohm, bottom_wire_ohm
+        self.shape, self.rows = cell_siemens.shape, len(cell_siemens)
+        self.wire_ohm = top_wire_ohm, bottom_wire_ohm
         self._root = np.sqrt(cell_siemens)
-        self._factor, self._half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
-        self._impedance, port_ohm = impedance_of(admittance_of(self._half), self._rows)
+        self.factor, self.half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
+        self.impedance, port_ohm = impedance_of(admittance_of(self.half), self.rows)
         self.port_ohm: Float = port_ohm.ravel()
 
     @cached_property
-    def _cell_current(self) -> Float:
+    def cell_current(self) -> Float:
         """Through all cells, per current into each electrode, (R+C, R, C)."""
-        per_potential = solve_lower(self._factor, self._half, transposed=True)
+        per_potential = solve_lower(self.factor, self.half, transposed=True)
         per_potential *= self._root.reshape(-1, 1)
-        return (self._impedance @ per_potential.T).reshape(-1, *self._root.shape)
+        return (self.impedance @ per_potential.T).reshape(-1, *self.shape)
 
     @cached_property
     def _wire_current(self) -> Float:
         """The same through all wires, (R+C, 2, R, C)."""
-        return wire_current(self._cell_current)
+        return wire_current(self.cell_current)
 
     def _slopes(self, current: Float, ohm: Float) -> Float:
-        lines = current.reshape(len(current), -1)
-        slopes = (lines[: self._rows, None] - lines[None, self._rows :]).reshape(-1, ohm.size)
+        slopes = port_difference(current.reshape(len(current), -1), self.rows)
         slopes *= slopes
         slopes *= ohm.ravel()
         return slopes
 
     def by_cell(self) -> Float:
         """Slopes by the cells, (RC, RC)."""
-        return self._slopes(self._cell_current, 1.0 / self._cell_siemens)
+        return self._slopes(self.cell_current, self._root**-2.0)
 
     def by_wires(self) -> Float:
         """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
-        ohm = [np.broadcast_to(layer, self._root.shape) for layer in self._wire_ohm]
+        ohm = [np.broadcast_to(layer, self.shape) for layer in self.wire_ohm]
         return self._slopes(self._wire_current, np.stack(ohm))
 
     def by_layers(self) -> Float:
         """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""
-        rows, found = self._rows, []
-        for layer, ohm in enumerate(self._wire_ohm):
-            current = self._wire_current[:, layer].reshape(len(self._impedance), -1)
+        rows, found = self.rows, []
+        for layer, ohm in enumerate(self.wire_ohm):
+            current = self._wire_current[:, layer].reshape(len(self.impedance), -1)
             power = (current * np.ravel(ohm)) @ current.T
             own = power.diagonal()
             found.append((own[:rows, None] + own[rows:] - 2.0 * power[:rows, rows:]).ravel())

@@ -24,33 +24,9 @@ G      (n, R, C)     rise of the cell's conductance above rest                  
 u(e) is the unloading branch. It lies h above the loading branch at a large force and meets it at no
 force, so that a cell without force returns to no rise. k and b differ between cells, log-normally.
 
-The defaults fit the shape of public measurements of a piezoresistive cell
-(TAMS-Group/tams_tactile_sensor_array_hardware), whose data are no part of this project. There, a
-cylindrical tip pressed the cell up to 7 or 8 N, in three series of 7 to 11 presses, one for each of
-three covers:
-
-================================================= ====================== =======================
-quantity                                          the three series       here
-================================================= ====================== =======================
-conductance on loading at 1 N [uS]                16, 38, 55             k = 30e-6 S
-exponent of loading, 0.2 to 2 N                   1.6, 1.7, 1.75         b = 1.7
-full contact [mS]                                 4.1, 4.1, 4.1          full = 4e-3 S
-unloading over loading, at 0.5 N                  1.5, 1.6, 1.5          1.6, at their pace
-the same at 1 N                                   1.0, 1.4, 1.2          1.4, at their pace
-width h that fits the loop beside the creep [N]   0, 0.045, 0.068        h = 0.06 N
-force that relaxes at hold, over what stays       0.30, 0.085, 0.089     a = 0.09
-time constant of that, in samples                 10.8, 5.4, 4.3         T = (1 + a) 5.4 samples
-scatter within a press, relative, 1 standard dev. 0.28, 0.20, 0.24       0.24
-correlation of that from sample to sample         0.33, 0.48, 0.66       time constant 1.4 samples
-scatter of whole presses, relative                0.11, 0.13, 0.13       0.12
-================================================= ====================== =======================
-
-Not measured but chosen are: a rate of 10 samples/s, as theirs is not told; cells that differ by
-20 % in k and 3 % in b; a time constant of a minute for the slow noise (in two series each press
-conducted less than the one before). Their cell breaks through to a short at 3 to 4 N; a knitted
-cell has nothing to break through, so here contact only saturates. k is in the range of theirs and
-gives the resistances of a knitted skin: 0.5 MOhm at 0.2 N, 33 kOhm at 1 N, 1 kOhm at 9 N. Not
-modelled are a force below which the layers do not touch, and pressure that spreads to neighbours.
+The defaults fit the shape of public measurements of one cell; docs/force.md compares them, and says
+what was chosen. Not modelled are a force below which the layers do not touch, and pressure that
+spreads to neighbours.
 
 [BS] Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, section 2.4.
 [Findley] Findley, Lai and Onaran, "Creep and Relaxation of Nonlinear Viscoelastic Materials", 1976.

@@ -36,6 +36,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
+from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE,
     HIDDEN,
@@ -61,13 +62,12 @@ class FullFit:
         prior: CellPrior,
         belief: WireBelief,
         ref_ohm: float,
-        current: Float,
-        current_std: Float,
+        ports: PortReadings,
         start: Float,
     ) -> None:
         """Minimise from these cells (RC,); `message` says if that did not converge."""
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
-        self._current, self._weight = current, 1.0 / current_std
+        self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
         self.cell: Float = start
         self._off_layers = np.zeros(2)  # u of the layers
@@ -75,7 +75,6 @@ class FullFit:
         self._by_segment = SEGMENT_STD * self._weighted(self._circuit.by_wires())
         self._noise = gram(self._by_segment)
         np.einsum("ii->i", self._noise)[:] += 1.0
-        self._noise_factor = cholesky(self._noise)
         self._minimise()
         self._conclude()
 
@@ -91,10 +90,6 @@ class FullFit:
     def _weighted(self, slopes: Float) -> Float:
         """Slopes of h from those of rho, (RC, ...)."""
         return slopes * (-self._weight * self._modelled**2)[:, None]
-
-    def _cost(self, cell: Float, off_layers: Float, residual: Float) -> float:
-        explained = residual @ solve(self._noise_factor, residual)
-        return float(explained + off_layers @ off_layers) + self._prior.cost(cell)
 
     def _linearise(self) -> None:
         """Slopes and S at the present state."""
@@ -115,32 +110,15 @@ class FullFit:
         step, moved = self._step()
         while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
-            before = self.cell, self._off_layers, self._residual
             self._move(step)
             if moved < CLOSE:
                 return
             self._evaluate()
             step, moved = self._step()
             if moved >= CLOSE:
-                self._step_back(*before)
                 self._linearise()
                 step, moved = self._step()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
-
-    def _step_back(self, cell: Float, off_layers: Float, residual: Float) -> None:
-        """Half the way to this state before, as long as the cost has risen: the step went too far.
-
-        What is lost is one circuit.
-        """
-        limit = self._cost(cell, off_layers, residual)
-        limit += 1e-9 * abs(limit) + 1e-3
-        while self._cost(self.cell, self._off_layers, self._residual) > limit:
-            if self.iterations == MAX_ITERATIONS:
-                return
-            self.cell = 0.5 * (self.cell + cell)
-            self._off_layers = 0.5 * (self._off_layers + off_layers)
-            self.iterations += 1
-            self._evaluate()
 
     def _step(self) -> tuple[Float, float]:
         """Step of u by the slopes there are; the most that it moves of a reading, or of a cell."""

@@ -29,6 +29,7 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings, cell_of
 from ohmskin.estimate.prior import (
+    HIDDEN,
     HIGHEST_TOUCH_SIEMENS,
     MISFIT,
     REST_STD,
@@ -42,11 +43,9 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 
-LOWER_LEVEL: Final = 0.8  # share of the level so far: a frame below it shows rest better
 LOSS: Final = (
     10.0  # deviations of the prior: a cell that conducts so much less than at rest is at fault
 )
-WIDEST: Final = 0.3  # log: touches that are known less are not linear enough for `touch`
 NEAR: Final = 10.0  # chi-square per port that a start from `matrix` may be away from its minimum
 # Change of a log resistance that makes a frame news of the wires: frames alike have alike errors.
 NEWS: Final = 1.5
@@ -76,14 +75,15 @@ class JointEstimator(Estimator):
             self._prior = self._finder = None
 
     def _solve(self, ports: PortReadings) -> Solution:
-        prior = self._prior_of(ports.current.ravel())
+        prior = self._prior_of(ports)
         touches = None
         # Under a finger that stays, few touches explain no frame: trying costs half the time.
         if self._finder is not None and self._touches <= 2 * self._finder.most:
-            touches = self._finder.find(ports.current.ravel(), ports.current_std.ravel())
+            touches = self._finder.find(ports)
         if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)
-        fit = self._fit(prior, ports, self._start(prior, ports, touches))
+        start = self._start(prior, ports, touches)
+        fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = fit.touches
         message = self._doubt(prior, fit)
         if not (ports.fault or message or fit.is_crowded):
@@ -109,11 +109,6 @@ class JointEstimator(Estimator):
             top_wire_ohm=top,
             bottom_wire_ohm=bottom,
         )
-
-    def _fit(self, prior: CellPrior, ports: PortReadings, start: Float) -> FullFit:
-        current, current_std = ports.current.ravel(), ports.current_std.ravel()
-        ref_ohm = self.knowledge.ref_ohm
-        return FullFit(prior, self._belief, ref_ohm, current, current_std, start)
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:
         """Why this fit cannot be the answer; empty if it can."""
@@ -151,7 +146,7 @@ class JointEstimator(Estimator):
             self._learned_from = fit.cell
             self._belief.learn(*fit.lesson)
 
-    def _prior_of(self, current: Float) -> CellPrior:
+    def _prior_of(self, ports: PortReadings) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.
 
         A level is one number for all cells: what has always been pressed is not taken for rest, as
@@ -159,12 +154,11 @@ class JointEstimator(Estimator):
         """
         known = self.knowledge
         if known.rest_ratio is None:
-            level = rest_level(current.reshape(self._shape), known.ref_ohm)
-            before = self._prior
-            if before is not None and level > LOWER_LEVEL * np.exp(-before.expected[0]):
+            log_ohm, before = -np.log(rest_level(ports.current, known.ref_ohm)), self._prior
+            if before is not None and log_ohm <= before.expected[0]:
                 return before
-            expected = np.full(current.size, -np.log(level))
-            std = np.full(current.size, UNKNOWN_REST_STD)
+            expected = np.full(ports.current.size, log_ohm)
+            std = np.full(expected.size, UNKNOWN_REST_STD)
         elif self._prior is not None:
             return self._prior
         else:
@@ -178,7 +172,8 @@ class JointEstimator(Estimator):
         level = rest_level(ports.current, self.knowledge.ref_ohm)
         expected = np.full(ports.current.size, -np.log(level))
         wide = CellPrior(expected, np.full(expected.size, UNLIMITED_STD))
-        fit = self._fit(wide, ports, self._start(wide, ports, None))
+        start = self._start(wide, ports, None)
+        fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, start)
         return fit.cell, np.hypot(fit.cell_std, REST_STD)
 
 
@@ -189,7 +184,7 @@ class TouchEstimator(JointEstimator):
 
     def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
         found = None if self.knowledge.rest_ratio is None else touches.explain()
-        if found is None or found.cell_std[found.cells].max(initial=0.0) > WIDEST:
+        if found is None or found.cell_std[found.cells].max(initial=0.0) > HIDDEN:
             return None
         # Around a finger, cells are pressed so lightly that they would pass for rest here.
         if not ports.fault and self._adjoining(found.cells) <= 1 < found.cells.size:

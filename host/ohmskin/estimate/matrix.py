@@ -40,7 +40,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import impedance_of, port_potential
+from ohmskin.circuit.skin import impedance_of, port_difference
 from ohmskin.estimate.base import (
     MAX_CELL_SIEMENS,
     MIN_CELL_SIEMENS,
@@ -83,10 +83,9 @@ def voltage_squared(impedance: Float, rows: int) -> Float:
 
     v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]) with j, l the nodes of the columns.
     """
-    lines = port_potential(impedance, rows)
-    voltage = lines[:rows, None, :] - lines[None, rows:, :]
+    voltage = port_difference(port_difference(impedance, rows).T, rows)
     voltage *= voltage
-    return np.asarray(voltage.reshape(-1, lines.shape[1]))
+    return voltage
 
 
 class MatrixEstimator(Estimator):

@@ -55,7 +55,7 @@ from ohmskin.circuit.skin import (
     READING_SENSES_TOP,
     READINGS_PER_CELL,
     Skin,
-    port_potential,
+    port_difference,
     ratio_from_current,
     readings,
 )
@@ -282,7 +282,7 @@ def initial_states(
     ports = np.arange(cell.size)
     port_megohm, impedance = solve_ports(1.0 / cell)
     current = 1.0 / (port_megohm.ravel() + sum(reference_megohm))
-    potential = (port_potential(impedance, rows) * current).T
+    potential = port_difference(impedance, rows) * current[:, None]
     ground = potential[ports, rows + ports % columns]
     potential += (reference_megohm[1] * current - ground)[:, None]
     potential = potential[ports.reshape(rows, columns).T.ravel()]  # by column-major selected cell

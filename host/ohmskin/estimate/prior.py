@@ -79,11 +79,6 @@ class CellPrior:
         """How far a cell conducts more than at rest, in deviations."""
         return (self.expected - log_ohm) / self.std
 
-    def cost(self, log_ohm: Float) -> float:
-        """-2 log p, up to a constant."""
-        square = self.rise(log_ohm) ** 2
-        return float((np.minimum(square, 1.0) + np.log(np.maximum(square, 1.0))).sum())
-
     def normal(
         self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
     ) -> tuple[Float, Float]:

@@ -35,8 +35,6 @@ rest is taken out. The last steps know that wires are known to P only, and weigh
 N^-1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -45,15 +43,10 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    admittance_of,
-    factorised,
-    impedance_of,
-    port_potential,
-    wire_current,
-)
+from ohmskin.circuit.skin import PortCircuit, port_difference, wire_current
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.base import MAX_CELL_SIEMENS
+from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE,
     HIGHEST_TOUCH_SIEMENS,
@@ -79,38 +72,29 @@ REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is 
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
-class RestNetwork:
-    """rho0, H and M of cells (R, C) [S] that all conduct, and wires (R, C) [ohm]."""
+class RestNetwork(PortCircuit):
+    """rho0, H and M of cells (R, C) [S] that all conduct, and wires [ohm], one number a layer."""
 
-    def __init__(self, cell_siemens: Float, top_wire_ohm: Float, bottom_wire_ohm: Float) -> None:
-        self.shape = cell_siemens.shape
-        rows = self.shape[0]
-        self.cell_siemens = cell_siemens.ravel()
-        self.top_wire_ohm, self.bottom_wire_ohm = top_wire_ohm, bottom_wire_ohm
-        root = np.sqrt(cell_siemens)
-        factor, half = factorised(root, top_wire_ohm, bottom_wire_ohm)
-        impedance, port_ohm = impedance_of(admittance_of(half), rows)
-        self.port_ohm = port_ohm.ravel()
+    def __init__(self, cell_siemens: Float, top_wire_ohm: float, bottom_wire_ohm: float) -> None:
+        super().__init__(cell_siemens, top_wire_ohm, bottom_wire_ohm)
+        self.cell_siemens = siemens = cell_siemens.ravel()
+        lines = self.cell_current.reshape(-1, siemens.size) / siemens
+        self.port_volt = port_difference(lines, self.rows).T
         # With L of the factor, L' = L^-1 sqrt(g): cell currents x are L'^T half V of the electrode
         # potentials V, and L'^T (1 - half Z half^T) L' of voltages inserted in series with cells.
-        inverse = solve_lower(factor, np.diag(root.ravel()))
-        cell_ohm = 1.0 / self.cell_siemens
-        by_port = half @ port_potential(impedance, rows)
-        self.port_volt = (inverse.T @ by_port) * cell_ohm[:, None]
-        between = half @ impedance @ half.T
-        between *= -1.0
-        between.ravel()[:: len(cell_ohm) + 1] += 1.0
-        in_series = inverse.T @ between @ inverse
-        self.cell_volt = -cell_ohm[:, None] * in_series * cell_ohm
-        self.cell_volt.ravel()[:: len(cell_ohm) + 1] += cell_ohm
-        self.own_port_volt = np.diagonal(self.port_volt).copy()
-        self.own_cell_volt = np.diagonal(self.cell_volt).copy()
+        inverse = solve_lower(self.factor, np.diag(np.sqrt(siemens)))
+        between = -(self.half @ self.impedance @ self.half.T)
+        between.ravel()[:: siemens.size + 1] += 1.0
+        self.cell_volt = -(inverse.T @ between @ inverse) / siemens / siemens[:, None]
+        self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
+        self.own_port_volt = self.port_volt.diagonal()
+        self.own_cell_volt = self.cell_volt.diagonal()
 
-    def by_wires(self, cell_current: Float) -> Float:
+    def wires_of(self, cell_current: Float) -> Float:
         """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents (m, RC)."""
         slopes = wire_current(cell_current.reshape(-1, *self.shape))
         slopes *= slopes
-        slopes *= np.stack([self.top_wire_ohm, self.bottom_wire_ohm])
+        slopes *= np.array(self.wire_ohm).reshape(2, 1, 1)
         return slopes.reshape(len(cell_current), -1)
 
 
@@ -183,23 +167,22 @@ class SparseFit:
         prior, belief = self.prior, self.belief
         self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        layers = belief.layers(belief.mean)
-        self.net = net = RestNetwork(rest_siemens, *layers)
+        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers))
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
-        wires = net.by_wires((net.port_volt * net.cell_siemens[:, None]).T)
+        wires = net.wires_of((net.port_volt * net.cell_siemens[:, None]).T)
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
         root = belief.root(wires * (self.current**2)[:, None])
         self.slack += np.einsum("ij,ij->i", root, root)
-        self.path_ohm = path_ohm(*layers)
+        self.path_ohm = path_ohm(*belief.layers(belief.mean))
         self.wire_std = float(np.hypot(belief.std(), SEGMENT_STD))
 
-    def find(self, current: Float, current_std: Float) -> FewTouches | None:
-        """The touched cells of one frame, (RC,) [S] both; None if they are not few."""
+    def find(self, ports: PortReadings) -> "FewTouches | None":
+        """The touched cells of one frame; None if they are not few."""
         if np.abs(self.belief.log_layers - self.log_layers).max() > REBUILD:
             self._solve_rest()
-        frame = FewTouches(self, current, current_std)
+        frame = FewTouches(self, ports)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
         frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
         for _ in range(MAX_ITERATIONS):
@@ -218,12 +201,11 @@ class SparseFit:
 class FewTouches:
     """One frame: the cells in the model, and all that follows from them."""
 
-    def __init__(self, skin: SparseFit, current: Float, current_std: Float) -> None:
+    def __init__(self, skin: SparseFit, ports: PortReadings) -> None:
         self._skin = skin
-        self._measured = current
-        self._reading_std = current_std
-        self._loose_std = np.sqrt(current_std**2 + skin.slack)
-        self._target_ohm = 1.0 / np.maximum(current, 1e-12) - skin.ref_ohm
+        self._measured, self._reading_std = ports.current.ravel(), ports.current_std.ravel()
+        self._loose_std = np.sqrt(self._reading_std**2 + skin.slack)
+        self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.ref_ohm
         self.steps = 0
 
     def _place(self, cells: Cells, log_siemens: Float) -> None:
@@ -380,6 +362,6 @@ class FewTouches:
         slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
         self._loose_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
         self._place(self.cells, self.log_siemens)
-        wires = net.by_wires(currents)
+        wires = net.wires_of(currents)
         wires *= -(square / self._std[ports])[:, None]
         return skin.belief.root(wires)
