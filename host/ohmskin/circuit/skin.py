@@ -225,16 +225,21 @@ class PortCircuit:
         self.shape, self.rows = cell_siemens.shape, len(cell_siemens)
         self.wire_ohm = top_wire_ohm, bottom_wire_ohm
         self._root = np.sqrt(cell_siemens)
-        self.factor, self.half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
-        self.impedance, port_ohm = impedance_of(admittance_of(self.half), self.rows)
+        self.factor, self._half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
+        self._impedance, port_ohm = impedance_of(admittance_of(self._half), self.rows)
         self.port_ohm: Float = port_ohm.ravel()
 
     @cached_property
+    def per_potential(self) -> Float:
+        """Currents through all cells per potential of each electrode, (RC, R+C) [S]."""
+        currents = solve_lower(self.factor, self._half, transposed=True)
+        currents *= self._root.reshape(-1, 1)
+        return currents
+
+    @cached_property
     def cell_current(self) -> Float:
-        """Through all cells, per current into each electrode, (R+C, R, C)."""
-        per_potential = solve_lower(self.factor, self.half, transposed=True)
-        per_potential *= self._root.reshape(-1, 1)
-        return (self.impedance @ per_potential.T).reshape(-1, *self.shape)
+        """Currents through all cells per current into each electrode, (R+C, R, C)."""
+        return (self._impedance @ self.per_potential.T).reshape(-1, *self.shape)
 
     @cached_property
     def _wire_current(self) -> Float:
@@ -260,7 +265,7 @@ class PortCircuit:
         """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""
         rows, found = self.rows, []
         for layer, ohm in enumerate(self.wire_ohm):
-            current = self._wire_current[:, layer].reshape(len(self.impedance), -1)
+            current = self._wire_current[:, layer].reshape(len(self._impedance), -1)
             power = (current * np.ravel(ohm)) @ current.T
             own = power.diagonal()
             found.append((own[:rows, None] + own[rows:] - 2.0 * power[:rows, rows:]).ravel())

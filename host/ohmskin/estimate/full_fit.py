@@ -163,22 +163,19 @@ class FullFit:
         """Whether so many cells are touched that rest is no more likely than a touch."""
         return self.touches > CROWDED * self.cell.size
 
-    def _deviations(self, factor: Float, cell_std: Float) -> tuple[Float, Float]:
-        """Share of each cell's prior variance that readings take away; what layers do to cells."""
-        own = solve_lower(factor, self._by_cell * cell_std)
-        by_layers = own.T @ solve_lower(factor, self._by_layers)
-        share = np.einsum("ij,ij->j", own, own)
-        return np.asarray(share), cell_std * np.linalg.norm(by_layers, axis=1)
-
     def _conclude(self) -> None:
-        """cell_std, and what the uncertain layers have in it, from the last factor that was made.
+        """cell_std, and what the uncertain layers have in it, by the last S.
 
         A cell is called untouched when the readings ask for less than the prior asks against it.
         Where that may be a touch all the same, small for the readings but not for the cell, it is
-        counted as uncertain by so much, and so is what depends on it.
+        counted as uncertain by so much, and so is what depends on it: S grows by those cells, of
+        deviation s' for s, and with L L^T = S, O = L^-1 J, H = O sqrt(s'^2 / s^2 - 1) of these,
+
+            J^T S'^-1 J = O^T (1 - H (1 + H^T H)^-1 H^T) O .
         """
         prior, cell_std = self._prior, self._cell_std
-        learned, self.by_layers = self._deviations(self._factor, cell_std)
+        own = solve_lower(self._factor, self._slopes)
+        learned = np.einsum("ij,ij->j", own, own)[:-2]
         distance = prior.expected - self.cell
         at_rest = np.abs(distance) < prior.std
         # What the readings alone say of a cell: rise of its conductance over rest, and deviation.
@@ -188,11 +185,19 @@ class FullFit:
         hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
         if self.is_crowded:
             hidden, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
-        self._hidden = hidden
-        if hidden.any() or self.is_crowded:
-            cell_std = np.where(hidden, rise + rise_std, cell_std)
-            _, factor = self._factorised(cell_std)
-            learned, self.by_layers = self._deviations(factor, cell_std)
+        self._hidden = hidden = hidden & (rise + rise_std > cell_std)
+        by_layers = own[:, :-2].T @ own[:, -2:]
+        if hidden.any():
+            wider = np.where(hidden, (rise + rise_std) / cell_std, 1.0)
+            more = np.sqrt(wider[hidden] ** 2 - 1.0)
+            seen = (own[:, :-2][:, hidden] * more).T @ own
+            system = np.eye(len(more)) + seen[:, :-2][:, hidden] * more
+            less = solve_lower(cholesky(system), seen)
+            learned = wider**2 * (learned - np.einsum("ij,ij->j", less, less)[:-2])
+            by_layers -= less[:, :-2].T @ less[:, -2:]
+            by_layers *= wider[:, None]
+            cell_std = wider * cell_std
+        self.by_layers: Float = cell_std * np.linalg.norm(by_layers, axis=1)
         self.cell_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     @property

@@ -77,8 +77,8 @@ class JointEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         prior = self._prior_of(ports)
         touches = None
-        # Under a finger that stays, few touches explain no frame: trying costs half the time.
-        if self._finder is not None and self._touches <= 2 * self._finder.most:
+        # Under a finger that stays, few touches explain no frame: trying costs time.
+        if self._finder is not None and self._touches <= self._finder.most:
             touches = self._finder.find(ports)
         if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)

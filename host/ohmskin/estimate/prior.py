@@ -193,10 +193,10 @@ def siemens_std(
     cell_ohm = 1.0 / siemens
     wider = np.expm1(REACH * layer_std) / (REACH * layer_std)
     up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * by_layers**2)
-    loop_ohm = cell_ohm + series_ohm
-    share = REACH * cell_ohm / loop_ohm
-    lowest_ohm = loop_ohm / (1.0 + up_std * share) - series_ohm
-    highest_ohm = loop_ohm / np.maximum(1.0 - log_std * share, 1e-6) - series_ohm
+    share = REACH * cell_ohm / (cell_ohm + series_ohm)
+    more, less = up_std * share, np.minimum(log_std * share, 1.0 - 1e-6)
+    lowest_ohm = (cell_ohm - more * series_ohm) / (1.0 + more)
+    highest_ohm = (cell_ohm + less * series_ohm) / (1.0 - less)
     highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
     up = np.maximum(siemens * log_std, (highest - siemens) / REACH)
     return np.asarray(up), np.asarray((siemens - 1.0 / highest_ohm) / REACH)

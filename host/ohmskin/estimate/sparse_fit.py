@@ -80,12 +80,13 @@ class RestNetwork(PortCircuit):
         self.cell_siemens = siemens = cell_siemens.ravel()
         lines = self.cell_current.reshape(-1, siemens.size) / siemens
         self.port_volt = port_difference(lines, self.rows).T
-        # With L of the factor, L' = L^-1 sqrt(g): cell currents x are L'^T half V of the electrode
-        # potentials V, and L'^T (1 - half Z half^T) L' of voltages inserted in series with cells.
-        inverse = solve_lower(self.factor, np.diag(np.sqrt(siemens)))
-        between = -(self.half @ self.impedance @ self.half.T)
-        between.ravel()[:: siemens.size + 1] += 1.0
-        self.cell_volt = -(inverse.T @ between @ inverse) / siemens / siemens[:, None]
+        # Currents through cells, by voltages inserted in series with them: with A = sqrt(g) (1 +
+        # sqrt(g) K sqrt(g))^-1 sqrt(g) they are A - A E^T Z E A, of which E A is `per_potential`.
+        inverse, _ = lapack.dpotri(self.factor, lower=1)
+        in_series = np.tril(inverse) + np.tril(inverse, -1).T
+        in_series *= np.sqrt(siemens) * np.sqrt(siemens)[:, None]
+        in_series -= self.per_potential @ (lines * siemens)
+        self.cell_volt = -in_series / siemens / siemens[:, None]
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
         self.own_port_volt = self.port_volt.diagonal()
         self.own_cell_volt = self.cell_volt.diagonal()
