@@ -258,8 +258,8 @@ class PortCircuit:
 
     def by_wires(self) -> Float:
         """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
-        ohm = [np.broadcast_to(layer, self.shape) for layer in self.wire_ohm]
-        return self._slopes(self._wire_current, np.stack(ohm))
+        ohm = np.stack(np.broadcast_arrays(*self.wire_ohm, self._root)[:2])
+        return self._slopes(self._wire_current, ohm)
 
     def by_layers(self) -> Float:
         """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""

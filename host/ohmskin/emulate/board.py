@@ -165,8 +165,6 @@ class EmulatedBoard:
             ratio += self._noise_ratio * self._random.standard_normal(ratio.shape)
         return quantise(ratio, protocol.ADC_BITS)
 
-    # ------------------------------------------------------------------------------ commands
-
     def receive(self, octets: bytes) -> None:
         """Take bytes from the host."""
         for raw in self._decoder.feed(octets):
@@ -212,8 +210,6 @@ class EmulatedBoard:
                     return "bad_baud"
                 self._baud = values["baud"]
         return "ok"
-
-    # ------------------------------------------------------------------------------- sending
 
     def _send(self, name: str, tail: bytes = b"", /, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]

@@ -21,7 +21,6 @@ readings no cell is known to be untouched, so every frame is for `joint`.
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
@@ -186,12 +185,6 @@ class TouchEstimator(JointEstimator):
         found = None if self.knowledge.rest_ratio is None else touches.explain()
         if found is None or found.cell_std[found.cells].max(initial=0.0) > HIDDEN:
             return None
-        # Around a finger, cells are pressed so lightly that they would pass for rest here.
-        if not ports.fault and self._adjoining(found.cells) <= 1 < found.cells.size:
+        if not ports.fault:
             self._learn(found)
         return found
-
-    def _adjoining(self, cells: NDArray[np.intp]) -> int:
-        """How many pairs of these cells are side by side."""
-        places = np.array(np.unravel_index(cells, self._shape))
-        return int((np.abs(places[:, :, None] - places[:, None]).sum(axis=0) == 1).sum()) // 2

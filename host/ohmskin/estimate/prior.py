@@ -96,17 +96,13 @@ class WireBelief:
     ) -> None:
         """wires: what is known of them, a `WireOhm`."""
         self.shape = (rows, columns)
-        nominal_top, nominal_bottom, log_std = wires
-        told = nominal_top is not None and nominal_bottom is not None
-        layer_std = LAYER_STD if told else UNKNOWN_LAYER_STD
+        *ohms, log_std = wires
+        layer_std = UNKNOWN_LAYER_STD if None in ohms else LAYER_STD
         # Both together, and what differs between them: a measurement tells their sum.
         apart = 0.5 * layer_std**2
         both = apart if log_std is None else float(np.clip(log_std, 0.01, 1.0)) ** 2
         self._prior_covariance = both + apart * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        nominal = [
-            max(UNKNOWN_WIRE_OHM if ohm is None else ohm, 1e-3)
-            for ohm in (nominal_top, nominal_bottom)
-        ]
+        nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in ohms]
         self._nominal: Float = np.log(nominal)
         self.reset()
 

@@ -346,8 +346,7 @@ class FewTouches:
         """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
         skin = self._skin
         move = (self._current**2 - skin.current**2) * skin.path_ohm * skin.wire_std
-        weight = move / self._std
-        heavy: NDArray[np.bool_] = weight > HEAVY
+        heavy: NDArray[np.bool_] = move > HEAVY * self._std
         heavy[self.cells] = True
         return heavy
 

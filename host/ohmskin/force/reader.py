@@ -109,8 +109,6 @@ class SkinReader:
         other._begin()
         return other
 
-    # ------------------------------------------------------------------------- what is known
-
     @property
     def method(self) -> str:
         """The method of the scan that was read last, and of the next one before the first."""
@@ -146,8 +144,6 @@ class SkinReader:
         make_estimator(method, self._knowledge(self.rest))
         self._wanted = method
 
-    # --------------------------------------------------------------------------------- rest
-
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
         """Take these readings (R, C, 4) for the rest, from the next scan on.
 
@@ -173,8 +169,6 @@ class SkinReader:
             raise TareRefused("there is no tare to undo")
         self._rests.pop()
         return None if self.rest is None else _recorded(self.rest.ratio)
-
-    # -------------------------------------------------------------------------------- scans
 
     def estimate(self, ratio: Float) -> Estimate:
         """What readings (R, C, 4) show, without forces. Raises ValueError for other cells."""

@@ -95,8 +95,6 @@ class Session(Device):
         self._want_scans = False
         super().close()
 
-    # ------------------------------------------------------------------------------ commands
-
     def _send(self, name: str, **values: protocol.Value) -> int:
         """Send a command and return its sequence number; nothing waits for the answer."""
         frame = protocol.FRAMES[name]
@@ -126,8 +124,6 @@ class Session(Device):
         if ack.result != "ok":
             reason = protocol.ENUMS["result"].docs.get(ack.result, "reason of a newer firmware")
             raise CommandRefused(name, ack.result, reason)
-
-    # ------------------------------------------------------------------------- reader thread
 
     def _read(self) -> None:
         heard_s = time.monotonic()

@@ -131,8 +131,6 @@ class ForceSensor(Closing):
             f"number a line and nothing else; does its sketch print at {self._baud} baud?"
         )
 
-    # ------------------------------------------------------------------------- reader thread
-
     def _read(self) -> None:
         try:
             while not self._closing:

@@ -91,8 +91,6 @@ class Replay(Device):
         self._messages.close()
         super().close()
 
-    # --------------------------------------------------------------------------- the thread
-
     def _play(self) -> None:
         rest_ratio = None
         error: OhmskinError = RecordingEnded(f"{self.name} has been played to where it was cut off")

@@ -57,8 +57,6 @@ class Panel:
         finally:
             self._board.watchers.discard(wake)
 
-    # ------------------------------------------------------------------------------ to the page
-
     async def _send(self) -> None:
         said = None
         self._news.set()
@@ -81,8 +79,6 @@ class Panel:
 
     async def _refuse(self, text: str) -> None:
         await self._say("notice", text=text, good=False, refused="")
-
-    # ---------------------------------------------------------------------------- from the page
 
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
