@@ -156,9 +156,6 @@ def test_both_pages_have_the_same_wiring() -> None:
     assert rows["README.md"] == rows["docs/build.md"]
 
 
-# --------------------------------------------------------------------------------------- the site
-
-
 def loaded(name: str) -> SimpleNamespace:
     """What a module in docs/ defines."""
     return SimpleNamespace(**run_path(str(DOCS / f"{name}.py")))
@@ -203,9 +200,6 @@ def test_tables_and_sessions_in_docstrings_stay_as_they_are() -> None:
     assert "\n    >>> f()\n    1\n" in shown
     assert "\nx[i] \\[ohm]\n" in shown
     assert shown.endswith("\nend")
-
-
-# ------------------------------------------------------------------------------------ docs/draw.py
 
 
 @pytest.fixture(scope="module")

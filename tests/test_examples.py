@@ -112,9 +112,6 @@ def test_two_boards_have_one_clock() -> None:
     assert {each[2] for each in scans if each} == {"1", "2"}
 
 
-# ------------------------------------------------------------------------- into other programs
-
-
 def check_periods(times_s: Sequence[float]) -> None:
     """Times are whole periods of 1/90 s apart: a busy computer misses scans."""
     periods = np.rint(90 * np.diff(times_s))

@@ -177,8 +177,6 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
     assert not out.exists()
 
 
-# --------------------------------------------------------------------------------------- table
-
 REST = "emulator://2x3?seed=1&unit=5"
 
 

@@ -180,9 +180,6 @@ def test_any_bytes_are_a_table_or_a_value_error_of_one_line(
         assert (found["force_n"] >= 0).all()
 
 
-# ---------------------------------------------------------------------------------- force logs
-
-
 def ramp(count: int = 20, step_s: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
     return step_s * np.arange(count), 2.0 * np.arange(count)
 
@@ -216,9 +213,6 @@ def test_what_is_long_or_unusual_but_not_both_is_no_gap(step_s: float, pause_s: 
     time_s, force_n = ramp(step_s=step_s)
     time_s[10:] += pause_s - step_s
     np.testing.assert_allclose(ForceLog(time_s, force_n).at((time_s[9] + time_s[10]) / 2), 19.0)
-
-
-# ---------------------------------------------------------------------------- tables of presses
 
 
 def test_a_table_is_read_in_any_order_of_columns(tmp_path: Path) -> None:

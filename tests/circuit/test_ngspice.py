@@ -122,8 +122,6 @@ def test_all_four_readings_agree_with_ngspice(name: str, tmp_path: Path) -> None
     np.testing.assert_allclose(laplacian_readings(skin), expected, rtol=0, atol=2e-11)
 
 
-# ------------------------------------------------------ a finger, by what ngspice has agreed with
-
 FINGER_CELLS = 0.7  # standard deviation of its pressure
 PRESSED_SIEMENS = 2e-6  # above rest
 CLEAR_SIEMENS = 0.25e-6  # above rest: between them a cell may be called either

@@ -171,9 +171,6 @@ def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
     assert bench.info == before
 
 
-# ------------------------------------------------------------------------------- in real time
-
-
 @pytest.mark.usefixtures("hasty")
 def test_ports_that_do_not_answer_are_findings(run: Run, pty_board: Serve) -> None:
     path = pty_board("emulator://2x2").path

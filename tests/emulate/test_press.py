@@ -107,9 +107,6 @@ def test_cells_differ_and_a_seed_repeats() -> None:
     assert (replace(model, seed=2).rise(time_s, force_n) != rise).all()
 
 
-# ------------------------------------------------------------------------------------ the scene
-
-
 def test_a_robot_presses_one_cell_after_another() -> None:
     scene = Scene("press", 2, 3, seed=5)
     time_s = np.arange(0, 130, 0.05)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames that no skin gives: no exception, and finite numbers where promised."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -91,3 +93,25 @@ def test_after_nonsense_a_good_frame_is_answered_as_if_nothing_had_been(method: 
     apart = np.abs(after.cell_siemens - first.cell_siemens) / first.cell_siemens_std
     assert apart.max() < 0.5
     assert after.converged
+
+
+def test_a_cell_beyond_the_hardest_touch_is_named() -> None:
+    rest = rest_of((4, 4))
+    cells = rest.cell_siemens.copy()
+    for siemens, message in ((1 / 600, ""), (1 / 100, "cell (2, 1): conducts more than any touch")):
+        cells[2, 1] = siemens
+        ratio = readings(Skin(cells, rest.top_wire_ohm, rest.bottom_wire_ohm))
+        found = make_estimator("joint", told(readings(rest))).estimate(ratio)
+        assert found.message.startswith(message)
+        assert found.converged == (not message)
+
+
+def test_wires_that_were_measured_are_known_better_than_nominal_ones() -> None:
+    rest = rest_of((4, 4))
+    knowledge = told(readings(rest))
+    ratio = readings(touch(rest, 3, np.random.default_rng(2)))
+    stated = []
+    for wires in (knowledge.nominal_wire_ohm, knowledge.nominal_wire_ohm._replace(log_std=0.02)):
+        known = replace(knowledge, nominal_wire_ohm=wires)
+        stated.append(make_estimator("joint", known).estimate(ratio).cell_siemens_std.max())
+    assert stated[1] < 0.8 * stated[0]

@@ -123,9 +123,6 @@ def test_a_pause_of_the_scans_does_not_confuse() -> None:
     assert np.abs(found_s - true_s)[board_s > 601].max() < 2e-3
 
 
-# --------------------------------------------------------------------------------- recordings
-
-
 def scans_at(board_s: Float, host_s: Float) -> list[Scan]:
     codes: NDArray[np.uint16] = np.zeros((1, 1, 4), dtype=np.uint16)
     return [
@@ -161,9 +158,6 @@ def test_scan_times_bridge_a_pause() -> None:
     board_s = np.concatenate([np.arange(0, 20, 1 / HZ), np.arange(600, 620, 1 / HZ)])
     host_s = 9.0 + 1.0001 * board_s
     np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=2e-6)
-
-
-# ------------------------------------------------------------------------ the firmware's clock
 
 
 @pytest.mark.simavr

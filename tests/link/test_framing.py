@@ -68,9 +68,6 @@ payloads = st.one_of(
 frames = st.builds(RawFrame, octet, octet, payloads)
 
 
-# -------------------------------------------------------------------------------------- COBS
-
-
 @settings(max_examples=300)
 @given(st.one_of(payloads, st.binary(max_size=1200)))
 @example(b"")
@@ -106,9 +103,6 @@ def test_the_same_refusals_as_the_cobs_package(stuffed: bytes) -> None:
     except cobs.DecodeError:
         expected = None
     assert framing.cobs_decode(stuffed) == expected
-
-
-# ------------------------------------------------------------------------------------ streams
 
 
 @given(frames, st.integers(0, 1 << 20))
@@ -209,9 +203,6 @@ def test_the_largest_frame_of_the_definition_fits() -> None:
     longer = Decoder()
     assert longer.feed(wire(RawFrame(scan.id, 0, b"\x55" * (size + 16)))) == []
     assert longer.stats.overlong == 1
-
-
-# --------------------------------------------------------------------------------- bad lines
 
 
 def test_a_million_random_bytes_make_no_scan() -> None:

@@ -154,9 +154,6 @@ def test_a_board_that_vanishes_ends_the_scans_and_is_named() -> None:
             pass
 
 
-# ------------------------------------------------------------------------------------- opening
-
-
 def test_the_boards_of_this_machine(pty_board: Serve, attach: Attach) -> None:
     one, two = (pty_board(f"emulator://8x8?unit={unit}").path for unit in (1, 2))
     attach((one, "uno"), ("/dev/ttyS0", ""), (two, "megaatmega2560"))
@@ -214,9 +211,6 @@ def test_two_of_one_unit_are_refused() -> None:
         f"{urls[1]} and {urls[2]} are both unit 2: rename one: "
         f"ohmskin configure {urls[2]} --unit-id 3 --save"
     )
-
-
-# -------------------------------------------------------------------------------- calibrations
 
 
 def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:

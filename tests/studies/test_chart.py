@@ -46,9 +46,6 @@ def of(rows: list[Row], **what: object) -> list[Row]:
     return [row for row in rows if all(getattr(row, k) == value for k, value in what.items())]
 
 
-# ------------------------------------------------------------------------------------ the front
-
-
 @pytest.mark.parametrize(
     ("points", "on_front"),
     [
@@ -71,9 +68,6 @@ def test_pareto_front_of_many_points() -> None:
         expected[index] = points[index, 1] < best
         best = min(best, points[index, 1])
     assert pareto_front([(x, y) for x, y in points]) == expected.tolist()
-
-
-# --------------------------------------------------------------------------------- measurements
 
 
 def test_all_methods_get_the_same_frames(rows: list[Row]) -> None:
@@ -127,8 +121,6 @@ def test_sweeps_are_the_papers(name: str) -> None:
     np.testing.assert_allclose(pressed, expected.ratio, atol=1e-7)
     np.testing.assert_allclose(rest, expected.rest_ratio, atol=1e-7)
 
-
-# --------------------------------------------------------------------------- NumPy against CasADi
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(casadi_circuit.COMPILER) is None, reason="needs a C compiler"
@@ -184,9 +176,6 @@ def test_without_a_compiler_there_is_no_generated_c_and_that_is_said(
     assert said == ["NumPy", "CasADi", "CasADi's C: no compiler"]
 
 
-# -------------------------------------------------------------------------------------- answers
-
-
 def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
     table = list(csv.DictReader(io.StringIO(chart_table.csv_text(rows))))
     evaluations = len(of(rows, scene="linearisation"))
@@ -226,9 +215,6 @@ def test_frames_without_touches_have_a_row_and_a_picture() -> None:
     assert (rows[0].pressed_cells, rows[0].error_percent, rows[0].limit_percent) == (0, None, None)
     assert not rows[0].on_front
     assert chart_figure.picture(rows, "a machine").startswith(b"\x89PNG")
-
-
-# --------------------------------------------------------------------------------- command line
 
 
 @pytest.fixture

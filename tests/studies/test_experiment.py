@@ -41,9 +41,6 @@ def flat() -> ForceTrial:
     return surface_trial(2, 2, 3, SMALL, PressModel(), curved=False)
 
 
-# ----------------------------------------------------------------------------------- the trials
-
-
 def test_calibration_presses_one_cell_and_the_test_three(flat: ForceTrial) -> None:
     single = flat.group < 0
     pressed = (flat.force_n > 0).sum(axis=(1, 2))
@@ -80,9 +77,6 @@ def test_a_seed_repeats_and_a_bend_comes_after_the_calibration(flat: ForceTrial)
     np.testing.assert_array_equal(bent.force_n[single], flat.force_n[single])
     # The noise of the board is drawn later than the bend, hence an LSB or two.
     np.testing.assert_allclose(bent.ratio[single], flat.ratio[single], atol=3 / 1024)
-
-
-# -------------------------------------------------------------------------------------- errors
 
 
 def test_the_baseline_is_a_line_through_raw_readings(flat: ForceTrial) -> None:
@@ -175,9 +169,6 @@ def test_the_paper_is_quoted() -> None:
         assert 100 * (1 - solved / naive) == pytest.approx(percent, abs=0.05)
 
 
-# -------------------------------------------------------------------------------------- limits
-
-
 def test_the_series_is_one_press_at_90_hz() -> None:
     trial = press_series(0)
     window = trial.group == 0
@@ -209,9 +200,6 @@ def test_a_smallest_force_follows_from_the_noise_of_readings() -> None:
 def test_the_margin_must_stay_above_zero(margin: list[float], expected: float) -> None:
     forces_n = np.array([1.0, np.sqrt(2), 2 * np.sqrt(2), 4 * np.sqrt(2)])
     assert force_limits._crossing(forces_n, np.array(margin)) == pytest.approx(expected)
-
-
-# --------------------------------------------------------------------------------- command line
 
 
 @pytest.fixture

@@ -37,9 +37,6 @@ def rows() -> list[Row]:
     return stability.measure(tiny_tasks(), jobs=1)
 
 
-# ----------------------------------------------------------------------------------- the verdict
-
-
 @pytest.mark.parametrize(
     ("cells_us", "std_us", "expected"),
     [
@@ -64,9 +61,6 @@ def test_verdict(cells_us: list[float], std_us: list[float], expected: str) -> N
     truth, cells, std = (1e-6 * np.array([each]) for each in ([200.0, 1.0], cells_us, std_us))
     assert verdict(cells, std, True, truth) == expected
     assert verdict(cells, std, False, truth) == Verdict.FLAGGED
-
-
-# ------------------------------------------------------------------------------------ the faults
 
 
 @pytest.fixture
@@ -170,9 +164,6 @@ def test_frames_before_are_read_and_not_judged() -> None:
     assert [frame.afresh for frame in build("before", "none").frames] == [True, True, True]
 
 
-# --------------------------------------------------------------------------------- the measuring
-
-
 def test_the_results_do_not_depend_on_the_number_of_processes(rows: list[Row]) -> None:
     two = stability.measure(tiny_tasks(), jobs=2)
     assert stability.csv_text(two) == stability.csv_text(rows)
@@ -235,9 +226,6 @@ def test_csv(rows: list[Row]) -> None:
 def test_picture_of_all_sweeps() -> None:
     rows = [Row(sweep, x, method, 4, 1, 1, 2) for sweep, x in SKINS for method in METHODS]
     assert stability_figure.picture(rows).startswith(b"\x89PNG")
-
-
-# ---------------------------------------------------------------------------------- command line
 
 
 @pytest.fixture
