@@ -12,9 +12,12 @@ import pytest
 
 import ohmskin
 from calibrations import NEWTON_SIEMENS, calibration, of_scene
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
+from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import LEVEL_METHODS
+from ohmskin.estimate.prior import UNKNOWN_LAYER_STD
+from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
@@ -82,7 +85,7 @@ def test_tare_is_refused_while_something_touches_the_skin() -> None:
     with ohmskin.open(GHOST, calibration=before) as board:
         with pytest.raises(TareRefused, match=r"cells \(2, 2\), \(2, 5\), \(5, 2\) are touched"):
             board.tare(0.1)
-        assert board.calibration is before
+        assert board.calibration.tare is None
         assert len(board.latest().contacts) == 3
         board.tare(0.1, force=True)
         assert board.latest().contacts == ()
@@ -90,6 +93,20 @@ def test_tare_is_refused_while_something_touches_the_skin() -> None:
         assert len(board.latest().contacts) == 3
         with pytest.raises(TareRefused, match="no tare to undo"):
             board.undo_tare()
+
+
+def test_wires_that_a_session_has_taught_are_kept(tmp_path: Path) -> None:
+    untold = replace(of_scene("multi", method="joint"), nominal_wire_ohm=NO_WIRES)
+    with ohmskin.open("emulator://8x8?scene=multi&seed=1", calibration=untold) as board:
+        assert board.calibration.nominal_wire_ohm == NO_WIRES
+        assert len(list(islice(board, 5))) == 5
+        board.calibration.save(tmp_path / "skin.json")
+    kept = load_calibration(tmp_path / "skin.json").nominal_wire_ohm
+    assert kept.both is not None
+    assert kept.log_std is not None
+    assert kept.log_std < 0.5 * UNKNOWN_LAYER_STD
+    off = np.mean(np.log(kept.both)) - np.mean(np.log([TOP_WIRE_OHM, BOTTOM_WIRE_OHM]))
+    assert abs(off) < 3 * kept.log_std
 
 
 def test_tare_follows_a_drift(tmp_path: Path) -> None:
@@ -123,7 +140,7 @@ def assert_same_forces(first: list[ForceScan], second: list[ForceScan]) -> None:
 
 @pytest.mark.parametrize("method", ["touch", "joint"])
 def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -> None:
-    port, path = "emulator://8x8?scene=moving&seed=1", tmp_path / "skin.mcap"
+    port, path = "emulator://8x8?scene=multi&seed=1", tmp_path / "skin.mcap"
     of_skin = of_scene("moving", method=method)
     live: list[ForceScan] = []
     with (

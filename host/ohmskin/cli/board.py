@@ -134,9 +134,6 @@ def configure(
     )
 
 
-# ---------------------------------------------------------------------------------- the firmware
-
-
 def flash(
     board: Annotated[str, typer.Argument(help=" | ".join(BOARDS))] = "",
     port: Annotated[str, typer.Option(help="serial port of the board")] = "",

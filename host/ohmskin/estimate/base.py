@@ -188,6 +188,10 @@ class Estimator(ABC):
         `message`.
         """
 
+    def wires(self) -> WireOhm:
+        """What is known of the wires: what was told, and what a method has learned since."""
+        return self.knowledge.nominal_wire_ohm
+
     def reset(self) -> None:
         """Forget the previous frame: the next one starts afresh. What is known of rest stays."""
         self._reader.reset()

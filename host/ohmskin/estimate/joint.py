@@ -23,7 +23,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
+from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution, WireOhm
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings, cell_of
@@ -42,9 +42,7 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 
-LOSS: Final = (
-    10.0  # deviations of the prior: a cell that conducts so much less than at rest is at fault
-)
+LOSS: Final = 10.0  # deviations of the prior below rest: a cell that conducts less is at fault
 NEAR: Final = 10.0  # chi-square per port that a start from `matrix` may be away from its minimum
 # Change of a log resistance that makes a frame news of the wires: frames alike have alike errors.
 NEWS: Final = 1.5
@@ -62,6 +60,10 @@ class JointEstimator(Estimator):
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
         self.reset()
+
+    def wires(self) -> WireOhm:
+        """As told, until a frame has taught more."""
+        return super().wires() if self._learned_from is None else WireOhm(*self._belief.learned())
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""

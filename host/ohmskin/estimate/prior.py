@@ -141,6 +141,11 @@ class WireBelief:
         """Standard deviation of the log of the layer that is known less."""
         return float(np.linalg.norm(self._root, axis=1).max())
 
+    def learned(self) -> tuple[float, float, float]:
+        """A `WireOhm`: mean segments of the layers [ohm], deviation of the log of both together."""
+        top, bottom = np.exp(self.log_layers)
+        return float(top), float(bottom), float(np.linalg.norm(self._root.sum(axis=0)) / 2)
+
     def layers(self, log_wires: Float) -> tuple[Float, Float]:
         """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
         top, bottom = np.exp(log_wires).reshape(2, *self.shape)

@@ -102,6 +102,7 @@ class SkinReader:
         elif rest_ratio is not None:
             self._rests = [Untouched(rest_ratio, now())]
         self._begin()
+        self._taught = [self._estimator]  # of all readers of this skin, the one that read last
 
     def another(self) -> Self:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
@@ -131,9 +132,11 @@ class SkinReader:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration with the latest tare; `Calibration.save` makes that last."""
-        tare, calibration = self.rest, self._calibration
-        if calibration is None or tare is calibration.untouched:
+        """The calibration with the latest tare and the wires learned since; `save` keeps them."""
+        if self._calibration is None:
+            return None
+        calibration = replace(self._calibration, nominal_wire_ohm=self._taught[0].wires())
+        if (tare := self.rest) is calibration.untouched:
             return calibration
         if isinstance(tare, Untouched):
             tare = Rest.of(calibration.method, self._knowledge(tare), tare.date)
@@ -186,6 +189,7 @@ class SkinReader:
         if self._made != (self._wanted, self.rest):
             self._make()
         found = self.estimate(scan.ratio)
+        self._taught[:] = [self._estimator]
         rise = self.rise(found)
         force_n = force_n_std = np.full(rise.shape, np.nan)
         weights = np.maximum(rise, 0.0), found.level_std
@@ -255,7 +259,7 @@ class CalibratedSkin(Closing):
 
     @property
     def calibration(self) -> Calibration:
-        """What forces are read by, with the latest tare; `Calibration.save` makes it last."""
+        """What forces are read by, with the latest tare and learned wires; `save` keeps them."""
         found = self._reader.calibration
         assert found is not None
         return found

@@ -52,8 +52,6 @@ class Device(Closing):
         self._want_scans = False
         self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
 
-    # ------------------------------------------------------------------------------- reading
-
     @property
     def info(self) -> Hello:
         """What the board has last said of itself."""
@@ -133,8 +131,6 @@ class Device(Closing):
         if not ratios:
             raise DeviceLost(f"{self.name} gives no more scans")
         return np.asarray(np.mean(ratios, axis=0))
-
-    # ------------------------------------------------------------------------------ commands
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already."""
@@ -261,8 +257,6 @@ class Device(Closing):
             self._newest = None
             if self._failure is None or isinstance(self._failure, RecordingEnded):
                 self._fail(DeviceLost(f"{self.name} was closed"))
-
-    # ----------------------------------------------------------------------- for a board's thread
 
     def _publish(self, scan: Scan) -> None:
         """Give a scan to all who read; what a slow iterator loses is missed before its next."""

@@ -181,8 +181,6 @@ class ViewedBoard(Closing):
         self._thread = threading.Thread(target=self._work, name=f"view {port}", daemon=True)
         self._thread.start()
 
-    # ----------------------------------------------------------------------------- for the page
-
     def state(self) -> dict[str, Any]:
         """What the page says beside the scans, as JSON has it."""
         reader, recording, running = self._reader, self._recording, self._running()
@@ -206,8 +204,6 @@ class ViewedBoard(Closing):
     def _changed(self) -> None:
         for watcher in tuple(self.watchers):
             watcher()
-
-    # --------------------------------------------------------------------------------- commands
 
     def use(self, method: str) -> str:
         """Estimate by another method. Commands return what was done, and raise why it was not."""
@@ -299,8 +295,6 @@ class ViewedBoard(Closing):
             number += 1
             path = self._folder / f"{stem}-{number}.mcap"
         return path
-
-    # ----------------------------------------------------------------------------------- thread
 
     def _work(self) -> None:
         while not self.closing.is_set():
