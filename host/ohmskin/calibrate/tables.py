@@ -73,9 +73,6 @@ _UNITS: Final = {
 }
 
 
-# ---------------------------------------------------------------------------------- force logs
-
-
 @dataclass(frozen=True, eq=False)
 class ForceLog:
     """Forces by the sensor's clock: time_s (n,) [s], increasing; force_n (n,) [N].
@@ -134,9 +131,6 @@ def load_force_log(path: str | os.PathLike[str]) -> ForceLog:
         return ForceLog(**columns, rows=rows)
 
 
-# ---------------------------------------------------------------------------- tables of presses
-
-
 def load_press_table(path: str | os.PathLike[str]) -> PressTable:
     """Read a table of presses, (n,) of `PRESS`, at least one. Raises ValueError: see the module."""
     with naming(path):
@@ -163,9 +157,6 @@ def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
     Raises ValueError if it cannot be written.
     """
     save_table(path, _COLUMNS, table.tolist())
-
-
-# ------------------------------------------------------------------------------------ CSV files
 
 
 def _read(

@@ -72,9 +72,6 @@ class FullFit:
         self.cell: Float = start
         self._off_layers = np.zeros(2)  # u of the layers
         self._evaluate()
-        self._by_segment = SEGMENT_STD * self._weighted(self._circuit.by_wires())
-        self._noise = gram(self._by_segment)
-        np.einsum("ii->i", self._noise)[:] += 1.0
         self._minimise()
         self._conclude()
 
@@ -92,7 +89,10 @@ class FullFit:
         return slopes * (-self._weight * self._modelled**2)[:, None]
 
     def _linearise(self) -> None:
-        """Slopes and S at the present state."""
+        """Slopes, N and S at the present state."""
+        self._by_segment = SEGMENT_STD * self._weighted(self._circuit.by_wires())
+        self._noise = gram(self._by_segment)
+        np.einsum("ii->i", self._noise)[:] += 1.0
         self._by_cell = self._weighted(self._circuit.by_cell())
         self._by_layers = self._belief.by_layers(self._weighted(self._circuit.by_layers()))
         self._cell_std = np.sqrt(self._variance)
@@ -115,7 +115,7 @@ class FullFit:
                 return
             self._evaluate()
             step, moved = self._step()
-            if moved >= CLOSE:
+            if moved >= 0.5 * CLOSE:
                 self._linearise()
                 step, moved = self._step()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"

@@ -30,10 +30,12 @@ from ohmskin.estimate.port_readings import PortReadings, cell_of
 from ohmskin.estimate.prior import (
     HIDDEN,
     HIGHEST_TOUCH_SIEMENS,
+    MAX_STEP,
     MISFIT,
     REST_STD,
     UNKNOWN_REST_STD,
-    UNLIMITED_STD,
+    UNTOUCHED_OHM,
+    UNTOUCHED_STD,
     CellPrior,
     WireBelief,
     path_ohm,
@@ -43,9 +45,6 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 
 LOSS: Final = 10.0  # deviations of the prior below rest: a cell that conducts less is at fault
-NEAR: Final = 10.0  # chi-square per port that a start from `matrix` may be away from its minimum
-# Change of a log resistance that makes a frame news of the wires: frames alike have alike errors.
-NEWS: Final = 1.5
 
 
 class JointEstimator(Estimator):
@@ -59,6 +58,7 @@ class JointEstimator(Estimator):
         self._belief = WireBelief(*self._shape, knowledge.nominal_wire_ohm)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
+        self._rest_by_wires = 0.0
         self.reset()
 
     def wires(self) -> WireOhm:
@@ -115,6 +115,8 @@ class JointEstimator(Estimator):
         """Why this fit cannot be the answer; empty if it can."""
         if fit.message:
             return fit.message
+        if self._rest_by_wires > REST_STD:
+            return "wires resist so much that cells at rest are uncertain"
         if fit.misfit > MISFIT:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
         cell = fit.cell.reshape(self._shape)
@@ -134,16 +136,16 @@ class JointEstimator(Estimator):
         """
         if touches is not None:
             return touches.cell
-        near = NEAR * ports.current.size
+        near = float(ports.current.size)  # to start from, a deviation of every reading will do
         fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires, near)
         self._without_wires = None if fit.message else fit.cell
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
 
     def _learn(self, fit: FullFit | Touched) -> None:
-        """Let the wires learn from a frame that is not like the last one learned from."""
+        """Let the wires learn from a frame that is news: frames alike have errors alike."""
         before = self._learned_from
-        if before is None or np.abs(fit.cell - before).max() >= NEWS:
+        if before is None or np.abs(fit.cell - before).max() >= MAX_STEP:
             self._learned_from = fit.cell
             self._belief.learn(*fit.lesson)
 
@@ -165,16 +167,17 @@ class JointEstimator(Estimator):
         else:
             expected, std = self._at_rest(self._reader.read(known.rest_ratio))
         self._prior = CellPrior(expected, std)
-        self._finder = SparseFit(self._prior, self._belief, known.ref_ohm)
+        if self._rest_by_wires <= REST_STD:
+            self._finder = SparseFit(self._prior, self._belief, known.ref_ohm)
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
         """Log resistances of the untouched cells, and how well they are known: the same fit."""
-        level = rest_level(ports.current, self.knowledge.ref_ohm)
-        expected = np.full(ports.current.size, -np.log(level))
-        wide = CellPrior(expected, np.full(expected.size, UNLIMITED_STD))
+        expected = np.full(ports.current.size, np.log(UNTOUCHED_OHM))
+        wide = CellPrior(expected, np.full(expected.size, UNTOUCHED_STD))
         start = self._start(wide, ports, None)
         fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, start)
+        self._rest_by_wires = float(fit.by_layers.max())
         return fit.cell, np.hypot(fit.cell_std, REST_STD)
 
 

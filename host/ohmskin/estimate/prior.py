@@ -38,6 +38,8 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.small import solve
 
 # Deviations (..._STD) are of the log of a resistance.
+UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
+UNTOUCHED_STD: Final = 1.0
 UNKNOWN_REST_STD: Final = 0.3  # of a cell whose rest readings are not known, about all cells' level
 REST_STD: Final = 0.05  # drift of a cell since the rest readings
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
@@ -48,14 +50,15 @@ HIDDEN: Final = 0.3  # a rise that must not go unnoticed
 
 UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
 UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a factor of two
-LAYER_STD: Final = 0.25  # the same where it is known: stretch, temperature
+LAYER_STD: Final = 0.3  # the same where it is known: stretch, temperature
 SEGMENT_STD: Final = 0.1  # what each segment has of its own
 FADE: Final = 0.1  # share of the knowledge of the wires that fades with each lesson: skins bend
 
 MAX_ITERATIONS: Final = 40
 CLOSE: Final = 0.5  # deviations: a step that moves no reading or cell by more is the last
 MISFIT: Final = 1.5  # chi-square per port: above it no resistances explain the readings
-MAX_STEP: Final = 1.5  # of the log of a resistance, in one step of a fit
+# Of the log of a resistance: no step of a fit is larger, and a frame that differs by it is news.
+MAX_STEP: Final = 1.5
 REACH: Final = 2.0  # deviations of what is normal that make as many deviations of a conductance
 
 Lesson = tuple[Float, Float, Float]  # what wires learn from: J L^T C^1/2, z and the factor of S
