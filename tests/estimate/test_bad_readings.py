@@ -8,7 +8,7 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimator, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from skins import told
 from studies.trials import skin_at_rest, touch
@@ -104,6 +104,18 @@ def test_a_cell_beyond_the_hardest_touch_is_named() -> None:
         found = make_estimator("joint", told(readings(rest))).estimate(ratio)
         assert found.message.startswith(message)
         assert found.converged == (not message)
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize(("ohm", "is_too_much"), [(1e3, False), (5e4, True)])
+def test_wires_as_large_as_cells_at_rest_are_said(
+    method: str, ohm: float, *, is_too_much: bool
+) -> None:
+    wires = np.full((8, 8), ohm)
+    rest = readings(Skin(rest_of((8, 8)).cell_siemens, wires, wires))
+    knowledge = replace(told(rest), nominal_wire_ohm=WireOhm(ohm, ohm))
+    found = make_estimator(method, knowledge).estimate(rest)
+    assert ("wires resist too much" in found.message) == is_too_much
 
 
 def test_wires_that_were_measured_are_known_better_than_nominal_ones() -> None:

@@ -116,7 +116,7 @@ class JointEstimator(Estimator):
         if fit.message:
             return fit.message
         if self._rest_by_wires > REST_STD:
-            return "wires resist so much that cells at rest are uncertain"
+            return "wires resist too much: even cells at rest are uncertain"
         if fit.misfit > MISFIT:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
         cell = fit.cell.reshape(self._shape)
