@@ -259,6 +259,6 @@ class Calibrator:
             rest=Rest.of(self.method, self._knowledge, date),
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
-            nominal_wire_ohm=self.nominal_wire_ohm,
+            nominal_wire_ohm=self.estimator.wires(),
         )
         return calibration, found.message_

@@ -262,7 +262,10 @@ def _finish(
     for each in (note, table, message):
         if each:
             _out.print(each)
-    if calibration.nominal_wire_ohm.both is None:
+    top, bottom, log_std = calibration.nominal_wire_ohm
+    if log_std is not None:
+        _out.print(f"wires, as presses tell: {top:.0f}, {bottom:.0f} Ohm, +- {100 * log_std:.0f} %")
+    elif top is None or bottom is None:
         _out.print("wires are not told (--wires): forces' standard deviations are wide")
     _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 

@@ -104,7 +104,7 @@ class WireBelief:
         # Both together, and what differs between them: a measurement tells their sum.
         apart = 0.5 * layer_std**2
         both = apart if log_std is None else float(np.clip(log_std, 0.01, 1.0)) ** 2
-        self._prior_covariance = both + apart * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        self._prior_covariance = both + max(apart, both) * np.array([[1.0, -1.0], [-1.0, 1.0]])
         nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in ohms]
         self._nominal: Float = np.log(nominal)
         self.reset()
