@@ -94,9 +94,6 @@ def verdict(diagnosis: Diagnosis) -> str:
     return "sound: nothing is wrong"
 
 
-# ----------------------------------------------------------------------- wires, what to press
-
-
 def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:
     """The figures; and the wires in words, unless touches or faults hide them."""
     if diagnosis.nominal_ohm is None:

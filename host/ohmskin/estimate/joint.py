@@ -34,7 +34,6 @@ from ohmskin.estimate.prior import (
     MISFIT,
     REST_STD,
     UNKNOWN_REST_STD,
-    UNTOUCHED_OHM,
     UNTOUCHED_STD,
     CellPrior,
     WireBelief,
@@ -44,6 +43,7 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 
+REST_FITS: Final = 3
 LOSS: Final = 10.0  # deviations of the prior below rest: a cell that conducts less is at fault
 
 
@@ -172,13 +172,19 @@ class JointEstimator(Estimator):
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
-        """Log resistances of the untouched cells, and how well they are known: the same fit."""
-        expected = np.full(ports.current.size, np.log(UNTOUCHED_OHM))
-        wide = CellPrior(expected, np.full(expected.size, UNTOUCHED_STD))
-        start = self._start(wide, ports, None)
-        fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, start)
+        """Log resistances of the untouched cells, and how well they are known: the same fit.
+
+        Made again about their median: many cells a little wrong would weigh more than readings.
+        """
+        level = rest_level(ports.current, self.knowledge.ref_ohm)
+        cell: Float = np.full(ports.current.size, -np.log(level))
+        for _ in range(REST_FITS):
+            std = np.full(cell.size, UNTOUCHED_STD)
+            wide = CellPrior(np.full(cell.size, np.median(cell)), std)
+            fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, cell)
+            cell = fit.cell
         self._rest_by_wires = float(fit.by_layers.max())
-        return fit.cell, np.hypot(fit.cell_std, REST_STD)
+        return cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
 
 
 class TouchEstimator(JointEstimator):

@@ -38,8 +38,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.small import solve
 
 # Deviations (..._STD) are of the log of a resistance.
-UNTOUCHED_OHM: Final = 1e6  # a cell, before any is read
-UNTOUCHED_STD: Final = 1.0
+UNTOUCHED_STD: Final = 1.0  # of a cell about all cells' level, before its rest is read
 UNKNOWN_REST_STD: Final = 0.3  # of a cell whose rest readings are not known, about all cells' level
 REST_STD: Final = 0.05  # drift of a cell since the rest readings
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch

@@ -153,9 +153,6 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
             uvicorn.Server(config).run(sockets=[listening])
 
 
-# -------------------------------------------------------------------------------- who may ask
-
-
 def _is_loopback(host: str) -> bool:
     """Whether nobody but this machine reaches that address."""
     if host == "localhost":
