@@ -173,7 +173,7 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
     """Conductance of untouched cells, all alike, from port currents per Vdd (R, C) [S].
 
     A port of R x C equal cells g, without wires, is (R + C - 1) / (R C g). Touches make every port
-    conduct more, so this goes by ports that conduct little.
+    conduct more, most of all those of touched cells: this goes by the median port.
     """
     rows, columns = current_siemens.shape
     current = float(np.median(current_siemens))
