@@ -17,14 +17,14 @@ N      (RC, RC)     covariance of y: of its noise and of what is not in x       
 ====== ============ ============================================================= ==========
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2, P of the cells re-weighted for the tails of their prior
-at every step. What segments have of their own is small: it is noise, N = 1 + W W^T, from where the
-fit begins, and W^T (y - h) of what is left is what it has been. The steps are Gauss-Newton's in the
-space of the readings (Tarantola 2005, eq. 3.51),
+at every step. What segments have of their own is small: it is noise, N = 1 + W W^T, and afterwards
+W^T S^-1 (y - h(u) + J u) says what it has been. The steps are Gauss-Newton's in the space of the
+readings (Tarantola 2005, eq. 3.51),
 
     u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 
-and the posterior covariance of u is 1 - J^T S^-1 J. S and J are made anew only where those of the
-step before, used once more, would still move something.
+and the posterior covariance of u is 1 - J^T S^-1 J. J, N and S are made anew only where those of
+the step before, used once more, would still move something.
 """
 
 from functools import cached_property
