@@ -84,13 +84,14 @@ class FullFit:
         self._residual = (self._current - self._modelled) * self._weight
         self._centre, self._variance = self._prior.normal(self.cell)
 
-    def _weighted(self, slopes: Float) -> Float:
-        """Slopes of h from those of rho, (RC, ...)."""
-        return slopes * (-self._weight * self._modelled**2)[:, None]
+    def _weighted(self, slopes: Float, share: float = 1.0) -> Float:
+        """Slopes of h from those of rho, (RC, ...), which are overwritten."""
+        slopes *= (-share * self._weight * self._modelled**2)[:, None]
+        return slopes
 
     def _linearise(self) -> None:
         """Slopes, N and S at the present state."""
-        self._by_segment = SEGMENT_STD * self._weighted(self._circuit.by_wires())
+        self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
         self._noise = gram(self._by_segment)
         np.einsum("ii->i", self._noise)[:] += 1.0
         self._by_cell = self._weighted(self._circuit.by_cell())
