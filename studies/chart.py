@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.methods import METHODS, PAPER_METHODS
+from ohmskin.estimate.methods import METHODS
 from ohmskin.record.readings import estimate_file
 from studies import casadi_circuit, published
 from studies.information import information_limit
-from studies.trials import Trial, random_trial, trial_of
+from studies.trials import PAPER_METHODS, Trial, random_trial, trial_of
 
 # The paper's methods take 0.1 s a frame with 9 cells, up to 16 s with 16 and a minute with 64.
 PAPER_CELLS: Final = 9

@@ -26,6 +26,8 @@ TOUCH_OHM: Final = (1e3, 1e5)
 # A cell counts as pressed from here on, as a multiple of its conductance at rest.
 PRESSED: Final = 1.5
 # A fingertip: radius of its pressure, range of its peaks, frames of its way round a circle.
+# The paper's programmes: they take minutes for a frame of 8x8 cells.
+PAPER_METHODS: Final = ("lsq", "regularized")
 FINGER_CELLS: Final = 0.7
 FINGER_SIEMENS: Final = (5e-5, 5e-4)
 FINGER_FRAMES: Final = 40

@@ -31,9 +31,6 @@ _METHODS: Final = ("ohm", "joint")
 _WIDTH: Final = 160
 _out = Console()
 
-# What is seen of a skin: a name, conductances [S] and touched cells, each (R, C).
-_View = tuple[str, Float, Bool]
-
 EPILOGS: Final = {
     "emulate": f"Scenes: {'; '.join(f'{k}: {v}' for k, v in SCENES.items())}. "
     f"Faults of the line: {'; '.join(f'{k}: {v}' for k, v in LINE_FAULTS.items())}. "
@@ -61,7 +58,7 @@ def demo(
         stats = skin.stats
     now_s = 1e-6 * scan.time_us
     truth = scene.touched(now_s)
-    views: list[_View] = [("truth", scene.skin(now_s).cell_siemens, truth)]
+    views = [("truth", scene.skin(now_s).cell_siemens, truth)]
     views += [
         (method, estimate.cell_siemens, estimate.touched)
         for method, estimate in zip(_METHODS, found[-1], strict=True)
@@ -87,8 +84,8 @@ def demo(
         out.print(f"picture: {picture}")
 
 
-def _save_picture(path: Path, views: Sequence[_View], title: str) -> None:
-    """A PNG of a skin as it was seen, side by side.
+def _save_picture(path: Path, views: Sequence[tuple[str, Float, Bool]], title: str) -> None:
+    """A PNG of views side by side: name, conductances [S] and touched cells, each (R, C).
 
     :raises OhmskinError: matplotlib is not installed.
     """

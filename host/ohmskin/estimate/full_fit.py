@@ -28,7 +28,6 @@ the step before, used once more, would still move something.
 """
 
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 
@@ -50,7 +49,6 @@ from ohmskin.estimate.prior import (
     WireBelief,
 )
 
-CROWDED: Final = 0.3  # share of touched cells: above it, no other cell is known to be at rest
 _LEAST_LOG, _MOST_LOG = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)  # of a cell
 
 
@@ -71,6 +69,7 @@ class FullFit:
         self.iterations, self.message = 0, ""
         self.cell: Float = start
         self._off_layers = np.zeros(2)  # u of the layers
+        self._moved = np.inf  # of a log resistance, since N was made
         self._evaluate()
         self._minimise()
         self._conclude()
@@ -90,10 +89,12 @@ class FullFit:
         return slopes
 
     def _linearise(self) -> None:
-        """Slopes, N and S at the present state."""
-        self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
-        self._noise = gram(self._by_segment)
-        np.einsum("ii->i", self._noise)[:] += 1.0
+        """Slopes and S at the present state, and N if that has moved by more than N is about."""
+        if self._moved > SEGMENT_STD:
+            self._moved = 0.0
+            self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
+            self._noise = gram(self._by_segment)
+            np.einsum("ii->i", self._noise)[:] += 1.0
         self._by_cell = self._weighted(self._circuit.by_cell())
         self._by_layers = self._belief.by_layers(self._weighted(self._circuit.by_layers()))
         self._cell_std = np.sqrt(self._variance)
@@ -135,7 +136,9 @@ class FullFit:
         cell = self.cell + self._cell_std * step[:-2]
         cell_step = np.minimum(np.maximum(cell, _LEAST_LOG), _MOST_LOG) - self.cell
         layers_step = self._belief.away(step[-2:]) - self._belief.log_layers
-        share = min(1.0, MAX_STEP / max(np.abs(cell_step).max(), np.abs(layers_step).max(), 1e-9))
+        most = max(np.abs(cell_step).max(), np.abs(layers_step).max(), 1e-9)
+        share = min(1.0, MAX_STEP / most)
+        self._moved += share * most
         self.cell = self.cell + share * cell_step
         self._off_layers = self._off_layers + share * step[-2:]
 
@@ -153,16 +156,6 @@ class FullFit:
     def misfit(self) -> float:
         """Chi-square per port of what is left."""
         return float(self._left @ self._left) / self._left.size
-
-    @property
-    def touches(self) -> int:
-        """Number of touched cells."""
-        return int(np.count_nonzero(self._prior.rise(self.cell) > TOUCHED))
-
-    @property
-    def is_crowded(self) -> bool:
-        """Whether so many cells are touched that rest is no more likely than a touch."""
-        return self.touches > CROWDED * self.cell.size
 
     def _conclude(self) -> None:
         """cell_std, and what the uncertain layers have in it, by the last S.
@@ -184,8 +177,6 @@ class FullFit:
         rise = distance / share
         rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
         hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
-        if self.is_crowded:
-            hidden, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
         self._hidden = hidden = hidden & (rise + rise_std > cell_std)
         by_layers = own[:, :-2].T @ own[:, -2:]
         if hidden.any():

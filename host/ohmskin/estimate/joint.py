@@ -28,6 +28,7 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings, cell_of
 from ohmskin.estimate.prior import (
+    CROWDED,
     HIDDEN,
     HIGHEST_TOUCH_SIEMENS,
     MAX_STEP,
@@ -84,10 +85,13 @@ class JointEstimator(Estimator):
         if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)
         start = self._start(prior, ports, touches)
-        fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, start)
-        self._touches = fit.touches
-        message = self._doubt(prior, fit)
-        if not (ports.fault or message or fit.is_crowded):
+        crowd = CROWDED * start.size
+        unsure = prior.touches(start) > crowd and self._belief.is_vague()
+        expected = prior.unsure() if unsure else prior
+        fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
+        self._touches = prior.touches(fit.cell)
+        message = self._doubt(expected, fit)
+        if not (ports.fault or message or self._touches > crowd):
             self._learn(fit)
         return self._solution(ports, fit, message)
 
@@ -160,8 +164,8 @@ class JointEstimator(Estimator):
             log_ohm, before = -np.log(rest_level(ports.current, known.ref_ohm)), self._prior
             if before is not None and log_ohm <= before.expected[0]:
                 return before
-            expected = np.full(ports.current.size, log_ohm)
-            std = np.full(expected.size, UNKNOWN_REST_STD)
+            cells = ports.current.size
+            expected, std = np.full(cells, log_ohm), np.full(cells, UNKNOWN_REST_STD)
         elif self._prior is not None:
             return self._prior
         else:

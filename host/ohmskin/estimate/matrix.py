@@ -138,6 +138,7 @@ class CellFit:
         self._target = ports.current.ravel()
         self._current_std = ports.current_std.ravel()
         self._ref_ohm, self._tolerance = ref_ohm, tolerance
+        self._far_cost = _FAR_CHI2 * self._target.size
         # 1 / (1 + G_read R), of a current that the most conductive cell allows.
         feasible = np.minimum(self._target, port_current(MAX_CELL_SIEMENS, ref_ohm))
         self._target_share = 1.0 - feasible * ref_ohm
@@ -146,15 +147,12 @@ class CellFit:
         cell = afresh if before is None else before
         trial = self._evaluate(cell)
         # A scene that jumped is nearer to the plain estimate than to the frame before it.
-        if before is not None and self._is_far(trial[-1]):
+        if before is not None and trial[-1] > self._far_cost:
             other_trial = self._evaluate(afresh)
             if other_trial[-1] < trial[-1]:
                 cell, trial = afresh, other_trial
         self._move_to(cell, *trial)
         self.message = self._run()
-
-    def _is_far(self, cost: float) -> bool:
-        return cost > _FAR_CHI2 * self._target.size
 
     def _evaluate(self, cell: Float) -> tuple[Float, Float, Float, float]:
         """Z, currents and residuals of these cells, and the chi-square."""
@@ -187,7 +185,7 @@ class CellFit:
     def _run(self) -> str:
         """Minimise; returns why not converged, or an empty string."""
         damping = 0.0
-        far = self._is_far(self.cost)
+        far = self.cost > self._far_cost
         while self.iterations < MAX_ITERATIONS:
             if self.cost < self._tolerance:  # no step lowers it by more
                 return ""
@@ -207,7 +205,7 @@ class CellFit:
                 if trial[-1] < self.cost:
                     self._move_to(cell, *trial)
                     damping = 0.0 if damping <= _LIGHT_DAMPING else damping / 10
-                    far = far and self._is_far(self.cost)
+                    far = far and self.cost > self._far_cost
                     continue
             if far:
                 far = False

@@ -21,8 +21,6 @@ VOLTAGE: Final = "voltage"
 LEVEL_METHODS: Final = tuple(_WHERE)
 # All that estimate conductances of their own.
 METHODS: Final = tuple(name for name in LEVEL_METHODS if name != VOLTAGE)
-# The paper's programmes: they take minutes for a frame of 8x8 cells.
-PAPER_METHODS: Final = ("lsq", "regularized")
 
 
 def make_estimator(method: str, knowledge: SkinKnowledge) -> Estimator:

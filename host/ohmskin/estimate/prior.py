@@ -46,6 +46,7 @@ HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
 UNLIMITED_STD: Final = 3.0  # what is not known of such a cell
 HIDDEN: Final = 0.3  # a rise that must not go unnoticed
+CROWDED: Final = 0.3  # share of touched cells: above it, rest is no more likely than a touch
 
 UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
 UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a factor of two
@@ -80,6 +81,14 @@ class CellPrior:
     def rise(self, log_ohm: Float) -> Float:
         """How far a cell conducts more than at rest, in deviations."""
         return (self.expected - log_ohm) / self.std
+
+    def touches(self, log_ohm: Float) -> int:
+        """Number of touched cells."""
+        return int(np.count_nonzero(self.rise(log_ohm) > TOUCHED))
+
+    def unsure(self) -> "CellPrior":
+        """What is expected where rest is no more likely: any cell, of the level at rest."""
+        return CellPrior(self.expected, np.maximum(self.std, UNTOUCHED_STD))
 
     def normal(
         self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
@@ -142,6 +151,10 @@ class WireBelief:
     def std(self) -> float:
         """Standard deviation of the log of the layer that is known less."""
         return float(np.linalg.norm(self._root, axis=1).max())
+
+    def is_vague(self) -> bool:
+        """Whether the wires are hardly better known than if nothing was told of them."""
+        return self.std() > 0.5 * (LAYER_STD + UNKNOWN_LAYER_STD)
 
     def learned(self) -> tuple[float, float, float]:
         """A `WireOhm`: mean segments of the layers [ohm], deviation of the log of both together."""

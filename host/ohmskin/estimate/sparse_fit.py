@@ -68,7 +68,6 @@ MOST_PER_LINE: Final = 0.5  # touches a row and column, on average; a fingertip 
 DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
 SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
 HEAVY: Final = 0.1  # share of a reading's noise: wires matter to it if they may move it by more
-REBUILD: Final = 0.05  # relative change of the wires to a cell: the network is then solved anew
 _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
@@ -181,7 +180,7 @@ class SparseFit:
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""
-        if np.abs(self.belief.log_layers - self.log_layers).max() > REBUILD:
+        if np.abs(self.belief.log_layers - self.log_layers).max() > 0.5 * SEGMENT_STD:
             self._solve_rest()
         frame = FewTouches(self, ports)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
