@@ -199,7 +199,7 @@ def test_a_failed_upload_is_said(run: Run, pio: Pio, attach: Attach) -> None:
 def test_a_board_that_stays_silent_is_said(
     run: Run, attach: Attach, pty_board: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
     attach((pty_board(board(), silent_s=30.0).path, "uno"))
     assert "is silent" in failed(run)
 

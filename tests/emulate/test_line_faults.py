@@ -241,7 +241,7 @@ def test_a_port_with_other_things_to_say(
     monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
 ) -> None:
     """As of a board with another sketch, which prints lines for ever."""
-    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.7)
+    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
     master, path = silent_port
     done = threading.Event()
 
@@ -267,33 +267,38 @@ def test_a_board_of_another_definition() -> None:
     assert "ohmskin flash" in str(error.value)
 
 
-def test_a_board_that_is_reset_by_the_opening_of_its_port() -> None:
-    """An Uno says nothing for up to 3 s after its port is opened; then it boots."""
+@pytest.mark.parametrize(("listens_s", "after_byte_s"), [(1.0, 0.0), (0.83, 5.0)])
+def test_a_board_that_is_reset_by_the_opening_of_its_port(
+    listens_s: float, after_byte_s: float
+) -> None:
+    """The boot loaders of an Uno and of a Mega, which a byte keeps from starting the firmware."""
     board, _, _ = emulated("emulator://3x3")
 
     class Bootloader(EmulatorLink):
-        """Silent and deaf at first; what the board has said meanwhile is the hello of its boot."""
+        """Deaf at first; what the board has said meanwhile is the hello of its boot."""
 
-        def _boots(self) -> bool:
-            return self._now_s() < 1.2
+        resets_board = True
+        _boots_s = listens_s
 
         def read(self) -> bytes:
             time.sleep(0.01)
-            return b"" if self._boots() else super().read()
+            return b"" if self._now_s() < self._boots_s else super().read()
 
         def write(self, octets: bytes) -> None:
-            if not self._boots():
+            if self._now_s() >= self._boots_s:
                 super().write(octets)
+            else:
+                self._boots_s = max(self._boots_s, self._now_s() + after_byte_s)
 
-    with Session(Bootloader(board, "an Uno")) as skin:
-        skin.start()
-        assert skin.latest().codes.shape == (3, 3, 4)
+    started_s = time.monotonic()
+    with Session(Bootloader(board, "a board")) as skin:
+        assert time.monotonic() - started_s < 5.0
         assert skin.stats.restarts == 0
 
 
 def test_a_lost_answer_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(session, "_HELLO_EVERY_S", 0.05)
+    monkeypatch.setattr(session, "_OFTEN", 80 * [("baud_default", True, 0.05)])
     for seed in range(5):
         with ohmskin.open(f"emulator://2x2?rate=200&drop=0.15&seed={seed}", start=False) as skin:
             for unit_id in range(10):
@@ -317,7 +322,7 @@ def test_refusals_on_a_bad_line_stay_refusals() -> None:
 def test_no_thread_or_file_is_left_when_opening_fails(
     monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
 ) -> None:
-    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
     for fault in ("silent=1", "foreign=1", "vanish=1e-6", ""):
         threads, files = threading.active_count(), len(os.listdir("/proc/self/fd"))
         with pytest.raises(OhmskinError):

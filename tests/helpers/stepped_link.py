@@ -11,6 +11,8 @@ from ohmskin.opening import emulated
 class SteppedLink:
     """The board of an ``emulator://`` URL, as a `Link`. Its time passes in `run` alone."""
 
+    resets_board = False
+
     def __init__(self, url: str) -> None:
         self._board, _, self._faults = emulated(url)
         self.name = url

@@ -311,6 +311,8 @@ class _Running:
 class EmulatorLink(_Running):
     """A running board as a `Link`."""
 
+    resets_board = False
+
     def __init__(self, board: EmulatedBoard, name: str, faults: LineFaults | None = None) -> None:
         super().__init__(board, faults)
         self.name = name

@@ -3,6 +3,7 @@
 
 import errno
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -28,6 +29,7 @@ class Link(Protocol):
     """What a `Device` needs of its port. `read` is called by one thread, `write` by any."""
 
     name: str
+    resets_board: bool  # whether opening it resets the board
 
     def read(self) -> bytes:
         """What has arrived. It is ``b""`` when nothing arrives for about `READ_TIMEOUT_S`.
@@ -62,6 +64,10 @@ class SerialLink:
             )
         except (serial.SerialException, OSError, ValueError) as exc:
             raise PortError(*_explain(path, exc)) from exc
+        # Its line DTR does that. A pseudo-terminal has no such lines.
+        self.resets_board = False
+        with suppress(OSError):
+            self.resets_board = self._port.dsr is not None
 
     def read(self) -> bytes:
         """See `Link.read`: waits for one byte, then takes all there are."""

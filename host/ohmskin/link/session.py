@@ -5,6 +5,7 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
+from typing import Final
 
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
 from ohmskin.link import framing, protocol
@@ -20,14 +21,22 @@ from ohmskin.link.messages import (
 )
 from ohmskin.link.serial_port import Link
 
-# Opening a port resets some boards, which are then silent for up to 3 s.
-CONNECT_TIMEOUT_S = 4.0
-# Time between two questions to a board that has not said hello yet [s].
-_HELLO_EVERY_S = 0.3
+# Until hello: speed of the line, whether to ask for it, time to listen [s]. A board that opening
+# does not reset is asked often. One that it resets says hello by itself: its boot loader takes a
+# byte for the start of an upload, and the Mega's then waits for 5 s after the last one.
+_OFTEN = 3 * (4 * [("baud_default", True, 0.3)] + [("baud_fast", True, 0.3)])
+_SELDOM: Final = (
+    ("baud_default", False, 2.0),
+    ("baud_default", True, 0.5),
+    ("baud_fast", True, 0.5),
+    ("baud_default", False, 5.5),
+    ("baud_default", True, 1.0),
+)
 # Time that a board has for its answer, besides the rest of a scan [s].
 _COMMAND_TIMEOUT_S = 1.0
-# A scanning board that sends no valid frame for so long is asked who it is [s].
+# A scanning board that sends no valid frame for so long is asked who it is, and again later [s].
 _SPEED_LOST_S = 2.5
+_ASK_AGAIN_S = 6.5
 
 
 class Session(Device):
@@ -63,23 +72,19 @@ class Session(Device):
             raise
 
     def _connect(self) -> None:
-        deadline = time.monotonic() + CONNECT_TIMEOUT_S
-        tries = 0
-        while self._hello is None:
-            tries += 1
-            # A board that was left at the other speed answers there; most never were.
-            speed = "baud_fast" if tries % 5 == 0 else "baud_default"
+        for speed, asks, listen_s in _SELDOM if self._link.resets_board else _OFTEN:
             self._link.set_baud(protocol.CONSTANTS[speed])
-            self._send("get_hello")
+            if asks:
+                self._send("get_hello")
             with self._changed:
-                greeted = self._wait(lambda: self._hello is not None, _HELLO_EVERY_S)
-            if not greeted and time.monotonic() > deadline:
-                speaks = self._decoder.stats.line.octets > 0
-                raise DeviceSilent(
-                    f"{self.name} {'sends bytes that are no frames' if speaks else 'is silent'}: "
-                    "is it the skin board's port? Flash the board with 'ohmskin flash'"
-                    f"{'' if speaks else ', and check its USB cable'}"
-                )
+                if self._wait(lambda: self._hello is not None, listen_s):
+                    return
+        speaks = self._decoder.stats.line.octets > 0
+        raise DeviceSilent(
+            f"{self.name} {'sends bytes that are no frames' if speaks else 'is silent'}: is it the "
+            "skin board's port? Flash the board with 'ohmskin flash'"
+            f"{'' if speaks else ', and check its USB cable'}"
+        )
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
@@ -140,7 +145,7 @@ class Session(Device):
                         self._changed.notify_all()
                 if self._want_scans and now_s - heard_s > _SPEED_LOST_S:
                     # A board that was reset is back at its default speed.
-                    heard_s = now_s
+                    heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
                     self._link.set_baud(protocol.CONSTANTS["baud_default"])
                     self._send("get_hello")
         except OhmskinError as exc:
