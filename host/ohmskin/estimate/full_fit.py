@@ -38,6 +38,7 @@ from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE,
+    CROWDED,
     HIDDEN,
     MAX_ITERATIONS,
     MAX_STEP,
@@ -177,6 +178,8 @@ class FullFit:
         rise = distance / share
         rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
         hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
+        if prior.touches(self.cell) > CROWDED * rise.size:
+            hidden, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
         self._hidden = hidden = hidden & (rise + rise_std > cell_std)
         by_layers = own[:, :-2].T @ own[:, -2:]
         if hidden.any():
