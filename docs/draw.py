@@ -29,6 +29,9 @@ from ohmskin.link import framing, protocol  # noqa: E402
 from ohmskin.link.codes import ADC_BITS, ratio_std  # noqa: E402
 
 CLOCK_HZ = 16_000_000
+# Hold to the change of pins, at most, and to the end of the conversion, at an ADC clock of 500 kHz.
+PINS_CYCLES = 120
+HELD_CYCLES = 23 * 32 // 2
 CELLS_OHM = (1e3, 1e4, 1e5, 1e6)
 REFERENCES_OHM = (3e3, 1e4, 3e4, 1e5)
 SIZES = range(1, 17)
@@ -56,8 +59,7 @@ def relative_std(cell_ohm: np.ndarray | float, ref_ohm: np.ndarray | float) -> A
 def slot() -> dict[str, float]:
     """A slot at the default setting (8x8, 90 Hz), clock cycles from the timer's zero."""
     trigger = _constant("board_avr.cpp", r"TRIGGER_AT = (\d+);")
-    early = _constant("board_avr.cpp", r"TRIGGER_AT \+ 2u \* prescaler \+ 3 - (\d+)\)")
-    select = _constant("core/scan_plan.h", r"SELECT_CYCLES_MAX = (\d+);")
+    early = _constant("board_avr.cpp", r"TRIGGER_AT \+ 3u \* prescaler \+ 3 - (\d+)\)")
     prescaler = 32
     hold = trigger + 2 * prescaler + 3
     readings, period = 256, round(CLOCK_HZ / 90)
@@ -67,13 +69,14 @@ def slot() -> dict[str, float]:
     return {
         "trigger": trigger,
         "hold": hold,
-        "interrupt": hold - early,
-        "pins_set": hold + select,
+        "interrupt": hold + prescaler - early,
+        "pins_set": hold + PINS_CYCLES,
         "conversion_done": trigger + 13 * prescaler + prescaler // 2 + 3,
         "cycles": cycles,
         "slots": slots,
         "rate_hz": CLOCK_HZ / (cycles * slots),
-        "settle_us": (cycles - select) * 1e6 / CLOCK_HZ,
+        "pins_us": (cycles - PINS_CYCLES) * 1e6 / CLOCK_HZ,
+        "settle_us": (cycles - HELD_CYCLES) * 1e6 / CLOCK_HZ,
     }
 
 
@@ -88,7 +91,8 @@ def scan_rates() -> dict[str, list[float]]:
         ]
     )
     readings = protocol.READINGS_PER_CELL * cells
-    rates = {"converter": CLOCK_HZ / (13 * 32 * readings)}
+    settle_us = _constant("core/scan_plan.h", r"SETTLE_US = (\d+);")
+    rates = {"converter": CLOCK_HZ / ((HELD_CYCLES + settle_us * CLOCK_HZ / 1e6) * readings)}
     for name in ("baud_default", "baud_fast"):
         rates[name] = protocol.CONSTANTS[name] / BITS_PER_BYTE / octets
     most = protocol.CONSTANTS["rate_mhz_max"] / 1000
@@ -117,7 +121,8 @@ def report(drawn: dict[str, Any]) -> None:
     at = drawn["slot"]
     print(
         f"slot at 8x8, 90 Hz: {at['cycles']} cycles, {1e6 * at['cycles'] / CLOCK_HZ:.2f} us; "
-        f"{at['slots']} slots a scan, {at['rate_hz']:.2f} Hz; settle time {at['settle_us']:.1f} us"
+        f"{at['slots']} slots a scan, {at['rate_hz']:.2f} Hz;\nsettle time of the pins {at['pins_us']:.1f} us, of the sample capacitor "
+        f"{at['settle_us']:.1f} us"
     )
     rates = drawn["scan-rate"]
     print("fastest scans a second:   converter   500 kbaud   1 Mbaud")
@@ -173,7 +178,7 @@ def _draw_slot(axes: Any) -> None:
         bar("interrupt", start + at["interrupt"], pins_set, "sets the pins")
         bar("pins, multiplexers", hold, pins_set, "pins may still change")
         settled = min(period + hold, 2 * period)
-        text = "for k+2" if start else f"for k+1: {at['settle_us']:.1f} us"
+        text = "for k+2" if start else f"for k+1: {at['pins_us']:.1f} us"
         bar("pins, multiplexers", pins_set, settled, "pins set: the skin settles", text)
         axes.plot([us * hold, us * hold], [-0.4, 3.4], color="#b03a2e", linewidth=1)
         axes.text(us * hold, 3.5, f"hold {name}", color="#b03a2e", ha="center", fontsize=8)
@@ -189,7 +194,7 @@ def _draw_slot(axes: Any) -> None:
 def _draw_rates(axes: Any) -> None:
     rates = scan_rates()
     names = {
-        "converter": "converter, free running",
+        "converter": "converter, 20 us to settle",
         "baud_default": "line, 500 kbaud",
         "baud_fast": "line, 1 Mbaud",
     }

@@ -90,11 +90,12 @@ constexpr Registers REGISTERS[] = {
 };
 
 // Timer 1 counts a slot. Compare B triggers the conversion, whose sample is held 2 ADC clocks and 3
-// cycles of synchronisation later. Compare A interrupts a little before that, so that the pins,
-// which change 59 cycles or more into the interrupt, do so some 40 cycles after the hold.
+// cycles of synchronisation later. Compare A interrupts so that the pins, which change 59 cycles or
+// more into the interrupt, do so an ADC clock and some cycles after the hold: the data sheet leaves
+// some of that clock open.
 constexpr uint16_t TRIGGER_AT = 8;
 constexpr uint16_t interrupt_at(uint8_t prescaler) {
-    return static_cast<uint16_t>(TRIGGER_AT + 2u * prescaler + 3 - 20);
+    return static_cast<uint16_t>(TRIGGER_AT + 3u * prescaler + 3 - 52);
 }
 uint8_t prescaler_bits(uint8_t prescaler) {
     uint8_t bits = 0;
@@ -114,25 +115,14 @@ inline void select(const Selection &selection) {
 ISR(TIMER1_COMPA_vect) {
     TIFR1 = _BV(OCF1B);  // the next trigger is the flag's next rising edge
     select(scanner.selection());
-    scanner.step(ADC);
-}
-
-// Free running: this comes 1.5 ADC clocks (48 cycles) before the hold, so the pins are set last.
-ISR(ADC_vect) {
-    const Selection next = scanner.selection();
-    scanner.step(ADC);
-    select(next);
+    const uint8_t status = ADCSRA;
+    ADCSRA = static_cast<uint8_t>(status & ~_BV(ADSC));  // clears ADIF if it is set
+    scanner.step(ADC, status & _BV(ADIF));
 }
 
 void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
     const uint8_t bits = prescaler_bits(adc_prescaler);
     select(scanner.selection());
-    if (plan.free_running) {
-        ADCSRB = 0;
-        ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | _BV(ADIE) | bits);
-        ADCSRA |= _BV(ADSC);
-        return;
-    }
     ADCSRB = _BV(ADTS2) | _BV(ADTS0);  // auto trigger by timer 1, compare B
     ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | bits);
     TCCR1A = 0;

@@ -15,15 +15,17 @@ from ohmskin.link import protocol
 pytestmark = pytest.mark.simavr
 
 
+# Slots of 15 ADC clocks.
+HIGHEST = {"rate_mhz": 0, "settle_us": 1}
 SCANS = [
     {},
     {"rate_mhz": 1_000_000, "rows": 1, "columns": 1},
     {"rate_mhz": 400_000, "rows": 3, "columns": 5},
     {"rate_mhz": 30_000, "rows": 16, "columns": 16},
-    {"rate_mhz": 300_000, "rows": 16, "columns": 1, "settle_us": 30},
+    {"rate_mhz": 300_000, "rows": 16, "columns": 1, "settle_us": 25},
     {"rate_mhz": 300_000, "rows": 1, "columns": 16, "settle_us": 20},
     {"rate_mhz": 0, "settle_us": 40},
-    {"rate_mhz": 70_000, "adc_prescaler": "clock_250khz"},
+    {"rate_mhz": 60_000, "adc_prescaler": "clock_250khz"},
     {"rate_mhz": 0, "adc_prescaler": "clock_250khz"},
     {"rate_mhz": 30_000, "adc_prescaler": "clock_125khz"},
     {"rate_mhz": 0, "adc_prescaler": "clock_125khz", "settle_us": 200},
@@ -66,7 +68,8 @@ def test_codes_order_time_and_settling_are_exact(
     assert np.abs(times - times[0] - since_start).max() <= 1
 
     assert hello["settle_us"] >= hello["settle_asked_us"]
-    assert stats["settle_cycles_min"] >= hello["settle_us"] * CYCLES_PER_US
+    for settled in ("settle_cycles_min", "channel_settle_cycles_min"):
+        assert stats[settled] >= hello["settle_us"] * CYCLES_PER_US
     assert stats["lost_results"] == stats["undriven"] == stats["reference_not_avcc"] == 0
 
 
@@ -85,10 +88,10 @@ def test_scan_starts_do_not_jitter(rig: Rig) -> None:
     assert_whole(rig)
 
 
-@pytest.mark.parametrize("rate_mhz", [90_000, 0])
-def test_settle_time_is_kept_while_commands_arrive(rig: Rig, rate_mhz: int) -> None:
+@pytest.mark.parametrize("scan", [{}, HIGHEST])
+def test_settle_time_is_kept_while_commands_arrive(rig: Rig, scan: dict[str, int]) -> None:
     go_fast(rig)
-    rig.start_scan(rate_mhz=rate_mhz)
+    rig.start_scan(**scan)
     hello = rig.hello()
     rig.sim.reset_stats()
     for _ in range(100):
@@ -154,7 +157,7 @@ def assert_missing_are_dropped(rig: Rig) -> None:
 def test_line_too_slow_drops_whole_scans_and_counts_them(
     rig: Rig, rng: np.random.Generator
 ) -> None:
-    rig.start_scan(rate_mhz=0)
+    rig.start_scan(rate_mhz=2_000_000, rows=1, columns=2)
     for _ in range(10):
         rig.run(0.1)
         rig.randomize(rng)
@@ -164,7 +167,7 @@ def test_line_too_slow_drops_whole_scans_and_counts_them(
     assert check.wrong == 0
     assert_missing_are_dropped(rig)
     assert rig.scans[-1].header["dropped"] > 10
-    assert len(rig.scans) > 0.7 * len(check.start_cycles)  # what the line carries arrives
+    assert len(rig.scans) > 0.65 * len(check.start_cycles)  # what the line carries arrives
 
 
 LOADS = [
@@ -174,9 +177,9 @@ LOADS = [
     ((16, 10), 0),
     ((5, 3), 0),
     ((2, 2), 0),
-    ((16, 16), 35_000),
-    ((8, 8), 143_000),
-    ((10, 10), 90_000),
+    ((16, 16), 32_000),
+    ((8, 8), 130_000),
+    ((10, 10), 80_000),
     ((2, 2), 1_200_000),
 ]
 
@@ -187,7 +190,7 @@ def test_no_load_damages_a_frame(rig: Rig, ratio: float | None) -> None:
     if ratio is not None:
         rig.set_codes(np.full(TABLE_SHAPE, int(ratio * CODES), np.uint16), np.random.default_rng(0))
     for (rows, columns), rate_mhz in LOADS:
-        rig.start_scan(rows=rows, columns=columns, rate_mhz=rate_mhz)
+        rig.start_scan(rows=rows, columns=columns, rate_mhz=rate_mhz, settle_us=not rate_mhz)
         rig.run(0.15)
         rig.must("stop")
         assert rig.damaged == 0, (rows, columns, rate_mhz)
@@ -216,20 +219,22 @@ def test_settle_time_before_each_hold(rig: Rig) -> None:
     assert set(slots[first_cell]) == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize("rate_mhz", [90_000, 0])
-def test_pins_change_after_the_hold_and_not_before(rig: Rig, rate_mhz: int) -> None:
-    """An ADC clock is 32 cycles; the data sheet leaves some of one open."""
-    rig.start_scan(rate_mhz=rate_mhz)
+@pytest.mark.parametrize(("clock_khz", "adc_clock"), [(500, 32), (250, 64), (125, 128)])
+def test_pins_change_after_the_hold_and_not_before(
+    rig: Rig, clock_khz: int, adc_clock: int
+) -> None:
+    """The data sheet leaves some of an ADC clock open."""
+    rig.start_scan(rate_mhz=0, adc_prescaler=f"clock_{clock_khz}khz")
     rig.sim.reset_stats()
     rig.run(0.1)
-    assert rig.sim.stats()["change_after_hold_cycles_min"] >= 32
+    assert rig.sim.stats()["change_after_hold_cycles_min"] >= adc_clock
 
 
 @pytest.mark.parametrize("cells", [(1, 1), (2, 1), (3, 1), (4, 3)])
 def test_small_scans_at_the_highest_rate_are_dropped_whole_and_carry_their_own_number(
     rig: Rig, rng: np.random.Generator, cells: tuple[int, int]
 ) -> None:
-    rig.start_scan(rate_mhz=0, rows=cells[0], columns=cells[1])
+    rig.start_scan(**HIGHEST, rows=cells[0], columns=cells[1])
     for _ in range(600):
         rig.run_cycles(int(rng.integers(1000, 5000)))
         rig.randomize(rng)
@@ -242,7 +247,7 @@ def test_small_scans_at_the_highest_rate_are_dropped_whole_and_carry_their_own_n
 def test_commands_back_to_back_at_the_highest_rate(rig: Rig, rng: np.random.Generator) -> None:
     commands = ("get_hello", "start", "get_hello", "start")
     go_fast(rig)
-    rig.start_scan(rate_mhz=0)
+    rig.start_scan(**HIGHEST)
     for _ in range(40):
         before = len(rig.frames("ack"))
         rig.sim.write(b"".join(rig.encode(name) for name in commands))
@@ -289,7 +294,7 @@ def test_a_command_at_the_highest_rate_loses_no_scan(
     rig: Rig, rng: np.random.Generator, command: str
 ) -> None:
     go_fast(rig)
-    rig.start_scan(rate_mhz=0)
+    rig.start_scan(**HIGHEST)
     for unit_id in range(40):
         rig.must("set_unit_id", unit_id=unit_id * 0x01010101)
         rig.must(command)
@@ -303,13 +308,13 @@ def test_the_fast_line_carries_every_scan(
     rig: Rig, rng: np.random.Generator, cells: tuple[int, int]
 ) -> None:
     go_fast(rig)
-    rig.start_scan(rate_mhz=0, rows=cells[0], columns=cells[1])
+    rig.start_scan(**HIGHEST, rows=cells[0], columns=cells[1])
     for _ in range(10):
         rig.run(0.07)
         rig.randomize(rng)
     rig.must("stop")
     assert_whole(rig)
-    assert rig.check().readings > 0.69 * 38_000
+    assert rig.check().readings > 0.69 * 33_000
 
 
 def test_random_bytes_change_nothing(rig: Rig, rng: np.random.Generator) -> None:
@@ -388,9 +393,9 @@ def test_nodes_of_a_few_us_settle_within_a_code_at_90_hz(rig: Rig, tau_us: float
     assert np.abs(codes - np.floor(np.array(RC_RATIO) * 1024)).max() <= 1
 
 
-@pytest.mark.parametrize("tau_us", [4.0, 8.0])
-def test_shortfall_at_free_running_is_that_of_the_settle_time(rig: Rig, tau_us: float) -> None:
-    codes, stats = readings_with_time_constant(rig, tau_us, rate_mhz=0)
+@pytest.mark.parametrize("tau_us", [6.0, 10.0])
+def test_a_shortfall_is_that_of_the_settle_time(rig: Rig, tau_us: float) -> None:
+    codes, stats = readings_with_time_constant(rig, tau_us, rate_mhz=130_000)
     slot = stats["trigger_gap_cycles_min"]
     a, b, c, d = RC_RATIO
     # A and C come right after a change of drive; B and D one slot later, of the other node. Each

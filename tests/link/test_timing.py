@@ -34,7 +34,7 @@ def test_readings_are_timed_as_the_emulated_board_takes_them(
     assert offsets_s.shape == (rows, columns, 4)
     in_order = offsets_s.transpose(1, 0, 2).reshape(-1)  # cells are column-major
     np.testing.assert_allclose(in_order, slots_s[0] * np.arange(in_order.size))
-    assert in_order[-1] < scan_s(hello) <= hello.scan_cycles / hello.clock_hz
+    assert in_order[-1] < scan_s(hello) < (hello.scan_cycles + 1) / hello.clock_hz
 
 
 @pytest.mark.simavr

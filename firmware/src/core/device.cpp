@@ -298,7 +298,7 @@ void Device::send_hello() {
         plan_.slot_cycles,
         board::CLOCK_HZ,
         settings_.request.settle_us,
-        settle_us(plan_, board::CLOCK_HZ),
+        settle_us(plan_, settings_.request.adc_prescaler, board::CLOCK_HZ),
         settings_.request.adc_prescaler,
         baud_,
         static_cast<uint8_t>(settings_source_),

@@ -72,20 +72,17 @@ Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan) 
 
     const uint16_t readings = readings_in(request.rows, request.columns);
     const uint16_t cycles_per_us = static_cast<uint16_t>(clock_hz / 1000000);
-    uint16_t slot_min = timing::triggered_slot_min(request.adc_prescaler);
+    const uint8_t prescaler = request.adc_prescaler;
+    uint16_t slot_min = timing::slot_min(prescaler);
+    const uint16_t settle_us =
+        request.rate_mhz == 0 && request.settle_us == 0 ? timing::SETTLE_US : request.settle_us;
     const uint16_t settled =
-        static_cast<uint16_t>(request.settle_us * cycles_per_us + timing::SELECT_CYCLES_MAX);
-    if (request.settle_us != 0 && settled > slot_min)
+        static_cast<uint16_t>(settle_us * cycles_per_us + timing::held_cycles(prescaler));
+    if (settle_us != 0 && settled > slot_min)
         slot_min = settled;
 
-    ScanPlan result = {slot_min, readings, 0, false};
+    ScanPlan result = {slot_min, readings, 0};
     if (request.rate_mhz == 0) {
-        // Only the default prescaler leaves the interrupt time to wait for the hold by itself.
-        if (request.settle_us == 0 &&
-            request.adc_prescaler == static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz)) {
-            result.free_running = true;
-            result.slot_cycles = timing::free_running_slot(request.adc_prescaler);
-        }
         // Small skins: the main loop keeps up with rate_mhz_max, as with any other rate.
         const uint32_t shortest = period_cycles(clock_hz, frames::RATE_MHZ_MAX);
         const uint16_t slots =

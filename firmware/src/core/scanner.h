@@ -15,7 +15,8 @@ namespace ohmskin {
 //
 // The interrupt comes once a slot, just after the sample of slot k is held. It sets pins and
 // multiplexers to selection(), so they settle while slot k is converted, and calls step(). Slots
-// beyond the last reading of a scan are idle: they fill up the scan's period.
+// beyond the last reading of a scan are idle: they fill up the scan's period. A slot whose
+// conversion is missing, because the converter was late, ends the scan.
 //
 // Codes reach the main loop a cell at a time, through a queue with one writer and one reader and
 // 8-bit indices, which an AVR reads and writes in one instruction: no interrupt is ever held off.
@@ -39,16 +40,18 @@ class Scanner {
         write_ = read_ = 0;
         scan_ = 0;
         skipping_ = true;
-        stopping_ = parked_ = false;
+        stopping_ = parked_ = late_ = false;
     }
 
-    // Once a slot, from the interrupt.
+    // Once a slot, from the interrupt. converted: whether a conversion has ended since the last
+    // one.
     const Selection &selection() const { return sequence_.at(); }
-    void step(uint16_t code) {
+    void step(uint16_t code, bool converted) {
         const uint8_t kinds = kinds_;
         const uint8_t held = kinds & HELD;
         if (held != 0)
-            push(code, held);
+            push(code, held, converted);
+        late_ = !converted;
         kinds_ = static_cast<uint8_t>(kinds << KIND_BITS | next_kind());
     }
 
@@ -108,18 +111,23 @@ class Scanner {
         return STARTS_SCAN;
     }
 
-    // Room is made sure of for a whole cell at its first code. Where there is none, the rest of the
-    // scan is left out, so that the main loop sees a scan cut short and never one with a hole.
-    void push(uint16_t code, uint8_t held) {
+    // Room is made sure of for a whole cell at its first code. Where there is none, or a code is
+    // missing, the rest of the scan is left out, so that the main loop sees a scan cut short and
+    // never one with a hole. A code that comes late is not taken for the first of the next scan.
+    void push(uint16_t code, uint8_t held, bool converted) {
         const uint8_t at = write_;
         if (held != READING << HELD_SHIFT) {
             const bool first_cell = held == STARTS_SCAN << HELD_SHIFT;
             if (first_cell) {
                 code |= FIRST | (scan_++ & (SCAN_NUMBERS - 1)) << frames::ADC_BITS;
-                skipping_ = false;
+                skipping_ = late_;
             }
             if (!skipping_ && static_cast<uint8_t>((at + CELL) & QUEUE_MASK) == read_)
                 skipping_ = true;
+        }
+        if (!converted) {
+            skipping_ = true;
+            write_ = static_cast<uint8_t>(at & ~(CELL - 1));
         }
         if (skipping_)
             return;
@@ -134,6 +142,7 @@ class Scanner {
     volatile bool stopping_ = false;
     volatile bool parked_ = false;
     bool skipping_ = true;  // until the next scan starts
+    bool late_ = false;     // the conversion of the slot before was
     bool idling_ = true;
     uint8_t kinds_ = 0;
     uint8_t scan_ = 0;

@@ -344,10 +344,11 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
     cells = (clear > UNSETTLED_LSB).any(axis=2)
     if not cells.any():
         return False
-    # A node that is left with e of its swing S after t settles with tau = t / ln(S / e).
+    # A node that is left with e of its swing S after a slot t settles with tau = t / ln(S / e).
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(float(change.max()), 0.9 * swing)
-    needed_us = settle_us * np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
+    slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
+    needed_us = settle_us + 1e6 * slot_s(usual.board) * (slots - 1)
     diagnosis.add(
         Kind.SETTLING,
         WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),

@@ -46,11 +46,11 @@ _CONSTANTS = protocol.CONSTANTS
 _PRESCALERS = protocol.ENUMS["adc_prescaler"].values
 _REASONS = protocol.ENUMS["result"].docs
 _DEFAULT_PRESCALER = "clock_500khz"
-# Longest time from the hold of a reading to the change of pins [cycles], and the longest slot
-# (firmware/src/core/scan_plan.h).
+# Longest time from the hold of a reading to the change of pins [cycles]; the longest slot, and what
+# it leaves for settling where nothing else is asked [us] (firmware/src/core/scan_plan.h).
 _SELECT_CYCLES = 120
-_SELECT_CYCLES_FREE_RUNNING = 180
 _SLOT_CYCLES_MAX = 60_000
+_SETTLE_US = 20
 # At a pseudo-terminal: without scans, faults that are due are looked for as often as this [s].
 _IDLE_S = 0.2
 # The largest number of bytes that is taken there from the host at once.
@@ -159,8 +159,8 @@ class EmulatedBoard:
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s)[: have[0], : have[1]]
         if self._sampled is not None:
-            slot_s, settle_s = self._plan["slot_cycles"] / CLOCK_HZ, 1e-6 * self._plan["settle_us"]
-            ratio = self._sampled(ratio, time_s, slot_s, settle_s)
+            slot_s = self._plan["slot_cycles"] / CLOCK_HZ
+            ratio = self._sampled(ratio, time_s, slot_s, slot_s - _SELECT_CYCLES / CLOCK_HZ)
         if self._noise_ratio:
             ratio += self._noise_ratio * self._random.standard_normal(ratio.shape)
         return quantise(ratio, protocol.ADC_BITS)
@@ -276,13 +276,11 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
             raise _Refused(result)
     prescaler = _PRESCALERS[wanted["adc_prescaler"]]
     readings = wanted["rows"] * wanted["columns"] * protocol.READINGS_PER_CELL
-    select = _SELECT_CYCLES
-    slot = 13 * prescaler + prescaler // 2 + 4
-    if settle:
-        slot = max(slot, settle * CLOCK_HZ // 1_000_000 + select)
+    # From the hold to the end of the conversion the sample capacitor is off.
+    slot, held = 15 * prescaler, 11 * prescaler + prescaler // 2
+    if settle or not rate:
+        slot = max(slot, (settle or _SETTLE_US) * CLOCK_HZ // 1_000_000 + held)
     if not rate:
-        if not settle and wanted["adc_prescaler"] == _DEFAULT_PRESCALER:
-            slot, select = 13 * prescaler, _SELECT_CYCLES_FREE_RUNNING
         shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
         period = slot * max(readings, math.ceil(shortest / slot))
     else:
@@ -292,7 +290,7 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
         # Equal slots fill the period: as short as the settle time lets them be, or long ones.
         slots = period // slot if settle else max(readings, -(-period // _SLOT_CYCLES_MAX))
         slot = period // slots
-    settle_us = (slot - select) * 1_000_000 // CLOCK_HZ
+    settle_us = (slot - held) * 1_000_000 // CLOCK_HZ
     return {"scan_cycles": period, "slot_cycles": slot, "settle_us": settle_us}
 
 

@@ -165,7 +165,7 @@ class Device(Closing):
     ) -> Hello:
         """Change how the board scans; what is not given stays. Returns what the board now keeps.
 
-        rate_hz: scans per second; 0: as fast as the converter runs. settle_us: least time from a
+        rate_hz: scans per second; 0: as fast as readings settle. settle_us: least time from a
         multiplexer change to the sample; 0: as long as the rate allows. adc_prescaler: a name of
         the enum `adc_prescaler`.
 
