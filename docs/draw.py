@@ -121,8 +121,9 @@ def report(drawn: dict[str, Any]) -> None:
     at = drawn["slot"]
     print(
         f"slot at 8x8, 90 Hz: {at['cycles']} cycles, {1e6 * at['cycles'] / CLOCK_HZ:.2f} us; "
-        f"{at['slots']} slots a scan, {at['rate_hz']:.2f} Hz;\nsettle time of the pins {at['pins_us']:.1f} us, of the sample capacitor "
-        f"{at['settle_us']:.1f} us"
+        f"{at['slots']} slots a scan, {at['rate_hz']:.2f} Hz;\n"
+        f"settle time of the pins {at['pins_us']:.1f} us, "
+        f"of the sample capacitor {at['settle_us']:.1f} us"
     )
     rates = drawn["scan-rate"]
     print("fastest scans a second:   converter   500 kbaud   1 Mbaud")
