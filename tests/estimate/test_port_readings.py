@@ -138,15 +138,22 @@ def test_readings_that_disagree_are_named(rest: Skin, touched: Skin) -> None:
     assert "readings of most cells disagree" in reader.read(ratio).fault
 
 
-@pytest.mark.parametrize("codes", [0.0, 0.05, 0.15, 0.3, 1.0, 4.0])
-def test_errors_of_currents_are_as_large_as_stated(rest: Skin, codes: float) -> None:
-    """Normal noise of so many codes, then rounding. Noise makes the four readings independent."""
+@pytest.mark.parametrize(
+    ("codes", "offset"),
+    [(0.0, 0), (0.05, 0), (0.15, 0), (0.3, 0), (1.0, 0), (4.0, 0), (0.3, 2), (1.0, -5)],
+)
+def test_errors_of_currents_are_as_large_as_stated(rest: Skin, codes: float, offset: int) -> None:
+    """Normal noise of so many codes, then rounding. Noise makes the four readings independent.
+
+    offset: of the top node's readings [codes], of which the currents show nothing.
+    """
     random = np.random.default_rng(4)
     reader = reader_of(None)
     exact = reader.read(readings(rest)).current
     away = []
     for _ in range(20):
         noisy = readings(rest) + codes / 1024 * random.standard_normal((8, 8, 4))
+        noisy[..., [0, 3]] += offset / 1024
         found = reader.read(ten_bits(noisy))
         assert not found.fault
         away.append((found.current - exact) / found.current_std)

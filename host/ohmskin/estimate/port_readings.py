@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 _DEGREES: Final = READINGS_PER_CELL - 1
 # Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
 _MOST_USUAL: Final = 9.0
+MOST_OFFSET: Final = 0.008  # of a sense node, ratio to Vdd: a larger one is a fault
 # Disagreement of a cell's readings, root of its mean square, ratio to Vdd: of most cells, of one.
 DISAGREE_ALL: Final = 0.016
 DISAGREE_ONE: Final = 0.03
@@ -107,6 +108,10 @@ class PortReader:
         """Currents of checked readings (R, C, 4), and what is wrong with them."""
         current = current_from_ratio(ratio, *self._ref_ohm)
         residual = ratio - ratio_from_current(current, *self._ref_ohm)
+        for pair in ((0, 3), (1, 2)):
+            # Currents do not show a node's offset: its two readings have it with opposite signs.
+            offset = np.median(residual[..., pair].mean(axis=2))
+            residual[..., pair] -= np.clip(offset, -MOST_OFFSET, MOST_OFFSET)
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
