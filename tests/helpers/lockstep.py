@@ -160,9 +160,9 @@ class Check:
 class Rig:
     """A board in lock-step with a host that knows what every reading must be."""
 
-    def __init__(self, board: str) -> None:
+    def __init__(self, board: str, sim: LockstepSim | None = None) -> None:
         self.board = board
-        self.sim = LockstepSim(board, elf_of(board))
+        self.sim = sim or LockstepSim(board, elf_of(board))
         self.decoder = framing.Decoder()
         self.scans: list[ReceivedScan] = []
         self.log: list[tuple[str, dict[str, Any]]] = []

@@ -1,0 +1,220 @@
+// SPDX-License-Identifier: Apache-2.0
+// A board: the chip's flash, peripherals of avr8js at the addresses of its data sheet, a host at its
+// serial line, and a skin behind its pins.
+"use strict";
+
+const avr8js = require("avr8js");
+const { Converter } = require("./converter");
+const { SerialLine } = require("./serial_line");
+
+const CPU_HZ = 16e6;
+const REGISTERS_END = 0x100; // avr8js counts what lies above it as SRAM
+const MCUSR = 0x54, TIFR1 = 0x36, OCF1B = 0x04;
+const POWER_ON = 0x01, EXTERNAL = 0x02, WATCHDOG = 0x08; // bits of MCUSR
+const NEVER_CYCLES = 0xffffffff;
+const A_TO_D = 4, EQUAL_DRIVE = 4, UNDRIVEN = 5, OTHER_CHANNEL = 6;
+
+const { timer0Config, timer1Config, usart0Config, eepromConfig, watchdogConfig } = avr8js;
+
+// The Mega's vectors are those of its data sheet, table 14-1, as word addresses. Its ports get no pin
+// interrupts, which avr8js has at the places of the ATmega328P only.
+const port = (letter) => ({ ...avr8js[`port${letter}Config`], pinChange: undefined, externalInterrupts: [] });
+const B = avr8js.portBConfig.PORT, D = avr8js.portDConfig.PORT, G = avr8js.portGConfig.PORT;
+const CHIPS = {
+    uno: {
+        flashBytes: 0x8000,
+        ramStart: 0x100,
+        ramBytes: 0x800,
+        eepromBytes: 1024,
+        ports: { B: port("B"), C: port("C"), D: port("D") },
+        timer0: timer0Config,
+        timer1: timer1Config,
+        usart0: usart0Config,
+        eeprom: eepromConfig,
+        watchdog: watchdogConfig,
+        converterVector: 0x2a,
+        // Port and lowest bit, as in the README's table of wires.
+        row: ["D", 4],
+        column: ["B", 0],
+        driveTop: ["D", 2],
+        driveBottom: ["D", 3],
+    },
+    megaatmega2560: {
+        flashBytes: 0x40000,
+        ramStart: 0x200,
+        ramBytes: 0x2000,
+        eepromBytes: 4096,
+        ports: Object.fromEntries([..."ABCDEFGHJKL"].map((letter) => [letter, port(letter)])),
+        timer0: {
+            ...timer0Config,
+            ...{ compAInterrupt: 0x2a, compBInterrupt: 0x2c, ovfInterrupt: 0x2e },
+            ...{ compPortA: B, compPinA: 7, compPortB: G, compPinB: 5 },
+            ...{ externalClockPort: D, externalClockPin: 7 },
+        },
+        timer1: {
+            ...timer1Config,
+            ...{ captureInterrupt: 0x20, compAInterrupt: 0x22, compBInterrupt: 0x24 },
+            ...{ compCInterrupt: 0x26, ovfInterrupt: 0x28, OCRC: 0x8c, OCFC: 8, OCIEC: 8 },
+            ...{ compPinA: 5, compPinB: 6, compPortC: B, compPinC: 7 },
+            ...{ externalClockPort: D, externalClockPin: 6 },
+        },
+        usart0: {
+            ...usart0Config,
+            ...{ rxCompleteInterrupt: 0x32, dataRegisterEmptyInterrupt: 0x34 },
+            ...{ txCompleteInterrupt: 0x36 },
+        },
+        eeprom: { ...eepromConfig, eepromReadyInterrupt: 0x3c },
+        watchdog: { ...watchdogConfig, watchdogInterrupt: 0x18 },
+        converterVector: 0x3a,
+        row: ["A", 0],
+        column: ["C", 0],
+        driveTop: ["L", 0],
+        driveBottom: ["L", 1],
+    },
+};
+
+class Board {
+    // hex: text of an Intel HEX file, as avrdude writes it into the flash.
+    constructor(name, hex) {
+        this.chip = CHIPS[name];
+        if (!this.chip) throw new Error(`no board '${name}': there are ${Object.keys(CHIPS).join(", ")}`);
+        this.flash = loadHex(hex, this.chip.flashBytes);
+        this.eeprom = new avr8js.EEPROMMemoryBackend(this.chip.eepromBytes);
+        this.table = new Float64Array(16 * 16 * A_TO_D);
+        this.sent = [];
+        this.logging = false;
+        this.holds = [];
+        this.counters = {
+            ...{ resets: 0, conversions: 0, lost_results: 0, ignored_triggers: 0 },
+            ...{ rx_overruns: 0, rx_ignored: 0 },
+        };
+        this.start(POWER_ON);
+    }
+
+    // A reset clears every register; flash, EEPROM, RAM and the time stay.
+    start(cause) {
+        const { chip } = this;
+        const before = this.cpu;
+        const ramEnd = chip.ramStart + chip.ramBytes;
+        const cpu = new avr8js.CPU(new Uint16Array(this.flash.buffer), ramEnd - REGISTERS_END);
+        this.cpu = cpu;
+        cpu.data[MCUSR] = cause;
+        if (before) {
+            cpu.cycles = before.cycles;
+            cpu.data[MCUSR] |= before.data[MCUSR];
+            cpu.data.set(before.data.subarray(chip.ramStart), chip.ramStart);
+            this.counters.resets++;
+        }
+        this.resetCause = 0;
+        cpu.reset = () => {
+            this.resetCause = WATCHDOG; // by the watchdog alone; done after the instruction
+        };
+        this.ports = {};
+        for (const [letter, config] of Object.entries(chip.ports))
+            this.ports[letter] = new avr8js.AVRIOPort(cpu, config);
+        this.pinsChanged = -Infinity;
+        for (const letter of new Set([chip.row, chip.column, chip.driveTop].map((pin) => pin[0])))
+            this.ports[letter].addListener(() => {
+                this.pinsChanged = cpu.cycles + 2; // an STS writes in its second cycle
+            });
+        new avr8js.AVRTimer(cpu, chip.timer0);
+        const timer1 = new avr8js.AVRTimer(cpu, chip.timer1);
+        new avr8js.AVREEPROM(cpu, this.eeprom, chip.eeprom);
+        const clock = new avr8js.AVRClock(cpu, CPU_HZ);
+        new avr8js.AVRWatchdog(cpu, chip.watchdog, clock);
+        this.line = new SerialLine(cpu, chip.usart0, CPU_HZ, this.sent, this.counters);
+        const sample = (channel, cycle) => this.sample(channel, cycle);
+        const converter = new Converter(cpu, chip.converterVector, sample, this.counters);
+        const setFlag = cpu.setInterruptFlag.bind(cpu);
+        cpu.setInterruptFlag = (interrupt) => {
+            const rises = interrupt === timer1.OCFB && !(cpu.data[TIFR1] & OCF1B);
+            setFlag(interrupt);
+            if (rises) converter.trigger(matchCycle(timer1));
+        };
+    }
+
+    run(cycles) {
+        const end = this.cpu.cycles + cycles;
+        while (this.cpu.cycles < end) this.step();
+    }
+
+    step() {
+        const { cpu } = this;
+        avr8js.avrInstruction(cpu);
+        do {
+            const before = cpu.cycles;
+            cpu.tick(); // at most one event, and one interrupt, whose entry avr8js lets take 2 cycles
+            if (cpu.cycles > before) cpu.cycles += cpu.pc22Bits ? 3 : 2;
+        } while (cpu.nextClockEvent && cpu.nextClockEvent.cycles <= cpu.cycles);
+        if (this.resetCause) this.start(this.resetCause);
+    }
+
+    reset() {
+        this.start(EXTERNAL);
+    }
+
+    takeSent() {
+        return Buffer.from(this.sent.splice(0));
+    }
+
+    // ---- the skin
+    pins([letter, bit], width) {
+        const { DDR, PORT } = this.chip.ports[letter];
+        const mask = ((1 << width) - 1) << bit;
+        const { data } = this.cpu;
+        return { value: (data[PORT] & mask) >> bit, driven: (data[DDR] & mask) === mask };
+    }
+
+    sample(channel, cycle) {
+        const { chip } = this;
+        const row = this.pins(chip.row, 4), column = this.pins(chip.column, 4);
+        const top = this.pins(chip.driveTop, 1), bottom = this.pins(chip.driveBottom, 1);
+        let configuration, ratio = 0;
+        if (channel > 1) {
+            configuration = OTHER_CHANNEL;
+        } else if (![row, column, top, bottom].every((pin) => pin.driven)) {
+            configuration = UNDRIVEN;
+        } else if (top.value === bottom.value) {
+            configuration = EQUAL_DRIVE;
+            ratio = top.value;
+        } else {
+            // A, B: top pin high, nodes top, bottom. C, D: bottom pin high, nodes bottom, top.
+            configuration = top.value ? channel : 3 - channel;
+            ratio = this.table[(row.value * 16 + column.value) * A_TO_D + configuration];
+        }
+        const code = Math.min(1023, Math.max(0, Math.floor(ratio * 1024)));
+        if (this.logging) {
+            const settle = Math.min(NEVER_CYCLES, Math.max(0, cycle - this.pinsChanged));
+            this.holds.push([cycle, row.value, column.value, configuration, channel, code, settle]);
+        }
+        return code;
+    }
+
+    stats() {
+        return { cycles: this.cpu.cycles, ...this.counters };
+    }
+}
+
+// When the counter reached compare B: avr8js notices after an instruction of several cycles.
+function matchCycle(timer) {
+    const turn = timer.TOP + 1;
+    return timer.lastCycle - ((timer.tcnt - timer.ocrB + turn) % turn) * timer.divider;
+}
+
+function loadHex(text, flashBytes) {
+    const flash = new Uint8Array(flashBytes).fill(0xff);
+    let base = 0;
+    for (const line of text.split(/\r?\n/).filter((line) => line !== "")) {
+        const record = Buffer.from(line.slice(1), "hex");
+        const sum = record.reduce((total, octet) => total + octet, 0);
+        if (line[0] !== ":" || record.length !== record[0] + 5 || sum & 0xff)
+            throw new Error(`not a record of an Intel HEX file: ${line}`);
+        const data = record.subarray(4, -1);
+        if (record[3] === 0) flash.set(data, base + record.readUInt16BE(1));
+        else if (record[3] === 2) base = data.readUInt16BE() * 16;
+        else if (record[3] === 4) base = data.readUInt16BE() * 0x10000;
+    }
+    return flash;
+}
+
+module.exports = { Board };

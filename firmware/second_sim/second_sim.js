@@ -1,0 +1,82 @@
+#!/usr/bin/env node
+// SPDX-License-Identifier: Apache-2.0
+// second_sim.js --board uno|megaatmega2560 firmware.hex: see README.md for the operations.
+"use strict";
+
+const fs = require("fs");
+const { Board } = require("./board");
+
+const STDIN = 0, STDOUT = 1;
+const HOLD_BYTES = 18;
+
+function read(count) {
+    const octets = Buffer.alloc(count);
+    for (let done = 0, got; done < count; done += got) {
+        got = fs.readSync(STDIN, octets, done, count - done, null);
+        if (got === 0) process.exit(0); // the other end has closed the pipe
+    }
+    return octets;
+}
+
+function reply(op, content) {
+    const header = Buffer.alloc(5);
+    header.write(op, 0, "latin1");
+    header.writeUInt32LE(content.length, 1);
+    const octets = Buffer.concat([header, content]);
+    for (let done = 0; done < octets.length; ) done += fs.writeSync(STDOUT, octets, done);
+}
+
+function packHolds(holds) {
+    const octets = Buffer.alloc(holds.length * HOLD_BYTES);
+    holds.forEach(([cycle, row, column, configuration, channel, code, settle], i) => {
+        const at = i * HOLD_BYTES;
+        octets.writeBigUInt64LE(BigInt(cycle), at);
+        octets.set([row, column, configuration, channel], at + 8);
+        octets.writeUInt16LE(code, at + 12);
+        octets.writeUInt32LE(settle, at + 14);
+    });
+    return octets;
+}
+
+function holdLog(board, wish) {
+    if (wish < 2) {
+        board.logging = wish === 1;
+        return "";
+    }
+    return packHolds(board.holds.splice(0));
+}
+
+const OPERATIONS = {
+    R: (board, content) => {
+        board.run(Number(content.readBigUInt64LE()));
+        return board.takeSent();
+    },
+    W: (board, content) => board.line.write(content),
+    T: (board, content) => {
+        board.table.forEach((_, i) => (board.table[i] = content.readDoubleLE(8 * i)));
+    },
+    S: (board) => Buffer.from(JSON.stringify(board.stats())),
+    L: (board, content) => holdLog(board, content[0]),
+    E: (board) => Buffer.from(board.eeprom.memory),
+    e: (board, content) => board.eeprom.memory.set(content.subarray(2), content.readUInt16LE()),
+    X: (board) => board.reset(),
+};
+
+function main() {
+    const [flag, name, path] = process.argv.slice(2);
+    if (flag !== "--board" || path === undefined) {
+        console.error("usage: second_sim.js --board uno|megaatmega2560 firmware.hex");
+        process.exit(2);
+    }
+    const board = new Board(name, fs.readFileSync(path, "latin1"));
+    for (;;) {
+        const header = read(5);
+        const op = String.fromCharCode(header[0]);
+        const content = read(header.readUInt32LE(1));
+        const operation = OPERATIONS[op];
+        if (operation) reply(op, Buffer.from(operation(board, content) ?? ""));
+        else reply("!", Buffer.from(`this simulator has no operation '${op}'`));
+    }
+}
+
+main();
