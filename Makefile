@@ -44,7 +44,7 @@ setup-host: $(HOST_STAMP) ## install what the host alone needs (.venv)
 $(HOST_STAMP): pyproject.toml tools/setup.sh
 	tools/setup.sh host
 
-$(STAMP): pyproject.toml tools/setup.sh
+$(STAMP): pyproject.toml tools/setup.sh firmware/second_sim/package-lock.json
 	tools/setup.sh all
 
 check: setup ## formatting, lint, types, generated files, docs
@@ -121,4 +121,4 @@ clean: ## remove what was built
 	$(MAKE) -C firmware/sim clean
 
 distclean: clean ## remove .venv and PlatformIO's packages too
-	rm -rf .venv .pio
+	rm -rf .venv .pio firmware/second_sim/node_modules

@@ -22,6 +22,9 @@ cpu_percent           cycles in which the main loop found nothing to do are idle
                       interrupts included. cpu_percent_max: with the shortest slots.
 settle_us_min_max     as settle_us_min, at rate 0.
 lost_scans, ...       of all runs together.
+wrong_second_simulator, readings_second_simulator
+                      the same as wrong and readings, in avr8js (firmware/second_sim), 8x8: a third
+                      each at 90 Hz, 120 Hz and rate 0.
 flash_bytes           avr-size, text + data.
 ram_bytes             avr-size, data + bss; the stack comes on top.
 
@@ -46,8 +49,10 @@ import numpy as np
 
 from lockstep import BOARDS, CPU_HZ, Rig, elf_of
 from ohmskin.link import protocol
+from second_simulator import SecondSim
 
 READINGS_WANTED = 1_000_000
+READINGS_WANTED_SECOND = 20_000
 
 
 # ------------------------------------------------------------------------------- measurements
@@ -105,6 +110,28 @@ def _sizes(elf: Path) -> tuple[int, int]:
     return text + data, data + bss
 
 
+def _measure_second(board: str, rng: np.random.Generator) -> dict[str, int]:
+    """Readings in the second simulator, and how many of them are wrong."""
+    rates_mhz = (90_000, 120_000, 0)
+    readings = wrong = 0
+    with Rig(board, SecondSim(board)) as rig:
+        rig.run(0.05)
+        rig.must("set_baud", baud=protocol.CONSTANTS["baud_fast"])
+        rig.run(0.01)
+        for rate_mhz in rates_mhz:
+            rig.randomize(rng)
+            rig.start_scan(rate_mhz=rate_mhz)
+            period = rig.hello()["scan_cycles"]
+            while sum(s.codes.size for s in rig.scans) < READINGS_WANTED_SECOND / len(rates_mhz):
+                rig.run_cycles(int(rng.integers(period, 5 * period)))
+                rig.randomize(rng)
+            rig.must("stop")
+            check = rig.check()
+            readings += check.readings
+            wrong += check.wrong
+    return {"wrong_second_simulator": wrong, "readings_second_simulator": readings}
+
+
 def measure(board: str) -> dict[str, Any]:
     """All figures of one board, as the JSON line has them."""
     rng = np.random.default_rng(BOARDS.index(board))
@@ -121,6 +148,7 @@ def measure(board: str) -> dict[str, Any]:
         large = _measure_run(rig, rng, READINGS_WANTED // 5, "rate 0, 16x16")
         rig.start_scan(rate_mhz=0, settle_us=1)
         shortest = _measure_run(rig, rng, READINGS_WANTED, "shortest slots")
+    second = _measure_second(board, rng)
     flash, ram = _sizes(elf_of(board))
     runs = (normal, fastest, large, shortest)
     return {
@@ -137,6 +165,7 @@ def measure(board: str) -> dict[str, Any]:
         "readings_max": shortest["readings"],
         "wrong_16x16": large["wrong"],
         "readings_16x16": large["readings"],
+        **second,
         "settle_us_min": round(normal["settle_us_min"], 3),
         "settle_us_min_max": round(fastest["settle_us_min"], 3),
         "cpu_percent": round(normal["cpu_percent"], 2),
@@ -172,6 +201,8 @@ BARS = (
     Bar("wrong_16x16", "0", lambda x: x == 0),
     Bar("readings_90hz", ">= 1,000,000", lambda x: x >= READINGS_WANTED),
     Bar("readings_max", ">= 1,000,000", lambda x: x >= READINGS_WANTED),
+    Bar("wrong_second_simulator", "0", lambda x: x == 0),
+    Bar("readings_second_simulator", ">= 20,000", lambda x: x >= READINGS_WANTED_SECOND),
     Bar("settle_us_min", ">= 20", lambda x: x >= 20),
     Bar("settle_us_min_max", ">= 20", lambda x: x >= 20),
     Bar("lost_scans", "0", lambda x: x == 0),
@@ -185,7 +216,7 @@ BARS = (
 def report(figures: dict[str, dict[str, Any]]) -> bool:
     """Print the bars; true when all are met."""
     all_met = True
-    print(f"{'board':16}{'figure':22}{'measured':>12}  {'bar':14}")
+    print(f"{'board':16}{'figure':26}{'measured':>12}  {'bar':14}")
     for board, measured in figures.items():
         for bar in BARS:
             if board in bar.boards:
@@ -193,7 +224,7 @@ def report(figures: dict[str, dict[str, Any]]) -> bool:
                 all_met = all_met and met
                 verdict = "pass" if met else "FAIL"
                 print(
-                    f"{board:16}{bar.figure:22}{measured[bar.figure]:>12}  {bar.wanted:14}{verdict}"
+                    f"{board:16}{bar.figure:26}{measured[bar.figure]:>12}  {bar.wanted:14}{verdict}"
                 )
     return all_met
 

@@ -17,6 +17,7 @@ from hypothesis import settings
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+import second_simulator
 from command_line import ENVIRONMENT, Command, Done, Run
 from ohmskin.cli import main as cli
 from ohmskin.emulate.board import EmulatedBoard, PtyServer
@@ -46,6 +47,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _is_missing("ngspice", "ngspice")
     if item.get_closest_marker("browser") and not shutil.which("chromium"):
         _is_missing("Chromium", "chromium")
+    if item.get_closest_marker("second_sim") and not second_simulator.is_installed():
+        _is_missing("avr8js", "npm")
 
 
 def _is_missing(program: str, package: str) -> None:

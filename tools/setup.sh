@@ -4,7 +4,8 @@
 # Usage: tools/setup.sh host|all        (run by `make`, from the repository's root)
 #
 # host: .venv with the ohmskin package.
-# all: also the AVR tools, ngspice and Chromium (for tests) from apt, and the development tools.
+# all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second simulator,
+# for tests) from npm, and the development tools.
 # Installs only what is missing, and says what.
 set -euo pipefail
 
@@ -77,6 +78,16 @@ pip_install() { # requirement
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable "$1"
 }
 
+npm_install() { # folder
+    [[ $1/node_modules/.package-lock.json -nt $1/package-lock.json ]] && return
+    if command -v npm >/dev/null; then
+        echo "setup: installing avr8js into $1/node_modules"
+        npm ci --prefix "$1" --ignore-scripts --no-audit --no-fund --fetch-retries=1 \
+            --loglevel=error && return
+    fi
+    echo "setup: without npm and its registry, tests in the second simulator are skipped"
+}
+
 case ${1:-} in
 host)
     make_venv
@@ -88,7 +99,9 @@ all)
         apt_install "${APT_PACKAGES[@]}"
         apt_install chromium fonts-dejavu-core ||
             echo "setup: without Chromium (Ubuntu has a snap alone) tests of the page are skipped"
+        command -v npm >/dev/null || apt_install nodejs npm || true
     fi
+    npm_install firmware/second_sim
     make_venv
     pip_install '.[dev]'
     touch .venv/.stamp-host .venv/.stamp

@@ -153,6 +153,10 @@ class Board {
         this.start(EXTERNAL);
     }
 
+    jump(byteAddress) {
+        this.cpu.pc = byteAddress / 2;
+    }
+
     takeSent() {
         return Buffer.from(this.sent.splice(0));
     }

@@ -39,11 +39,8 @@ function packHolds(holds) {
 }
 
 function holdLog(board, wish) {
-    if (wish < 2) {
-        board.logging = wish === 1;
-        return "";
-    }
-    return packHolds(board.holds.splice(0));
+    if (wish === 2) return packHolds(board.holds.splice(0));
+    board.logging = wish === 1;
 }
 
 const OPERATIONS = {
@@ -60,6 +57,7 @@ const OPERATIONS = {
     E: (board) => Buffer.from(board.eeprom.memory),
     e: (board, content) => board.eeprom.memory.set(content.subarray(2), content.readUInt16LE()),
     X: (board) => board.reset(),
+    J: (board, content) => board.jump(content.readUInt32LE()),
 };
 
 function main() {

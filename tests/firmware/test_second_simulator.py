@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The HEX files that boards are flashed with, in avr8js: what simavr says, a second time."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import test_firmware_commands as commands
+import test_firmware_scan as scans
+import test_firmware_self_test as self_test
+import test_firmware_settings as settings
+
+from firmware_helpers import BOOT_S, CYCLES_PER_US, assert_whole, go_fast
+from lockstep import BOARDS, TABLE_SHAPE, Rig, elf_of, first_holds
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.link.codes import quantise
+from second_simulator import SecondSim
+
+pytestmark = pytest.mark.second_sim
+
+saved = settings.saved
+test_boot_hello = commands.test_boot_hello
+test_golden_commands = commands.test_golden_commands_are_acknowledged
+test_golden_damaged_frames = commands.test_golden_damaged_frames_are_not_answered
+test_bad_commands = commands.test_bad_commands_are_refused_by_name_and_change_nothing
+test_commands_at_the_highest_rate = scans.test_commands_back_to_back_at_the_highest_rate
+test_saved_settings = settings.test_saved_settings_survive_a_reset
+test_save_while_scanning = settings.test_save_while_scanning_loses_no_scan
+test_self_test = self_test.test_self_test_of_a_sound_board
+test_watchdog = scans.test_watchdog_restarts_a_hung_main_loop
+
+
+@pytest.fixture(params=BOARDS)
+def rig(request: pytest.FixtureRequest, rng: np.random.Generator) -> Iterator[Rig]:
+    if not elf_of(request.param).with_suffix(".hex").exists():
+        pytest.skip(f"the firmware for {request.param} is not built: make firmware")
+    with Rig(request.param, SecondSim(request.param)) as rig:
+        rig.run(BOOT_S)
+        rig.randomize(rng)
+        yield rig
+
+
+@pytest.mark.parametrize("rate_mhz", [90_000, 120_000, 0])
+def test_codes_times_and_settling(rig: Rig, rng: np.random.Generator, rate_mhz: int) -> None:
+    """Circuits that change; their references differ, so no two configurations read alike."""
+    go_fast(rig)
+    rig.start_scan(rate_mhz=rate_mhz)
+    hello = rig.hello()
+    for _ in range(5):
+        cells, wires_ohm = 10 ** rng.uniform(-6, -3, (8, 8)), rng.uniform(0, 300, (2, 8, 8))
+        codes = np.zeros(TABLE_SHAPE, np.uint16)
+        codes[:8, :8] = quantise(readings(Skin(cells, *wires_ohm, ref_top_ohm=20e3)))
+        rig.set_codes(codes, rng)
+        rig.run_cycles(int(rng.integers(300_000, 700_000)))
+    rig.must("stop")
+    assert_whole(rig)
+    check, holds = rig.check(), rig.holds()
+    assert check.readings > 2000
+    np.testing.assert_array_equal(np.diff(check.start_cycles), hello["scan_cycles"])
+    settled = holds["settle_cycles"][first_holds(holds)[1] :]
+    assert settled.min() >= hello["settle_us"] * CYCLES_PER_US
+    assert rig.sim.stats()["ignored_triggers"] == 0
