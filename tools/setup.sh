@@ -4,8 +4,8 @@
 # Usage: tools/setup.sh host|all        (run by `make`, from the repository's root)
 #
 # host: .venv with the ohmskin package.
-# all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second simulator,
-# for tests) from npm, and the development tools.
+# all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second
+# simulator, for tests) from npm, and the development tools.
 # Installs only what is missing, and says what.
 set -euo pipefail
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A board: the chip's flash, peripherals of avr8js at the addresses of its data sheet, a host at its
-// serial line, and a skin behind its pins.
+// A board: the chip's flash, peripherals of avr8js at the addresses of its data sheet, a host at
+// its serial line, and a skin behind its pins.
 "use strict";
 
 const avr8js = require("avr8js");
@@ -16,9 +16,13 @@ const A_TO_D = 4, EQUAL_DRIVE = 4, UNDRIVEN = 5, OTHER_CHANNEL = 6;
 
 const { timer0Config, timer1Config, usart0Config, eepromConfig, watchdogConfig } = avr8js;
 
-// The Mega's vectors are those of its data sheet, table 14-1, as word addresses. Its ports get no pin
-// interrupts, which avr8js has at the places of the ATmega328P only.
-const port = (letter) => ({ ...avr8js[`port${letter}Config`], pinChange: undefined, externalInterrupts: [] });
+// The Mega's vectors are those of its data sheet, table 14-1, as word addresses. Ports have no pin
+// interrupts: avr8js has them where the ATmega328P has them, and the firmware uses none.
+const port = (letter) => ({
+    ...avr8js[`port${letter}Config`],
+    pinChange: undefined,
+    externalInterrupts: [],
+});
 const B = avr8js.portBConfig.PORT, D = avr8js.portDConfig.PORT, G = avr8js.portGConfig.PORT;
 const CHIPS = {
     uno: {
@@ -77,7 +81,8 @@ class Board {
     // hex: text of an Intel HEX file, as avrdude writes it into the flash.
     constructor(name, hex) {
         this.chip = CHIPS[name];
-        if (!this.chip) throw new Error(`no board '${name}': there are ${Object.keys(CHIPS).join(", ")}`);
+        const names = Object.keys(CHIPS).join(", ");
+        if (!this.chip) throw new Error(`no board '${name}': there are ${names}`);
         this.flash = loadHex(hex, this.chip.flashBytes);
         this.eeprom = new avr8js.EEPROMMemoryBackend(this.chip.eepromBytes);
         this.table = new Float64Array(16 * 16 * A_TO_D);
@@ -143,7 +148,7 @@ class Board {
         avr8js.avrInstruction(cpu);
         do {
             const before = cpu.cycles;
-            cpu.tick(); // at most one event, and one interrupt, whose entry avr8js lets take 2 cycles
+            cpu.tick(); // at most one event, and one interrupt, in which avr8js spends 2 cycles
             if (cpu.cycles > before) cpu.cycles += cpu.pc22Bits ? 3 : 2;
         } while (cpu.nextClockEvent && cpu.nextClockEvent.cycles <= cpu.cycles);
         if (this.resetCause) this.start(this.resetCause);
@@ -199,7 +204,8 @@ class Board {
     }
 }
 
-// When the counter reached compare B: avr8js notices after an instruction of several cycles.
+// When the counter reached compare B: avr8js notices after an instruction of several cycles. It says
+// so in fields that it does not document: another version may need another function.
 function matchCycle(timer) {
     const turn = timer.TOP + 1;
     return timer.lastCycle - ((timer.tcnt - timer.ocrB + turn) % turn) * timer.divider;

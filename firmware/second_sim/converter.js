@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The analog-to-digital converter after the data sheet of the ATmega328P, chapter 24. That of avr8js
-// samples when a conversion begins, and knows neither free running nor a trigger.
+// The analog-to-digital converter after the data sheet of the ATmega328P, chapter "ADC". That of
+// avr8js samples when a conversion begins, and knows neither free running nor a trigger.
 //
 //     conversion          sample held    ended       ADC clocks after its begin
 //     first after ADEN    13.5           25
@@ -104,7 +104,7 @@ class Converter {
         for (const [at] of this.steps) cpu.addClockEvent(this.wake, at - cpu.cycles);
     }
 
-    // Instructions take several cycles, so steps are done late but in order, and with their own time.
+    // Instructions take several cycles: steps are done late, but in order and with their own time.
     advance(now) {
         while (this.steps.length && this.steps[0][0] <= now) {
             const [at, step] = this.steps.shift();

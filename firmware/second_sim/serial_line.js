@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// USART0 with its buffers, and a host at the other end of the line. avr8js has the registers, speeds
-// and interrupts; its transmitter and receiver keep one byte, so that full speed would lose bytes
-// which a chip does not lose.
+// USART0 with its buffers, and a host at the other end of the line. avr8js has the registers,
+// speeds and interrupts. Its transmitter and receiver keep one byte each: at 1 Mbaud, bytes would
+// be lost that a chip does not lose.
 "use strict";
 
 const { AVRUSART } = require("avr8js");
@@ -24,9 +24,9 @@ class SerialLine {
         const { RXC, TXC, UDRE } = this.usart;
         const writeStatus = cpu.writeHooks[config.UCSRA];
         cpu.writeHooks[config.UCSRA] = (value, old) => {
-            writeStatus(value, old); // clears flags that a write must not clear
-            const written = value & TXC.flagMask;
-            cpu.data[config.UCSRA] |= old & (RXC.flagMask | UDRE.flagMask | TXC.flagMask) & ~written;
+            writeStatus(value, old); // clears every flag; a one clears TXC, nothing the others
+            const kept = RXC.flagMask | UDRE.flagMask | (TXC.flagMask & ~value);
+            cpu.data[config.UCSRA] |= old & kept;
             return true;
         };
         cpu.writeHooks[config.UDR] = (octet) => {
