@@ -204,8 +204,8 @@ class Board {
     }
 }
 
-// When the counter reached compare B: avr8js notices after an instruction of several cycles. It says
-// so in fields that it does not document: another version may need another function.
+// When the counter reached compare B: avr8js notices after an instruction of several cycles.
+// It says so in fields that it does not document: another version may need another function.
 function matchCycle(timer) {
     const turn = timer.TOP + 1;
     return timer.lastCycle - ((timer.tcnt - timer.ocrB + turn) % turn) * timer.divider;
