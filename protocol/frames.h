@@ -6,7 +6,7 @@
 namespace ohmskin {
 namespace frames {
 
-constexpr uint16_t LAYOUT_CRC = 0x75C9;
+constexpr uint16_t LAYOUT_CRC = 0x4D00;
 constexpr uint8_t DELIMITER = 0x00;
 constexpr uint16_t CRC_POLYNOMIAL = 0x1021;
 constexpr uint16_t CRC_INITIAL = 0xFFFF;
@@ -17,6 +17,8 @@ constexpr uint8_t ROWS_MAX = 16;
 constexpr uint8_t COLUMNS_MAX = 16;
 // readings of a cell in a scan, in the order of the enum `reading`
 constexpr uint8_t READINGS_PER_CELL = 4;
+// readings of a cell that follow each other, with one drive; a scan passes once a drive over all cells
+constexpr uint8_t READINGS_PER_PASS = 2;
 // bits of one code; codes are packed without gaps, least significant bit first
 constexpr uint8_t ADC_BITS = 10;
 // slowest scan rate
@@ -141,7 +143,7 @@ struct __attribute__((packed)) Hello {
 };
 static_assert(sizeof(Hello) == 48, "wire size");
 
-// board to host: all readings of one scan. The codes follow the header: readings of a cell in the order of the enum `reading`, cells in column-major order (rows run fastest), adc_bits each, packed least significant bit first; 4 codes of 10 bits fill 5 bytes. The last byte is padded with zero bits.
+// board to host: all readings of one scan. The codes follow the header: A and B of each cell, cells in column-major order (rows run fastest), then C and D of each cell; adc_bits each, packed least significant bit first; 4 codes of 10 bits fill 5 bytes. The last byte is padded with zero bits.
 struct __attribute__((packed)) Scan {
     uint32_t scan;  // number of the scan since start, dropped ones counted; wraps
     uint32_t time_us;  // [us] board time at which the scan started; wraps

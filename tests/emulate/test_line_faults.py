@@ -43,7 +43,7 @@ ADC = "clock_250khz"
 )
 def test_bad_line(fault: str, at_a_port: bool, pty_board: Serve) -> None:
     """100 scans: all that was made is counted, and each that came is the truth."""
-    url = f"emulator://8x8?scene=multi&seed=5&noise=0&rate=140&{fault}"
+    url = f"emulator://8x8?scene=multi&seed=5&noise=0&rate=120&{fault}"
     expected = quantise(Scene("multi", 8, 8, seed=5).ratio(0.0))
     with ohmskin.open(pty_board(url).path if at_a_port else url) as skin:
         found = list(itertools.islice(skin, 100))

@@ -10,6 +10,7 @@ from ohmskin.emulate.faults import SKIN_FAULTS, SkinFaults, faults_of
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import PortError
 from ohmskin.opening import emulated
+from skins import scan_order
 
 R, C = 4, 5
 
@@ -67,13 +68,9 @@ def test_hum_is_met_by_every_reading_at_its_own_time() -> None:
     flat = np.full((3, 2, 4), 0.5)
     slot_s, start_s = 1e-3, 7.1234
     found = SkinFaults(hum=50, hum_lsb=4).sampled(flat, start_s, slot_s, 1e-4)
-    at = 0
-    for column in range(2):
-        for row in range(3):
-            for reading in range(4):
-                hum = 4 / 1024 * np.sin(2 * np.pi * 50 * (start_s + at * slot_s))
-                assert found[row, column, reading] == pytest.approx(0.5 + hum, abs=1e-12)
-                at += 1
+    for at, place in enumerate(scan_order(3, 2)):
+        hum = 4 / 1024 * np.sin(2 * np.pi * 50 * (start_s + at * slot_s))
+        assert found[place] == pytest.approx(0.5 + hum, abs=1e-12)
     assert np.array_equal(flat, np.full((3, 2, 4), 0.5))
 
 
@@ -85,14 +82,12 @@ def test_nodes_settle_slot_by_slot() -> None:
     top = bottom = 0.0
     for _ in range(5):
         expected = np.empty_like(ratio)
-        for column in range(2):
-            for row in range(3):
-                a, b, c, d = ratio[row, column]
-                slots = [(a, b), (a, b), (d, c), (d, c)]
-                for reading, (top_goal, bottom_goal) in enumerate(slots):
-                    top = top_goal + (top - top_goal) * kept
-                    bottom = bottom_goal + (bottom - bottom_goal) * kept
-                    expected[row, column, reading] = (top, bottom, bottom, top)[reading]
+        for row, column, reading in scan_order(3, 2):
+            a, b, c, d = ratio[row, column]
+            top_goal, bottom_goal = (a, b) if reading < 2 else (d, c)
+            top = top_goal + (top - top_goal) * kept
+            bottom = bottom_goal + (bottom - bottom_goal) * kept
+            expected[row, column, reading] = (top, bottom, bottom, top)[reading]
     found = SkinFaults(tau_us=tau_us).sampled(ratio, 0.0, 40e-6, settle_s)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     assert np.abs(found - ratio).max() > 0.05

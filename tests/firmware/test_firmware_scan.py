@@ -370,12 +370,15 @@ def test_watchdog_restarts_a_hung_main_loop(rig: Rig, scanning: bool) -> None:
     assert reset(rig)["reset_cause"] == ("external",)
 
 
-RC_RATIO = (0.9, 0.1, 0.8, 0.3)
+RC_RATIO = (0.9, 0.1, 0.8, 0.3)  # of even rows
+OTHER_RATIO = (0.6, 0.4, 0.5, 0.45)  # of odd rows
 
 
 def readings_with_time_constant(rig: Rig, tau_us: float, **scan: Any) -> tuple[np.ndarray, dict]:
-    """Codes (scans, 4) of a cell within a column, and counters; every cell is the same."""
-    rig.sim.set_table(np.tile(RC_RATIO, (16, 16, 1)))
+    """Codes (n, 4) of cells of even rows, and counters; all rows of a kind are the same."""
+    table = np.tile(OTHER_RATIO, (16, 16, 1))
+    table[::2] = RC_RATIO
+    rig.sim.set_table(table)
     rig.sim.set_tau_us(tau_us)
     rig.start_scan(**scan)
     rig.run(0.02)
@@ -383,7 +386,7 @@ def readings_with_time_constant(rig: Rig, tau_us: float, **scan: Any) -> tuple[n
     rig.run(0.1)
     stats = rig.sim.stats()
     rig.must("stop")
-    codes = np.stack([scan.codes[2:, 1:] for scan in rig.scans[1:]])
+    codes = np.stack([scan.codes[2::2] for scan in rig.scans[1:]])
     return codes.reshape(-1, 4).astype(int), stats
 
 
@@ -397,14 +400,13 @@ def test_nodes_of_a_few_us_settle_within_a_code_at_90_hz(rig: Rig, tau_us: float
 def test_a_shortfall_is_that_of_the_settle_time(rig: Rig, tau_us: float) -> None:
     codes, stats = readings_with_time_constant(rig, tau_us, rate_mhz=130_000)
     slot = stats["trigger_gap_cycles_min"]
-    a, b, c, d = RC_RATIO
-    # A and C come right after a change of drive; B and D one slot later, of the other node. Each
-    # node swings between two values, both for two slots.
+    # A and C come right after a change of row; B and D one slot later, of the other node. Each node
+    # swings between the values of two rows, both for two slots.
     shortest = stats["settle_cycles_min"]
     longest = stats["settle_cycles_max"] - slot
     swing = 1 / (1 + math.exp(-2 * slot / CYCLES_PER_US / tau_us))
-    swings = ((0, a, d, 0), (1, b, c, slot), (2, c, b, 0), (3, d, a, slot))
-    for reading, target, before, later in swings:
+    for reading, (target, before) in enumerate(zip(RC_RATIO, OTHER_RATIO, strict=True)):
+        later = reading % 2 * slot
         expected = [
             1024 * (target + (before - target) * swing * math.exp(-s / CYCLES_PER_US / tau_us))
             for s in (shortest + later, longest + later)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ohmskin.emulate.simavr import SkinSim
 from ohmskin.link import framing, protocol
 from places import ROOT
+from skins import scan_order
 
 CPU_HZ = 16_000_000
 BOARDS = ("uno", "megaatmega2560")
@@ -314,7 +315,7 @@ class Rig:
         cycles = holds["cycle"][first[numbers][:, None] + np.arange(size)].astype(np.int64)
         # The simulator holds first where a hold and a new table fall on the same cycle.
         table = np.searchsorted(np.array(self._table_cycles), cycles, side="left") - 1
-        in_order = np.stack(self._tables)[:, :rows, :columns].transpose(0, 2, 1, 3)
-        expected = in_order.reshape(-1, size)[table, np.arange(size)]
-        received = np.stack([s.codes.transpose(1, 0, 2).reshape(-1) for s in self.scans])
+        place = tuple(np.transpose(scan_order(rows, columns)))
+        expected = np.stack(self._tables)[(table, *place)]
+        received = np.stack([scan.codes[place] for scan in self.scans])
         return Check(received.size, int((received != expected).sum()), starts)

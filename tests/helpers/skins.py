@@ -4,6 +4,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
@@ -36,3 +37,17 @@ def told(rest_ratio: Float, *, wires: bool = True) -> SkinKnowledge:
         rest_ratio=ten_bits(rest_ratio),
         nominal_wire_ohm=WireOhm(100.0, 200.0) if wires else NO_WIRES,
     )
+
+
+def scan_order(rows: int, columns: int) -> list[tuple[int, int, int]]:
+    """Row, column and reading of the codes of a scan, one after the other, as frames.toml says."""
+    cells = [(row, column) for column in range(columns) for row in range(rows)]
+    return [(*cell, first + n) for first in (0, 2) for cell in cells for n in (0, 1)]
+
+
+def placed(in_order: list[int], rows: int, columns: int) -> NDArray[np.uint16]:
+    """Codes (rows, columns, 4) of a scan that come in this order."""
+    codes = np.empty((rows, columns, 4), np.uint16)
+    for place, code in zip(scan_order(rows, columns), in_order, strict=True):
+        codes[place] = code
+    return codes

@@ -27,6 +27,7 @@ from ohmskin.link.messages import (
     SelfTestReport,
 )
 from places import ROOT
+from skins import placed
 
 each_valid = pytest.mark.parametrize("vector", VECTORS["valid"], ids=lambda v: v["name"])
 each_damaged = pytest.mark.parametrize("vector", VECTORS["damaged"], ids=lambda v: v["name"])
@@ -64,8 +65,7 @@ def test_valid_vector_is_encoded_to_the_same_bytes(vector: dict[str, Any]) -> No
     payload = kind.pack(**python_values(vector["fields"]))
     if "codes" in vector:
         rows, columns = vector["fields"]["rows"], vector["fields"]["columns"]
-        codes = np.array(vector["codes"], dtype=np.uint16).reshape(columns, rows, -1)
-        payload += protocol.pack_codes(codes.transpose(1, 0, 2))
+        payload += protocol.pack_codes(placed(vector["codes"], rows, columns))
     assert framing.encode(kind.id, content[1], payload).hex() == vector["wire"]
 
 
@@ -115,13 +115,8 @@ def test_vectors_of_a_board_become_messages(kind: str, expected: type[Message]) 
             assert message.time_us == fields["time_us"]
             assert message.host_time_s == 12.5
             assert (message.rows, message.columns) == (fields["rows"], fields["columns"])
-            in_order = [
-                (message.ratio[row, column, reading] * 1024) - 0.5
-                for column in range(message.columns)
-                for row in range(message.rows)
-                for reading in range(4)
-            ]
-            assert in_order == vector["codes"]
+            codes = message.ratio * 1024 - 0.5
+            np.testing.assert_array_equal(codes, placed(vector["codes"], *codes.shape[:2]))
         elif isinstance(message, ForeignHello):
             assert message.layout_crc == fields["layout_crc"]
         else:
@@ -157,7 +152,7 @@ def test_codes_are_packed_like_one_long_integer(rows: int, columns: int, random:
     in_order = [random.getrandbits(10) for _ in range(rows * columns * 4)]
     number = sum(code << (10 * i) for i, code in enumerate(in_order))
     packed = number.to_bytes((len(in_order) * 10 + 7) // 8, "little")
-    codes = np.array(in_order, dtype=np.uint16).reshape(columns, rows, 4).transpose(1, 0, 2)
+    codes = placed(in_order, rows, columns)
     assert protocol.codes_size(rows, columns) == len(packed)
     assert protocol.pack_codes(codes) == packed
     np.testing.assert_array_equal(protocol.unpack_codes(packed, rows, columns), codes)

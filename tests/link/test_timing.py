@@ -9,6 +9,7 @@ from ohmskin.arrays import Float
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.link.clock import line_delay_s, reading_offsets_s, scan_s, slot_s
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from skins import scan_order
 
 
 @pytest.mark.parametrize(
@@ -32,7 +33,7 @@ def test_readings_are_timed_as_the_emulated_board_takes_them(
     assert slot_s(hello) == slots_s[0]
     offsets_s = reading_offsets_s(hello)
     assert offsets_s.shape == (rows, columns, 4)
-    in_order = offsets_s.transpose(1, 0, 2).reshape(-1)  # cells are column-major
+    in_order = np.array([offsets_s[place] for place in scan_order(rows, columns)])
     np.testing.assert_allclose(in_order, slots_s[0] * np.arange(in_order.size))
     assert in_order[-1] < scan_s(hello) < (hello.scan_cycles + 1) / hello.clock_hz
 

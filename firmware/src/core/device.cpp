@@ -24,8 +24,8 @@ bool Device::poll() {
         receive();
         worked = true;
     }
-    if (board::scanner.has_cell()) {
-        take_cell();
+    if (board::scanner.has_group()) {
+        take_group();
         return true;
     }
     // Cells cannot wait, the rest can.
@@ -39,14 +39,14 @@ bool Device::attend() {
     bool worked = false;
     if (!settings_writer_.idle())
         worked = poll_save();
-    if (mode_ != Mode::Idle && board::scanner.parked() && !board::scanner.has_cell())
+    if (mode_ != Mode::Idle && board::scanner.parked() && !board::scanner.has_group())
         finish_slots();
-    if (cells_left_ == 0)
+    if (groups_left_ == 0)
         send_pending();
     watch_baud();
     // Answers that wait for the end of a frame are sent there, by begin_scan().
     const bool answers = hello_pending_ || report_pending_ || ack_count_ != 0;
-    attention_ = (answers && cells_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
+    attention_ = (answers && groups_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
                  !settings_writer_.idle();
     return worked;
 }
@@ -242,7 +242,7 @@ Result Device::start() {
 }
 
 void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
-    cells_left_ = 0;
+    groups_left_ = 0;
     board::scanner.begin(request.rows, request.columns, plan.idle_slots);
     const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
     scan_time_us_ = board::now_us() + Scanner::FIRST_SLOT * plan.slot_cycles / cycles_per_us;
@@ -252,7 +252,7 @@ void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
 
 void Device::finish_slots() {
     board::stop_slots();
-    if (cells_left_ != 0)
+    if (groups_left_ != 0)
         drop_open_scan();
     if (mode_ == Mode::SelfTesting) {
         report_pending_ = true;

@@ -42,10 +42,10 @@ class Device {
     OHMSKIN_RARE void send_hello();
 
     // ---- scan frames (device_scan.cpp)
-    OHMSKIN_APART void take_cell();
+    OHMSKIN_APART void take_group();
     OHMSKIN_RARE void begin_scan();
     OHMSKIN_RARE void drop_open_scan();
-    void put_cell(const uint16_t *code);
+    void put_group(const uint16_t *code);
     OHMSKIN_RARE void count_scan();
     OHMSKIN_RARE void account_for_lost_scans();
     OHMSKIN_RARE uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan,
@@ -80,7 +80,7 @@ class Device {
     uint8_t ack_count_ = 0;
 
     // The scan in progress.
-    uint16_t cells_left_ = 0;  // of the scan whose frame is open; 0: none is
+    uint16_t groups_left_ = 0;  // of the scan whose frame is open; 0: none is
     uint32_t scan_number_ = 0;
     uint32_t scan_time_us_ = 0;
     uint8_t scan_time_rest_ = 0;  // clock cycles beyond scan_time_us_

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The device's scan frames: from the scanner's cells to bytes for the line.
+// The device's scan frames: from the scanner's groups of codes to bytes for the line.
 #include "board.h"
 #include "core/device.h"
 
@@ -14,8 +14,8 @@ constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
 constexpr uint16_t ANSWERS_SPACE =
     FrameWriter::line_bytes(sizeof(frames::Hello)) + FrameWriter::line_bytes(sizeof(frames::Ack));
 
-// What the last cell of a frame may take: its bytes, a block's length, CRC, delimiter.
-constexpr uint16_t CELL_SPACE = 5 + 2 + 2 + 1;
+// What the last group of a frame may take: its bytes, a block's length, CRC, delimiter.
+constexpr uint16_t GROUP_SPACE = 5 + 2 + 2 + 1;
 
 uint16_t scan_payload(uint8_t rows, uint8_t columns) {
     return static_cast<uint16_t>(sizeof(frames::Scan) +
@@ -28,29 +28,29 @@ uint16_t cycles_per_byte(uint32_t baud) {
 
 }  // namespace
 
-void Device::take_cell() {
+void Device::take_group() {
     Scanner &scanner = board::scanner;
     if (mode_ == Mode::SelfTesting) {
-        self_test_.take(scanner.cell());
+        self_test_.take(scanner.group());
         scanner.stop_after_scan();  // one scan is enough
     } else {
         if (scanner.starts_scan())
             begin_scan();
-        if (cells_left_ != 0 && writer_.space() < CELL_SPACE)
+        if (groups_left_ != 0 && writer_.space() < GROUP_SPACE)
             drop_open_scan();
-        if (cells_left_ != 0) {
-            put_cell(scanner.cell());
-            if (--cells_left_ == 0) {
+        if (groups_left_ != 0) {
+            put_group(scanner.group());
+            if (--groups_left_ == 0) {
                 writer_.end();
                 attention_ = true;
             }
         }
     }
-    scanner.release_cell();
+    scanner.release_group();
 }
 
 void Device::begin_scan() {
-    if (cells_left_ != 0)
+    if (groups_left_ != 0)
         drop_open_scan();
     account_for_lost_scans();
     if (hello_pending_ || report_pending_ || ack_count_ != 0)
@@ -61,7 +61,7 @@ void Device::begin_scan() {
                                      reader_.errors(), rows,          columns};
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
-        cells_left_ = static_cast<uint16_t>(rows * columns);
+        groups_left_ = static_cast<uint16_t>(rows * columns);
     } else {
         dropped_++;
     }
@@ -72,7 +72,7 @@ void Device::begin_scan() {
 // of plan_scan() and ring_limit(), but if it does, the scan is lost as a whole.
 void Device::drop_open_scan() {
     writer_.abandon();
-    cells_left_ = 0;
+    groups_left_ = 0;
     dropped_++;
 }
 
@@ -93,8 +93,8 @@ void Device::count_scan() {
     scan_time_rest_ = static_cast<uint8_t>(cycles % cycles_per_us);
 }
 
-// Codes of 10 bits, least significant bit first: a cell's four make five bytes.
-void Device::put_cell(const uint16_t *code) {
+// Codes of 10 bits, least significant bit first: a group's four make five bytes.
+void Device::put_group(const uint16_t *code) {
     static_assert(frames::ADC_BITS == 10 && frames::READINGS_PER_CELL == 4, "the shifts below");
     const uint8_t octets[] = {
         static_cast<uint8_t>(code[0]),
@@ -103,7 +103,7 @@ void Device::put_cell(const uint16_t *code) {
         static_cast<uint8_t>(code[2] >> 4 | static_cast<uint8_t>(code[3]) << 6),
         static_cast<uint8_t>(code[3] >> 2),
     };
-    // At 500 kbaud the chip's two bytes leave within 640 cycles, and a cell's work takes longer.
+    // At 500 kbaud the chip's two bytes leave within 640 cycles, and a group's work takes longer.
     writer_.put(octets, 3);
     transmit();
     writer_.put(octets + 3, 2);

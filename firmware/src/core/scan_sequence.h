@@ -31,8 +31,9 @@ struct Selection {
     uint8_t reading;  // index into CONFIGURATIONS
 };
 
-// The order of a scan: readings of a cell, then rows, then columns. Inlined into the slot
-// interrupt.
+// The order of a scan: two readings of a cell, with one drive, then rows, then columns; then the
+// same with the other drive. A drive that changes from cell to cell would charge the lines that are
+// not selected anew each time, through the cells. Inlined into the slot interrupt.
 class ScanSequence {
   public:
     void begin(uint8_t rows, uint8_t columns) {
@@ -44,24 +45,19 @@ class ScanSequence {
 
     // Steps to the next reading; true when that is the first of a scan again.
     bool next() {
-        const uint8_t reading = static_cast<uint8_t>(at_.reading + 1);
-        at_.reading = reading < frames::READINGS_PER_CELL ? reading : 0;
-        if (at_.reading != 0)
-            return false;
-        return next_cell();
-    }
-
-  private:
-    bool next_cell() {
-        if (++at_.row < rows_)
+        at_.reading ^= 1;
+        if (at_.reading & 1 || ++at_.row < rows_)
             return false;
         at_.row = 0;
         if (++at_.column < columns_)
             return false;
         at_.column = 0;
-        return true;
+        at_.reading ^= 2;
+        return at_.reading == 0;
     }
 
+  private:
+    static_assert(frames::READINGS_PER_CELL == 4 && frames::READINGS_PER_PASS == 2, "two bits");
     Selection at_ = {0, 0, 0};
     uint8_t rows_ = 1;
     uint8_t columns_ = 1;

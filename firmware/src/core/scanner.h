@@ -18,11 +18,12 @@ namespace ohmskin {
 // beyond the last reading of a scan are idle: they fill up the scan's period. A slot whose
 // conversion is missing, because the converter was late, ends the scan.
 //
-// Codes reach the main loop a cell at a time, through a queue with one writer and one reader and
+// Codes reach the main loop four at a time, through a queue with one writer and one reader and
 // 8-bit indices, which an AVR reads and writes in one instruction: no interrupt is ever held off.
 class Scanner {
   public:
-    static constexpr uint8_t CELL = frames::READINGS_PER_CELL;
+    // As many codes as fill whole bytes, and as many groups a scan as there are cells.
+    static constexpr uint8_t GROUP = frames::READINGS_PER_CELL;
 
     static constexpr uint16_t CODE = 0x03FF;
     static constexpr uint8_t SCAN_NUMBERS = 32;
@@ -56,17 +57,17 @@ class Scanner {
     }
 
     // ---- main loop's side
-    bool has_cell() const { return static_cast<uint8_t>((write_ - read_) & QUEUE_MASK) >= CELL; }
+    bool has_group() const { return static_cast<uint8_t>((write_ - read_) & QUEUE_MASK) >= GROUP; }
 
-    // The oldest cell's CELL codes, until release_cell(); to be masked with CODE.
-    const uint16_t *cell() const { return queue_ + read_; }
+    // The oldest group's codes, until release_group(); to be masked with CODE.
+    const uint16_t *group() const { return queue_ + read_; }
     bool starts_scan() const { return queue_[read_] & FIRST; }
-    // Of the scan that this cell starts, modulo SCAN_NUMBERS: gaps tell of scans whose very start
+    // Of the scan that this group starts, modulo SCAN_NUMBERS: gaps tell of scans whose very start
     // was lost because the main loop was late.
     uint8_t scan_number() const { return (queue_[read_] >> frames::ADC_BITS) & (SCAN_NUMBERS - 1); }
-    void release_cell() {
+    void release_group() {
         __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the codes have been read by now
-        read_ = static_cast<uint8_t>((read_ + CELL) & QUEUE_MASK);
+        read_ = static_cast<uint8_t>((read_ + GROUP) & QUEUE_MASK);
     }
 
     void stop_after_scan() { stopping_ = true; }
@@ -74,8 +75,8 @@ class Scanner {
     bool parked() const { return parked_; }
 
   private:
-    static constexpr uint16_t FIRST = 0x8000;         // in a code: the scan's first
-    static constexpr uint8_t QUEUE_SIZE = 16 * CELL;  // whole cells, so that none wraps
+    static constexpr uint16_t FIRST = 0x8000;          // in a code: the scan's first
+    static constexpr uint8_t QUEUE_SIZE = 16 * GROUP;  // whole groups, so that none wraps
     static constexpr uint8_t QUEUE_MASK = QUEUE_SIZE - 1;
     static_assert((QUEUE_SIZE & QUEUE_MASK) == 0, "indices are masked");
     static constexpr uint16_t LEAD_IN = 1;  // slots until the first selection has settled
@@ -84,7 +85,7 @@ class Scanner {
     // slot selection() is for, the slot the pins are set for, and the slot held last, whose code
     // arrives with the next step().
     static constexpr uint8_t KIND_BITS = 2;
-    static constexpr uint8_t IDLE = 0, READING = 1, STARTS_CELL = 2, STARTS_SCAN = 3;
+    static constexpr uint8_t IDLE = 0, READING = 1, STARTS_SCAN = 2;
     static constexpr uint8_t HELD_SHIFT = 2 * KIND_BITS;
     static constexpr uint8_t HELD = 3 << HELD_SHIFT;
 
@@ -92,7 +93,7 @@ class Scanner {
         if (idling_)
             return idle();
         if (!sequence_.next())
-            return sequence_.at().reading == 0 ? STARTS_CELL : READING;
+            return READING;
         if (idle_slots_ == 0 && !stopping_)
             return STARTS_SCAN;
         idle_left_ = idle_slots_ ? idle_slots_ : 1;
@@ -111,23 +112,21 @@ class Scanner {
         return STARTS_SCAN;
     }
 
-    // Room is made sure of for a whole cell at its first code. Where there is none, or a code is
+    // Room is made sure of for a whole group at its first code. Where there is none, or a code is
     // missing, the rest of the scan is left out, so that the main loop sees a scan cut short and
     // never one with a hole. A code that comes late is not taken for the first of the next scan.
     void push(uint16_t code, uint8_t held, bool converted) {
         const uint8_t at = write_;
-        if (held != READING << HELD_SHIFT) {
-            const bool first_cell = held == STARTS_SCAN << HELD_SHIFT;
-            if (first_cell) {
-                code |= FIRST | (scan_++ & (SCAN_NUMBERS - 1)) << frames::ADC_BITS;
-                skipping_ = late_;
-            }
-            if (!skipping_ && static_cast<uint8_t>((at + CELL) & QUEUE_MASK) == read_)
-                skipping_ = true;
+        if (held == STARTS_SCAN << HELD_SHIFT) {
+            code |= FIRST | (scan_++ & (SCAN_NUMBERS - 1)) << frames::ADC_BITS;
+            skipping_ = late_;
         }
         if (!converted) {
             skipping_ = true;
-            write_ = static_cast<uint8_t>(at & ~(CELL - 1));
+            write_ = static_cast<uint8_t>(at & ~(GROUP - 1));
+        } else if (!(at & (GROUP - 1)) &&
+                   static_cast<uint8_t>((at + GROUP) & QUEUE_MASK) == read_) {
+            skipping_ = true;
         }
         if (skipping_)
             return;

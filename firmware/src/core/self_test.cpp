@@ -35,11 +35,15 @@ void SelfTest::begin() {
         min_[i] = FULL_SCALE;
         max_[i] = 0;
     }
+    groups_ = 0;
 }
 
-void SelfTest::take(const uint16_t *cell) {
-    for (uint8_t i = 0; i < frames::READINGS_PER_CELL; i++) {
-        const uint16_t code = cell[i] & Scanner::CODE;
+void SelfTest::take(const uint16_t *codes) {
+    constexpr uint16_t CELLS = frames::ROWS_MAX * frames::COLUMNS_MAX;
+    const uint8_t first = groups_++ < CELLS / 2 ? 0 : frames::READINGS_PER_PASS;
+    for (uint8_t n = 0; n < Scanner::GROUP; n++) {
+        const uint8_t i = first + (n & (frames::READINGS_PER_PASS - 1));
+        const uint16_t code = codes[n] & Scanner::CODE;
         if (code < min_[i])
             min_[i] = code;
         if (code > max_[i])

@@ -13,7 +13,7 @@ namespace ohmskin {
 class SelfTest {
   public:
     OHMSKIN_RARE void begin();
-    void take(const uint16_t *cell);
+    void take(const uint16_t *codes);  // the scan's groups, in order
     OHMSKIN_RARE frames::SelfTestReport report() const;
 
     // How all multiplexer inputs are scanned: slow enough for any skin's wiring to settle.
@@ -24,6 +24,7 @@ class SelfTest {
   private:
     uint16_t min_[frames::READINGS_PER_CELL] = {};
     uint16_t max_[frames::READINGS_PER_CELL] = {};
+    uint16_t groups_ = 0;  // taken so far
 };
 
 }  // namespace ohmskin

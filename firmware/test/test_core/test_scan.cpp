@@ -36,6 +36,31 @@ struct Pipeline {
     }
 };
 
+// Takes what there is, and checks that each scan's codes come in order, from its first one.
+struct Taker {
+    ScanSequence expected;
+    uint8_t rows, columns;
+    uint16_t codes = 0, scans = 0, whole = 0;  // of the scan at hand; begun; come to their end
+    uint8_t number = 0xFF;
+
+    Taker(uint8_t r, uint8_t c) : rows(r), columns(c) {}
+    void take(Scanner &scanner) {
+        for (; scanner.has_group(); scanner.release_group()) {
+            if (scanner.starts_scan()) {
+                number = scanner.scan_number();
+                expected.begin(rows, columns);
+                codes = 0;
+                scans++;
+            }
+            for (uint8_t i = 0; i < Scanner::GROUP; i++, expected.next())
+                CHECK_EQ(code_of(expected.at()), scanner.group()[i] & Scanner::CODE);
+            codes = static_cast<uint16_t>(codes + Scanner::GROUP);
+            if (codes == readings_in(rows, columns))
+                whole++;
+        }
+    }
+};
+
 }  // namespace
 
 TEST(ninety_hertz_is_kept_to_50_mhz_and_leaves_20_us_to_settle) {
@@ -73,7 +98,8 @@ TEST(rate_zero_is_as_fast_as_nodes_settle) {
     for (uint8_t prescaler : prescalers) {
         ScanPlan plan;
         CHECK_EQ(Result::Ok, plan_scan(request(8, 8, 0, 0, prescaler), CLOCK_HZ, &plan));
-        // From the hold, 11.5 ADC clocks to the conversion's end, and 20 us; 15 ADC clocks at least.
+        // From the hold, 11.5 ADC clocks to the conversion's end, and 20 us; 15 ADC clocks at
+        // least.
         const uint16_t settled = static_cast<uint16_t>(prescaler * 23 / 2 + 320);
         CHECK_EQ(prescaler == 128 ? 15 * 128 : settled, plan.slot_cycles);
         CHECK_EQ(256, plan.slots_per_scan);
@@ -106,46 +132,40 @@ TEST(what_is_out_of_range_is_refused_by_name) {
     CHECK_EQ(Result::TooFast, plan_scan(request(8, 8, 150000), CLOCK_HZ, &plan));
 }
 
-TEST(rows_run_fastest) {
+TEST(a_scan_passes_over_all_cells_once_a_drive_and_rows_run_fastest) {
     ScanSequence sequence;
     sequence.begin(2, 3);
-    for (uint8_t column = 0; column < 3; column++)
-        for (uint8_t row = 0; row < 2; row++)
-            for (uint8_t reading = 0; reading < frames::READINGS_PER_CELL; reading++) {
-                CHECK_EQ(row, sequence.at().row);
-                CHECK_EQ(column, sequence.at().column);
-                CHECK_EQ(reading, sequence.at().reading);
-                const bool last = column == 2 && row == 1 && reading == 3;
-                CHECK_EQ(last, sequence.next());
-            }
+    for (uint8_t first = 0; first < 4; first = static_cast<uint8_t>(first + 2))
+        for (uint8_t column = 0; column < 3; column++)
+            for (uint8_t row = 0; row < 2; row++)
+                for (uint8_t reading = first; reading < first + 2; reading++) {
+                    CHECK_EQ(row, sequence.at().row);
+                    CHECK_EQ(column, sequence.at().column);
+                    CHECK_EQ(reading, sequence.at().reading);
+                    const bool last = column == 2 && row == 1 && reading == 3;
+                    CHECK_EQ(last, sequence.next());
+                }
     CHECK_EQ(0, sequence.at().column);
+    CHECK_EQ(0, sequence.at().reading);
 }
 
-TEST(every_code_is_of_the_cell_it_is_counted_for) {
-    const uint8_t sizes[][2] = {{1, 1}, {3, 2}, {16, 16}};
+TEST(every_code_is_of_the_reading_it_is_counted_for) {
+    const uint8_t sizes[][2] = {{1, 1}, {3, 1}, {3, 2}, {16, 16}};
     const uint16_t idle_counts[] = {0, 1, 2, 7};
     for (const auto &size : sizes)
         for (uint16_t idle : idle_counts) {
             Scanner scanner;
             Pipeline pipeline;
+            Taker taker(size[0], size[1]);
             scanner.begin(size[0], size[1], idle);
-            ScanSequence expected;
-            expected.begin(size[0], size[1]);
-            bool first = true;
-            uint16_t taken = 0, slots = 0;
             const uint16_t readings = readings_in(size[0], size[1]);
             const uint16_t scans = 3;
-            for (; taken < scans * readings && slots < 4 * scans * readings + 100; slots++) {
+            uint16_t slots = 0;
+            for (; taker.whole < scans && slots < 4 * scans * readings + 100; slots++) {
                 pipeline.slot(scanner);
-                while (scanner.has_cell()) {
-                    CHECK_EQ(first, scanner.starts_scan());
-                    for (uint8_t i = 0; i < Scanner::CELL; i++, taken++) {
-                        CHECK_EQ(code_of(expected.at()), scanner.cell()[i] & Scanner::CODE);
-                        first = expected.next();
-                    }
-                    scanner.release_cell();
-                }
+                taker.take(scanner);
             }
+            CHECK_EQ(scans, taker.scans);
             // Two slots of lead-in, one until the last conversion is done.
             CHECK_EQ(2 + scans * readings + (scans - 1) * idle + 1, slots);
         }
@@ -165,12 +185,12 @@ TEST(a_stop_ends_with_a_whole_scan) {
                 if (!CHECK(slot < 100))
                     break;
                 pipeline.slot(scanner);
-                for (; scanner.has_cell(); taken++)
-                    scanner.release_cell();
+                for (; scanner.has_group(); taken++)
+                    scanner.release_group();
             }
             CHECK_EQ(0, taken % 2);
             pipeline.slot(scanner);
-            CHECK(!scanner.has_cell());
+            CHECK(!scanner.has_group());
         }
 }
 
@@ -180,29 +200,16 @@ TEST(a_late_main_loop_cuts_scans_short_and_never_leaves_holes) {
     for (uint16_t pause = 0; pause < 200; pause++) {
         Scanner scanner;
         Pipeline pipeline;
+        Taker taker(5, 1);
         scanner.begin(5, 1, 3);
-        uint16_t next_row = 0, scans = 0;
-        uint8_t last = 0xFF;
         for (uint16_t slot = 0; slot < 2 + 20 * 23 + 1; slot++) {
             pipeline.slot(scanner);
-            if (slot % 230 < pause)
-                continue;
-            while (scanner.has_cell()) {
-                if (scanner.starts_scan()) {
-                    last = scanner.scan_number();
-                    next_row = 0;
-                    scans++;
-                }
-                for (uint8_t reading = 0; reading < 4; reading++)
-                    CHECK_EQ(code_of(Selection{static_cast<uint8_t>(next_row), 0, reading}),
-                             scanner.cell()[reading] & Scanner::CODE);
-                next_row++;
-                scanner.release_cell();
-            }
+            if (slot % 230 >= pause)
+                taker.take(scanner);
         }
-        CHECK_EQ(19, last);  // the last of 20 scans is taken whole
-        CHECK_EQ(5, next_row);
-        CHECK(pause > 100 ? scans < 20 : scans == 20 || pause > 60);
+        CHECK_EQ(19, taker.number);  // the last of 20 scans is taken whole
+        CHECK_EQ(20, taker.codes);
+        CHECK(pause > 100 ? taker.scans < 20 : taker.scans == 20 || pause > 60);
     }
 }
 
@@ -212,8 +219,8 @@ TEST(a_late_conversion_costs_its_scan_and_no_other_is_wrong) {
     for (uint16_t late = 0; late < 3 * 14; late++) {
         Scanner scanner;
         Pipeline pipeline;
+        Taker taker(3, 1);
         scanner.begin(3, 1, 2);
-        uint8_t next_row = 0, whole = 0, number = 0xFF;
         Selection held = pipeline.pins;
         for (uint16_t slot = 0; slot < 2 + 6 * 14 + 1; slot++) {
             const uint16_t code = pipeline.result;
@@ -223,20 +230,10 @@ TEST(a_late_conversion_costs_its_scan_and_no_other_is_wrong) {
                 pipeline.result = code_of(held);
             pipeline.pins = scanner.selection();
             scanner.step(code, slot != 0 && slot != late + 1);
-            for (; scanner.has_cell(); scanner.release_cell()) {
-                if (scanner.starts_scan()) {
-                    number = scanner.scan_number();
-                    next_row = 0;
-                }
-                for (uint8_t reading = 0; reading < 4; reading++)
-                    CHECK_EQ(code_of(Selection{next_row, 0, reading}),
-                             scanner.cell()[reading] & Scanner::CODE);
-                if (++next_row == 3)
-                    whole++;
-            }
+            taker.take(scanner);
         }
-        CHECK_EQ(5, number);  // a scan that is left out is counted
+        CHECK_EQ(5, taker.number);  // a scan that is left out is counted
         const bool only_idle = (late + 12) % 14 == 12;
-        CHECK_EQ(only_idle ? 6 : 5, whole);
+        CHECK_EQ(only_idle ? 6 : 5, taker.whole);
     }
 }

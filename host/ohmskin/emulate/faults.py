@@ -26,7 +26,7 @@ from ohmskin.circuit.skin import (
     ratio_from_current,
     readings,
 )
-from ohmskin.link.protocol import ADC_BITS
+from ohmskin.link.protocol import ADC_BITS, from_scan_order, in_scan_order
 
 # Resistance of a wire that is open [ohm], a million times that of a cell at rest.
 OPEN_OHM: Final = 1e12
@@ -208,20 +208,21 @@ class SkinFaults:
         v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau), with an equal scan before this one. Hum
         adds hum_lsb sin(2 pi hum t) at the reading's own time t.
         """
-        order = ratio.transpose(1, 0, 2)  # cells are column-major: rows run fastest
-        read = order.reshape(-1)
+        read = in_scan_order(ratio)
         if self.tau_us:
             kept = float(np.exp(-settle_s / (1e-6 * self.tau_us)))
             # A pair of readings with the same drive sets both nodes, whichever of them is read.
             top, bottom = (
-                _settled(order[..., pairs].reshape(-1), kept)
+                _settled(in_scan_order(ratio[..., pairs]), kept)
                 for pairs in ([0, 0, 3, 3], [1, 1, 2, 2])
             )
-            read = np.where(np.resize(READING_SENSES_TOP, read.shape), top, bottom)
+            read = np.where(
+                in_scan_order(np.broadcast_to(READING_SENSES_TOP, ratio.shape)), top, bottom
+            )
         if self.hum:
             time_s = start_s + slot_s * np.arange(len(read))
             read = read + self.hum_lsb / 2**ADC_BITS * np.sin(2 * np.pi * self.hum * time_s)
-        return np.asarray(read.reshape(order.shape).transpose(1, 0, 2))
+        return from_scan_order(read, *ratio.shape[:2])
 
 
 SKIN_FAULTS: Final = {name: text for name, (_, text) in _options(SkinFaults).items()}

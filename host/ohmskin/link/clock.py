@@ -80,9 +80,8 @@ def scan_s(board: Hello) -> float:
 
 def reading_offsets_s(board: Hello) -> Float:
     """Time of each reading since the first of its scan [s], shape (rows, columns, readings)."""
-    shape = (board.columns, board.rows, board.readings_per_cell)
-    order = np.arange(np.prod(shape), dtype=np.float64).reshape(shape)
-    return np.asarray(slot_s(board) * order.transpose(1, 0, 2))
+    slots = np.arange(board.rows * board.columns * board.readings_per_cell)
+    return slot_s(board) * protocol.from_scan_order(slots, board.rows, board.columns)
 
 
 def line_delay_s(scan: Scan, board: Hello) -> float:

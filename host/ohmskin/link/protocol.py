@@ -7,7 +7,6 @@ value of an enum field is a name. Framing and ports are not known here.
 
 import binascii
 import json
-import math
 import struct
 import tomllib
 from collections.abc import Mapping
@@ -154,6 +153,7 @@ _LAYOUT = json.loads(
 LAYOUT_CRC = crc16(json.dumps(_LAYOUT, sort_keys=True, separators=(",", ":")).encode())
 
 READINGS_PER_CELL = CONSTANTS["readings_per_cell"]
+_PASSES = READINGS_PER_CELL // CONSTANTS["readings_per_pass"]
 ADC_BITS = CONSTANTS["adc_bits"]
 _LARGEST_CODE = (1 << ADC_BITS) - 1
 _BIT_VALUES = 1 << np.arange(ADC_BITS, dtype=np.uint16)
@@ -178,20 +178,29 @@ def codes_size(rows: int, columns: int) -> int:
 def unpack_codes(packed: bytes, rows: int, columns: int) -> NDArray[np.uint16]:
     """Codes of a scan, shape (rows, columns, readings), from the tail of a `scan` frame.
 
-    On the wire cells are column-major and rows run fastest, see frames.toml.
-
     :raises ValueError: `packed` has the wrong length for rows x columns.
     """
     if len(packed) != codes_size(rows, columns):
         raise ValueError(f"{len(packed)} bytes of codes do not make {rows}x{columns} cells")
-    shape = (columns, rows, READINGS_PER_CELL)
     bits = np.unpackbits(
         np.frombuffer(packed, dtype=np.uint8),
-        count=math.prod(shape) * ADC_BITS,
+        count=rows * columns * READINGS_PER_CELL * ADC_BITS,
         bitorder="little",
     )
-    codes: NDArray[np.uint16] = bits.reshape(*shape, ADC_BITS) @ _BIT_VALUES
-    return codes.transpose(1, 0, 2)
+    codes: NDArray[np.uint16] = bits.reshape(-1, ADC_BITS) @ _BIT_VALUES
+    return from_scan_order(codes, rows, columns)
+
+
+def in_scan_order(readings: NDArray[Any]) -> NDArray[Any]:
+    """Readings (rows, columns, readings) one after the other, as a board takes and sends them."""
+    passes = readings.reshape(*readings.shape[:2], _PASSES, -1)
+    return passes.transpose(2, 1, 0, 3).ravel()
+
+
+def from_scan_order(in_order: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
+    """The inverse of `in_scan_order`: shape (rows, columns, readings)."""
+    passes = in_order.reshape(_PASSES, columns, rows, -1)
+    return passes.transpose(2, 1, 0, 3).reshape(rows, columns, READINGS_PER_CELL)
 
 
 def pack_codes(codes: NDArray[np.uint16]) -> bytes:
@@ -201,6 +210,6 @@ def pack_codes(codes: NDArray[np.uint16]) -> bytes:
     """
     if codes.size and int(codes.max()) > _LARGEST_CODE:
         raise ValueError(f"code above {_LARGEST_CODE}")
-    in_order = np.ascontiguousarray(codes.transpose(1, 0, 2), dtype="<u2").reshape(-1, 1)
+    in_order = in_scan_order(codes).astype("<u2").reshape(-1, 1)
     bits = np.unpackbits(in_order.view(np.uint8), axis=1, count=ADC_BITS, bitorder="little")
     return np.packbits(bits, bitorder="little").tobytes()

@@ -73,6 +73,8 @@ class Session(Device):
 
     def _connect(self) -> None:
         for speed, asks, listen_s in _SELDOM if self._link.resets_board else _OFTEN:
+            if self._hello is not None:
+                return
             self._link.set_baud(protocol.CONSTANTS[speed])
             if asks:
                 self._send("get_hello")
