@@ -212,39 +212,33 @@ class _Bounded:
 def _records(file: _Bounded) -> Iterator[McapRecord]:
     """The records of an MCAP file, up to its footer or to where it was cut off."""
     reader = StreamReader(cast(IO[bytes], file), emit_chunks=True, record_size_limit=LARGEST_RECORD)
-    records = reader.records
     first = True
-    while True:
-        try:
-            record = next(records)
-        except (StopIteration, EndOfFile):
-            if first:
-                raise ValueError("the file is cut off before its first record") from None
-            return
-        except _DAMAGE as exc:
-            raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
-        first = False
-        if not isinstance(record, Chunk):
-            yield record
+    try:
+        for record in reader.records:
+            first = False
+            yield from _unpacked(record) if isinstance(record, Chunk) else [record]
             if isinstance(record, Footer):
                 return
-            continue
-        try:
-            if _unpacked_size(record) > LARGEST_RECORD:
-                raise ValueError("damaged: a chunk larger than any recorder writes")
-            yield from breakup_chunk(record, validate_crc=True)
-        except _DAMAGE as exc:
-            raise ValueError(f"damaged: {exc}") from exc
+    except EndOfFile:
+        if first:
+            raise ValueError("the file is cut off before its first record") from None
+    except _DAMAGE as exc:
+        raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
 
 
-def _unpacked_size(chunk: Chunk) -> int:
-    """What a chunk will take in memory: what its packed data say, not only its header."""
-    declared = chunk.uncompressed_size
+def _unpacked(chunk: Chunk) -> list[McapRecord]:
+    """The records in a chunk. Its header alone does not say how much memory they take."""
+    size = chunk.uncompressed_size
     if chunk.compression == "zstd":
-        return max(declared, zstandard.frame_content_size(chunk.data))
-    if chunk.compression == "lz4":
-        return max(declared, int(lz4.frame.get_frame_info(chunk.data)["content_size"]))
-    return declared
+        size = max(size, zstandard.frame_content_size(chunk.data))
+    elif chunk.compression == "lz4":
+        size = max(size, int(lz4.frame.get_frame_info(chunk.data)["content_size"]))
+    if size > LARGEST_RECORD:
+        raise ValueError("damaged: a chunk larger than any recorder writes")
+    try:
+        return breakup_chunk(chunk, validate_crc=True)
+    except EndOfFile as exc:  # of the chunk: the file goes on
+        raise ValueError(f"damaged: {exc}") from exc
 
 
 def _message(name: str, octets: bytes) -> Recorded:
@@ -318,14 +312,8 @@ def export(recording: Recording, out: Path, begin_s: float = 0.0, end_s: float =
     scans = _between(recording.scans, begin_s, end_s)
     if out.suffix == ".csv":
         _save_csv(scans, out)
-        return len(scans)
-    arrays = _arrays(recording, scans)
-    if arrays["ratio"].nbytes > MAX_ARRAY_BYTES:
-        raise RecordingError(
-            f"{len(scans)} scans are more than a readings file holds: export a part of them, "
-            "--begin and --end"
-        )
-    save_arrays(out, arrays)
+    else:
+        save_arrays(out, _arrays(recording, scans))
     return len(scans)
 
 
@@ -353,8 +341,14 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
     """
     board = recording.hellos[0]
     codes = np.array([scan.codes for scan in scans])
+    ratio = ratio_from_codes(codes, board.adc_bits).astype(np.float32)
+    if ratio.nbytes > MAX_ARRAY_BYTES:
+        raise RecordingError(
+            f"{len(scans)} scans are more than a readings file holds: export a part of them, "
+            "--begin and --end"
+        )
     arrays: dict[str, Any] = {
-        "ratio": ratio_from_codes(codes, board.adc_bits).astype(np.float32),
+        "ratio": ratio,
         "ref_top_ohm": float(board.ref_top_ohm),
         "ref_bottom_ohm": float(board.ref_bottom_ohm),
         "adc_bits": board.adc_bits,
