@@ -77,14 +77,14 @@ def still_wanted(wanted: Iterable[Press], read: Iterable[Press]) -> list[Press]:
     """What is wanted and not read yet, in order. Each press read counts once."""
     left, missing = list(read), []
     for press in wanted:
-        for index, other in enumerate(left):
-            if other.cell == press.cell and math.isclose(
-                other.force_n, press.force_n, rel_tol=1e-6
-            ):
-                del left[index]
-                break
-        else:
+        on_cell = (each for each in left if each.cell == press.cell)
+        alike = (
+            each for each in on_cell if math.isclose(each.force_n, press.force_n, rel_tol=1e-6)
+        )
+        if (found := next(alike, None)) is None:
             missing.append(press)
+        else:
+            left.remove(found)
     return missing
 
 

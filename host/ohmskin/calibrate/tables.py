@@ -190,17 +190,14 @@ def _read(
 
 def _rows(text: io.TextIOWrapper) -> Iterator[tuple[int, list[str]]]:
     """The rows that are not empty, each with its number."""
-    reader = csv.reader(text, strict=True)
-    while True:
-        row = reader.line_num + 1
-        try:
-            cells = next(reader, None)
-        except csv.Error as error:
-            raise ValueError(f"row {row} is damaged: {error}: mend it, or leave it out") from error
-        if cells is None:
-            return
-        if len(cells) > 1 or "".join(cells).strip():
-            yield row, cells
+    reader, row = csv.reader(text, strict=True), 1
+    try:
+        for cells in reader:
+            if len(cells) > 1 or "".join(cells).strip():
+                yield row, cells
+            row = reader.line_num + 1
+    except csv.Error as error:
+        raise ValueError(f"row {row} is damaged: {error}: mend it, or leave it out") from error
 
 
 def _places(
