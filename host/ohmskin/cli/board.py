@@ -51,9 +51,7 @@ def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")
     if as_json:
         print(json.dumps([asdict(port) for port in found]))  # noqa: T201
         return
-    table = Table(box=None)
-    for heading in ("port", "board", "description"):
-        table.add_column(heading)
+    table = Table("port", "board", "description", box=None)
     for port in found:
         table.add_row(port.path, port.board or "?", port.description)
     _out.print(table if found else "no serial ports: is the board plugged in?")
@@ -81,9 +79,10 @@ def info(
     for name, value in facts.items():
         table.add_row(name, _text(name, value))
     _out.print(table)
-    for finding in facts.get("findings", ()):
+    findings = facts.get("findings", ())
+    for finding in findings:
         _out.print(f"[red]{finding}[/]: {ENUMS['finding'].docs[finding]}")
-    if facts.get("findings"):
+    if findings:
         raise SystemExit(1)
 
 
@@ -191,10 +190,9 @@ def _answer(board: str, port: str, before: set[str]) -> tuple[str, Hello]:
     """Where the flashed board is now, which may be a new port, and what it says of itself."""
     deadline_s = time.monotonic() + REBOOT_S
     while True:
-        attached = serial_ports()
-        new = [each.path for each in attached if each.board == board and each.path not in before]
-        gone = port in before and all(each.path != port for each in attached)
-        at = new[0] if gone and len(new) == 1 else port
+        now = {each.path: each.board for each in serial_ports()}
+        new = [path for path, name in now.items() if name == board and path not in before]
+        at = new[0] if port in before - now.keys() and len(new) == 1 else port
         try:
             with ohmskin.open(at, start=False) as skin:
                 return at, skin.info

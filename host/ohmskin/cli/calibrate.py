@@ -2,14 +2,14 @@
 """``ohmskin calibrate``: with weights, from a recording, from a table of presses; ``tare``."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, track
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 import ohmskin
 from ohmskin.arrays import Float
@@ -25,7 +25,7 @@ from ohmskin.calibrate.tables import (
     save_press_table,
 )
 from ohmskin.cli.board import Wires, wires_of
-from ohmskin.cli.record import until_stopped
+from ohmskin.cli.record import progress, until_stopped
 from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
@@ -33,7 +33,7 @@ from ohmskin.files import naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.force.regression import MIN_PRESSES
 from ohmskin.link.device import Device
-from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
 
 # Standard gravity [m/s^2].
@@ -142,7 +142,7 @@ def recording(
             samples = np.array([(each.host_time_s, each.force_n) for each in given.forces])
             log = ForceLog(*samples.T)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s))
-        history = calibrator.measure(given.scans, _with_progress)
+        history = calibrator.measure(given.scans, progress("scans"))
         alignment = align(history.time_s, history.of_skin, log)
         presses = find_presses(history, log, alignment.offset_s)
     note = (
@@ -268,12 +268,6 @@ def _finish(
     elif top is None or bottom is None:
         _out.print("wires are not told (--wires): forces' standard deviations are wide")
     _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
-
-
-def _with_progress(scans: Iterable[Scan]) -> Iterable[Scan]:
-    """The scans, and a bar in a terminal that says how many have been read."""
-    console = Console(stderr=True)
-    return track(scans, "scans", console=console, transient=True, disable=not console.is_terminal)
 
 
 # -------------------------------------------------------------------------------- with weights

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -109,6 +109,13 @@ def record(
         done += f", {recorder.forces} forces"
         done += f", {sensor.damaged} lines that are no numbers" if sensor.damaged else ""
     _out.print(f"{file}: {done}", markup=False)
+
+
+def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
+    """Passes things on; in a terminal, a bar says how many have been."""
+    console = Console(stderr=True)
+    hidden = not console.is_terminal
+    return partial(track, description=what, console=console, transient=True, disable=hidden)
 
 
 def until_stopped(scans: Iterable[_T]) -> Iterator[_T]:
@@ -223,11 +230,7 @@ def estimate(
     cold: Annotated[bool, typer.Option(help="start every frame afresh")] = False,
 ) -> None:
     """Estimate every cell of every frame of a readings file."""
-    given = load_readings(readings)
-    errors = Console(stderr=True)
-    hidden = not errors.is_terminal
-    bar = partial(track, description=method, console=errors, transient=True, disable=hidden)
-    answers = estimate_file(given, method, cold=cold, watch=bar)
+    answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))
     save_arrays(out, answers)
     frames = len(answers["converged"])
     _out.print(
