@@ -259,9 +259,8 @@ def _finish(
     ]
     title = "held-out error [N], of so many presses; *: no curve of its own"
     table = cell_table(np.reshape(texts, model.pooled.shape).tolist(), title)
-    for each in (note, table, message):
-        if each:
-            _out.print(each)
+    for each in filter(None, (note, table, message)):
+        _out.print(each)
     top, bottom, log_std = calibration.nominal_wire_ohm
     if log_std is not None:
         _out.print(f"wires, as presses tell: {top:.0f}, {bottom:.0f} Ohm, +- {100 * log_std:.0f} %")

@@ -57,7 +57,7 @@ class ContactTracker:
     """
 
     def __init__(self) -> None:
-        self._known: list[tuple[Contact, int]] = []  # with the time it was last seen [us]
+        self._known: dict[int, tuple[Contact, int]] = {}  # by identity, with when last seen [us]
         self._last = 0
         self._before_us = 0
 
@@ -65,37 +65,32 @@ class ContactTracker:
         self, time_us: int, touched: NDArray[np.bool_], force_n: Float, force_n_std: Float
     ) -> tuple[Contact, ...]:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
-        known = []
-        for contact, seen_us in self._known:
+        for identity, (_, seen_us) in list(self._known.items()):
             longest_us = SLOWEST_SCAN_US if seen_us == self._before_us else MEMORY_US
-            if 0 <= time_us - seen_us <= longest_us:
-                known.append((contact, seen_us))
+            if not 0 <= time_us - seen_us <= longest_us:
+                del self._known[identity]
         self._before_us = time_us
         found = _found(touched, force_n, force_n_std)
-        for new, old in _matches(found, [contact for contact, _ in known]):
-            found[new] = replace(found[new], identity=known[old][0].identity)
+        identities = _identities(found, [contact for contact, _ in self._known.values()])
         for index, contact in enumerate(found):
-            if not contact.identity:
+            if index not in identities:
                 self._last += 1
-                found[index] = replace(contact, identity=self._last)
-        found.sort(key=lambda contact: contact.identity)
-        here = {contact.identity for contact in found}
-        gone = [each for each in known if each[0].identity not in here]
-        self._known = [*gone, *((contact, time_us) for contact in found)]
-        return tuple(found)
+            found[index] = replace(contact, identity=identities.get(index, self._last))
+        self._known |= {contact.identity: (contact, time_us) for contact in found}
+        return tuple(sorted(found, key=lambda contact: contact.identity))
 
 
-def _matches(found: list[Contact], known: list[Contact]) -> list[tuple[int, int]]:
-    """Indices of a contact that is found and of the known contact that it is."""
+def _identities(found: list[Contact], known: list[Contact]) -> dict[int, int]:
+    """By the index of each contact that is found and was known: the identity it had."""
     from scipy.optimize import linear_sum_assignment
 
     if not found or not known:
-        return []
+        return {}
     new, old = (np.array([(each.row, each.column) for each in some]) for some in (found, known))
     away = np.hypot(*(new[:, None] - old[None]).transpose(2, 0, 1))
     away[away > FARTHEST_CELLS] = _FAR
     pairs = zip(*linear_sum_assignment(away), strict=True)
-    return [(one, other) for one, other in pairs if away[one, other] < _FAR]
+    return {one: known[other].identity for one, other in pairs if away[one, other] < _FAR}
 
 
 def _found(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> list[Contact]:

@@ -116,9 +116,14 @@ class SkinReader:
         return self._made[0]
 
     @property
+    def force_method(self) -> str | None:
+        """The method that gives newtons: that of the calibration, if there is one."""
+        return None if self._calibration is None else self._calibration.method
+
+    @property
     def has_forces(self) -> bool:
         """Whether scans get newtons: there is a calibration, and the method is its own."""
-        return self._calibration is not None and self._calibration.method == self._made[0]
+        return self.method == self.force_method
 
     @property
     def rest(self) -> Rest | Untouched | None:

@@ -47,10 +47,10 @@ class Replay(Device):
     :raises ValueError: a negative speed.
     """
 
-    def __init__(self, path: str, speed: float = 1.0, name: str = "") -> None:
+    def __init__(self, path: str, speed: float, name: str) -> None:
         if not 0 <= speed < float("inf"):
             raise ValueError(f"speed must be 0 or more, not {speed}")
-        super().__init__(name or f"replay://{path}", BoardStats())
+        super().__init__(name, BoardStats())
         self._speed = speed
         self._messages = messages(path)
         hello = next(self._messages)

@@ -194,7 +194,7 @@ class ViewedBoard(Closing):
             "board": board and {name: getattr(board, name) for name in _OF_BOARD},
             "methods": [] if reader is None else _methods(reader),
             "method": "" if reader is None else reader.method,
-            "force_method": None if reader is None else _force_method(reader),
+            "force_method": None if reader is None else reader.force_method,
             "rest_date": rest and rest.date,
             "tared": reader is not None and reader.is_tared,
             "recording": "" if running is None else str(running.recorder.path),
@@ -223,7 +223,7 @@ class ViewedBoard(Closing):
         with self._one_at_a_time():
             skin, reader = self._there()
             self._record_rest(reader.tare(skin.mean_ratio(TARE_S), force=force))
-        lasts = "; 'ohmskin tare' makes one that lasts" if _force_method(reader) else ""
+        lasts = "; 'ohmskin tare' makes one that lasts" if reader.force_method else ""
         return f"tared, until this program ends{lasts}"
 
     def undo_tare(self) -> str:
@@ -371,14 +371,9 @@ class ViewedBoard(Closing):
         self._changed()
 
 
-def _force_method(reader: SkinReader) -> str | None:
-    """The method that gives newtons, if there is one."""
-    return None if reader.calibration is None else reader.calibration.method
-
-
 def _methods(reader: SkinReader) -> tuple[str, ...]:
     """The methods that the page offers."""
-    own = _force_method(reader)
+    own = reader.force_method
     return LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
 
 
