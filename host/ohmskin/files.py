@@ -10,9 +10,11 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import BinaryIO, Self
 
+PathName = str | os.PathLike[str]
+
 
 @contextmanager
-def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+def naming(path: PathName) -> Iterator[None]:
     """Put the file's name before the text of a ValueError from inside, and keep it one line."""
     try:
         yield
@@ -21,7 +23,7 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
         raise ValueError(f"{os.fspath(path)}: {reason}") from error
 
 
-def read_bounded(path: str | os.PathLike[str], most_bytes: int) -> bytes:
+def read_bounded(path: PathName, most_bytes: int) -> bytes:
     """All bytes of a file. Raises ValueError if it cannot be read, or is larger than that."""
     try:
         with open(path, "rb") as file:
@@ -34,7 +36,7 @@ def read_bounded(path: str | os.PathLike[str], most_bytes: int) -> bytes:
 
 
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def whole_file(path: PathName) -> Iterator[BinaryIO]:
     """A file to write beside `path`, which takes its place at the end if nothing was raised.
 
     Raises ValueError, which names the path, if it cannot be written.
@@ -54,9 +56,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise ValueError(f"{target}: cannot be written: {error.strerror or error}") from error
 
 
-def save_table(
-    path: str | os.PathLike[str], names: Iterable[str], rows: Iterable[Iterable[object]]
-) -> None:
+def save_table(path: PathName, names: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
     """Write a CSV file with these column names, as `whole_file`. Numbers are kept bit for bit."""
     with whole_file(path) as file:
         text = TextIOWrapper(file, encoding="ascii", newline="", write_through=True)

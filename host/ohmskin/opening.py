@@ -14,7 +14,6 @@ What only one kind needs is imported when that kind is opened.
 from __future__ import annotations
 
 import heapq
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 from urllib.parse import parse_qsl
 
 from ohmskin.errors import DeviceSilent, PortError
-from ohmskin.files import Closing, naming
+from ohmskin.files import Closing, PathName, naming
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import CalibratedSkin
 from ohmskin.link import protocol
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from ohmskin.emulate.faults import LineFaults, SkinFaults
     from ohmskin.emulate.scenes import Scene
 
-CalibrationLike = Calibration | str | os.PathLike[str]
+CalibrationLike = Calibration | PathName
 
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3

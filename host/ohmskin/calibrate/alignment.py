@@ -34,9 +34,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.tables import ForceLog, between_gaps
 
 # Both are compared on a grid of this step [s]: as fine as the scans of most boards.
@@ -113,7 +113,7 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     )
 
 
-def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, NDArray[np.bool_]]:
+def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
     """Edges on a grid that begins with `time_s`, 0 in gaps; and where there is no gap."""
     from scipy.ndimage import binary_erosion, gaussian_filter1d
 
@@ -140,9 +140,7 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, NDArray[np.b
     return np.where(inside, np.gradient(smooth, STEP_S), 0.0), inside
 
 
-def correlations(
-    x: Float, in_x: NDArray[np.bool_], y: Float, in_y: NDArray[np.bool_]
-) -> tuple[Float, Float]:
+def correlations(x: Float, in_x: Bool, y: Float, in_y: Bool) -> tuple[Float, Float]:
     """r and n (K,) of all lags, the first being 1 - Y; r is 0 where either does not vary.
 
     x, y: edges; in_x, in_y: where there are edges, not gaps.

@@ -8,9 +8,8 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.presses import SECOND_SHARE
 
 # Cells as (row, column).
@@ -65,7 +64,7 @@ class Step(NamedTuple):
     rise_std: float = math.nan
 
 
-def pressed_cells(rise: Float, touched: NDArray[np.bool_]) -> Cells:
+def pressed_cells(rise: Float, touched: Bool) -> Cells:
     """The touched cell that rises most, and all that rise by more than `SECOND_SHARE` of it."""
     top = float(np.max(rise, where=touched, initial=0.0))
     if top <= 0:
@@ -140,7 +139,7 @@ class Guide:
         self._is_read = False
         self._window: deque[tuple[float, float]] = deque()  # times [s], rises of the wanted cell
 
-    def feed(self, time_s: float, rise: Float, touched: NDArray[np.bool_]) -> Step:
+    def feed(self, time_s: float, rise: Float, touched: Bool) -> Step:
         """One scan, in order: time on any clock [s]; rise above rest [S], touched (R, C)."""
         if self._window and time_s <= self._window[-1][0]:
             self._window.clear()

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.tables import ForceLog, PressTable
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
@@ -83,7 +83,7 @@ class LevelHistory:
     time_s: Float
     rise: Float
     rise_std: Float
-    touched: NDArray[np.bool_]
+    touched: Bool
 
     @property
     def of_skin(self) -> Float:
@@ -128,7 +128,7 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     )
 
 
-def _pressed(rise: Float, touched: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _pressed(rise: Float, touched: Bool) -> NDArray[np.intp]:
     """Index of the cell that each scan belongs to, or `_NOTHING`. Arrays (n, R * C)."""
     from scipy.ndimage import binary_closing
 

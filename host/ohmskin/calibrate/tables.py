@@ -24,7 +24,6 @@ import codecs
 import csv
 import io
 import math
-import os
 import re
 from array import array
 from collections.abc import Iterator, Sequence
@@ -35,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.files import naming, read_bounded, save_table
+from ohmskin.files import PathName, naming, read_bounded, save_table
 from ohmskin.force.curve import require_rows
 from ohmskin.record.readings import MAX_CELLS
 
@@ -124,14 +123,14 @@ def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
     return np.where(inside & is_gap[after - 1], np.nan, found)
 
 
-def load_force_log(path: str | os.PathLike[str]) -> ForceLog:
+def load_force_log(path: PathName) -> ForceLog:
     """Read a force log. Raises ValueError: see the module."""
     with naming(path):
         columns, rows = _read(path, ("time_s", "force_n"))
         return ForceLog(**columns, rows=rows)
 
 
-def load_press_table(path: str | os.PathLike[str]) -> PressTable:
+def load_press_table(path: PathName) -> PressTable:
     """Read a table of presses, (n,) of `PRESS`, at least one. Raises ValueError: see the module."""
     with naming(path):
         columns, rows = _read(path, _NEEDED, _COLUMNS[len(_NEEDED) :])
@@ -151,7 +150,7 @@ def load_press_table(path: str | os.PathLike[str]) -> PressTable:
         return table
 
 
-def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
+def save_press_table(path: PathName, table: PressTable) -> None:
     """Write a file that is either complete or not there, and is read back bit for bit.
 
     Raises ValueError if it cannot be written.
@@ -160,7 +159,7 @@ def save_press_table(path: str | os.PathLike[str], table: PressTable) -> None:
 
 
 def _read(
-    path: str | os.PathLike[str], needed: Sequence[str], optional: Sequence[str] | None = None
+    path: PathName, needed: Sequence[str], optional: Sequence[str] | None = None
 ) -> tuple[dict[str, Float], NDArray[np.int64]]:
     """Columns (n,) by name, and the number (n,) in the file of each row.
 

@@ -10,7 +10,8 @@ from enum import Enum, StrEnum
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ohmskin.arrays import Bool
 
 Cell = tuple[int, int]  # row, column
 
@@ -75,7 +76,7 @@ class Place:
     cells: tuple[Cell, ...] = ()
 
     @classmethod
-    def of_cells(cls, where: NDArray[np.bool_]) -> Self:
+    def of_cells(cls, where: Bool) -> Self:
         """Each cell that is true in `where` (R, C)."""
         return cls(cells=tuple((int(row), int(column)) for row, column in np.argwhere(where)))
 
@@ -83,7 +84,7 @@ class Place:
 WHOLE_SKIN: Final = Place()
 
 
-def lines_of(where: NDArray[np.bool_]) -> tuple[int, ...]:
+def lines_of(where: Bool) -> tuple[int, ...]:
     """Number of each line that is true in `where` (R,) or (C,)."""
     return tuple(map(int, np.flatnonzero(where)))
 

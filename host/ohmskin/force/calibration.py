@@ -29,7 +29,6 @@ its fields, their types, shapes and ranges are checked before anything is made o
 """
 
 import json
-import os
 from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Final, Self
@@ -41,7 +40,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
-from ohmskin.files import naming, read_bounded, whole_file
+from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
 from ohmskin.record.readings import MAX_CELLS
 
@@ -154,7 +153,7 @@ class Calibration:
                 "calibrate this skin, or force it if the same skin has a new board"
             )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: PathName) -> None:
         """Write a file that is either complete or not there: a temporary file, then a rename.
 
         Raises ValueError if it cannot be written.
@@ -185,7 +184,7 @@ def _check_date(date: str) -> None:
         raise ValueError(f"date is {date[:40]!r}, not ISO 8601") from None
 
 
-def load_calibration(path: str | os.PathLike[str]) -> Calibration:
+def load_calibration(path: PathName) -> Calibration:
     """Read and check a calibration file.
 
     Raises ValueError, one line that names the file and the field, for whatever is wrong with it.

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 
 # A contact moves by at most so many cells between two scans: at 30 Hz a finger at 0.5 m/s passes
 # over 1.7 cells of 1 cm.
@@ -38,7 +37,7 @@ class Contact:
     column: float
     force_n: float
     force_n_std: float
-    cells: NDArray[np.bool_]
+    cells: Bool
 
     @property
     def force_text(self) -> str:
@@ -62,7 +61,7 @@ class ContactTracker:
         self._before_us = 0
 
     def update(
-        self, time_us: int, touched: NDArray[np.bool_], force_n: Float, force_n_std: Float
+        self, time_us: int, touched: Bool, force_n: Float, force_n_std: Float
     ) -> tuple[Contact, ...]:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
         for identity, (_, seen_us) in list(self._known.items()):
@@ -93,7 +92,7 @@ def _identities(found: list[Contact], known: list[Contact]) -> dict[int, int]:
     return {one: known[other].identity for one, other in pairs if away[one, other] < _FAR}
 
 
-def _found(touched: NDArray[np.bool_], force_n: Float, force_n_std: Float) -> list[Contact]:
+def _found(touched: Bool, force_n: Float, force_n_std: Float) -> list[Contact]:
     """The contacts of a scan, without their numbers."""
     from scipy.ndimage import center_of_mass, label
 

@@ -34,7 +34,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 
 LINEAR: Final = "linear"
 POWER: Final = "power"
@@ -65,7 +65,7 @@ class ForceModel:
     correlation: Float
     residual_std: Float
     residual_share: Float
-    pooled: NDArray[np.bool_]
+    pooled: Bool
     held_out_rmse: Float
 
     def __post_init__(self) -> None:
@@ -157,7 +157,7 @@ def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
     return np.maximum(force_by(curve, x + dx) - here, here - force_by(curve, x - dx))
 
 
-def require(name: str, good: NDArray[np.bool_], what: str) -> None:
+def require(name: str, good: Bool, what: str) -> None:
     """Raise ValueError, naming the first cell where it is not so. good: (R, C)."""
     if not good.all():
         row, column = (int(index) for index in np.argwhere(~good)[0])
@@ -167,7 +167,7 @@ def require(name: str, good: NDArray[np.bool_], what: str) -> None:
 def require_rows(
     name: str,
     values: NDArray[Any],
-    good: NDArray[np.bool_],
+    good: Bool,
     must: str,
     rows: NDArray[np.int64] | None = None,
 ) -> None:

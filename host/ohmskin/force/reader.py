@@ -17,9 +17,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import NO_WIRES, Estimate, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -318,7 +317,7 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def touched_cells(touched: NDArray[np.bool_]) -> str:
+def touched_cells(touched: Bool) -> str:
     """Which cells are touched, in words."""
     cells = [f"({row}, {column})" for row, column in np.argwhere(touched)]
     more = len(cells) - _NAMED_CELLS

@@ -48,7 +48,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.force.curve import (
     LINEAR,
     MAX_EXPONENT,
@@ -163,7 +163,7 @@ def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
     return {cell: curve for cell, curve in curves.items() if curve is not None}
 
 
-def _pooled_message(pooled: NDArray[np.bool_], pressed: NDArray[np.intp], skin: Curve) -> str:
+def _pooled_message(pooled: Bool, pressed: NDArray[np.intp], skin: Curve) -> str:
     """Which cells have no curve of their own. pressed: flat indices of those with presses."""
     if not pooled.any():
         return ""

@@ -21,7 +21,6 @@ a frame is not converged, or what is wrong with its readings), chi2 (F, per read
 iterations (F), seconds (F).
 """
 
-import os
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -35,7 +34,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, READINGS_PER_CELL
 from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.files import naming, whole_file
+from ohmskin.files import PathName, naming, whole_file
 
 MAX_ARRAY_BYTES: Final = 200_000_000
 # The estimators' matrices grow with the square: 4096 cells make 134 MB.
@@ -116,7 +115,7 @@ def _of_frame(per_frame: Float | None, frame: int) -> float | None:
     return float(per_frame[frame] if per_frame.ndim else per_frame)
 
 
-def load_readings(path: str | os.PathLike[str]) -> Readings:
+def load_readings(path: PathName) -> Readings:
     """Read a readings file. Nothing in it is executed; no array may exceed 2e8 bytes.
 
     Raises ValueError, one line that names the file and the array, for whatever is wrong with it.
@@ -189,7 +188,7 @@ def estimate_file(
     return {name: np.array([getattr(each, name) for each in estimates]) for name in names}
 
 
-def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]]) -> None:
+def save_arrays(path: PathName, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write an .npz that is either complete or not there: a temporary file, then a rename.
 
     Raises ValueError if it cannot be written, or for an array of Python objects.

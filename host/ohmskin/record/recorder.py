@@ -19,7 +19,7 @@ from mcap.writer import Writer
 
 from ohmskin.arrays import Float
 from ohmskin.errors import RecordingError
-from ohmskin.files import Closing
+from ohmskin.files import Closing, PathName
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.force_sensor import ForceSensor
@@ -47,7 +47,7 @@ class Recorder(Closing):
         more is written, and what was written before can be read.
     """
 
-    def __init__(self, path: str | os.PathLike[str], board: Hello) -> None:
+    def __init__(self, path: PathName, board: Hello) -> None:
         self.path = Path(path)
         self.scans = self.missed = self.forces = 0
         self.board = board

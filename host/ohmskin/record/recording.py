@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
-from ohmskin.files import save_table
+from ohmskin.files import PathName, save_table
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
@@ -147,7 +147,7 @@ class Recording:
     cut_off: bool
 
 
-def load_recording(path: str | os.PathLike[str]) -> Recording:
+def load_recording(path: PathName) -> Recording:
     """Read a whole recording; that of a recorder that was killed, up to its last whole chunk.
 
     :raises RecordingError: one line that names the file and what is wrong with it.
@@ -161,7 +161,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), not whole)
 
 
-def messages(path: str | os.PathLike[str]) -> Generator[Recorded | None, None, None]:
+def messages(path: PathName) -> Generator[Recorded | None, None, None]:
     """The messages of a recording in order, hello first; None last of all if it ended properly.
 
     :raises RecordingError: as `load_recording`.
