@@ -19,13 +19,7 @@ import time
 from dataclasses import replace
 from typing import Final
 
-from ohmskin.errors import (
-    CommandRefused,
-    OhmskinError,
-    PortError,
-    RecordingEnded,
-    RecordingError,
-)
+from ohmskin.errors import CommandRefused, PortError, RecordingEnded, RecordingError
 from ohmskin.link import protocol
 from ohmskin.link.device import QUEUE_SCANS, Device
 from ohmskin.link.messages import BoardStats, Hello, Scan
@@ -92,8 +86,7 @@ class Replay(Device):
         super().close()
 
     def _play(self) -> None:
-        rest_ratio = None
-        error: OhmskinError = RecordingEnded(f"{self.name} has been played to where it was cut off")
+        rest_ratio, end = None, "where it was cut off"
         try:
             for message in self._messages:
                 if isinstance(message, Hello | Scan) and not self._wait_for(message):
@@ -106,10 +99,10 @@ class Replay(Device):
                     case Tare():
                         rest_ratio = message.rest_ratio
                     case None:
-                        error = RecordingEnded(f"{self.name} has been played to its end")
+                        end = "its end"
+            self._fail(RecordingEnded(f"{self.name} has been played to {end}"))
         except RecordingError as exc:
-            error = exc
-        self._fail(error)
+            self._fail(exc)
 
     def _play_scan(self, scan: Scan) -> None:
         if int(scan.codes.max()) >> protocol.ADC_BITS:
