@@ -22,7 +22,7 @@ from rich.text import Text
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli.stream import cell_table
+from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.reader import SkinReader
@@ -36,8 +36,6 @@ from ohmskin.record.recording import export as export_recording
 
 # With a force sensor the first scans are a tare of so many seconds, unless told.
 FORCE_TARE_S: Final = 2.0
-# A display looks at ten scans a second [s].
-_SEE_EVERY_S: Final = 0.1
 # So many different messages of estimates are printed for a file.
 _MESSAGES: Final = 8
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -163,7 +161,7 @@ class PressDisplay:
     def see(self, scan: Scan) -> None:
         """Look at a scan that was recorded; at some of them, for estimates take time."""
         tare = self._recorder.tare
-        if tare is None or scan.host_time_s - self._seen_s < _SEE_EVERY_S:
+        if tare is None or scan.host_time_s - self._seen_s < DISPLAY_EVERY_S:
             return
         self._seen_s = scan.host_time_s
         if self._reader is None:

@@ -23,7 +23,7 @@ from ohmskin.arrays import Float
 from ohmskin.errors import ctrl_c_kept
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
-from ohmskin.force.reader import ForceScan, SkinReader
+from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
@@ -36,7 +36,7 @@ FULL_SCALE_N: Final = 10.0
 KNOWN_N: Final = 0.1
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 # Time between two pictures in a terminal [s]; every scan is counted all the same.
-_DISPLAY_EVERY_S: Final = 0.1
+DISPLAY_EVERY_S: Final = 0.1
 # What is printed of a contact.
 _OF_CONTACT: Final = ("identity", "row", "column", "force_n", "force_n_std")
 
@@ -77,10 +77,11 @@ def stream(
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
         with suppress(KeyboardInterrupt), ctrl_c_kept():
+            given = _limited(iter(skin), scans, seconds)
             if as_json:
-                _print_scans(skin, reader, scans, seconds)
+                _print_scans(reader, given)
             else:
-                _show_scans(skin, reader, scans, seconds)
+                _show_scans(skin, reader, given)
     lost = skin.stats
     if lost.missed or lost.line.damaged or lost.restarts:
         text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
@@ -96,8 +97,8 @@ def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan
             return
 
 
-def _print_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
-    for scan in _limited(iter(skin), count, seconds):
+def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
+    for scan in scans:
         line: dict[str, Any] = {
             "scan": scan.number,
             "time_us": scan.time_us,
@@ -131,11 +132,11 @@ def _numbers(values: ArrayLike) -> Any:
     return np.where(np.isnan(values), np.array(None), values).tolist()
 
 
-def _show_scans(skin: Device, reader: SkinReader | None, count: int, seconds: float) -> None:
+def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
     shown_s = 0.0
     with Live(console=_out, auto_refresh=False) as live:
-        for scan in _limited(iter(skin), count, seconds):
-            if scan.host_time_s - shown_s >= _DISPLAY_EVERY_S:
+        for scan in scans:
+            if scan.host_time_s - shown_s >= DISPLAY_EVERY_S:
                 shown_s = scan.host_time_s
                 live.update(_picture(skin, reader, scan), refresh=True)
 
@@ -157,19 +158,15 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
         least_n = np.where(found.estimate.touched, 0.0, KNOWN_N)
         uncertain = found.force_n_std > np.maximum(found.force_n, least_n)
         table = _coloured(np.where(uncertain, np.nan, found.force_n), FULL_SCALE_N)
-        caption = f"{_contact_line(found)}\n{caption}"
+        contacts = (
+            f"contact {each.identity}: {each.force_text} at ({each.row:.1f}, {each.column:.1f})"
+            for each in found.contacts
+        )
+        caption = f"{'   '.join(contacts) or 'no contact'}\n{caption}"
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
         table = conductances(found.estimate.cell_siemens)
     return Group(Text(title), table, Text(caption))
-
-
-def _contact_line(scan: ForceScan) -> str:
-    texts = (
-        f"contact {each.identity}: {each.force_text} at ({each.row:.1f}, {each.column:.1f})"
-        for each in scan.contacts
-    )
-    return "   ".join(texts) or "no contact"
 
 
 def conductances(cell_siemens: Float, title: str = "") -> Table:

@@ -241,15 +241,12 @@ class CalibratedSkin(Closing):
 
     def __init__(self, device: Device, calibration: Calibration, *, force: bool = False) -> None:
         self.device = device
+        self.name = device.name
+        """See `Device.name`."""
         board = device.info
         calibration.check(board.unit_id, board.rows, board.columns, force=force)
         self._reader = SkinReader(board, calibration)  # even forced, it must have the same cells
         self._lock = threading.Lock()
-
-    @property
-    def name(self) -> str:
-        """See `Device.name`."""
-        return self.device.name
 
     @property
     def info(self) -> Hello:
