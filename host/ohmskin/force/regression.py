@@ -287,17 +287,17 @@ class _Trial:
         of_skin: for cells that nobody pressed, the groups being cells.
         """
         rows, v = self._rows, self._v[grows]
-        fits = ((kind, _FITS[kind](rows.x, rows.force, v)) for kind in self._kinds(grows))
-        kind, curve = next((each for each in fits if each[1] is not None), ("", None))
+        fits = (_FITS[kind](rows.x, rows.force, v) for kind in self._kinds(grows))
+        curve = next((each for each in fits if each is not None), None)
         if curve is None:
             return None
-        coefficients = 2 if kind == POWER else 1
+        coefficients = 2 if curve.kind == POWER else 1
         # Of Student's t: rss / (n - p) times (n - p) / (n - p - 2).
         freedom = rows.x.size - coefficients
         square = float(np.sum((rows.force - force_by(curve, rows.x)) ** 2 / v)) / (freedom - 2)
         of_rise = float(np.mean(spread(curve, rows.x, rows.dx) ** 2 / v))
         s = float(np.sqrt(max(square - of_rise, 0.0)))
-        error = self._errors.get((kind, grows), np.full_like(v, np.nan))
+        error = self._errors.get((curve.kind, grows), np.full_like(v, np.nan))
         held_out_s = _rms(error / np.sqrt(v))
         if of_skin:
             s = float(np.maximum(s, held_out_s))  # NaN stays
