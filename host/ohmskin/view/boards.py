@@ -116,29 +116,22 @@ def _number(value: float) -> float | None:
 
 
 class _Recording(Closing):
-    """Records `skin` to `path` in a thread of its own, until it is closed or the board is gone.
+    """Records `skin` in a thread of its own, until it is closed or the board is gone.
 
-    tare: the one in force. ended: is called, from that thread, when the file is whole. text: then
-    says how it went.
-
-    :raises RecordingError: the file cannot be written.
+    ended: is called, from that thread, when the file is whole. text: then says how it went.
     """
 
-    def __init__(
-        self, skin: Device, path: Path, tare: Tare | None, ended: Callable[[], None]
-    ) -> None:
+    def __init__(self, skin: Device, recorder: Recorder, ended: Callable[[], None]) -> None:
         self.text = ""
-        self.recorder = Recorder(path, skin.info)
+        self.recorder = recorder
         self._until_s = float("inf")
-        self._thread = threading.Thread(target=self._work, args=(skin, tare, ended))
+        self._thread = threading.Thread(target=self._work, args=(skin, ended))
         self._thread.start()
 
-    def _work(self, skin: Device, tare: Tare | None, ended: Callable[[], None]) -> None:
+    def _work(self, skin: Device, ended: Callable[[], None]) -> None:
         trouble = ""
         try:
             with self.recorder as recorder:
-                if tare is not None:
-                    recorder.add(tare)
                 in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, skin)
                 record(skin, recorder, in_time)
         except OhmskinError as exc:
@@ -239,11 +232,10 @@ class ViewedBoard(Closing):
             skin, reader = self._there()
             if (running := self._running()) is not None:
                 raise OhmskinError(f"{running.recorder.path} is being recorded already")
-            tare = None
+            recorder = Recorder(self._new_file(reader.board.unit_id), skin.info)
             if reader.is_tared and reader.rest is not None:
-                tare = Tare(reader.rest.ratio, time.monotonic())
-            path = self._new_file(reader.board.unit_id)
-            self._recording = _Recording(skin, path, tare, self._changed)
+                recorder.add(Tare(reader.rest.ratio, time.monotonic()))
+            self._recording = _Recording(skin, recorder, self._changed)
         return "recording: every scan, whatever is shown"
 
     def stop_recording(self) -> str:
