@@ -83,7 +83,7 @@ class ForceSensor(Closing):
         self._decoder = ForceLineDecoder(newtons_per_unit)
         self._octets = 0  # since the last force
         self._changed = threading.Condition()
-        self._waiting: deque[ForceSample] = deque()
+        self._waiting: deque[ForceSample] = deque(maxlen=QUEUE_SAMPLES)
         self._last_s = time.monotonic()
         self._closing = self._is_gone = False
         self._thread = threading.Thread(target=self._read, name=f"read {path}", daemon=True)
@@ -147,13 +147,11 @@ class ForceSensor(Closing):
             if not forces_n:
                 return
             self._octets = 0
+            self.dropped += max(len(self._waiting) + len(forces_n) - QUEUE_SAMPLES, 0)
             step_s = min((now_s - self._last_s) / len(forces_n), _LONGEST_STEP_S)
             for later, force_n in zip(reversed(range(len(forces_n))), forces_n, strict=True):
                 self._last_s = max(now_s - later * step_s, self._last_s + _SHORTEST_STEP_S)
                 self._waiting.append(ForceSample(force_n, self._last_s, source=self.path))
-            while len(self._waiting) > QUEUE_SAMPLES:
-                self._waiting.popleft()
-                self.dropped += 1
             self._changed.notify_all()
 
     def close(self) -> None:
