@@ -18,14 +18,14 @@ from contextlib import asynccontextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import anyio
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
@@ -193,13 +193,13 @@ class Guard:
         await answer(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> str:
-        headers = Headers(scope=scope)
-        host, origin = headers.get("host", ""), headers.get("origin")
+        asked = HTTPConnection(scope)
+        host, origin = asked.headers.get("host", ""), asked.headers.get("origin")
         if self._token is None:
             if _name(host) not in self._names:
                 return "this page is at 127.0.0.1, and by no other name"
         elif scope["path"] not in self._public:
-            given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+            given = asked.query_params.get("token", "")
             if not secrets.compare_digest(given.encode(), self._token.encode()):
                 return "open the address that 'ohmskin view' has printed, with its token"
         changes = scope["type"] == "websocket" or scope["method"] not in _READS
