@@ -19,7 +19,6 @@ from ohmskin.cli.stream import FULL_SCALE_US, conductances
 from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
-from ohmskin.errors import OhmskinError
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -78,8 +77,9 @@ def demo(
     )
     try:
         _save_picture(picture, views, title)
-    except OhmskinError as exc:
-        out.print(f"no picture: {exc}", markup=False)
+    except ImportError:
+        hint = "no picture: pictures need matplotlib: pip install 'ohmskin[plot]'"
+        out.print(hint, markup=False)
     else:
         out.print(f"picture: {picture}")
 
@@ -87,12 +87,10 @@ def demo(
 def _save_picture(path: Path, views: Sequence[tuple[str, Float, Bool]], title: str) -> None:
     """A PNG of views side by side: name, conductances [S] and touched cells, each (R, C).
 
-    :raises OhmskinError: matplotlib is not installed.
+    :raises ImportError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as exc:
-        raise OhmskinError("pictures need matplotlib: pip install 'ohmskin[plot]'") from exc
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(3.4 * len(views) + 0.8, 3.9), layout="constrained")
     figure.suptitle(title)
     all_axes = figure.subplots(1, len(views), squeeze=False)[0]
