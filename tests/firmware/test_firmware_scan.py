@@ -103,9 +103,9 @@ def test_settle_time_is_kept_while_commands_arrive(rig: Rig, scan: dict[str, int
 def test_board_clock_runs_on_between_scans(rig: Rig) -> None:
     """The time of the first scan follows the simulator's clock, to the clock's 4 us."""
     ahead_us = []
-    for pause_s in (0.0, 0.0123, 0.3, 0.0011):
-        rig.run(pause_s)
-        rig.start_scan()
+    for rows, rate_mhz in (8, 90_000), (1, 90_000), (1, 50_000), (2, 7_000), (8, 90_000):
+        rig.run(0.0123 * rows)
+        rig.start_scan(rows=rows, columns=rows, rate_mhz=rate_mhz)
         rig.run(0.1)
         rig.must("stop")
         start = rig.check().start_cycles[0]

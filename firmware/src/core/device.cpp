@@ -245,8 +245,9 @@ void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
     groups_left_ = 0;
     board::scanner.begin(request.rows, request.columns, plan.idle_slots);
     const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
-    scan_time_us_ = board::now_us() + Scanner::FIRST_SLOT * plan.slot_cycles / cycles_per_us;
-    scan_time_rest_ = 0;
+    const uint32_t ahead = uint32_t{plan.slot_cycles} * Scanner::FIRST_SLOT;  // beyond 16 bits
+    scan_time_us_ = board::now_us() + ahead / cycles_per_us;
+    scan_time_rest_ = static_cast<uint8_t>(ahead % cycles_per_us);
     board::start_slots(plan, request.adc_prescaler);
 }
 

@@ -228,7 +228,7 @@ TEST(a_scan_frame_holds_every_code_in_order) {
     CHECK(fake::state.slots_running);
     bench.host.rewind();
     bench.slots(2 + 2 * 12 + fake::state.plan.idle_slots + 1, ramp);
-    const uint32_t period_us = fake::state.plan.scan_cycles() / 16;
+    const ScanPlan plan = fake::state.plan;
     for (uint8_t scan = 0; scan < 2; scan++) {
         Frame frame;
         if (!CHECK(bench.host.next(&frame)))
@@ -238,7 +238,7 @@ TEST(a_scan_frame_holds_every_code_in_order) {
         memcpy(&header, frame.payload, sizeof header);
         CHECK_EQ(sizeof header + 15, frame.size);
         CHECK_EQ(scan, header.scan);
-        CHECK_EQ(5000 + 2 * fake::state.plan.slot_cycles / 16 + scan * period_us, header.time_us);
+        CHECK_EQ(5000 + (2 * plan.slot_cycles + scan * plan.scan_cycles()) / 16, header.time_us);
         CHECK_EQ(0, header.dropped);
         CHECK_EQ(3, header.rows);
         for (uint8_t i = 0; i < 12; i++) {
@@ -269,6 +269,39 @@ TEST(stop_is_answered_after_the_last_whole_scan) {
     }
     CHECK(!bench.host.next(&frame));
     CHECK(!fake::state.slots_running);
+}
+
+TEST(time_stamps_of_small_skins_are_exact_at_any_rate) {
+    // The slots of small slow skins are long: two of them take more cycles than 16 bits count.
+    const uint8_t sizes[][2] = {{1, 1}, {1, 2}, {2, 2}};
+    Bench &bench = fresh();
+    for (const auto &size : sizes)
+        for (uint32_t rate = 1000; rate <= 2000000; rate = rate * 3 / 2 + 7) {
+            const frames::Configure request = {size[0], size[1], rate, 0, 32};
+            bench.host.rewind();
+            CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &request, sizeof request));
+            const uint32_t started_us = fake::state.now_us = rate * 977;  // wraps now and then
+            bench.host.answer_to(Type::Start);
+            const ScanPlan plan = fake::state.plan;
+            const uint16_t readings = readings_in(size[0], size[1]);
+            bench.slots(static_cast<uint16_t>(2 + readings + plan.slots_per_scan), ramp);
+            bench.host.send(Type::Stop);
+            bench.slots(static_cast<uint16_t>(2 * plan.slots_per_scan + 4), ramp);
+            // The first reading is held in the third slot, and the next scan a period later.
+            uint64_t cycles = 2ull * plan.slot_cycles;
+            uint8_t scans = 0;
+            Frame frame;
+            while (bench.host.next(&frame)) {
+                if (frame.type != static_cast<uint8_t>(Type::Scan))
+                    continue;
+                frames::Scan header;
+                memcpy(&header, frame.payload, sizeof header);
+                CHECK_EQ(static_cast<uint32_t>(started_us + cycles / 16), header.time_us);
+                cycles += plan.scan_cycles();
+                scans++;
+            }
+            CHECK(scans >= 2);
+        }
 }
 
 TEST(commands_that_would_tear_a_scan_are_refused) {
