@@ -53,7 +53,7 @@ enum class Board : uint8_t {
 enum class Settings : uint8_t {
     Stored = 0,  // read from EEPROM, CRC right
     DefaultsBlank = 1,  // EEPROM never written: defaults
-    DefaultsDamaged = 2,  // EEPROM record torn or of another layout: defaults
+    DefaultsDamaged = 2,  // EEPROM holds no sound record, or a scan that does not fit: defaults, but for a unit id that is sound
 };
 
 // ADC clock divisor: a conversion takes 13 ADC clocks at 16 MHz / divisor

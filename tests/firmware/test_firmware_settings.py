@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_helpers import OTHER_SCAN, RECORD_SIZE, assert_whole, reset
+from firmware_helpers import OTHER_SCAN, RECORD_AT, RECORD_SIZE, assert_whole, reset
 from lockstep import DEFAULT_SCAN, Rig
 from ohmskin.link import protocol
 
@@ -33,7 +33,8 @@ def test_saved_settings_survive_a_reset(rig: Rig, saved: dict[str, Any]) -> None
     assert hello["settings"] == "stored"
     assert settings_in(hello) == saved
     content = rig.sim.eeprom()
-    assert content[RECORD_SIZE:] == b"\xff" * (len(content) - RECORD_SIZE)
+    others = content[:RECORD_AT] + content[RECORD_AT + RECORD_SIZE :]
+    assert others == b"\xff" * len(others)
     rig.must("save")
     assert rig.sim.eeprom() == content
 
@@ -42,7 +43,7 @@ def test_a_record_with_any_one_byte_damaged_yields_the_defaults(
     rig: Rig, rng: np.random.Generator, saved: dict[str, Any]
 ) -> None:
     sound = rig.sim.eeprom()
-    for offset in range(RECORD_SIZE):
+    for offset in range(RECORD_AT, RECORD_AT + RECORD_SIZE):
         rig.sim.write_eeprom(bytes([sound[offset] ^ int(rng.integers(1, 256))]), offset)
         hello = reset(rig)
         assert hello["settings"] == "defaults_damaged", offset
@@ -53,37 +54,35 @@ def test_a_record_with_any_one_byte_damaged_yields_the_defaults(
     assert reset(rig)["settings"] == "defaults_blank"
 
 
-def test_a_record_of_impossible_settings_yields_the_defaults(
-    rig: Rig, saved: dict[str, Any]
+@pytest.mark.parametrize(("at", "head"), [(RECORD_AT, b"\x01\x09"), (0, b"\xbe\xef")])
+def test_the_unit_id_outlives_other_protocols_and_impossible_scans(
+    rig: Rig, at: int, head: bytes
 ) -> None:
-    scan = protocol.FRAMES["configure"].pack(**(DEFAULT_SCAN | {"rows": 200}))
-    record = struct.pack("<HI", protocol.LAYOUT_CRC, 5) + scan
-    rig.sim.write_eeprom(record + struct.pack("<H", protocol.crc16(record)))
-    hello = reset(rig)
-    assert (hello["settings"], hello["rows"], hello["unit_id"]) == ("defaults_damaged", 8, 0)
-
-
-def test_a_reset_during_save_leaves_old_settings_new_ones_or_defaults(
-    rig: Rig, saved: dict[str, Any]
-) -> None:
-    sound = rig.sim.eeprom()
-    seen = set()
-    for pause_ms in (0, 1, 4, 9, 17, 25, 40, 60):
-        rig.must("configure", **DEFAULT_SCAN)
-        rig.must("set_unit_id", unit_id=1)
-        new = settings_in(rig.hello())
-        rig.send("save")
-        rig.run(0.0005 + pause_ms / 1000)
+    """At 0 is the record of older firmware, which begins with its protocol's layout CRC."""
+    for rows, source, kept in (200, "defaults_damaged", 8), (5, "stored", 5):
+        scan = protocol.FRAMES["configure"].pack(**(DEFAULT_SCAN | {"rows": rows}))
+        record = head + struct.pack("<I", 5) + scan
+        rig.sim.write_eeprom(record + struct.pack("<H", protocol.crc16(record)), at)
         hello = reset(rig)
-        seen.add(hello["settings"])
-        if hello["settings"] == "stored":
-            assert settings_in(hello) in (saved, new)
-        else:
-            assert hello["settings"] == "defaults_damaged"
-            assert (hello["rows"], hello["unit_id"]) == (8, 0)
-        rig.sim.write_eeprom(sound)
-        reset(rig)
-    assert seen == {"stored", "defaults_damaged"}
+        assert (hello["settings"], hello["rows"], hello["unit_id"]) == (source, kept, 5)
+
+
+def test_a_reset_during_save_leaves_the_old_settings_or_the_new(
+    rig: Rig, rng: np.random.Generator, saved: dict[str, Any]
+) -> None:
+    seen = set()
+    for unit_id in range(60):
+        rig.must("configure", **(OTHER_SCAN if unit_id % 2 else DEFAULT_SCAN))
+        rig.must("set_unit_id", unit_id=unit_id * 0x01010101)
+        old, saved = saved, settings_in(rig.hello())
+        rig.send("save")
+        rig.run(0.06 * rng.random())
+        hello = reset(rig)
+        assert hello["settings"] == "stored"
+        assert settings_in(hello) in (old, saved)
+        seen.add(settings_in(hello) == saved)
+        saved = settings_in(hello)
+    assert seen == {False, True}
 
 
 def test_save_while_scanning_loses_no_scan(rig: Rig, rng: np.random.Generator) -> None:

@@ -14,7 +14,7 @@ BAUD_DEFAULT = protocol.CONSTANTS["baud_default"]
 BAUD_FAST = protocol.CONSTANTS["baud_fast"]
 VECTORS = json.loads((ROOT / "protocol" / "vectors.json").read_text(encoding="utf-8"))
 COMMANDS = [f.name for f in protocol.FRAMES.values() if f.sender == "host"]
-RECORD_SIZE = 2 + 4 + protocol.FRAMES["configure"].struct.size + 2  # layout, unit id, scan, CRC
+RECORD_AT, RECORD_SIZE = 32, 17  # of the first record of settings in EEPROM
 OTHER_SCAN = {
     "rows": 5,
     "columns": 3,

@@ -10,66 +10,116 @@ namespace ohmskin {
 
 namespace {
 
-constexpr uint8_t RECORD_SIZE = SettingsWriter::RECORD_SIZE;
+using Record = SettingsRecord;
 
-Crc16 record_crc(const uint8_t *record) {
+// Two records are written in turn: while one is being written, the other stays whole.
+constexpr uint8_t FIRST_AT = 32, SECOND_AT = 64;
+// Older firmware had one record here, with the protocol's layout CRC in place of version and
+// sequence. It is read where there is no other, and never written.
+constexpr uint8_t OLD_AT = 0;
+constexpr uint8_t NOWHERE = 0xFF;
+constexpr uint8_t BLANK = 0xFF;
+
+uint8_t *bytes_of(Record *record) { return reinterpret_cast<uint8_t *>(record); }
+
+Crc16 crc_of(Record *record) {
     Crc16 crc;
-    for (uint8_t i = 0; i < RECORD_SIZE - 2; i++)
-        crc.add(record[i]);
+    for (uint8_t i = 0; i < sizeof *record - 2; i++)
+        crc.add(bytes_of(record)[i]);
     return crc;
+}
+
+// Reads a record; false where its CRC is wrong.
+bool read(uint8_t at, Record *record) {
+    for (uint8_t i = 0; i < sizeof *record; i++)
+        bytes_of(record)[i] = board::eeprom_read(at + i);
+    const Crc16 crc = crc_of(record);
+    return record->crc_low == crc.low() && record->crc_high == crc.high();
+}
+
+// Reads the newest sound record of this version; where it is, or NOWHERE.
+uint8_t read_newest(Record *newest) {
+    uint8_t found = NOWHERE;
+    for (uint8_t at = FIRST_AT; at <= SECOND_AT; at += SECOND_AT - FIRST_AT) {
+        Record record;
+        if (!read(at, &record) || record.version != Record::VERSION)
+            continue;
+        if (found != NOWHERE && static_cast<int8_t>(record.sequence - newest->sequence) <= 0)
+            continue;
+        *newest = record;
+        found = at;
+    }
+    return found;
+}
+
+bool all_blank() {
+    for (uint8_t at = OLD_AT; at < SECOND_AT + sizeof(Record); at++)
+        if (board::eeprom_read(at) != BLANK)
+            return false;
+    return true;
+}
+
+// Of another version, as newer firmware may have left it.
+bool foreign(uint8_t at) {
+    const uint8_t version = board::eeprom_read(at);
+    return version != Record::VERSION && version != BLANK;
 }
 
 }  // namespace
 
 frames::Settings load_settings(Settings *settings) {
-    uint8_t record[RECORD_SIZE];
-    bool blank = true;
-    for (uint8_t i = 0; i < RECORD_SIZE; i++) {
-        record[i] = board::eeprom_read(i);
-        blank = blank && record[i] == 0xFF;
-    }
     *settings = DEFAULT_SETTINGS;
-    if (blank)
-        return frames::Settings::DefaultsBlank;
-    const Crc16 crc = record_crc(record);
-    uint16_t layout;
-    memcpy(&layout, record, sizeof layout);
-    if (record[RECORD_SIZE - 2] != crc.low() || record[RECORD_SIZE - 1] != crc.high() ||
-        layout != frames::LAYOUT_CRC)
-        return frames::Settings::DefaultsDamaged;
-    Settings stored;
-    memcpy(&stored, record + 2, sizeof stored);
+    Record record;
+    if (read_newest(&record) == NOWHERE && !read(OLD_AT, &record))
+        return all_blank() ? frames::Settings::DefaultsBlank : frames::Settings::DefaultsDamaged;
+    settings->unit_id = record.unit_id;
+    const ScanRequest request = {record.rows, record.columns, record.rate_mhz, record.settle_us,
+                                 record.adc_prescaler};
     ScanPlan plan;
-    if (plan_scan(stored.request, board::CLOCK_HZ, &plan) != frames::Result::Ok)
+    if (plan_scan(request, board::CLOCK_HZ, &plan) != frames::Result::Ok)
         return frames::Settings::DefaultsDamaged;
-    *settings = stored;
+    settings->request = request;
     return frames::Settings::Stored;
 }
 
 void SettingsWriter::begin(const Settings &settings) {
-    const uint16_t layout = frames::LAYOUT_CRC;
-    memcpy(record_, &layout, sizeof layout);
-    memcpy(record_ + 2, &settings, sizeof settings);
-    const Crc16 crc = record_crc(record_);
-    record_[RECORD_SIZE - 2] = crc.low();
-    record_[RECORD_SIZE - 1] = crc.high();
-    at_ = 0;
+    Record last = {};
+    const uint8_t newest = read_newest(&last);
+    const ScanRequest &scan = settings.request;
+    record_ = {Record::VERSION, last.sequence,  settings.unit_id,   scan.rows,    scan.columns,
+               scan.rate_mhz,   scan.settle_us, scan.adc_prescaler, last.crc_low, last.crc_high};
     state_ = State::Writing;
+    at_ = newest;
+    left_ = 0;
+    // An EEPROM lasts 100,000 writes: what it holds already is not written again.
+    if (newest != NOWHERE && memcmp(&record_, &last, sizeof last) == 0)
+        return;
+    const bool second =
+        newest == FIRST_AT || (newest == NOWHERE && foreign(FIRST_AT) && !foreign(SECOND_AT));
+    at_ = second ? SECOND_AT : FIRST_AT;
+    left_ = sizeof record_;
+    record_.sequence++;
+    const Crc16 crc = crc_of(&record_);
+    record_.crc_low = crc.low();
+    record_.crc_high = crc.high();
 }
 
+// The bytes are written from the last to the first. So until all others are there, a record keeps
+// its old sequence, by which the other one is newer, or is still of no version.
 SettingsWriter::State SettingsWriter::poll() {
     if (state_ != State::Writing || board::eeprom_busy())
         return State::Idle;
-    if (at_ < RECORD_SIZE) {
-        // Cells that already hold their value are spared: an EEPROM lasts 100,000 writes.
-        if (board::eeprom_read(at_) != record_[at_])
-            board::eeprom_write(at_, record_[at_]);
-        at_++;
+    if (left_ != 0) {
+        // Cells that already hold their value are spared too.
+        left_--;
+        const uint8_t octet = bytes_of(&record_)[left_];
+        if (board::eeprom_read(at_ + left_) != octet)
+            board::eeprom_write(at_ + left_, octet);
         return State::Writing;
     }
     state_ = State::Idle;
-    for (uint8_t i = 0; i < RECORD_SIZE; i++)
-        if (board::eeprom_read(i) != record_[i])
+    for (uint8_t i = 0; i < sizeof record_; i++)
+        if (board::eeprom_read(at_ + i) != bytes_of(&record_)[i])
             return State::Failed;
     return State::Done;
 }

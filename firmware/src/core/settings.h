@@ -14,11 +14,31 @@ struct Settings {
 
 constexpr Settings DEFAULT_SETTINGS = {0, {8, 8, 90000, 0, 32}};
 
-// Loads settings from EEPROM; a record that is blank, torn, of another layout or cannot be scanned
-// yields the defaults, and the result says which.
+// Settings as the EEPROM holds them. The fields are the record's own, not the protocol's, so that a
+// change of the protocol forgets nothing. A change of the fields needs a new VERSION; `version` and
+// `sequence` stay the first two bytes.
+struct __attribute__((packed)) SettingsRecord {
+    static constexpr uint8_t VERSION = 1;
+
+    uint8_t version;
+    uint8_t sequence;  // one more than that of the record written before; wraps
+    uint32_t unit_id;
+    uint8_t rows;
+    uint8_t columns;
+    uint32_t rate_mhz;
+    uint16_t settle_us;
+    uint8_t adc_prescaler;
+    uint8_t crc_low, crc_high;  // over all before
+};
+static_assert(sizeof(SettingsRecord) == 17, "no padding; a change needs a new VERSION");
+
+// Loads settings from EEPROM. Without a sound record of this version it yields the defaults. Where
+// this firmware cannot make the record's scan, the unit id stays and the scan is the default. The
+// result says which.
 OHMSKIN_RARE frames::Settings load_settings(Settings *settings);
 
-// Writes settings to EEPROM one byte at a time without waiting, so that the scan goes on.
+// Writes settings to EEPROM one byte at a time without waiting, so that the scan goes on. A reset
+// at any moment leaves the old settings or the new ones.
 class SettingsWriter {
   public:
     enum class State : uint8_t { Idle, Writing, Done, Failed };
@@ -28,12 +48,10 @@ class SettingsWriter {
     OHMSKIN_RARE State poll();
     bool idle() const { return state_ == State::Idle; }
 
-    // Layout of the record: the protocol's layout CRC, the settings, a CRC over both.
-    static constexpr uint8_t RECORD_SIZE = 2 + sizeof(Settings) + 2;
-
   private:
-    uint8_t record_[RECORD_SIZE] = {};
-    uint8_t at_ = 0;
+    SettingsRecord record_ = {};
+    uint8_t at_ = 0;    // in EEPROM
+    uint8_t left_ = 0;  // bytes still to be written: from the last to the first
     State state_ = State::Idle;
 };
 

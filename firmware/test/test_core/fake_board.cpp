@@ -46,9 +46,14 @@ bool serial_read(uint8_t *octet) {
 uint8_t eeprom_read(uint16_t address) { return state.eeprom[address]; }
 bool eeprom_busy() { return state.eeprom_busy_polls && state.eeprom_busy_polls--; }
 void eeprom_write(uint16_t address, uint8_t octet) {
+    state.eeprom_busy_polls = 3;
+    state.eeprom_wear[address]++;
+    if (state.eeprom_cut_at != 0 && --state.eeprom_cut_at == 0) {
+        state.eeprom[address] = state.eeprom_torn(state.eeprom[address], octet);
+        state.eeprom_worn_out = true;
+    }
     if (!state.eeprom_worn_out)
         state.eeprom[address] = octet;
-    state.eeprom_busy_polls = 3;
 }
 
 }  // namespace board

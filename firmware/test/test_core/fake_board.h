@@ -13,10 +13,13 @@ struct State {
     uint32_t now_us;
     bool slots_running;
     ohmskin::ScanPlan plan;
-    uint8_t eeprom[64];
-    int eeprom_busy_polls;  // polls until a write is finished
-    bool eeprom_worn_out;   // writes change nothing
-    uint8_t received[64];   // bytes on their way to the board
+    uint8_t eeprom[96];
+    uint16_t eeprom_wear[96];  // writes of each byte
+    int eeprom_busy_polls;     // polls until a write is finished
+    bool eeprom_worn_out;      // writes change nothing
+    int eeprom_cut_at;         // this write is cut short, and all after it fail; 0: none
+    uint8_t (*eeprom_torn)(uint8_t before, uint8_t wanted);  // what a write cut short leaves
+    uint8_t received[64];                                    // bytes on their way to the board
     uint8_t received_size, received_at;
     bool damage_next;  // the line reports an error with the next byte
     uint32_t baud;

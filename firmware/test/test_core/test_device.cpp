@@ -357,7 +357,7 @@ TEST(settings_survive_a_restart_and_damage_is_named) {
     CHECK_EQ(frames::Settings::Stored, static_cast<frames::Settings>(hello.settings));
     CHECK_EQ(0xABCD1234, hello.unit_id);
     CHECK_EQ(7, hello.columns);
-    for (uint8_t i = 0; i < SettingsWriter::RECORD_SIZE; i++) {
+    for (uint8_t i = 32; i < 32 + sizeof(SettingsRecord); i++) {
         fake::state.eeprom[i] ^= 0x10;
         bench.boot();
         hello = bench.host.hello();
