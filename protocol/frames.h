@@ -81,7 +81,7 @@ enum class Result : uint8_t {
     EepromFailed = 13,  // the EEPROM does not hold what was written
 };
 
-// bits of hello.reset_cause; none set: the bootloader cleared them
+// bits of hello.reset_cause, only those that are known: most boot loaders clear the chip's own record
 enum class ResetCause : uint8_t {
     PowerOn = 1,  // supply came up
     External = 2,  // reset pin, as when a host opens the port

@@ -11,17 +11,21 @@
 #include <simavr/avr_extint.h>
 #include <simavr/avr_timer.h>
 #include <simavr/avr_uart.h>
+#include <simavr/avr_watchdog.h>
 #include <simavr/sim_core.h>
 #include <simavr/sim_cycle_timers.h>
 #include <simavr/sim_elf.h>
 #include <simavr/sim_interrupts.h>
 
-enum { MCUSR_ = 0x54, PORF_ = 1, EXTRF_ = 2, WDRF_ = 8, CHAINED_MAX = 12 };
+enum { MCUSR_ = 0x54, PORF_ = 1, EXTRF_ = 2, WDRF_ = 8, WDTCSR_ = 0x60, WDE_ = 8 };
+enum { CHAINED_MAX = 12 };
 
 avr_t *cpu;
 static avr_run_t run_instructions;
 static instant stop_at;
 static uint8_t external_interrupts;
+static avr_watchdog_t *watchdog;
+static instant watchdog_reset_at = NEVER;
 
 /* ---- register hooks */
 
@@ -137,6 +141,14 @@ static void on_interrupt(struct avr_irq_t *irq, uint32_t running, void *param) {
     }
 }
 
+/* In interrupt and reset mode an interrupt that nobody took by the next time-out becomes a reset;
+ * simavr would wait for ever. */
+static void on_watchdog_pending(struct avr_irq_t *irq, uint32_t pending, void *param) {
+    (void)irq, (void)param;
+    const bool resets = pending && (cpu->data[WDTCSR_] & WDE_);
+    watchdog_reset_at = resets ? cpu->cycle + watchdog->cycle_count : NEVER;
+}
+
 /* simavr's own waits for the wall clock. */
 static void on_sleep(avr_t *avr, avr_cycle_count_t how_long) { (void)avr, (void)how_long; }
 
@@ -171,6 +183,7 @@ static void reset_with(uint8_t flag, avr_run_t reset) {
     reset(cpu);
     cpu->run = run_instructions;
     cpu->data[MCUSR_] = flags;
+    watchdog_reset_at = NEVER;
     for (uint8_t i = 0; i < external_interrupts;
          i++) /* a low INTn pin is polled every cycle otherwise */
         avr_extint_set_strict_lvl_trig(cpu, i, 0);
@@ -203,6 +216,8 @@ void cpu_run_until(instant target) {
             cpu->interrupt_state = (int8_t)avr_has_pending_interrupts(cpu);
         if (cpu->run != run_instructions) /* simavr's watchdog wants its reset */
             reset_with(WDRF_, cpu->run);
+        if (cpu->cycle >= watchdog_reset_at)
+            reset_with(WDRF_, avr_reset);
         if (!cpu_alive())
             return;
     }
@@ -271,6 +286,9 @@ bool cpu_start(const struct board *board, const char *elf_path) {
         avr_int_vector_t *vector = cpu->interrupts.vector[i];
         avr_irq_register_notify(&vector->irq[AVR_INT_IRQ_RUNNING], on_interrupt, vector);
     }
+    watchdog = cpu_find_io("watchdog", 0);
+    avr_irq_register_notify(&watchdog->watchdog.irq[AVR_INT_IRQ_PENDING], on_watchdog_pending,
+                            NULL);
     adc_start();
     timer_start();
     uart_start();

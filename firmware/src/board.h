@@ -21,7 +21,7 @@ void begin();
 // Bits of frames::ResetCause.
 uint8_t reset_cause();
 // Once a pass of the main loop: keeps now_us() counting, which needs it every millisecond, and the
-// watchdog quiet, which restarts the board after 250 ms without.
+// watchdog quiet, which restarts the board after 250 ms without (500 ms with interrupts off).
 void keep_alive();
 uint32_t now_us();  // since begin(); wraps
 // Tells an observer whether a pass of the main loop found something to do; costs one instruction.

@@ -8,6 +8,7 @@
 #include <avr/wdt.h>
 
 #include "board.h"
+#include "core/reset_cause.h"
 
 namespace ohmskin {
 namespace board {
@@ -149,6 +150,15 @@ namespace {
 uint8_t reset_cause_bits;
 uint32_t overflows_us;
 
+// The C runtime does not clear these.
+__attribute__((section(".noinit"))) Mark mark;
+__attribute__((section(".noinit"))) uint8_t loader_status;
+
+// Runs before the C runtime's own code for memory. No other code uses r2: -ffixed-r2.
+__attribute__((naked, used, section(".init3"))) void take_loader_status() {
+    asm volatile("sts %0, r2\n\tclr r2" ::"i"(&loader_status));
+}
+
 void clock_begin() {
     TIMSK0 = 0;  // the Arduino core counts milliseconds in this interrupt
     TCCR0A = 0;
@@ -167,14 +177,30 @@ void converter_begin() {
 }
 }  // namespace
 
+// The main loop has hung. The watchdog could reset the chip now, but two boot loaders would not
+// survive it: those of Megas of before 2012 and of old Nanos leave the watchdog on after its reset,
+// which then resets them for ever. So the firmware starts anew from its reset vector. What could
+// interrupt that start is switched off, as a reset would; begin() sets the rest. Where this
+// interrupt cannot come, because interrupts are off or begin() itself hangs, the chip is reset.
+ISR(WDT_vect) {
+    wdt_disable();
+    TIMSK1 = 0;
+    ADCSRA = 0;
+    UCSR0B = 0;
+    mark = Mark::Hung;
+    asm volatile("jmp 0");
+}
+
 void begin() {
-    reset_cause_bits = MCUSR & (_BV(PORF) | _BV(EXTRF) | _BV(BORF) | _BV(WDRF));
+    reset_cause_bits = ohmskin::reset_cause(MCUSR, mark, loader_status);
+    mark = Mark::Ran;
     MCUSR = 0;
     wdt_enable(WDTO_250MS);
     pins_begin();
     clock_begin();
     converter_begin();
     serial_speed(frames::BAUD_DEFAULT);
+    WDTCSR |= _BV(WDIE);  // the first time-out interrupts, the second one resets
 }
 
 uint8_t reset_cause() { return reset_cause_bits; }
