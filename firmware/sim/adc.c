@@ -135,6 +135,8 @@ void adc_trigger_edge(enum adc_trigger source, instant when) {
         trigger(when);
 }
 
+static bool trigger_flag(unsigned source);
+
 static void write_adcsra(avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
     (void)param;
     const instant when = cpu_write_instant();
@@ -159,6 +161,9 @@ static void write_adcsra(avr_t *avr, avr_io_addr_t address, uint8_t value, void 
         start_single(when);
     if (adc.phase == IDLE || adc.phase == WAITING)
         connect_channel(when);
+    /* The datasheet does not say whether a flag that is set already counts as an edge. */
+    if ((now & ADATE_) && !(old & ADATE_) && trigger_flag(trigger_source()))
+        trigger(when);
     cpu_retry_interrupt(adc.vector);
 }
 

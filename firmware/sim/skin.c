@@ -7,12 +7,17 @@
 #include <math.h>
 #include <string.h>
 
-/* The one table of pins. PINx, DDRx and PORTx follow each other in data space. */
+/* The one table of pins. PINx, DDRx and PORTx follow each other in data space. Of all ports: the
+ * pins that a board can use, without the sense pins, the crystal's and the reset pin. */
+static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x3C}, {0x2B, 0xFF}, {0, 0}};
+static const struct port MEGA[] = {{0x22, 0xFF},  {0x25, 0xFF},  {0x28, 0xFF},  {0x2B, 0xFF},
+                                   {0x2E, 0xFF},  {0x31, 0xFC},  {0x34, 0x3F},  {0x102, 0xFF},
+                                   {0x105, 0xFF}, {0x108, 0xFF}, {0x10B, 0xFF}, {0, 0}};
 static const struct board BOARDS[] = {
     /* rows PORTD4-7, columns PORTB0-3, drive PD2 and PD3 */
-    {"uno", "atmega328p", 0x2B, 0x25, 0x2B, 4, 0, 2, 3},
+    {"uno", "atmega328p", 0x2B, 0x25, 0x2B, 4, 0, 2, 3, UNO, {0x2B, 1 << 1}},
     /* rows PORTA0-3, columns PORTC0-3, drive PL0 and PL1 */
-    {"megaatmega2560", "atmega2560", 0x22, 0x28, 0x10B, 0, 0, 0, 1},
+    {"megaatmega2560", "atmega2560", 0x22, 0x28, 0x10B, 0, 0, 0, 1, MEGA, {0x2E, 1 << 1}},
 };
 
 struct node {
@@ -93,6 +98,20 @@ static void on_pins(instant when) {
     skin.undriven = undriven;
     retarget(when);
     stats_pins_changed(when);
+}
+
+unsigned skin_floating_pins(void) {
+    unsigned count = 0;
+    for (const struct port *p = skin.board->ports; p->mask; p++)
+        for (uint8_t left = p->mask & ~(cpu->data[p->port - 1] | cpu->data[p->port]); left;
+             left >>= 1)
+            count += left & 1;
+    return count;
+}
+
+bool skin_tx_pin_is_high(void) {
+    const struct port tx = skin.board->tx;
+    return is_output(tx.port, tx.mask) && (cpu->data[tx.port] & tx.mask);
 }
 
 void skin_start(const struct board *board) {

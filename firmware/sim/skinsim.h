@@ -77,10 +77,16 @@ enum { NODE_TOP, NODE_BOTTOM, NODES };
 /* Configurations A to D as in the table, then what no table entry describes. */
 enum { CONFIG_A, CONFIG_B, CONFIG_C, CONFIG_D, CONFIG_NO_CURRENT, CONFIG_UNDRIVEN, CONFIG_OTHER };
 
+struct port {
+    uint16_t port; /* data-space address of PORTx */
+    uint8_t mask;
+};
 struct board {
     const char *name, *mcu;
     uint16_t row_port, column_port, drive_port; /* data-space addresses of PORTx */
     uint8_t row_shift, column_shift, drive_top_bit, drive_bottom_bit;
+    const struct port *ports; /* to a mask of 0 */
+    struct port tx;
 };
 const struct board *skin_find_board(const char *name);
 void skin_start(const struct board *board);
@@ -88,6 +94,10 @@ void skin_reset(void);
 void skin_set_table(const double *ratio);
 void skin_set_tau_us(double tau_us);
 double skin_ratio(unsigned node, instant when);
+/* Inputs without a pull-up, besides the sense pins. */
+unsigned skin_floating_pins(void);
+/* What the line sees while the transmitter is off. */
+bool skin_tx_pin_is_high(void);
 struct skin_pins {
     uint8_t row, column, configuration;
 };
@@ -142,7 +152,7 @@ struct gap {
 struct stats {
     uint64_t conversions, lost_results, undriven, reference_not_avcc, unmodelled_triggers,
         unmodelled_timer_modes;
-    uint64_t tx_bytes, tx_ignored, tx_undrained_lost, rx_bytes, rx_overruns, rx_ignored,
+    uint64_t tx_bytes, tx_ignored, tx_let_go, tx_undrained_lost, rx_bytes, rx_overruns, rx_ignored,
         rx_framing_errors;
     uint64_t pty_dropped, late_slices, hold_log_dropped;
     struct gap settle, channel_settle, after_hold, trigger;

@@ -224,6 +224,7 @@ char *stats_json(void) {
     COUNT(unmodelled_timer_modes);
     COUNT(tx_bytes);
     COUNT(tx_ignored);
+    COUNT(tx_let_go);
     COUNT(tx_undrained_lost);
     COUNT(rx_bytes);
     COUNT(rx_overruns);
@@ -235,6 +236,7 @@ char *stats_json(void) {
     COUNT(idle_cycles);
     COUNT(passes);
 #undef COUNT
+    fprintf(out, "\"floating_pins\": %u, ", skin_floating_pins());
     print_gap(out, "settle_cycles", &stats.settle);
     print_gap(out, "channel_settle_cycles", &stats.channel_settle);
     print_gap(out, "change_after_hold_cycles", &stats.after_hold);

@@ -285,6 +285,8 @@ static void write_ucsra(avr_t *avr, avr_io_addr_t address, uint8_t value, void *
 static void write_ucsrb(avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
     (void)param;
     events_until(cpu_write_instant());
+    if ((avr->data[address] & ~value & TXEN_) && !skin_tx_pin_is_high())
+        stats.tx_let_go++;
     avr->data[address] = value & (uint8_t)~RXB8_;
     if (!(value & RXEN_))
         flush_receiver();

@@ -14,7 +14,10 @@ namespace ohmskin {
 namespace board {
 
 // ------------------------------------------------------------- wiring: the one table that says it
-// Sense nodes: top on A0, bottom on A1.
+// Sense nodes: top on A0, bottom on A1. No other pin floats. The serial line's RX has its pull-up
+// on. Its TX is an output at 1, which holds the line idle while the transmitter is off. Unused pins
+// of the ports that each slot writes as a whole are outputs at 0: connect nothing to them. All
+// other unused pins are inputs with pull-ups.
 const uint32_t CLOCK_HZ = F_CPU;
 const uint32_t REF_TOP_OHM = 30000;
 const uint32_t REF_BOTTOM_OHM = 30000;
@@ -28,19 +31,21 @@ constexpr uint8_t CHANNEL_BOTTOM = 1;
 const frames::Board KIND = frames::Board::Uno;
 namespace {
 // Row address D4-D7 (PD4-7), drive top D2 (PD2), drive bottom D3 (PD3), column address D8-D11
-// (PB0-3). PD0 is the serial line's RX: its pull-up stays on.
+// (PB0-3). Serial line: RX D0 (PD0), TX D1 (PD1). Outputs at 0: D12, D13 (PB4-5). Pull-ups: A2-A5
+// (PC2-5).
 constexpr uint8_t DRIVE_TOP = _BV(PD2);
 constexpr uint8_t DRIVE_BOTTOM = _BV(PD3);
-constexpr uint8_t RX_PULL_UP = _BV(PD0);
+constexpr uint8_t LINE_IDLE = _BV(PD0) | _BV(PD1);
 inline void pins_begin() {
-    PORTD = RX_PULL_UP;
+    PORTD = LINE_IDLE;
     PORTB = 0;
-    DDRD = 0xF0 | DRIVE_TOP | DRIVE_BOTTOM;
-    DDRB = 0x0F;
+    PORTC = 0x3C;
+    DDRD = 0xF0 | DRIVE_TOP | DRIVE_BOTTOM | _BV(PD1);
+    DDRB = 0x3F;
 }
 inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
     row = static_cast<uint8_t>(row << 4);  // a swap of nibbles, as a statement of its own
-    PORTD = row | drive | RX_PULL_UP;
+    PORTD = row | drive | LINE_IDLE;
     PORTB = column;
 }
 }  // namespace
@@ -48,14 +53,19 @@ inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
 const frames::Board KIND = frames::Board::Megaatmega2560;
 namespace {
 // Row address D22-D25 (PA0-3), column address D37-D34 (PC0-3), drive top D49 (PL0), drive bottom
-// D48 (PL1).
+// D48 (PL1). Serial line: RX D0 (PE0), TX D1 (PE1). Outputs at 0: D26-D33 (PA4-7, PC4-7), D42-D47
+// (PL2-7), and D13 (PB7), whose pull-up would light the board's lamp.
 constexpr uint8_t DRIVE_TOP = _BV(PL0);
 constexpr uint8_t DRIVE_BOTTOM = _BV(PL1);
 inline void pins_begin() {
     PORTA = PORTC = PORTL = 0;
-    DDRA = DDRC = 0x0F;
-    DDRL = DRIVE_TOP | DRIVE_BOTTOM;
-    PORTE = _BV(PE0);  // pull-up of the serial line's RX
+    DDRA = DDRC = DDRL = 0xFF;
+    PORTB = 0x7F;
+    DDRB = _BV(PB7);
+    PORTD = PORTG = PORTH = PORTJ = PORTK = 0xFF;
+    PORTE = 0xFF;
+    DDRE = _BV(PE1);
+    PORTF = 0xFC;
 }
 inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
     PORTA = row;
@@ -124,6 +134,9 @@ ISR(TIMER1_COMPA_vect) {
 void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
     const uint8_t bits = prescaler_bits(adc_prescaler);
     select(scanner.selection());
+    // A trigger flag from before must not start a conversion: the timer stands still first.
+    TCCR1B = 0;
+    TIFR1 = _BV(OCF1A) | _BV(OCF1B);
     ADCSRB = _BV(ADTS2) | _BV(ADTS0);  // auto trigger by timer 1, compare B
     ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | bits);
     TCCR1A = 0;
@@ -132,7 +145,6 @@ void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
     OCR1B = TRIGGER_AT;
     OCR1A = interrupt_at(adc_prescaler);
     TCNT1 = 0;
-    TIFR1 = _BV(OCF1A) | _BV(OCF1B);
     TIMSK1 = _BV(OCIE1A);
     TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);
 }
@@ -270,6 +282,7 @@ ISR(USART_RX_vect) {
     if (next == received_read)
         return;
     received[at] = octet;
+    __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the byte is there before received_write says so
     received_write = next;
 }
 
@@ -278,6 +291,7 @@ bool serial_has_byte() { return received_write != received_read; }
 bool serial_read(uint8_t *octet) {
     const uint8_t at = received_read;
     *octet = received[at];
+    __atomic_signal_fence(__ATOMIC_SEQ_CST);  // it has been read by now
     received_read = (at + 1) & (RECEIVED_SIZE - 1);
     const bool sound = !received_damage;
     received_damage = false;
