@@ -163,7 +163,8 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
                {'U', 8, 8, false}, {'S', 0, 0, false},
                {'Z', 0, 0, false}, {'L', 1, 1, false},
                {'E', 0, 0, false}, {'e', 2, 2 + 4096, false},
-               {'X', 0, 0, false}, {'J', 4, 4, false}};
+               {'X', 0, 0, false}, {'J', 4, 4, false},
+               {'D', 3, 3, false}};
     size_t i = 0;
     while (i < sizeof OPS / sizeof *OPS && OPS[i].op != op)
         i++;
@@ -202,6 +203,10 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
     case 'J':
         memcpy(&address, payload, sizeof address);
         return cpu_jump(address) ? control_reply('J', NULL, 0) : refuse("J: no such instruction");
+    case 'D':
+        return cpu_poke((uint16_t)(payload[0] | payload[1] << 8), payload[2])
+                   ? control_reply('D', NULL, 0)
+                   : refuse("D: no such register");
     default:
         cpu_external_reset();
         return control_reply('X', NULL, 0);

@@ -198,6 +198,13 @@ bool cpu_jump(uint32_t address) {
     return true;
 }
 
+bool cpu_poke(uint16_t address, uint8_t value) {
+    if (address >= 0x20 && address != MCUSR_)
+        return false;
+    cpu->data[address] = value;
+    return true;
+}
+
 /* ---- running */
 
 bool cpu_alive(void) { return cpu->state == cpu_Running || cpu->state == cpu_Sleeping; }

@@ -33,6 +33,8 @@ const char *cpu_state_name(void);
 void cpu_external_reset(void);
 /* False, and nothing happens, where `address` is no instruction of this chip's flash. */
 bool cpu_jump(uint32_t address);
+/* What a boot loader leaves: r0 to r31, or MCUSR. False: `address` is none of these. */
+bool cpu_poke(uint16_t address, uint8_t value);
 /* When the register access being executed takes effect; only valid inside a register hook. */
 instant cpu_write_instant(void);
 instant cpu_read_instant(void);

@@ -28,6 +28,12 @@ def test_boot_hello(rig: Rig) -> None:
     assert rig.hello() == hello | {"reset_cause": ("external",)}
 
 
+def test_reset_causes_are_those_that_a_boot_loader_passes_in_r2(rig: Rig) -> None:
+    mcusr, r2 = 0x54, 2
+    for passed, causes in ({r2: 4}, ("brown_out",)), ({}, ()), ({r2: 3}, ("power_on",)), ({}, ()):
+        assert reset(rig, {mcusr: 0} | passed)["reset_cause"] == causes
+
+
 def test_golden_commands_are_acknowledged(rig: Rig) -> None:
     sent = 0
     for vector in VECTORS["valid"]:
@@ -98,13 +104,11 @@ def test_set_baud_lasts_until_reset(rig: Rig) -> None:
     rig.sim.set_baud(BAUD_DEFAULT)
     rig.must("set_baud", baud=BAUD_FAST)
     rig.sim.set_baud(BAUD_FAST)
-    rig.run(0.9)
-    assert rig.hello()["baud"] == BAUD_FAST
-    rig.run(1.2)
-    assert rig.hello()["baud"] == BAUD_FAST
+    for pause_s in (0.9, 1.2):
+        rig.run(pause_s)
+        assert rig.hello()["baud"] == BAUD_FAST
     rig.sim.set_baud(BAUD_DEFAULT)
-    assert reset(rig)["baud"] == BAUD_DEFAULT
-    assert rig.hello()["baud"] == BAUD_DEFAULT
+    assert reset(rig)["baud"] == rig.hello()["baud"] == BAUD_DEFAULT
     assert rig.damaged == rig.sim.stats()["tx_let_go"] == 0
 
 

@@ -339,9 +339,7 @@ def test_random_bytes_change_nothing(rig: Rig, rng: np.random.Generator) -> None
 
 
 def address_of(board: str, symbol: str) -> int:
-    listing = subprocess.run(
-        ["avr-nm", elf_of(board)], capture_output=True, text=True, check=True
-    ).stdout
+    listing = subprocess.check_output(["avr-nm", elf_of(board)], text=True)
     return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
 
 

@@ -24,10 +24,12 @@ OTHER_SCAN = {
 }
 
 
-def reset(rig: Rig) -> dict[str, Any]:
-    """Pull the reset pin; what the board then says by itself."""
+def reset(rig: Rig, registers: dict[int, int] | None = None) -> dict[str, Any]:
+    """Pull the reset pin, leave registers as a boot loader does; what the board says by itself."""
     before = len(rig.frames("hello"))
     rig.sim.reset()
+    for address, value in (registers or {}).items():
+        rig.sim.poke(address, value)
     rig.run(BOOT_S)
     (hello,) = rig.frames("hello")[before:]
     return hello

@@ -122,6 +122,10 @@ class LockstepSim(SkinSim):
         """Go on at this byte address of the flash, as a fault in the program counter would."""
         self.request("J", struct.pack("<I", address))
 
+    def poke(self, address: int, value: int) -> None:
+        """Set a register, r0 (0) to r31 (31) or MCUSR (0x54), as a boot loader may leave it."""
+        self.request("D", struct.pack("<HB", address, value))
+
 
 def elf_of(board: str) -> Path:
     """Where PlatformIO leaves the firmware; it need not exist."""
