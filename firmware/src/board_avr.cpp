@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The board contract on an ATmega328P (Uno) and an ATmega2560 (Mega), with registers alone: the
 // Arduino core's Serial, millis() and delay() would each bring an interrupt that makes the slot
-// interrupt late. Besides that there is one other interrupt, a short one, for bytes received.
+// interrupt late. Besides that there is one other interrupt, a short one, for bytes received, and
+// the watchdog's, which does not return.
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
