@@ -74,11 +74,12 @@ Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan) 
     const uint16_t cycles_per_us = static_cast<uint16_t>(clock_hz / 1000000);
     const uint8_t prescaler = request.adc_prescaler;
     uint16_t slot_min = timing::slot_min(prescaler);
-    const uint16_t settle_us =
-        request.rate_mhz == 0 && request.settle_us == 0 ? timing::SETTLE_US : request.settle_us;
+    uint16_t least_us = request.settle_us;
+    if (request.rate_mhz == 0 && least_us == 0)
+        least_us = timing::SETTLE_US;
     const uint16_t settled =
-        static_cast<uint16_t>(settle_us * cycles_per_us + timing::held_cycles(prescaler));
-    if (settle_us != 0 && settled > slot_min)
+        static_cast<uint16_t>(least_us * cycles_per_us + timing::held_cycles(prescaler));
+    if (least_us != 0 && settled > slot_min)
         slot_min = settled;
 
     ScanPlan result = {slot_min, readings, 0};
