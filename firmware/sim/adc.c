@@ -62,7 +62,7 @@ static void begin(instant start, double hold_clocks, double all_clocks) {
     adc.all_clocks = adc.first ? 25 : all_clocks;
     adc.first = false;
     adc.start = start;
-    adc.end = start + (instant)(adc.all_clocks * adc.divider);
+    adc.end = start + (instant)(adc.all_clocks * adc.divider) + (instant)settings.late_cycles;
     cpu->data[ADCSRA_] |= ADSC_;
     adc.phase = WAITING;
     events_set(EVENT_ADC, start);

@@ -93,13 +93,10 @@ static bool set_table(void) {
     return control_reply('T', NULL, 0);
 }
 
-static bool set_tau(void) {
-    double tau_us;
-    memcpy(&tau_us, payload, sizeof tau_us);
-    if (!isfinite(tau_us) || tau_us < 0 || tau_us > 1e9)
-        return refuse("U: tau_us must be from 0 to 1e9");
-    skin_set_tau_us(tau_us);
-    return control_reply('U', NULL, 0);
+static bool set_setting(size_t length) {
+    payload[length] = 0;
+    const char *error = settings_set((char *)payload);
+    return error ? refuse(error) : control_reply('O', NULL, 0);
 }
 
 static bool set_baud(void) {
@@ -158,12 +155,12 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         uint8_t op;
         uint32_t shortest, longest;
         bool lock_step_only;
-    } OPS[] = {{'R', 8, 8, true},  {'W', 0, REQUEST_MAX, true},
-               {'B', 4, 4, false}, {'T', TABLE_BYTES, TABLE_BYTES, false},
-               {'U', 8, 8, false}, {'S', 0, 0, false},
-               {'Z', 0, 0, false}, {'L', 1, 1, false},
-               {'E', 0, 0, false}, {'e', 2, 2 + 4096, false},
-               {'X', 0, 0, false}, {'J', 4, 4, false},
+    } OPS[] = {{'R', 8, 8, true},   {'W', 0, REQUEST_MAX, true},
+               {'B', 4, 4, false},  {'T', TABLE_BYTES, TABLE_BYTES, false},
+               {'O', 1, 80, false}, {'S', 0, 0, false},
+               {'Z', 0, 0, false},  {'L', 1, 1, false},
+               {'E', 0, 0, false},  {'e', 2, 2 + 4096, false},
+               {'X', 0, 0, false},  {'J', 4, 4, false},
                {'D', 3, 3, false}};
     size_t i = 0;
     while (i < sizeof OPS / sizeof *OPS && OPS[i].op != op)
@@ -187,8 +184,8 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         return set_baud();
     case 'T':
         return set_table();
-    case 'U':
-        return set_tau();
+    case 'O':
+        return set_setting(length);
     case 'S':
         return send_stats();
     case 'Z':

@@ -28,7 +28,6 @@ struct node {
 static struct {
     const struct board *board;
     double ratio[SKIN_ROWS][SKIN_COLUMNS][SKIN_CONFIGURATIONS];
-    double tau_cycles;
     uint8_t row, column;
     bool top_high, bottom_high, undriven;
     struct node node[NODES];
@@ -62,9 +61,10 @@ static double target(unsigned node) {
 
 double skin_ratio(unsigned node, instant when) {
     const struct node *n = &skin.node[node];
-    if (skin.tau_cycles <= 0 || when < n->since)
+    const double tau_cycles = settings.tau_us * (CPU_HZ / 1e6);
+    if (tau_cycles <= 0 || when < n->since)
         return n->target;
-    return n->target + (n->start - n->target) * exp(-(double)(when - n->since) / skin.tau_cycles);
+    return n->target + (n->start - n->target) * exp(-(double)(when - n->since) / tau_cycles);
 }
 
 /* From `when` on each node heads for the value that pins and table now give it. */
@@ -136,10 +136,7 @@ void skin_set_table(const double *ratio) {
     retarget(cpu->cycle);
 }
 
-void skin_set_tau_us(double tau_us) {
-    retarget(cpu->cycle);
-    skin.tau_cycles = tau_us * (CPU_HZ / 1e6);
-}
+void skin_before_setting(void) { retarget(cpu->cycle); }
 
 struct skin_pins skin_pins(unsigned node) {
     return (struct skin_pins){skin.row, skin.column,

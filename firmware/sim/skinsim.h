@@ -94,7 +94,8 @@ const struct board *skin_find_board(const char *name);
 void skin_start(const struct board *board);
 void skin_reset(void);
 void skin_set_table(const double *ratio);
-void skin_set_tau_us(double tau_us);
+/* Settings are about to change: the voltages up to now follow from the old ones. */
+void skin_before_setting(void);
 double skin_ratio(unsigned node, instant when);
 /* Inputs without a pull-up, besides the sense pins. */
 unsigned skin_floating_pins(void);
@@ -104,6 +105,17 @@ struct skin_pins {
     uint8_t row, column, configuration;
 };
 struct skin_pins skin_pins(unsigned node);
+
+/* ---- settings.c: how far the board is from ideal; all zero at the start */
+
+struct settings {
+    double tau_us;
+    double late_cycles;
+    double seed;
+};
+extern struct settings settings;
+/* Takes "name=number" and overwrites it; NULL, or what is wrong with it. */
+const char *settings_set(char *text);
 
 /* ---- adc.c */
 

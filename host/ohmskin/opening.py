@@ -103,10 +103,14 @@ def _device(url: str) -> Device:
     if scheme == "simavr":
         from ohmskin.emulate.simavr import SimavrLink
 
-        options = _options(url, query, "scene", "seed", "rows", "columns", "baud")
+        # All others are settings of the simulator, which refuses those that it does not know.
+        settings = dict(parse_qsl(query, keep_blank_values=True))
+        known = ("scene", "rows", "columns", "baud")
+        options = {name: settings.pop(name) for name in known if name in settings}
         size, baud = f"{options.get('rows', 8)}x{options.get('columns', 8)}", _baud(options)
         with _wrong(url):
-            return Session(SimavrLink(place, _scene(size, options), url), baud)
+            scene = _scene(size, options | settings)
+            return Session(SimavrLink(place, scene, url, settings), baud)
     if scheme == "replay":
         from ohmskin.record.replay import Replay
 

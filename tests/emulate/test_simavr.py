@@ -161,6 +161,19 @@ def test_what_does_not_trigger(simulate: Simulate) -> None:
     assert len(hold_cycles(simulate(triggered(693, 10) + FOREVER), 100_000)) == 1
 
 
+@pytest.mark.parametrize(("late", "gap"), [(0, 437), (1, 437), (2, 874), (32, 874)])
+def test_a_late_conversion_swallows_the_trigger_it_meets(
+    simulate: Simulate, late: int, gap: int
+) -> None:
+    """Slots of 143 scans/s: 437 cycles, of which a conversion takes 3 + 13.5 * 32 = 435."""
+    sim = simulate(triggered(436, 10) + CLEAR_OCF1B_FOREVER)
+    sim.set(late_cycles=late)
+    assert set(np.diff(hold_cycles(sim, 40_000)[1:])) == {gap}
+    sim = simulate(FREE_RUNNING + FOREVER)
+    sim.set(late_cycles=late)
+    assert set(np.diff(hold_cycles(sim, 10_000)[1:])) == {13 * 32 + late}
+
+
 def test_a_million_timer_periods_are_exact(simulate: Simulate) -> None:
     sim = simulate(triggered(99, 10, adps=1) + CLEAR_OCF1B_FOREVER)
     sim.run_cycles(1000)
@@ -621,7 +634,10 @@ def test_bad_requests_are_refused(build: Build) -> None:
         request(b"R", b"\xff" * 8),
         request(b"T", b"\x00" * 16),
         request(b"T", b"\xff" * 8192),
-        request(b"U", struct.pack("<d", -1)),
+        request(b"O", b"tau_us=-1"),
+        request(b"O", b"tau_us="),
+        request(b"O", b"tau"),
+        request(b"O", b"none=1"),
         request(b"B", struct.pack("<I", 7)),
         request(b"L", b"\x09"),
         request(b"e", b"\xff\xffx"),

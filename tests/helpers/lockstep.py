@@ -72,7 +72,7 @@ class LockstepSim(SkinSim):
 
         Raises SimulationError unless 0 to 1e9.
         """
-        self.request("U", struct.pack("<d", tau_us))
+        self.set(tau_us=tau_us)
 
     def write(self, uart_bytes: bytes) -> None:
         """Queue bytes on the line to the device; they arrive one after the other at line speed."""

@@ -12,6 +12,7 @@ import struct
 import subprocess
 import tempfile
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
@@ -99,6 +100,14 @@ class SkinSim(Closing):
         table[: ratio.shape[0], : ratio.shape[1]] = ratio
         self.request("T", table.tobytes())
 
+    def set(self, **settings: float | str) -> None:
+        """Change settings of the simulator: firmware/sim/README.md lists them.
+
+        Raises SimulationError for one that is not there, or out of its range.
+        """
+        for name, value in settings.items():
+            self.request("O", f"{name}={value}".encode())
+
     def request(self, op: str, payload: bytes = b"") -> bytes:
         """The reply to an operation of firmware/sim/README.md.
 
@@ -139,18 +148,21 @@ class SkinSim(Closing):
 class SimavrLink(SerialLink):
     """A simulated board's pseudo-terminal, and the skin that it reads.
 
-    board: one of `BOARDS`, with the firmware that `make firmware` builds.
+    board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: `SkinSim.set`.
 
-    :raises PortError: there is no such board, or firmware or simulator are not built.
+    :raises PortError: there is no such board or setting, or firmware or simulator are not built.
     """
 
-    def __init__(self, board: str, scene: Scene, name: str = "") -> None:
+    def __init__(
+        self, board: str, scene: Scene, name: str = "", settings: Mapping[str, str] = {}
+    ) -> None:
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
         elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
         with ExitStack() as opened:
             try:
                 self.sim = opened.enter_context(SkinSim(board, elf, pty=True))
+                self.sim.set(**settings)
                 self.sim.set_table(scene.ratio(0.0))
                 super().__init__(self.sim.pty_path)
                 self.sim.request("G")  # the port is open: nothing that the board says is lost
