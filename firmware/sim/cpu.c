@@ -17,8 +17,16 @@
 #include <simavr/sim_elf.h>
 #include <simavr/sim_interrupts.h>
 
-enum { MCUSR_ = 0x54, PORF_ = 1, EXTRF_ = 2, WDRF_ = 8, WDTCSR_ = 0x60, WDE_ = 8 };
-enum { CHAINED_MAX = 12 };
+enum {
+    MCUSR_ = 0x54,
+    WDTCSR_ = 0x60,
+    WDCE_ = 0x10,
+    WDE_ = 8,
+    PORF_ = 1,
+    EXTRF_ = 2,
+    WDRF_ = 8,
+    CHAINED_MAX = 12
+};
 
 avr_t *cpu;
 static avr_run_t run_instructions;
@@ -189,6 +197,16 @@ static void reset_with(uint8_t flag, avr_run_t reset) {
         avr_extint_set_strict_lvl_trig(cpu, i, 0);
 }
 
+/* A shorter time-out counts from the write that sets it; simavr lets the longer one end first. */
+static void on_watchdog_setting(instant when) {
+    static uint8_t before;
+    (void)when;
+    const uint8_t now = cpu->data[WDTCSR_];
+    if (now != before && !(now & WDCE_))
+        avr_ioctl(cpu, AVR_IOCTL_WATCHDOG_RESET, NULL);
+    before = now;
+}
+
 void cpu_external_reset(void) { reset_with(EXTRF_, avr_reset); }
 
 bool cpu_jump(uint32_t address) {
@@ -239,7 +257,7 @@ static void log_errors(struct avr_t *avr, const int level, const char *format, v
 static bool fits(const char *what, uint32_t base, uint32_t size, uint32_t end) {
     if (base <= end && size <= end - base)
         return true;
-    fprintf(stderr, "skinsim: the ELF's %s does not fit this chip\n", what);
+    fprintf(stderr, "skinsim: the %s does not fit this chip\n", what);
     return false;
 }
 
@@ -258,7 +276,56 @@ static bool enlarge_memories(void) {
     return true;
 }
 
-bool cpu_start(const struct board *board, const char *elf_path) {
+/* One record of an Intel hex file: its bytes, or -1 where it is none. */
+static int hex_record(const char *line, uint8_t bytes[300]) {
+    int count = 0, used;
+    unsigned byte, sum = 0;
+    if (*line++ != ':')
+        return -1;
+    for (; count < 300 && sscanf(line, "%2x%n", &byte, &used) == 1 && used == 2; line += 2) {
+        bytes[count++] = (uint8_t)byte;
+        sum += byte;
+    }
+    return count >= 5 && count == bytes[0] + 5 && !(sum & 0xFF) ? count : -1;
+}
+
+/* The boot section, which BOOTRST makes the start, begins where the loader does. simavr's own
+ * reader of such files stops at a record of the start address, which Arduino's loaders have. */
+static bool load_boot_loader(const char *path, uint32_t program_end) {
+    enum { DATA = 0, SEGMENT = 2, LINEAR = 4, ADDRESS = 1, TYPE = 3, CONTENT = 4 };
+    FILE *file = fopen(path, "r");
+    uint32_t base = 0, start = UINT32_MAX;
+    bool good = file != NULL;
+    char line[700];
+    while (good && fgets(line, sizeof line, file)) {
+        uint8_t record[300];
+        good = hex_record(line, record) > 0;
+        if (!good)
+            break;
+        const uint32_t content = (uint32_t)record[CONTENT] << 8 | record[CONTENT + 1];
+        const uint32_t at = base + ((uint32_t)record[ADDRESS] << 8 | record[ADDRESS + 1]);
+        if (record[TYPE] == SEGMENT)
+            base = content << 4;
+        else if (record[TYPE] == LINEAR)
+            base = content << 16;
+        else if (record[TYPE] == DATA) {
+            if (!fits("boot loader", at, record[0], cpu->flashend + 1))
+                break;
+            memcpy(cpu->flash + at, record + CONTENT, record[0]);
+            start = at < start ? at : start;
+        }
+    }
+    if (file)
+        fclose(file);
+    if (!good || start == UINT32_MAX) {
+        fprintf(stderr, "skinsim: cannot load '%s' as an Intel hex file\n", path);
+        return false;
+    }
+    cpu->reset_pc = start;
+    return fits("program below the boot loader", 0, program_end, start);
+}
+
+bool cpu_start(const struct board *board, const char *elf_path, const char *loader_path) {
     const char *mcu = board->mcu;
     static elf_firmware_t firmware;
     static avr_io_t resets = {.kind = "skinsim", .reset = on_reset};
@@ -277,12 +344,14 @@ bool cpu_start(const struct board *board, const char *elf_path) {
         fprintf(stderr, "skinsim: out of memory\n");
         return false;
     }
-    if (!fits("program", firmware.flashbase, firmware.flashsize, cpu->flashend + 1) ||
-        !fits("EEPROM section", 0, firmware.eesize, cpu->e2end + 1u))
+    if (!fits("ELF's program", firmware.flashbase, firmware.flashsize, cpu->flashend + 1) ||
+        !fits("ELF's EEPROM section", 0, firmware.eesize, cpu->e2end + 1u))
         return false;
     firmware.frequency = CPU_HZ;
     strcpy(firmware.mmcu, mcu);
     avr_load_firmware(cpu, &firmware);
+    if (loader_path && !load_boot_loader(loader_path, firmware.flashbase + firmware.flashsize))
+        return false;
     cpu->log = LOG_ERROR;
     cpu->gdb_port = 0;
     cpu->sleep = on_sleep;
@@ -301,6 +370,7 @@ bool cpu_start(const struct board *board, const char *elf_path) {
     uart_start();
     eeprom_start();
     skin_start(board);
+    cpu_after_write(WDTCSR_, false, on_watchdog_setting);
     avr_register_io(cpu, &resets);
     reset_with(PORF_, avr_reset);
     cpu->data[MCUSR_] = PORF_;

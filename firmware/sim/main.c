@@ -11,18 +11,23 @@
 #include <unistd.h>
 
 static int usage(void) {
-    fprintf(stderr, "usage: skinsim --board uno|megaatmega2560 [--pty] ELF\n");
+    fprintf(stderr, "usage: skinsim --board uno|megaatmega2560 [--bootloader HEX] [--pty] ELF\n");
     return 2;
 }
 
 int main(int argc, char **argv) {
-    static const struct option OPTIONS[] = {
-        {"board", required_argument, NULL, 'b'}, {"pty", no_argument, NULL, 'p'}, {0}};
+    static const struct option OPTIONS[] = {{"board", required_argument, NULL, 'b'},
+                                            {"bootloader", required_argument, NULL, 'l'},
+                                            {"pty", no_argument, NULL, 'p'},
+                                            {0}};
     const struct board *board = NULL;
+    const char *loader = NULL;
     bool pty = false;
     for (int option; (option = getopt_long(argc, argv, "", OPTIONS, NULL)) != -1;) {
         if (option == 'b')
             board = skin_find_board(optarg);
+        else if (option == 'l')
+            loader = optarg;
         else if (option == 'p')
             pty = true;
         else
@@ -41,7 +46,7 @@ int main(int argc, char **argv) {
     }
     signal(SIGPIPE, SIG_IGN);
     control_start(STDIN_FILENO, replies);
-    if (!cpu_start(board, argv[optind]))
+    if (!cpu_start(board, argv[optind], loader))
         return 1;
     if (pty)
         return pty_run();

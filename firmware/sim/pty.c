@@ -41,6 +41,22 @@ static int open_pty(char *path, size_t path_size) {
     return tcsetattr(slave, TCSANOW, &raw) ? -1 : master;
 }
 
+/* The host's end of the line has the speed that a program gave the terminal; 0, which follows the
+ * device, if it is none of the firmware's. */
+static uint32_t line_baud(int master) {
+    struct termios now;
+    if (tcgetattr(master, &now))
+        return 0;
+    switch (cfgetospeed(&now)) {
+    case B500000:
+        return 500000;
+    case B1000000:
+        return 1000000;
+    default:
+        return 0;
+    }
+}
+
 /* What the terminal does not take now is lost, as with a host that does not read. */
 static void device_to_pty(int master) {
     size_t count;
@@ -95,6 +111,7 @@ int pty_run(void) {
             due = now;
         }
         due += SLICE_NS;
+        uart_set_host_baud(line_baud(master));
         if (cpu_alive())
             cpu_run_until(cpu->cycle + SLICE_CYCLES);
         device_to_pty(master);

@@ -24,8 +24,9 @@ typedef uint64_t instant;
 
 extern avr_t *cpu;
 struct board;
-/* Loads the program, starts every part below and powers the board on. Says on stderr why not. */
-bool cpu_start(const struct board *board, const char *elf_path);
+/* Loads the program, starts every part below and powers the board on. Says on stderr why not.
+ * A boot loader (an Intel hex file, or NULL) lies beside the program and runs after each reset. */
+bool cpu_start(const struct board *board, const char *elf_path, const char *loader_path);
 /* Runs to the first instruction boundary at or after `target`, or to a crash or a final sleep. */
 void cpu_run_until(instant target);
 bool cpu_alive(void);
@@ -61,6 +62,7 @@ enum event {
     EVENT_TIMER1,
     EVENT_ADC,
     EVENT_UART_TX,
+    EVENT_UART_LINE,
     EVENT_UART_RX,
     EVENT_EEPROM,
     EVENTS

@@ -44,12 +44,17 @@ static struct {
     struct frame fifo[2], shift;
     unsigned fifo_count;
     bool shift_full, frame_lost;
+    bool receiving;
+    uint8_t arriving;   /* the bits of a frame seen so far ... */
+    unsigned bits_seen; /* ... of start, data and stop */
+    double edge;        /* instant at which the frame's start bit began */
     /* line */
     uint32_t host_baud;
-    bool arriving;
-    uint8_t arriving_byte;
-    double line_free; /* instant at which the line can carry the next byte */
-    double host_bit;  /* cycles, of the byte arriving */
+    bool on_line;
+    uint8_t line_byte;
+    double byte_start; /* instant at which its start bit began */
+    double line_free;  /* instant at which the line can carry the next byte */
+    double host_bit;   /* cycles, of the byte on the line */
     uint8_t *queue;
     size_t queue_head, queue_tail, queue_size;
     uint8_t *sent;
@@ -116,12 +121,12 @@ void uart_drain(size_t count) {
 
 size_t uart_host_queue(void) { return uart.queue_tail - uart.queue_head; }
 
-static void schedule_arrival(void) {
-    if (uart.arriving || !uart_host_queue())
+static void schedule_line(void) {
+    if (uart.on_line || !uart_host_queue())
         return;
     if (uart.line_free < (double)cpu->cycle)
         uart.line_free = (double)cpu->cycle;
-    events_set(EVENT_UART_RX, (instant)ceil(uart.line_free));
+    events_set(EVENT_UART_LINE, (instant)ceil(uart.line_free));
 }
 
 bool uart_host_write(const uint8_t *bytes, size_t count) {
@@ -135,7 +140,7 @@ bool uart_host_write(const uint8_t *bytes, size_t count) {
         return false;
     memcpy(uart.queue + waiting, bytes, count);
     uart.queue_tail += count;
-    schedule_arrival();
+    schedule_line();
     return true;
 }
 
@@ -164,34 +169,63 @@ static void shift_to_fifo(void) {
     uart.shift_full = false;
 }
 
-/* The start bit of a byte that finds both the FIFO and the shift register full costs the byte in
- * the shift register; DOR shows with the next one that survives. */
-static void start_arrival(instant when) {
-    uart.arriving = true;
-    uart.arriving_byte = uart.queue[uart.queue_head++];
-    uart.host_bit = host_bit_cycles();
-    if (uart.line_free < (double)when - 1)
-        uart.line_free = (double)when;
+/* Level of the line: a start bit, eight bits, the lowest first, a stop bit. */
+static bool line_high(double when) {
+    const double bit = floor((when - uart.byte_start) / uart.host_bit);
+    return !uart.on_line || bit < 0 || bit > HOST_BITS - 2 ||
+           (bit > 0 && uart.line_byte >> ((unsigned)bit - 1) & 1);
+}
+
+/* The receiver looks at the middle of each of its own bits after a falling edge. The start bit of
+ * a byte that finds both the FIFO and the shift register full costs the byte in the shift register;
+ * DOR shows with the next one that survives. */
+static void start_frame(double edge) {
     if (uart.shift_full) {
         uart.shift_full = false;
         uart.frame_lost = true;
         stats.rx_overruns++;
     }
-    /* The receiver has the byte in the middle of the stop bit. */
-    events_set(EVENT_UART_RX, (instant)ceil(uart.line_free + (HOST_BITS - 0.5) * uart.host_bit));
-    uart.line_free += HOST_BITS * uart.host_bit;
+    uart.receiving = true;
+    uart.edge = edge;
+    uart.bits_seen = 0;
+    uart.arriving = 0;
+    events_set(EVENT_UART_RX, (instant)ceil(edge + 0.5 * device_bit_cycles()));
 }
 
-static void end_arrival(void) {
-    uart.arriving = false;
-    stats.rx_bytes++;
-    if (!(cpu->data[UCSRB_] & RXEN_)) {
-        stats.rx_ignored++;
-        return;
+/* A receiver that is free takes the next falling edge for a start bit, wherever in the byte that is
+ * on the line it lies. */
+static void seek_edge(double when) {
+    for (unsigned bit = 0; uart.on_line && bit < HOST_BITS - 1; bit++) {
+        const double edge = uart.byte_start + bit * uart.host_bit, half = 0.5 * uart.host_bit;
+        if (edge >= when && !line_high(edge + half) && (!bit || line_high(edge - half))) {
+            start_frame(edge);
+            return;
+        }
     }
-    uart.shift = (struct frame){.byte = uart.arriving_byte};
-    if (rates_differ(uart.host_bit)) {
-        uart.shift.byte ^= GARBLED;
+}
+
+static void on_line(instant due) {
+    (void)due;
+    uart.on_line = uart_host_queue() > 0;
+    if (!uart.on_line)
+        return;
+    uart.line_byte = uart.queue[uart.queue_head++];
+    uart.host_bit = host_bit_cycles();
+    uart.byte_start = uart.line_free;
+    uart.line_free += HOST_BITS * uart.host_bit;
+    events_set(EVENT_UART_LINE, (instant)ceil(uart.line_free));
+    if (!(cpu->data[UCSRB_] & RXEN_)) {
+        stats.rx_bytes++;
+        stats.rx_ignored++;
+    } else if (!uart.receiving) {
+        start_frame(uart.byte_start);
+    }
+}
+
+static void end_frame(bool stop_bit) {
+    stats.rx_bytes++;
+    uart.shift = (struct frame){.byte = uart.arriving};
+    if (!stop_bit) {
         uart.shift.errors |= FE_;
         stats.rx_framing_errors++;
     }
@@ -203,14 +237,21 @@ static void end_arrival(void) {
     show_fifo();
 }
 
-static void on_receive(instant due) {
-    if (uart.arriving) {
-        end_arrival();
-        if (uart_host_queue())
-            events_set(EVENT_UART_RX, (instant)ceil(uart.line_free));
-    } else if (uart_host_queue()) {
-        start_arrival(due);
+static void on_sample(instant due) {
+    (void)due;
+    const double bit = device_bit_cycles(), when = uart.edge + (uart.bits_seen + 0.5) * bit;
+    const bool high = line_high(when);
+    if (uart.bits_seen == HOST_BITS - 1)
+        end_frame(high);
+    else if (uart.bits_seen)
+        uart.arriving |= (uint8_t)(high << (uart.bits_seen - 1));
+    if (uart.bits_seen == HOST_BITS - 1 || (!uart.bits_seen && high)) {
+        uart.receiving = false;
+        seek_edge(when);
+        return;
     }
+    uart.bits_seen++;
+    events_set(EVENT_UART_RX, (instant)ceil(when + bit));
 }
 
 static uint8_t read_udr(avr_t *avr, avr_io_addr_t address, void *param) {
@@ -228,6 +269,8 @@ static uint8_t read_udr(avr_t *avr, avr_io_addr_t address, void *param) {
 
 static void flush_receiver(void) {
     uart.fifo_count = 0;
+    uart.receiving = false;
+    events_set(EVENT_UART_RX, NEVER);
     uart.shift_full = uart.frame_lost = false;
     show_fifo();
 }
@@ -284,12 +327,16 @@ static void write_ucsra(avr_t *avr, avr_io_addr_t address, uint8_t value, void *
 
 static void write_ucsrb(avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
     (void)param;
-    events_until(cpu_write_instant());
+    const instant when = cpu_write_instant();
+    events_until(when);
     if ((avr->data[address] & ~value & TXEN_) && !skin_tx_pin_is_high())
         stats.tx_let_go++;
+    const bool was_on = avr->data[address] & RXEN_;
     avr->data[address] = value & (uint8_t)~RXB8_;
     if (!(value & RXEN_))
         flush_receiver();
+    else if (!was_on)
+        seek_edge((double)when);
     cpu_retry_interrupt(&uart.stock->txc);
     uart_level();
 }
@@ -310,7 +357,8 @@ void uart_start(void) {
     uart.stock = cpu_find_io("uart", '0');
     uart.stock->io.reset = NULL;
     events_handle(EVENT_UART_TX, on_transmitted);
-    events_handle(EVENT_UART_RX, on_receive);
+    events_handle(EVENT_UART_LINE, on_line);
+    events_handle(EVENT_UART_RX, on_sample);
     cpu_on_write(UDR_, write_udr, NULL);
     cpu_on_read(UDR_, read_udr, NULL);
     cpu_on_write(UCSRA_, write_ucsra, NULL);
@@ -321,7 +369,7 @@ void uart_start(void) {
     cpu_on_write(UBRRH_, write_setting, NULL);
 }
 
-/* A byte being sent is cut off; one that is arriving keeps arriving, and finds RXEN off. */
+/* A byte being sent is cut off; the line from the host goes on, and finds RXEN off. */
 void uart_reset(void) {
     cpu->data[UCSRA_] = UDRE_;
     cpu->data[UCSRC_] = 0x06; /* 8N1 */

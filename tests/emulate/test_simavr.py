@@ -485,18 +485,18 @@ def test_baud_mismatch_garbles_both_ways(simulate: Simulate) -> None:
     sim.run_cycles(1000)
     sim.write(b"x")
     assert sim.run(0.003) == bytes([RXC0]) + b"x"
-    sim.set_baud(115_200)
-    sim.write(b"x")
-    sim.run(0.0001)
-    garbled = sim.run(0.003)
-    assert len(garbled) == 2
-    assert garbled[0] != RXC0 | FE0  # garbled on the way back as well
-    sim.write(b"x")
-    sim.run_cycles(1500)
-    sim.set_baud(0)
-    status, byte = sim.run(0.003)
-    assert status == RXC0 | FE0
-    assert byte != ord("x")
+    # Bits of 8.68 us, which the board looks at every 2 us. The start bit and three zeros outlast a
+    # frame of 20 us; the last zero, after four ones, reads as a start bit and 0, 0, 0, 1, ...
+    frames = bytes([RXC0 | FE0, 0, RXC0, 0xF8])
+    for follows in (False, True):
+        sim.set_baud(115_200)
+        sim.write(b"x")
+        sim.run_cycles(1500)
+        if follows:
+            sim.set_baud(0)
+        answer = sim.run(0.003)
+        assert (answer == frames) == follows  # else it is garbled on the way back as well
+        assert len(answer) == len(frames)
 
 
 # ---- resets, EEPROM, idle time -----------------------------------------------------------------
@@ -529,6 +529,43 @@ def test_power_on_watchdog_and_external_reset(simulate: Simulate, board: str) ->
     stats = sim.stats()
     assert stats["resets"] == 2
     assert stats["cycles"] >= 0.075 * CPU_HZ
+
+
+LOADERS = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
+OPTIBOOT = ("uno", "optiboot/optiboot_atmega328.hex")
+OF_MEGA = ("megaatmega2560", "stk500v2/stk500boot_v2_mega2560.hex")
+FLASHES_S = 6 / 16  # optiboot.c: LED_START_FLASHES is 3
+ALWAYS = [0.3 * n for n in range(20)]
+
+
+@pytest.mark.skipif(not LOADERS.exists(), reason="needs Debian's arduino-core-avr")
+@pytest.mark.parametrize(
+    ("loader", "asked_s", "starts_s"),
+    [
+        (OPTIBOOT, [], FLASHES_S + 1.024),  # the watchdog's time of 2**17 cycles of 128 kHz
+        (OPTIBOOT, ALWAYS, FLASHES_S + 0.016),
+        (OF_MEGA, [], 0.83),
+        (OF_MEGA, [0.4], 5.4),
+        (OF_MEGA, ALWAYS, math.inf),
+    ],
+)
+def test_boot_loader_hears_a_programmer_in_every_byte(
+    build: Build, loader: tuple[str, str], asked_s: list[float], starts_s: float
+) -> None:
+    """Times from the port's opening to the program, as the same files took in avr8js."""
+    board, file = loader
+    elf = build(board, "int main(void) { transmitter(); send('!'); send('O'); for (;;) {} }")
+    with LockstepSim(board, elf, bootloader=LOADERS / file) as sim:
+        sim.set_baud(500_000)
+        sim.reset()
+        sent, now_s = b"", 0.0
+        while b"!O" not in sent and now_s < 6:
+            if asked_s and asked_s[0] <= now_s:
+                sim.write(bytes.fromhex("00058101872500"))  # get_hello
+                asked_s = asked_s[1:]
+            sent += sim.run(0.01)
+            now_s += 0.01
+    assert (now_s if b"!O" in sent else math.inf) == pytest.approx(starts_s, abs=0.021)
 
 
 EEPROM = """

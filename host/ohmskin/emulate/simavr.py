@@ -47,7 +47,8 @@ class SimulationError(RuntimeError):
 class SkinSim(Closing):
     """A board with a skin, simulated cycle by cycle.
 
-    board: one of `BOARDS`. elf: the firmware. pty: run in real time, from the request "G" on, with
+    board: one of `BOARDS`. elf: the firmware. bootloader: an Intel hex file of the boot section, in
+    which the processor then starts. pty: run in real time, from the request "G" on, with
     the UART on the pseudo-terminal `pty_path`; else time passes only in requests that run the
     board.
 
@@ -55,11 +56,15 @@ class SkinSim(Closing):
     simulator does not start. Not thread-safe.
     """
 
-    def __init__(self, board: str, elf: Path, *, pty: bool = False) -> None:
+    def __init__(
+        self, board: str, elf: Path, *, pty: bool = False, bootloader: str | Path = ""
+    ) -> None:
         for path, made_by in ((PROGRAM, "make sim"), (elf, "make firmware")):
             if not path.is_file():
                 raise FileNotFoundError(f"{path} is missing: run '{made_by}' in a checkout")
-        command = [str(PROGRAM), "--board", board, *(["--pty"] if pty else []), str(elf)]
+        options = [f"--bootloader={bootloader}"] if bootloader else []
+        options += ["--pty"] if pty else []
+        command = [str(PROGRAM), "--board", board, *options, str(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._stderr)
@@ -148,7 +153,8 @@ class SkinSim(Closing):
 class SimavrLink(SerialLink):
     """A simulated board's pseudo-terminal, and the skin that it reads.
 
-    board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: `SkinSim.set`.
+    board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: those of
+    `SkinSim.set`, and `bootloader`: its file; the board is then reset as its port opens.
 
     :raises PortError: there is no such board or setting, or firmware or simulator are not built.
     """
@@ -159,12 +165,16 @@ class SimavrLink(SerialLink):
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
         elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
+        options = dict(settings)
         with ExitStack() as opened:
             try:
-                self.sim = opened.enter_context(SkinSim(board, elf, pty=True))
-                self.sim.set(**settings)
+                loader = options.pop("bootloader", "")
+                self.sim = opened.enter_context(SkinSim(board, elf, pty=True, bootloader=loader))
+                self.sim.set(**options)
                 self.sim.set_table(scene.ratio(0.0))
                 super().__init__(self.sim.pty_path)
+                if loader:
+                    self.reset()  # as opening the port of a real board does
                 self.sim.request("G")  # the port is open: nothing that the board says is lost
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
@@ -184,6 +194,10 @@ class SimavrLink(SerialLink):
             except SimulationError as exc:
                 raise DeviceLost(f"{self.name} has ended: {exc}") from exc
         return super().read()
+
+    def reset(self) -> None:
+        """Pull the reset pin, as the DTR line of a serial port does."""
+        self.sim.request("X")
 
     def close(self) -> None:
         """See `Link.close`."""
