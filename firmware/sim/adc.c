@@ -9,6 +9,9 @@
  *   first after ADEN   13.5    25
  *   single, free run    1.5    13
  *   auto triggered      2      13.5
+ *
+ * The sample capacitor is joined to its channel from the last ADC clock of a conversion on, where
+ * the channel is unlocked, until the next hold.
  */
 #include "skinsim.h"
 
@@ -21,7 +24,7 @@ enum { ADC_L = 0x78, ADC_H = 0x79, ADCSRA_ = 0x7A, ADCSRB_ = 0x7B, ADMUX_ = 0x7C
 enum { ADEN_ = 0x80, ADSC_ = 0x40, ADATE_ = 0x20, ADIF_ = 0x10, ADIE_ = 0x08, ADPS_ = 0x07 };
 enum { ADLAR_ = 0x20, REFS_ = 0xC0, REFS_AVCC = 0x40, MUX_ = 0x1F, MUX5_ = 0x08, ADTS_ = 0x07 };
 
-enum phase { IDLE, WAITING, SAMPLING, HOLDING };
+enum phase { IDLE, WAITING, SAMPLING, HOLDING, TRACKING };
 
 static struct {
     avr_int_vector_t *vector;
@@ -32,7 +35,6 @@ static struct {
     unsigned divider;   /* CPU cycles in one ADC clock, of the conversion in progress */
     double hold_clocks, all_clocks;
     unsigned channel; /* connected to the sample and hold */
-    instant mux_written;
     uint16_t code, result;
     bool locked, unread; /* ADCL read and ADCH not; result not read */
 } adc;
@@ -46,10 +48,15 @@ static unsigned selected_channel(void) {
     return (cpu->data[ADMUX_] & MUX_) | (cpu->data[ADCSRB_] & MUX5_) << 2;
 }
 
+static bool multiplexer_is_free(void) {
+    return adc.phase == IDLE || adc.phase == WAITING || adc.phase == TRACKING;
+}
+
 static void connect_channel(instant when) {
     if (selected_channel() == adc.channel)
         return;
     adc.channel = selected_channel();
+    skin_connect(adc.channel, when);
     stats_channel_changed(when);
 }
 
@@ -75,6 +82,7 @@ static void hold(instant when) {
     if ((cpu->data[ADMUX_] & REFS_) != REFS_AVCC)
         stats.reference_not_avcc++;
     stats_hold(when, adc.channel, adc.code);
+    skin_connect(NODES, when); /* the capacitor keeps what it has while the converter works */
 }
 
 static void finish(instant when) {
@@ -87,9 +95,6 @@ static void finish(instant when) {
     }
     adc.phase = IDLE;
     cpu->data[ADCSRA_] = control & (uint8_t)~ADSC_;
-    /* A channel written meanwhile is connected in the last ADC clock of the conversion. */
-    const instant unlocked = when - adc.divider;
-    connect_channel(adc.mux_written > unlocked ? adc.mux_written : unlocked);
     if ((control & ADATE_) && trigger_source() == ADC_TRIGGER_FREE)
         begin(when, 1.5, 13);
     avr_raise_interrupt(cpu, adc.vector);
@@ -107,9 +112,15 @@ static void on_event(instant due) {
     case SAMPLING:
         hold(due);
         adc.phase = HOLDING;
+        events_set(EVENT_ADC, adc.end - adc.divider);
+        break;
+    case HOLDING: /* a channel written meanwhile is connected in the conversion's last ADC clock */
+        adc.phase = TRACKING;
+        skin_connect(adc.channel, due);
+        connect_channel(due);
         events_set(EVENT_ADC, adc.end);
         break;
-    case HOLDING:
+    case TRACKING:
         finish(due);
         break;
     }
@@ -159,7 +170,7 @@ static void write_adcsra(avr_t *avr, avr_io_addr_t address, uint8_t value, void 
     }
     if ((value & ADSC_) && adc.phase == IDLE)
         start_single(when);
-    if (adc.phase == IDLE || adc.phase == WAITING)
+    if (multiplexer_is_free())
         connect_channel(when);
     /* The datasheet does not say whether a flag that is set already counts as an edge. */
     if ((now & ADATE_) && !(old & ADATE_) && trigger_flag(trigger_source()))
@@ -181,8 +192,7 @@ static void write_mux(avr_t *avr, avr_io_addr_t address, uint8_t value, void *pa
     events_until(when);
     const unsigned old_source = trigger_source();
     avr->data[address] = value;
-    adc.mux_written = when;
-    if (adc.phase == IDLE || adc.phase == WAITING)
+    if (multiplexer_is_free())
         connect_channel(when);
     const unsigned source = trigger_source();
     if (source == old_source)
@@ -240,6 +250,7 @@ void adc_start(void) {
 void adc_reset(void) {
     adc.phase = IDLE;
     adc.channel = 0;
+    skin_connect(0, cpu->cycle);
     adc.result = 0;
     adc.locked = adc.unread = false;
     events_set(EVENT_ADC, NEVER);

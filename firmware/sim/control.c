@@ -18,6 +18,7 @@
 
 enum {
     REQUEST_MAX = 4 << 20,
+    ADMITTANCE_BYTES = SKIN_LINES * SKIN_LINES * sizeof(double),
     TABLE_BYTES = SKIN_ROWS * SKIN_COLUMNS * SKIN_CONFIGURATIONS * sizeof(double)
 };
 static const uint64_t RUN_MAX = (uint64_t)CPU_HZ * 3600;
@@ -93,6 +94,16 @@ static bool set_table(void) {
     return control_reply('T', NULL, 0);
 }
 
+static bool set_admittance(void) {
+    static double siemens[SKIN_LINES * SKIN_LINES];
+    memcpy(siemens, payload, sizeof siemens);
+    for (size_t i = 0; i < sizeof siemens / sizeof *siemens; i++)
+        if (!isfinite(siemens[i]))
+            return refuse("C: an admittance is not finite");
+    skin_set_admittance(siemens);
+    return control_reply('C', NULL, 0);
+}
+
 static bool set_setting(size_t length) {
     payload[length] = 0;
     const char *error = settings_set((char *)payload);
@@ -155,13 +166,13 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         uint8_t op;
         uint32_t shortest, longest;
         bool lock_step_only;
-    } OPS[] = {{'R', 8, 8, true},   {'W', 0, REQUEST_MAX, true},
-               {'B', 4, 4, false},  {'T', TABLE_BYTES, TABLE_BYTES, false},
-               {'O', 1, 80, false}, {'S', 0, 0, false},
-               {'Z', 0, 0, false},  {'L', 1, 1, false},
-               {'E', 0, 0, false},  {'e', 2, 2 + 4096, false},
-               {'X', 0, 0, false},  {'J', 4, 4, false},
-               {'D', 3, 3, false}};
+    } OPS[] = {{'R', 8, 8, true},         {'W', 0, REQUEST_MAX, true},
+               {'B', 4, 4, false},        {'T', TABLE_BYTES, TABLE_BYTES, false},
+               {'O', 1, 80, false},       {'C', ADMITTANCE_BYTES, ADMITTANCE_BYTES, false},
+               {'S', 0, 0, false},        {'Z', 0, 0, false},
+               {'L', 1, 1, false},        {'E', 0, 0, false},
+               {'e', 2, 2 + 4096, false}, {'X', 0, 0, false},
+               {'J', 4, 4, false},        {'D', 3, 3, false}};
     size_t i = 0;
     while (i < sizeof OPS / sizeof *OPS && OPS[i].op != op)
         i++;
@@ -184,6 +195,8 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         return set_baud();
     case 'T':
         return set_table();
+    case 'C':
+        return set_admittance();
     case 'O':
         return set_setting(length);
     case 'S':

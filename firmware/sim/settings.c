@@ -17,6 +17,11 @@ static const struct setting {
     double least, most;
 } SETTINGS[] = {
     {"tau_us", &settings.tau_us, 0, 1e9},
+    {"sample_pf", &settings.sample_pf, 0, 1e6},
+    {"input_ohm", &settings.input_ohm, 0, 1e6},
+    {"node_pf", &settings.node_pf, 0, 1e6},
+    {"line_pf", &settings.line_pf, 0, 1e6},
+    {"cell_pf", &settings.cell_pf, 0, 1e6},
     {"late_cycles", &settings.late_cycles, 0, 1000},
     {"seed", &settings.seed, 0, 4294967295.0},
 };

@@ -5,6 +5,7 @@
 #include "skinsim.h"
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 /* The one table of pins. PINx, DDRx and PORTx follow each other in data space. Of all ports: the
@@ -33,6 +34,23 @@ static struct {
     struct node node[NODES];
 } skin;
 
+/* With any capacitance set, the nodes are part of a circuit, and its voltages are kept here: of
+ * the skin's lines (rows first), the two nodes and the sample capacitor. */
+enum { SAMPLE = SKIN_LINES + NODES, STATES };
+enum { MATRICES = CONFIG_OTHER };
+#define REF_OHM 30e3
+#define MUX_OHM 1.0
+/* Where nothing else is: it settles in 0.3 ns. */
+#define STRAY_PF 0.01
+
+static struct {
+    double siemens[SKIN_LINES][SKIN_LINES];
+    double volt[STATES]; /* V/Vdd ... */
+    instant since;       /* ... then */
+    unsigned connected;  /* node at the sample capacitor */
+    struct modes *modes[SKIN_ROWS][SKIN_COLUMNS][MATRICES][NODES + 1];
+} circuit;
+
 const struct board *skin_find_board(const char *name) {
     for (size_t i = 0; i < sizeof BOARDS / sizeof *BOARDS; i++)
         if (!strcmp(name, BOARDS[i].name))
@@ -59,7 +77,124 @@ static double target(unsigned node) {
     return skin.ratio[skin.row][skin.column][config];
 }
 
+static bool is_circuit(void) {
+    return settings.line_pf > 0 || settings.node_pf > 0 || settings.sample_pf > 0;
+}
+
+/* Without lines, each node hangs on a source with the table's voltage. Of the reference resistor
+ * and the skin behind it, R (1 - R I) is the parallel, and 1 - R I is A, C, 1 - B or 1 - D. */
+static double source_ohm(unsigned node) {
+    const double ratio = target(node) > 1 ? 1 : target(node) < 0 ? 0 : target(node);
+    return REF_OHM * fmax(ratio, 1 - ratio);
+}
+
+/* The states of the circuit: lines that carry something, if lines have a capacitance, and the rest.
+ */
+static size_t list_states(size_t states[STATES]) {
+    size_t n = 0;
+    for (size_t i = 0; i < STATES; i++)
+        if (i >= SKIN_LINES || (settings.line_pf > 0 && circuit.siemens[i][i] > 0))
+            states[n++] = i;
+    return n;
+}
+
+static void join(double a[STATES][STATES], size_t i, size_t j, double value) {
+    a[i][i] += value;
+    a[j][j] += value;
+    a[i][j] -= value;
+    a[j][i] -= value;
+}
+
+static struct modes *make_modes(size_t n, const size_t states[n]) {
+    static double farad[STATES][STATES], siemens[STATES][STATES];
+    memset(farad, 0, sizeof farad);
+    memset(siemens, 0, sizeof siemens);
+    const size_t of_node[NODES] = {skin.row, SKIN_ROWS + skin.column};
+    for (unsigned node = 0; node < NODES; node++) {
+        const size_t at = SKIN_LINES + node, line = of_node[node];
+        farad[at][at] = 1e-12 * fmax(settings.node_pf, STRAY_PF);
+        if (settings.line_pf <= 0)
+            siemens[at][at] = 1 / source_ohm(node);
+        else if (!skin.undriven)
+            siemens[at][at] = 1 / REF_OHM;
+        if (settings.line_pf > 0 && circuit.siemens[line][line] > 0)
+            join(siemens, at, line, 1 / MUX_OHM);
+    }
+    farad[SAMPLE][SAMPLE] = 1e-12 * fmax(settings.sample_pf, STRAY_PF);
+    if (circuit.connected < NODES && settings.sample_pf > 0)
+        join(siemens, SAMPLE, SKIN_LINES + circuit.connected, 1 / fmax(settings.input_ohm, 1));
+    double c[n][n], g[n][n];
+    for (size_t i = 0; i < n; i++) {
+        const size_t line = states[i];
+        if (line >= SKIN_LINES)
+            continue;
+        farad[line][line] += 1e-12 * settings.line_pf;
+        for (size_t j = 0; j < i; j++)
+            if (line >= SKIN_ROWS && states[j] < SKIN_ROWS)
+                join(farad, line, states[j], 1e-12 * settings.cell_pf);
+        for (size_t j = 0; j < SKIN_LINES; j++)
+            siemens[line][j] += circuit.siemens[line][j];
+    }
+    for (size_t i = 0; i < n; i++)
+        for (size_t j = 0; j < n; j++) {
+            c[i][j] = farad[states[i]][states[j]];
+            g[i][j] = siemens[states[i]][states[j]];
+        }
+    return modes_make(n, *c, *g);
+}
+
+static void forget_modes(void) {
+    struct modes **all = &circuit.modes[0][0][0][0];
+    for (size_t i = 0; i < sizeof circuit.modes / sizeof *all; i++) {
+        free(all[i]);
+        all[i] = NULL;
+    }
+}
+
+/* Brings the circuit's voltages to `when`, before anything about it changes. */
+static void advance(instant when) {
+    if (!is_circuit() || when <= circuit.since)
+        return;
+    size_t states[STATES];
+    const size_t n = list_states(states);
+    struct modes **modes =
+        &circuit.modes[skin.row][skin.column][configuration(NODE_TOP)][circuit.connected];
+    if (!*modes)
+        *modes = make_modes(n, states);
+    double volt[n], ampere[n];
+    for (size_t i = 0; i < n; i++) {
+        volt[i] = circuit.volt[states[i]];
+        ampere[i] = 0;
+    }
+    for (unsigned node = 0; node < NODES; node++) {
+        const bool high = node == NODE_TOP ? skin.top_high : skin.bottom_high;
+        ampere[n - 1 - NODES + node] = settings.line_pf <= 0 ? target(node) / source_ohm(node)
+                                       : skin.undriven       ? 0
+                                                             : high / REF_OHM;
+    }
+    modes_advance(*modes, ampere, (double)(when - circuit.since) / CPU_HZ, volt);
+    for (size_t i = 0; i < n; i++)
+        circuit.volt[states[i]] = volt[i];
+    circuit.since = when;
+}
+
+void skin_connect(unsigned node, instant when) {
+    advance(when);
+    circuit.connected = node < NODES ? node : NODES;
+}
+
+void skin_set_admittance(const double *siemens) {
+    advance(cpu->cycle);
+    memcpy(circuit.siemens, siemens, sizeof circuit.siemens);
+    forget_modes();
+}
+
 double skin_ratio(unsigned node, instant when) {
+    if (is_circuit()) {
+        advance(when);
+        const bool sampled = settings.sample_pf > 0 && circuit.connected == node;
+        return circuit.volt[sampled ? SAMPLE : SKIN_LINES + node];
+    }
     const struct node *n = &skin.node[node];
     const double tau_cycles = settings.tau_us * (CPU_HZ / 1e6);
     if (tau_cycles <= 0 || when < n->since)
@@ -91,6 +226,7 @@ static void on_pins(instant when) {
     if (row == skin.row && column == skin.column && top_high == skin.top_high &&
         bottom_high == skin.bottom_high && undriven == skin.undriven)
         return;
+    advance(when);
     skin.row = row;
     skin.column = column;
     skin.top_high = top_high;
@@ -132,11 +268,21 @@ void skin_start(const struct board *board) {
 void skin_reset(void) { on_pins(cpu->cycle); }
 
 void skin_set_table(const double *ratio) {
+    advance(cpu->cycle);
+    forget_modes();
     memcpy(skin.ratio, ratio, sizeof skin.ratio);
     retarget(cpu->cycle);
 }
 
-void skin_before_setting(void) { retarget(cpu->cycle); }
+void skin_before_setting(void) {
+    retarget(cpu->cycle);
+    forget_modes();
+    if (is_circuit())
+        return;
+    circuit.since = cpu->cycle; /* it may become one, and begins with these voltages */
+    for (unsigned i = 0; i < NODES; i++)
+        circuit.volt[SKIN_LINES + i] = skin.node[i].start;
+}
 
 struct skin_pins skin_pins(unsigned node) {
     return (struct skin_pins){skin.row, skin.column,

@@ -98,20 +98,34 @@ void skin_reset(void);
 void skin_set_table(const double *ratio);
 /* Settings are about to change: the voltages up to now follow from the old ones. */
 void skin_before_setting(void);
+/* What the converter sees of a node. */
 double skin_ratio(unsigned node, instant when);
 /* Inputs without a pull-up, besides the sense pins. */
 unsigned skin_floating_pins(void);
 /* What the line sees while the transmitter is off. */
 bool skin_tx_pin_is_high(void);
+/* The sample capacitor is joined to this node from now on; NODES: to none. */
+void skin_connect(unsigned node, instant when);
+enum { SKIN_LINES = SKIN_ROWS + SKIN_COLUMNS };
+/* Currents into the electrodes (rows first) per potential of each [S], (32, 32). */
+void skin_set_admittance(const double *siemens);
 struct skin_pins {
     uint8_t row, column, configuration;
 };
 struct skin_pins skin_pins(unsigned node);
 
+/* ---- network.c: C dv/dt = -G v + i */
+
+struct modes;
+/* Of n nodes with these capacitances and conductances, (n, n) each; free() it. */
+struct modes *modes_make(size_t n, const double *farad, const double *siemens);
+void modes_advance(const struct modes *modes, const double *ampere, double seconds, double *volt);
+
 /* ---- settings.c: how far the board is from ideal; all zero at the start */
 
 struct settings {
     double tau_us;
+    double sample_pf, input_ohm, node_pf, line_pf, cell_pf;
     double late_cycles;
     double seed;
 };

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from lockstep import CPU_HZ, LockstepSim
 from ohmskin.emulate import simavr
@@ -276,19 +277,21 @@ def test_undriven_pins_and_equal_drive(simulate: Simulate) -> None:
     assert undriven == states.count((5, 0)) > 5
 
 
+# Pins: outputs first, drive top high at row 0, then row 1 a little later.
+SETTLING = sts(ADMUX, 0x40) + sts(ADCSRA, 0x83)  # ADEN at 6, ADC clock 8 cycles
+SETTLING += "ldi r16, 15\n out 0x04, r16\n ldi r16, 0xFC\n out 0x0A, r16\n"  # driven low: 0.0
+SETTLING += "ldi r16, 0x04\n out 0x0B, r16\n"  # 12: configuration A, row 0
+SETTLING += "ldi r24, 20\n 2: dec r24\n brne 2b\n"  # 1 + 20 * 3 - 1 cycles: 72
+SETTLING += "ldi r16, 0x14\n out 0x0B, r16\n"  # 74: row 1
+SETTLING += sts(ADCSRA, 0xC3) + FOREVER  # 77: first conversion, from the edge at 78
+
+
 def test_settling_is_exponential_and_continues_from_an_unsettled_value(simulate: Simulate) -> None:
-    # Pins: outputs first, drive top high at row 0, then row 1 a little later.
-    program = sts(ADMUX, 0x40) + sts(ADCSRA, 0x83)  # ADEN at 6, ADC clock 8 cycles
-    program += "ldi r16, 15\n out 0x04, r16\n ldi r16, 0xFC\n out 0x0A, r16\n"  # driven low: 0.0
-    program += "ldi r16, 0x04\n out 0x0B, r16\n"  # 12: configuration A, row 0
-    program += "ldi r24, 20\n 2: dec r24\n brne 2b\n"  # 1 + 20 * 3 - 1 cycles: 72
-    program += "ldi r16, 0x14\n out 0x0B, r16\n"  # 74: row 1
-    program += sts(ADCSRA, 0xC3) + FOREVER  # 77: first conversion, from the edge at 78
     changed, changed_again, held = 12, 74, 78 + 108
     table = np.zeros((2, 1, 4))
     table[0, 0, 0], table[1, 0, 0] = 0.9, 0.3
     tau_us = 4.0
-    sim = simulate(program)
+    sim = simulate(SETTLING)
     sim.set_table(table)
     sim.set_tau_us(tau_us)
     record = hold_log(sim, 1000)[0]
@@ -299,6 +302,77 @@ def test_settling_is_exponential_and_continues_from_an_unsettled_value(simulate:
     assert int(record["cycle"]) == held
     assert int(record["code"]) == math.floor(expected * 1024)
     assert stats["settle_cycles_min"] == held - changed_again
+
+
+@pytest.mark.parametrize("input_ohm", [1, 1e5])
+@pytest.mark.parametrize(("line_pf", "cell_pf"), [(30, 0), (30, 2), (300, 20)])
+def test_lines_settle_as_the_matrix_exponential_says(
+    simulate: Simulate, line_pf: float, cell_pf: float, input_ohm: float
+) -> None:
+    """Rows 0 and 1 and columns 0 and 1 of the skin, both nodes, the sample capacitor."""
+    cells = np.array([[1 / 20e3, 1 / 1e6], [1 / 50e3, 1 / 5e3]])
+    siemens, farad = (np.zeros((7, 7)) for _ in range(2))
+    joints = [(siemens, r, 2 + c, cells[r, c]) for r in (0, 1) for c in (0, 1)]
+    joints += [(farad, r, 2 + c, 1e-12 * cell_pf) for r in (0, 1) for c in (0, 1)]
+    for of, a, b, value in joints:
+        of[np.ix_([a, b], [a, b])] += value * np.array([[1, -1], [-1, 1]])
+    admittance = siemens[:4, :4].copy()
+    siemens[[4, 5], [4, 5]] += 1 / 30e3
+    siemens[np.ix_([4, 6], [4, 6])] += np.array([[1, -1], [-1, 1]]) / input_ohm
+    farad[range(7), range(7)] += 1e-12 * np.array([line_pf] * 4 + [50, 50, 14])
+    volt = np.zeros(7)
+    for row, cycles in ((0, 74 - 12), (1, 78 + 108 - 74)):
+        # The multiplexers make one node of two: their charges add.
+        merged = np.eye(7)[:, [0, 1, 2, 3, 6]]
+        merged[[4, 5], [row, 2]] = 1
+        g, c = merged.T @ siemens @ merged, merged.T @ farad @ merged
+        goal = np.linalg.solve(g, merged[4] / 30e3)
+        off = np.linalg.solve(c, merged.T @ farad @ volt) - goal
+        volt = merged @ (goal + expm(np.linalg.solve(c, -g) * cycles / CPU_HZ) @ off)
+    sim = simulate(SETTLING)
+    sim.set(line_pf=line_pf, cell_pf=cell_pf, node_pf=50, sample_pf=14, input_ohm=input_ohm)
+    sim.set_admittance(admittance, 2)
+    assert hold_log(sim, 1000)[0]["code"] == pytest.approx(1024 * volt[6] - 0.5, abs=0.6)
+
+
+ALTERNATELY = """
+int main(void) {
+    DDRB = 15; DDRD = 0xFC; PORTD = 4;
+    ADMUX = 0x40; ADCSRB = TRIGGER;
+    TCCR1B = 0x18; ICR1 = SLOT - 1; OCR1B = 8; OCR1A = 100; TCCR1B = 0x19;
+    ADCSRA = 0xE5;
+    for (;;) { while (!(TIFR1 & 2)) {} TIFR1 = 6; ADMUX ^= 1; }
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("slot", "joined", "errors_lsb"),
+    [(416, 80, (16, 28)), (437, 101, (8, 19)), (509, 173, (0.8, 5)), (694, 358, (0, 0))],
+)
+def test_sample_capacitor_remembers_the_reading_before(
+    simulate: Simulate, slot: int, joined: int, errors_lsb: tuple[float, float]
+) -> None:
+    """Nodes at 0 and Vdd, behind 30 kOhm each, read in turn at 150, 143, 120 and 90 scans/s.
+
+    An error e leaves (1 - e) of Vdd for the next: e = (1 - e) k, with k the share of the charge
+    that the last ADC clock of a conversion and the time to the hold (`joined`, cycles) leave.
+    """
+    trigger = "0" if slot == 416 else "5"
+    program = ALTERNATELY.replace("SLOT", str(slot)).replace("TRIGGER", trigger)
+    for node_pf, known_lsb in zip((50, 100), errors_lsb, strict=True):
+        whole_pf = 14 + node_pf
+        k = 14 / whole_pf * math.exp(-joined / CPU_HZ / (30e3 * 1e-12 * whole_pf))
+        sim = simulate(program)
+        sim.set(sample_pf=14, node_pf=node_pf)
+        sim.run_cycles(10_000)
+        sim.reset_stats()
+        holds = hold_log(sim, 10_000)
+        low, high = (holds["code"][holds["channel"] == channel] for channel in (1, 0))
+        assert 1024 * k / (1 + k) == pytest.approx(known_lsb, abs=0.9)
+        assert set(low) == {math.floor(1024 * k / (1 + k))}
+        assert set(high) == {math.floor(1024 / (1 + k))}
+        assert sim.stats()["channel_settle_cycles_max"] == joined
 
 
 def test_gaps_between_changes_and_holds(simulate: Simulate) -> None:

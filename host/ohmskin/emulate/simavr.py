@@ -105,6 +105,16 @@ class SkinSim(Closing):
         table[: ratio.shape[0], : ratio.shape[1]] = ratio
         self.request("T", table.tobytes())
 
+    def set_admittance(self, siemens: Float, rows: int) -> None:
+        """Set what counts instead of the table where lines have a capacitance (`line_pf`).
+
+        siemens: `electrode_admittance` of a skin, (rows + columns, rows + columns).
+        """
+        at = np.r_[:rows, 16 : 16 + len(siemens) - rows]
+        of_all = np.zeros((32, 32))
+        of_all[np.ix_(at, at)] = siemens
+        self.request("C", of_all.tobytes())
+
     def set(self, **settings: float | str) -> None:
         """Change settings of the simulator: firmware/sim/README.md lists them.
 
