@@ -75,9 +75,35 @@ static void begin(instant start, double hold_clocks, double all_clocks) {
     events_set(EVENT_ADC, start);
 }
 
+/* Of a normal distribution with deviation 1, by the method of Box and Muller; the same for a seed.
+ */
+static double noise(void) {
+    static double seed = -1;
+    static uint64_t state;
+    double uniform[2];
+    if (seed != settings.seed)
+        state = (uint64_t)(seed = settings.seed);
+    for (int i = 0; i < 2; i++) { /* splitmix64 */
+        uint64_t mixed = state += 0x9E3779B97F4A7C15;
+        mixed = (mixed ^ mixed >> 30) * 0xBF58476D1CE4E5B9;
+        mixed = (mixed ^ mixed >> 27) * 0x94D049BB133111EB;
+        uniform[i] = (double)((mixed ^ mixed >> 31) >> 11) * 0x1p-53;
+    }
+    return sqrt(-2 * log(1 - uniform[0])) * cos(2 * M_PI * uniform[1]);
+}
+
+/* What the ideal converter would have to see to give this one's code [LSB]. */
+static double with_errors(double ratio) {
+    const struct settings *s = &settings;
+    const unsigned clock = cpu->data[ADCSRA_] & ADPS_;
+    const double bow = 4 * ratio * (1 - ratio);
+    return ratio * 1024 + s->half_code / 2 + s->offset_lsb[clock] + s->gain_lsb[clock] * ratio +
+           s->inl_lsb[clock] * bow + (s->noise_lsb[clock] > 0 ? s->noise_lsb[clock] * noise() : 0);
+}
+
 static void hold(instant when) {
     const double ratio = adc.channel < NODES ? skin_ratio(adc.channel, when) : 0.0;
-    const double code = floor(ratio * 1024);
+    const double code = floor(with_errors(ratio));
     adc.code = code > 1023 ? 1023 : code > 0 ? (uint16_t)code : 0;
     if ((cpu->data[ADMUX_] & REFS_) != REFS_AVCC)
         stats.reference_not_avcc++;

@@ -15,17 +15,43 @@ static const struct setting {
     const char *name;
     double *value;
     double least, most;
+    bool by_clock; /* one value an ADC clock */
 } SETTINGS[] = {
-    {"tau_us", &settings.tau_us, 0, 1e9},
-    {"sample_pf", &settings.sample_pf, 0, 1e6},
-    {"input_ohm", &settings.input_ohm, 0, 1e6},
-    {"node_pf", &settings.node_pf, 0, 1e6},
-    {"line_pf", &settings.line_pf, 0, 1e6},
-    {"cell_pf", &settings.cell_pf, 0, 1e6},
-    {"late_cycles", &settings.late_cycles, 0, 1000},
-    {"seed", &settings.seed, 0, 4294967295.0},
+    {"tau_us", &settings.tau_us, 0, 1e9, false},
+    {"sample_pf", &settings.sample_pf, 0, 1e6, false},
+    {"input_ohm", &settings.input_ohm, 0, 1e6, false},
+    {"node_pf", &settings.node_pf, 0, 1e6, false},
+    {"line_pf", &settings.line_pf, 0, 1e6, false},
+    {"cell_pf", &settings.cell_pf, 0, 1e6, false},
+    {"half_code", &settings.half_code, 0, 1, false},
+    {"offset_lsb", settings.offset_lsb, -1024, 1024, true},
+    {"gain_lsb", settings.gain_lsb, -1024, 1024, true},
+    {"inl_lsb", settings.inl_lsb, -1024, 1024, true},
+    {"noise_lsb", settings.noise_lsb, 0, 1024, true},
+    {"late_cycles", &settings.late_cycles, 0, 1000, false},
+    {"seed", &settings.seed, 0, UINT32_MAX, false},
 };
-enum { SETTINGS_COUNT = sizeof SETTINGS / sizeof *SETTINGS };
+enum { SETTINGS_COUNT = sizeof SETTINGS / sizeof *SETTINGS, CLOCKS = 8 };
+
+/* The first and the last value that a name stands for: "offset_lsb" for all ADC clocks,
+ * "offset_lsb_500khz" for one. False if it does not stand for this setting. */
+static bool is_named(const struct setting *s, const char *name, size_t *first, size_t *last) {
+    const size_t length = strlen(s->name);
+    *first = 0;
+    *last = s->by_clock ? CLOCKS - 1 : 0;
+    if (strncmp(name, s->name, length))
+        return false;
+    if (!name[length])
+        return true;
+    for (size_t adps = 1; s->by_clock && adps < CLOCKS; adps++) {
+        char clock[16];
+        snprintf(clock, sizeof clock, "_%ukhz", CPU_HZ / 1000 >> adps);
+        *first = *last = adps;
+        if (!strcmp(name + length, clock))
+            return true;
+    }
+    return false;
+}
 
 const char *settings_set(char *text) {
     static char error[600];
@@ -36,7 +62,8 @@ const char *settings_set(char *text) {
     const double value = strtod(separator + 1, &end);
     for (size_t i = 0; i < SETTINGS_COUNT; i++) {
         const struct setting *s = &SETTINGS[i];
-        if (strcmp(s->name, text))
+        size_t first, last;
+        if (!is_named(s, text, &first, &last))
             continue;
         /* Written so that it also refuses what is not a number. */
         if (end == separator + 1 || *end || !(value >= s->least && value <= s->most)) {
@@ -44,7 +71,8 @@ const char *settings_set(char *text) {
             return error;
         }
         skin_before_setting();
-        *s->value = value;
+        while (first <= last)
+            s->value[first++] = value;
         return NULL;
     }
     int at = snprintf(error, sizeof error, "no setting '%.40s': there are", text);

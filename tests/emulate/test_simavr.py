@@ -264,6 +264,24 @@ def test_codes_of_every_cell_and_configuration(simulate: Simulate, board: str) -
     assert list(codes[2, 0]) == [1023, 0, 1023, 0]
 
 
+@pytest.mark.parametrize(("adps", "offset"), [(5, 1.5), (7, -2.0)])
+def test_errors_of_the_converter_by_clock(simulate: Simulate, adps: int, offset: float) -> None:
+    """Codes over a ramp follow a parabola; what is left is rounding, of 1/12, and noise."""
+    sim = simulate(SCAN.replace("0x82", f"0x8{adps}"))
+    ramp = np.linspace(0.01, 0.99, 1024)
+    sim.set_table(ramp.reshape(16, 16, 4))
+    sim.set(half_code=1, offset_lsb=1.5, offset_lsb_125khz=-2, gain_lsb=3, inl_lsb=-1.5)
+    sim.set(noise_lsb=0.6, seed=1)
+    codes = np.frombuffer(sim.run(0.2), "<u2").reshape(16, 16, 4).transpose(1, 0, 2).ravel()
+    errors = codes - 1024 * ramp  # a code's centre is code / 1024, as the data sheet draws it
+    bow, slope, start = found = np.polyfit(ramp, errors, 2)
+    assert start == pytest.approx(offset, abs=0.15)
+    assert start + slope + bow == pytest.approx(offset + 3, abs=0.15)
+    assert bow / -4 == pytest.approx(-1.5, abs=0.2)
+    residual = errors - np.polyval(found, ramp)
+    assert residual.var() == pytest.approx(0.6**2 + 1 / 12, rel=0.15)
+
+
 def test_undriven_pins_and_equal_drive(simulate: Simulate) -> None:
     program = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA2) + sts(ADCSRA, 0xE2)
     delay = "ldi r24, 0\n 2: dec r24\n brne 2b\n"
