@@ -56,23 +56,22 @@ static void tridiagonal(size_t n, double a[n][n], double d[n], double e[n]) {
     for (size_t i = 0; i < n; i++)
         q[i][i] = 1;
     for (size_t k = 0; k + 2 < n; k++) {
-        double norm = 0, square = 0, up = 0;
+        double norm = 0, up = 0;
         for (size_t i = k + 1; i < n; i++)
-            norm = hypot(norm, a[i][k]);
+            norm += a[i][k] * a[i][k];
         if (norm == 0)
             continue;
+        norm = sqrt(norm);
         for (size_t i = k + 1; i < n; i++)
             u[i] = a[i][k];
         u[k + 1] += copysign(norm, u[k + 1]);
+        const double weight = 1 / (norm * fabs(u[k + 1])); /* 2 / u'u */
+        memset(p, 0, sizeof p);
+        for (size_t j = k + 1; j < n; j++)
+            for (size_t i = k; i < n; i++)
+                p[i] += weight * u[j] * a[j][i];
         for (size_t i = k + 1; i < n; i++)
-            square += u[i] * u[i];
-        for (size_t i = k; i < n; i++) {
-            p[i] = 0;
-            for (size_t j = k + 1; j < n; j++)
-                p[i] += 2 / square * a[i][j] * u[j];
-        }
-        for (size_t i = k + 1; i < n; i++)
-            up += u[i] * p[i] / square;
+            up += weight / 2 * u[i] * p[i];
         for (size_t i = k + 1; i < n; i++)
             p[i] -= up * u[i];
         for (size_t i = k + 1; i < n; i++) {
@@ -80,13 +79,13 @@ static void tridiagonal(size_t n, double a[n][n], double d[n], double e[n]) {
             for (size_t j = k + 1; j < n; j++)
                 a[i][j] -= u[i] * p[j] + p[i] * u[j];
         }
-        for (size_t j = 0; j < n; j++) { /* q = (1 - 2 u u' / u'u) q */
-            double along = 0;
-            for (size_t i = k + 1; i < n; i++)
-                along += u[i] * q[i][j];
-            for (size_t i = k + 1; i < n; i++)
-                q[i][j] -= 2 / square * along * u[i];
-        }
+        memset(p, 0, sizeof p); /* q = (1 - weight u u') q */
+        for (size_t i = k + 1; i < n; i++)
+            for (size_t j = 0; j < n; j++)
+                p[j] += weight * u[i] * q[i][j];
+        for (size_t i = k + 1; i < n; i++)
+            for (size_t j = 0; j < n; j++)
+                q[i][j] -= u[i] * p[j];
     }
     for (size_t i = 0; i < n; i++) {
         d[i] = a[i][i];
@@ -113,7 +112,7 @@ static void diagonalise(size_t n, double d[n], double e[n], double q[n][n]) {
             double s = 1, c = 1, p = 0;
             size_t i = m;
             while (i-- > l) {
-                const double f = s * e[i], b = c * e[i], r = hypot(f, g);
+                const double f = s * e[i], b = c * e[i], r = sqrt(f * f + g * g);
                 e[i + 1] = r;
                 if (r == 0) {
                     d[i + 1] -= p;
@@ -157,18 +156,18 @@ struct modes *modes_make(size_t n, const double *farad, const double *siemens) {
     solve_lower(n, l, q);
     tridiagonal(n, q, modes->rate, e);
     diagonalise(n, modes->rate, e, q);
+    memset(modes->to, 0, n * n * sizeof(double));
+    memcpy(modes->from, q, sizeof q);
+    transpose(n, l);
     for (size_t mode = 0; mode < n; mode++) {
         double *to = modes->to + mode * n, *from = modes->from + mode * n;
-        for (size_t j = 0; j < n; j++) { /* to = Q' L' */
-            to[j] = 0;
-            for (size_t k = 0; k <= j; k++)
-                to[j] += q[mode][k] * l[j][k];
-        }
-        for (size_t j = n; j-- > 0;) { /* from, transposed: L' from' = Q */
-            from[j] = q[mode][j];
-            for (size_t k = j + 1; k < n; k++)
-                from[j] -= l[k][j] * from[k];
-            from[j] /= l[j][j];
+        for (size_t k = 0; k < n; k++) /* to = Q' L' */
+            for (size_t j = k; j < n; j++)
+                to[j] += q[mode][k] * l[k][j];
+        for (size_t k = n; k-- > 0;) { /* from, transposed: L' from' = Q */
+            from[k] /= l[k][k];
+            for (size_t j = 0; j < k; j++)
+                from[j] -= l[j][k] * from[k];
         }
     }
     return modes;

@@ -157,8 +157,9 @@ static void advance(instant when) {
         return;
     size_t states[STATES];
     const size_t n = list_states(states);
-    struct modes **modes =
-        &circuit.modes[skin.row][skin.column][configuration(NODE_TOP)][circuit.connected];
+    /* With lines, what drives the circuit is no part of its matrix. */
+    const unsigned matrix = settings.line_pf > 0 ? skin.undriven : configuration(NODE_TOP);
+    struct modes **modes = &circuit.modes[skin.row][skin.column][matrix][circuit.connected];
     if (!*modes)
         *modes = make_modes(n, states);
     double volt[n], ampere[n];

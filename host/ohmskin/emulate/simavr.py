@@ -20,12 +20,32 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import electrode_admittance
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
 from ohmskin.link.serial_port import SerialLink
 
-BOARDS: Final = ("uno", "megaatmega2560")
+# Boards, and the boot loaders that they are sold with, in Debian's arduino-core-avr.
+_LOADERS: Final = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
+BOARDS: Final = {
+    "uno": _LOADERS / "optiboot/optiboot_atmega328.hex",
+    "megaatmega2560": _LOADERS / "stk500v2/stk500boot_v2_mega2560.hex",
+}
+# What a board on a desk may add to the ideal one; units and meaning are in firmware/sim/README.md.
+DESK: Final = {
+    "sample_pf": 14,
+    "input_ohm": 10_000,
+    "node_pf": 100,
+    "line_pf": 30,
+    "cell_pf": 2,
+    "half_code": 1,
+    "offset_lsb": 2,
+    "gain_lsb": 2,
+    "inl_lsb": 1.5,
+    "noise_lsb": 0.5,
+    "late_cycles": 16,
+}
 _REPOSITORY: Final = Path(__file__).resolve().parents[3]
 # The simulator, in a checkout; it need not exist.
 PROGRAM: Final = _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
@@ -164,7 +184,8 @@ class SimavrLink(SerialLink):
     """A simulated board's pseudo-terminal, and the skin that it reads.
 
     board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: those of
-    `SkinSim.set`, and `bootloader`: its file; the board is then reset as its port opens.
+    `SkinSim.set`; `bootloader`, its file: the board is then reset as its port opens; `desk`: not 0
+    for all of `DESK` and the board's own loader, but for what else is given.
 
     :raises PortError: there is no such board or setting, or firmware or simulator are not built.
     """
@@ -175,13 +196,16 @@ class SimavrLink(SerialLink):
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
         elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
-        options = dict(settings)
+        options: dict[str, float | str] = dict(settings)
+        if options.pop("desk", "0") != "0":
+            options = {"bootloader": str(BOARDS[board])} | DESK | options
         with ExitStack() as opened:
             try:
-                loader = options.pop("bootloader", "")
+                loader = str(options.pop("bootloader", ""))
                 self.sim = opened.enter_context(SkinSim(board, elf, pty=True, bootloader=loader))
                 self.sim.set(**options)
-                self.sim.set_table(scene.ratio(0.0))
+                self._scene, self._has_lines = scene, float(options.get("line_pf", 0)) > 0
+                self._show(0.0)
                 super().__init__(self.sim.pty_path)
                 if loader:
                     self.reset()  # as opening the port of a real board does
@@ -189,7 +213,6 @@ class SimavrLink(SerialLink):
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
             opened.pop_all()
-        self._scene = scene
         self._begin_s = time.monotonic()
         self._table_due_s = 0.0 if scene.moves else float("inf")
         self.name = name or f"simavr://{board}"
@@ -200,10 +223,16 @@ class SimavrLink(SerialLink):
         if elapsed_s >= self._table_due_s:
             self._table_due_s = elapsed_s + _TABLE_EVERY_S
             try:
-                self.sim.set_table(self._scene.ratio(elapsed_s))
+                self._show(elapsed_s)
             except SimulationError as exc:
                 raise DeviceLost(f"{self.name} has ended: {exc}") from exc
         return super().read()
+
+    def _show(self, time_s: float) -> None:
+        self.sim.set_table(self._scene.ratio(time_s))
+        if self._has_lines:
+            admittance = electrode_admittance(self._scene.skin(time_s))
+            self.sim.set_admittance(admittance, self._scene.rows)
 
     def reset(self) -> None:
         """Pull the reset pin, as the DTR line of a serial port does."""
