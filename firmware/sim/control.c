@@ -94,13 +94,20 @@ static bool set_table(void) {
     return control_reply('T', NULL, 0);
 }
 
-static bool set_admittance(void) {
+static bool set_admittance(size_t length) {
     static double siemens[SKIN_LINES * SKIN_LINES];
-    memcpy(siemens, payload, sizeof siemens);
-    for (size_t i = 0; i < sizeof siemens / sizeof *siemens; i++)
+    const size_t rows = payload[0];
+    size_t lines = 0;
+    while (1 + lines * lines * sizeof *siemens < length)
+        lines++;
+    if (1 + lines * lines * sizeof *siemens != length || rows > SKIN_ROWS || lines < rows ||
+        lines - rows > SKIN_COLUMNS)
+        return refuse("C: rows, then a square matrix of up to 16 rows and 16 columns");
+    memcpy(siemens, payload + 1, length - 1);
+    for (size_t i = 0; i < lines * lines; i++)
         if (!isfinite(siemens[i]))
             return refuse("C: an admittance is not finite");
-    skin_set_admittance(siemens);
+    skin_set_admittance(rows, lines, siemens);
     return control_reply('C', NULL, 0);
 }
 
@@ -168,7 +175,7 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         bool lock_step_only;
     } OPS[] = {{'R', 8, 8, true},         {'W', 0, REQUEST_MAX, true},
                {'B', 4, 4, false},        {'T', TABLE_BYTES, TABLE_BYTES, false},
-               {'O', 1, 80, false},       {'C', ADMITTANCE_BYTES, ADMITTANCE_BYTES, false},
+               {'O', 1, 80, false},       {'C', 1, 1 + ADMITTANCE_BYTES, false},
                {'S', 0, 0, false},        {'Z', 0, 0, false},
                {'L', 1, 1, false},        {'E', 0, 0, false},
                {'e', 2, 2 + 4096, false}, {'X', 0, 0, false},
@@ -196,7 +203,7 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
     case 'T':
         return set_table();
     case 'C':
-        return set_admittance();
+        return set_admittance(length);
     case 'O':
         return set_setting(length);
     case 'S':

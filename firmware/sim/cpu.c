@@ -225,6 +225,8 @@ bool cpu_poke(uint16_t address, uint8_t value) {
 
 /* ---- running */
 
+bool cpu_has_boot_loader(void) { return cpu->reset_pc != 0; }
+
 bool cpu_alive(void) { return cpu->state == cpu_Running || cpu->state == cpu_Sleeping; }
 
 const char *cpu_state_name(void) {
@@ -350,7 +352,8 @@ bool cpu_start(const struct board *board, const char *elf_path, const char *load
     firmware.frequency = CPU_HZ;
     strcpy(firmware.mmcu, mcu);
     avr_load_firmware(cpu, &firmware);
-    if (loader_path && !load_boot_loader(loader_path, firmware.flashbase + firmware.flashsize))
+    if (loader_path && *loader_path &&
+        !load_boot_loader(loader_path, firmware.flashbase + firmware.flashsize))
         return false;
     cpu->log = LOG_ERROR;
     cpu->gdb_port = 0;

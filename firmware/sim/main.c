@@ -8,6 +8,7 @@
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <unistd.h>
 
 static int usage(void) {
@@ -35,6 +36,8 @@ int main(int argc, char **argv) {
         if (!board && option == 'b')
             return usage();
     }
+    if (board && loader && !strcmp(loader, "board"))
+        loader = board->loader;
     if (!board || optind != argc - 1)
         return usage();
 

@@ -89,6 +89,8 @@ int pty_run(void) {
     while ((said = control_serve_one(true)) != CONTROL_GO)
         if (said == CONTROL_END)
             return 0;
+    if (cpu_has_boot_loader()) /* DTR has been pulled as the port was opened */
+        cpu_external_reset();
     int64_t due = now_ns();
     for (;;) {
         const int64_t wait = due - now_ns();

@@ -53,8 +53,27 @@ static bool is_named(const struct setting *s, const char *name, size_t *first, s
     return false;
 }
 
+/* What a board on a desk may have; the setting `desk` is this, or none of it. */
+static const struct {
+    const char *name;
+    double value;
+} DESK[] = {{"sample_pf", 14}, {"input_ohm", 10e3}, {"node_pf", 100},   {"line_pf", 30},
+            {"cell_pf", 2},    {"half_code", 1},    {"offset_lsb", 2},  {"gain_lsb", 2},
+            {"inl_lsb", 1.5},  {"noise_lsb", 0.5},  {"late_cycles", 16}};
+
+static const char *set_desk(bool on) {
+    for (size_t i = 0; i < sizeof DESK / sizeof *DESK; i++) {
+        char text[40];
+        snprintf(text, sizeof text, "%s=%g", DESK[i].name, on ? DESK[i].value : 0);
+        settings_set(text);
+    }
+    return NULL;
+}
+
 const char *settings_set(char *text) {
     static char error[600];
+    if (!strcmp(text, "desk=1") || !strcmp(text, "desk=0"))
+        return set_desk(text[5] == '1');
     char *separator = strchr(text, '='), *end;
     if (!separator)
         return "O: write name=number";
@@ -75,7 +94,7 @@ const char *settings_set(char *text) {
             s->value[first++] = value;
         return NULL;
     }
-    int at = snprintf(error, sizeof error, "no setting '%.40s': there are", text);
+    int at = snprintf(error, sizeof error, "no setting '%.40s': there are desk,", text);
     for (size_t i = 0; i < SETTINGS_COUNT; i++)
         at += snprintf(error + at, sizeof error - (size_t)at, "%s %s", i ? "," : "",
                        SETTINGS[i].name);

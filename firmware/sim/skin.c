@@ -8,6 +8,9 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* Of Debian's arduino-core-avr. */
+#define LOADERS "/usr/share/arduino/hardware/arduino/avr/bootloaders/"
+
 /* The one table of pins. PINx, DDRx and PORTx follow each other in data space. Of all ports: the
  * pins that a board can use, without the sense pins, the crystal's and the reset pin. */
 static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x3C}, {0x2B, 0xFF}, {0, 0}};
@@ -16,9 +19,31 @@ static const struct port MEGA[] = {{0x22, 0xFF},  {0x25, 0xFF},  {0x28, 0xFF},  
                                    {0x105, 0xFF}, {0x108, 0xFF}, {0x10B, 0xFF}, {0, 0}};
 static const struct board BOARDS[] = {
     /* rows PORTD4-7, columns PORTB0-3, drive PD2 and PD3 */
-    {"uno", "atmega328p", 0x2B, 0x25, 0x2B, 4, 0, 2, 3, UNO, {0x2B, 1 << 1}},
+    {"uno",
+     "atmega328p",
+     0x2B,
+     0x25,
+     0x2B,
+     4,
+     0,
+     2,
+     3,
+     UNO,
+     {0x2B, 1 << 1},
+     LOADERS "optiboot/optiboot_atmega328.hex"},
     /* rows PORTA0-3, columns PORTC0-3, drive PL0 and PL1 */
-    {"megaatmega2560", "atmega2560", 0x22, 0x28, 0x10B, 0, 0, 0, 1, MEGA, {0x2E, 1 << 1}},
+    {"megaatmega2560",
+     "atmega2560",
+     0x22,
+     0x28,
+     0x10B,
+     0,
+     0,
+     0,
+     1,
+     MEGA,
+     {0x2E, 1 << 1},
+     LOADERS "stk500v2/stk500boot_v2_mega2560.hex"},
 };
 
 struct node {
@@ -184,9 +209,14 @@ void skin_connect(unsigned node, instant when) {
     circuit.connected = node < NODES ? node : NODES;
 }
 
-void skin_set_admittance(const double *siemens) {
+void skin_set_admittance(size_t rows, size_t lines, const double *siemens) {
     advance(cpu->cycle);
-    memcpy(circuit.siemens, siemens, sizeof circuit.siemens);
+    memset(circuit.siemens, 0, sizeof circuit.siemens);
+    for (size_t i = 0; i < lines; i++)
+        for (size_t j = 0; j < lines; j++)
+            circuit
+                .siemens[i < rows ? i : SKIN_ROWS + i - rows][j < rows ? j : SKIN_ROWS + j - rows] =
+                siemens[i * lines + j];
     forget_modes();
 }
 

@@ -25,11 +25,13 @@ typedef uint64_t instant;
 extern avr_t *cpu;
 struct board;
 /* Loads the program, starts every part below and powers the board on. Says on stderr why not.
- * A boot loader (an Intel hex file, or NULL) lies beside the program and runs after each reset. */
+ * A boot loader (an Intel hex file; NULL or "": none) lies beside the program and runs after each
+ * reset. */
 bool cpu_start(const struct board *board, const char *elf_path, const char *loader_path);
 /* Runs to the first instruction boundary at or after `target`, or to a crash or a final sleep. */
 void cpu_run_until(instant target);
 bool cpu_alive(void);
+bool cpu_has_boot_loader(void);
 const char *cpu_state_name(void);
 void cpu_external_reset(void);
 /* False, and nothing happens, where `address` is no instruction of this chip's flash. */
@@ -91,6 +93,7 @@ struct board {
     uint8_t row_shift, column_shift, drive_top_bit, drive_bottom_bit;
     const struct port *ports; /* to a mask of 0 */
     struct port tx;
+    const char *loader; /* with which it is sold */
 };
 const struct board *skin_find_board(const char *name);
 void skin_start(const struct board *board);
@@ -107,8 +110,8 @@ bool skin_tx_pin_is_high(void);
 /* The sample capacitor is joined to this node from now on; NODES: to none. */
 void skin_connect(unsigned node, instant when);
 enum { SKIN_LINES = SKIN_ROWS + SKIN_COLUMNS };
-/* Currents into the electrodes (rows first) per potential of each [S], (32, 32). */
-void skin_set_admittance(const double *siemens);
+/* Currents into the electrodes (rows first) per potential of each [S], (lines, lines). */
+void skin_set_admittance(size_t rows, size_t lines, const double *siemens);
 struct skin_pins {
     uint8_t row, column, configuration;
 };

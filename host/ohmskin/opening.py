@@ -103,14 +103,12 @@ def _device(url: str) -> Device:
     if scheme == "simavr":
         from ohmskin.emulate.simavr import SimavrLink
 
-        # All others are settings of the simulator, which refuses those that it does not know.
         settings = dict(parse_qsl(query, keep_blank_values=True))
-        known = ("scene", "rows", "columns", "baud")
-        options = {name: settings.pop(name) for name in known if name in settings}
-        size, baud = f"{options.get('rows', 8)}x{options.get('columns', 8)}", _baud(options)
+        size, baud = f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}", _baud(settings)
         with _wrong(url):
-            scene = _scene(size, options | settings)
-            return Session(SimavrLink(place, scene, url, settings), baud)
+            scene = _scene(size, settings)
+            own = {name: settings[name] for name in settings if name not in ("scene", "baud")}
+            return Session(SimavrLink(place, scene, url, own), baud)
     if scheme == "replay":
         from ohmskin.record.replay import Replay
 

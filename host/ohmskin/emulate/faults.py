@@ -23,6 +23,7 @@ from ohmskin.circuit.skin import (
     READING_SENSES_TOP,
     Skin,
     electrode_admittance,
+    impedance_of,
     ratio_from_current,
     readings,
 )
@@ -246,8 +247,7 @@ def cut(skin: Skin, layer: str, line: int, place: int = 0) -> Skin:
 def joined_readings(skin: Skin, joints: Iterable[Pair]) -> Float:
     """As `circuit.skin.readings`, with pairs of electrodes (rows first) joined by 0.1 ohm each.
 
-    A joint adds its conductance to the skin's Y. Z is the inverse of Y with any one electrode
-    grounded, and rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j]. Open cells are taken for 10 TOhm.
+    A joint adds its conductance to the skin's Y. Open cells are taken for 10 TOhm.
     """
     rows = skin.shape[0]
     conducting = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, _LEAST_SIEMENS))
@@ -256,10 +256,6 @@ def joined_readings(skin: Skin, joints: Iterable[Pair]) -> Float:
         ends = np.array(joint)
         admittance[ends, ends] += SHORT_SIEMENS
         admittance[ends, ends[::-1]] -= SHORT_SIEMENS
-    ground = np.argmax(np.diagonal(admittance))
-    admittance[ground, ground] *= 2
-    impedance = np.linalg.inv(admittance)
-    diagonal = np.diagonal(impedance)
-    port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
+    _, port_ohm = impedance_of(admittance, rows)
     current = 1.0 / (np.maximum(port_ohm, 0.0) + skin.ref_top_ohm + skin.ref_bottom_ohm)
     return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)

@@ -90,7 +90,7 @@ class Scene:
         self._rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
         self._touches = self._place(random)
         self._robot = _Robot(rows, columns, seed) if name == "press" else None
-        self._still_ratio = lru_cache(maxsize=1)(lambda: self._readings(0.0))
+        self._still_ratio = lru_cache(maxsize=1)(lambda: self.faults.readings(self.skin(0.0)))
 
     @property
     def rest_ratio(self) -> Float:
@@ -124,10 +124,7 @@ class Scene:
 
     def ratio(self, time_s: float) -> Float:
         """Exact readings at a time, shape (rows, columns, 4)."""
-        return self._readings(time_s) if self.moves else self._still_ratio()
-
-    def _readings(self, time_s: float) -> Float:
-        return self.faults.readings(self.skin(time_s))
+        return self.faults.readings(self.skin(time_s)) if self.moves else self._still_ratio()
 
     def _place(self, random: np.random.Generator) -> Float:
         touches = np.zeros((self.rows, self.columns))

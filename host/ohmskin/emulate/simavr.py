@@ -4,8 +4,8 @@
 The simulator `skinsim` (firmware/sim) is a separate program, which `SkinSim` starts and talks to
 over two pipes. It runs the firmware unchanged, with a skin at its pins.
 
-firmware/sim/README.md lists what is not modelled. Above all these are noise, the ADC's own errors
-and its sample-and-hold capacitor, crystal tolerance, and everything on the USB side of the UART.
+firmware/sim/README.md lists settings, and what is not modelled: above all crystal tolerance, and
+everything on the USB side of the UART.
 """
 
 import struct
@@ -20,38 +20,16 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import electrode_admittance
+from ohmskin.circuit.skin import READING_OFFSET, electrode_admittance
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
 from ohmskin.link.serial_port import SerialLink
 
-# Boards, and the boot loaders that they are sold with, in Debian's arduino-core-avr.
-_LOADERS: Final = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
-BOARDS: Final = {
-    "uno": _LOADERS / "optiboot/optiboot_atmega328.hex",
-    "megaatmega2560": _LOADERS / "stk500v2/stk500boot_v2_mega2560.hex",
-}
-# What a board on a desk may add to the ideal one; units and meaning are in firmware/sim/README.md.
-DESK: Final = {
-    "sample_pf": 14,
-    "input_ohm": 10_000,
-    "node_pf": 100,
-    "line_pf": 30,
-    "cell_pf": 2,
-    "half_code": 1,
-    "offset_lsb": 2,
-    "gain_lsb": 2,
-    "inl_lsb": 1.5,
-    "noise_lsb": 0.5,
-    "late_cycles": 16,
-}
+BOARDS: Final = ("uno", "megaatmega2560")
 _REPOSITORY: Final = Path(__file__).resolve().parents[3]
 # The simulator, in a checkout; it need not exist.
 PROGRAM: Final = _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
-# The simulator's table of readings has this shape; a cell without current reads like this.
-_TABLE_SHAPE: Final = (16, 16, 4)
-_NO_CURRENT: Final = (1.0, 0.0, 1.0, 0.0)
 # Requests and replies begin with an operation (u8) and the length of what follows (u32).
 _HEADER: Final = struct.Struct("<BI")
 # A simulator whose pipes are closed ends at once; after this time it is killed [s].
@@ -67,8 +45,8 @@ class SimulationError(RuntimeError):
 class SkinSim(Closing):
     """A board with a skin, simulated cycle by cycle.
 
-    board: one of `BOARDS`. elf: the firmware. bootloader: an Intel hex file of the boot section, in
-    which the processor then starts. pty: run in real time, from the request "G" on, with
+    board: one of `BOARDS`. elf: the firmware. bootloader: an Intel hex file of the boot section, or
+    "board" for the one the board is sold with. pty: run in real time, from the request "G" on, with
     the UART on the pseudo-terminal `pty_path`; else time passes only in requests that run the
     board.
 
@@ -76,14 +54,11 @@ class SkinSim(Closing):
     simulator does not start. Not thread-safe.
     """
 
-    def __init__(
-        self, board: str, elf: Path, *, pty: bool = False, bootloader: str | Path = ""
-    ) -> None:
+    def __init__(self, board: str, elf: Path, *, pty: bool = False, bootloader: str = "") -> None:
         for path, made_by in ((PROGRAM, "make sim"), (elf, "make firmware")):
             if not path.is_file():
                 raise FileNotFoundError(f"{path} is missing: run '{made_by}' in a checkout")
-        options = [f"--bootloader={bootloader}"] if bootloader else []
-        options += ["--pty"] if pty else []
+        options = ["--bootloader", bootloader, *(["--pty"] if pty else [])]
         command = [str(PROGRAM), "--board", board, *options, str(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
         pipe = subprocess.PIPE
@@ -120,8 +95,7 @@ class SkinSim(Closing):
         nodes head for the new values from this cycle on. Raises SimulationError for a ratio that is
         not finite.
         """
-        table = np.empty(_TABLE_SHAPE, dtype="<f8")
-        table[:] = _NO_CURRENT
+        table = np.tile(READING_OFFSET, (16, 16, 1))
         table[: ratio.shape[0], : ratio.shape[1]] = ratio
         self.request("T", table.tobytes())
 
@@ -130,10 +104,7 @@ class SkinSim(Closing):
 
         siemens: `electrode_admittance` of a skin, (rows + columns, rows + columns).
         """
-        at = np.r_[:rows, 16 : 16 + len(siemens) - rows]
-        of_all = np.zeros((32, 32))
-        of_all[np.ix_(at, at)] = siemens
-        self.request("C", of_all.tobytes())
+        self.request("C", bytes([rows]) + siemens.tobytes())
 
     def set(self, **settings: float | str) -> None:
         """Change settings of the simulator: firmware/sim/README.md lists them.
@@ -183,9 +154,8 @@ class SkinSim(Closing):
 class SimavrLink(SerialLink):
     """A simulated board's pseudo-terminal, and the skin that it reads.
 
-    board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: those of
-    `SkinSim.set`; `bootloader`, its file: the board is then reset as its port opens; `desk`: not 0
-    for all of `DESK` and the board's own loader, but for what else is given.
+    board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: `bootloader` of
+    `SkinSim` and those of its `set`; with `desk`, the board has its boot loader unless told.
 
     :raises PortError: there is no such board or setting, or firmware or simulator are not built.
     """
@@ -196,19 +166,15 @@ class SimavrLink(SerialLink):
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
         elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
-        options: dict[str, float | str] = dict(settings)
-        if options.pop("desk", "0") != "0":
-            options = {"bootloader": str(BOARDS[board])} | DESK | options
+        own = dict(settings)
+        loader = own.pop("bootloader", "board" if "desk" in own else "")
         with ExitStack() as opened:
             try:
-                loader = str(options.pop("bootloader", ""))
                 self.sim = opened.enter_context(SkinSim(board, elf, pty=True, bootloader=loader))
-                self.sim.set(**options)
-                self._scene, self._has_lines = scene, float(options.get("line_pf", 0)) > 0
+                self.sim.set(**own)
+                self._scene = scene
                 self._show(0.0)
                 super().__init__(self.sim.pty_path)
-                if loader:
-                    self.reset()  # as opening the port of a real board does
                 self.sim.request("G")  # the port is open: nothing that the board says is lost
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
@@ -230,13 +196,8 @@ class SimavrLink(SerialLink):
 
     def _show(self, time_s: float) -> None:
         self.sim.set_table(self._scene.ratio(time_s))
-        if self._has_lines:
-            admittance = electrode_admittance(self._scene.skin(time_s))
-            self.sim.set_admittance(admittance, self._scene.rows)
-
-    def reset(self) -> None:
-        """Pull the reset pin, as the DTR line of a serial port does."""
-        self.sim.request("X")
+        admittance = electrode_admittance(self._scene.skin(time_s))
+        self.sim.set_admittance(admittance, self._scene.rows)
 
     def close(self) -> None:
         """See `Link.close`."""
