@@ -349,7 +349,7 @@ def test_lines_settle_as_the_matrix_exponential_says(
         volt = merged @ (goal + expm(np.linalg.solve(c, -g) * cycles / CPU_HZ) @ off)
     sim = simulate(SETTLING)
     sim.set(line_pf=line_pf, cell_pf=cell_pf, node_pf=50, sample_pf=14, input_ohm=input_ohm)
-    sim.set_admittance(admittance, 2)
+    sim.request("C", b"\x02" + admittance.tobytes())
     assert hold_log(sim, 1000)[0]["code"] == pytest.approx(1024 * volt[6] - 0.5, abs=0.6)
 
 

@@ -142,8 +142,7 @@ class EmulatedBoard:
             self.now_s = end
             self._send_scan(end - self._period_s)
         self.now_s = max(self.now_s, now_s)
-        sent = bytes(self._out)
-        self._out.clear()
+        sent, self._out = bytes(self._out), bytearray()
         return sent
 
     def heard(self, faults: LineFaults, now_s: float) -> bytes:
@@ -213,8 +212,7 @@ class EmulatedBoard:
 
     def _send(self, name: str, tail: bytes = b"", /, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
-        payload = frame.pack(**values) + tail
-        self._out += framing.encode(frame.id, self._sequence, payload)
+        self._out += framing.encode(frame.id, self._sequence, frame.pack(**values) + tail)
         self._sequence += 1
 
     def _send_scan(self, start_s: float) -> None:
@@ -325,8 +323,7 @@ class EmulatorLink(_Running):
             while True:
                 now = self._listen()
                 if self._waiting or now >= deadline:
-                    octets = bytes(self._waiting)
-                    self._waiting.clear()
+                    octets, self._waiting = bytes(self._waiting), bytearray()
                     return octets
                 self._wake.wait(min(deadline, self._board.next_scan_s or deadline) - now)
 

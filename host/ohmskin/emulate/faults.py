@@ -125,11 +125,9 @@ class LineFaults:
 
     def resets(self, now_s: float) -> bool:
         """Whether a reset is due; True once for each."""
-        due = int(now_s / self.reset) if self.reset else 0
-        if due <= self._resets_done:
-            return False
-        self._resets_done = due
-        return True
+        due, done = int(now_s / self.reset) if self.reset else 0, self._resets_done
+        self._resets_done = max(due, done)
+        return due > done
 
     def vanished(self, now_s: float) -> bool:
         """Whether the board has been unplugged by now."""

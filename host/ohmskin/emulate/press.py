@@ -94,13 +94,11 @@ class PressModel:
         steps = np.diff(times) / self.creep_time_s
         stays = np.exp(-steps)
         # Exact where forces are straight between the times.
-        of_step = 1 + np.expm1(-steps) / steps
+        follows = (1 + np.expm1(-steps) / steps)[:, None] * np.diff(forces, axis=0)
         pressing = np.empty_like(forces)
         pressing[0] = crept = forces[0]
-        for i, (stay, of_change) in enumerate(zip(stays, of_step, strict=True), start=1):
-            crept = (
-                stay * crept + (1 - stay) * forces[i - 1] + of_change * (forces[i] - forces[i - 1])
-            )
+        for i, (stay, follow) in enumerate(zip(stays, follows, strict=True), start=1):
+            crept = stay * crept + (1 - stay) * forces[i - 1] + follow
             depth = (forces[i] + self.creep * crept) / (1 + self.creep)
             width = depth + self.play_n
             unloading = depth + self.play_n * depth / np.where(width > 0, width, 1.0)

@@ -134,9 +134,7 @@ class Scene:
             (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
             # The touches are light: with heavy ones, methods that neglect the wires show a trace at
             # the fourth corner.
-            touches[top, left] = 1 / 30e3
-            touches[top, right] = 1 / 40e3
-            touches[bottom, left] = 1 / 35e3
+            touches[[top, top, bottom], [left, right, left]] = 1 / np.array([30e3, 40e3, 35e3])
         elif self.name == "multi":
             count = min(5, touches.size)
             cells = random.choice(touches.size, count, replace=False)
@@ -160,8 +158,7 @@ class Scene:
         row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
         away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
-        touch: Float = _FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_CELLS**2))
-        return touch
+        return np.asarray(_FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_CELLS**2)))
 
 
 def _two_of(count: int) -> tuple[int, int]:

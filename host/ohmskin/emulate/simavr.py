@@ -67,10 +67,8 @@ class SkinSim(Closing):
         assert self._process.stdout is not None
         self._requests, self._replies = self._process.stdin, self._process.stdout
         try:
-            # Either answer shows that the simulator has started.
-            self.pty_path = self._reply("P").decode() if pty else ""
-            if not pty:
-                self.request("S")
+            # Either answer, a path or nothing, shows that the simulator has started.
+            self.pty_path = (self._reply("P") if pty else self.request("Z")).decode()
         except BaseException:
             self.close()
             raise
@@ -90,21 +88,12 @@ class SkinSim(Closing):
     def set_table(self, ratio: Float) -> None:
         """Set sense voltage / Vdd, shape (rows, columns, 4), up to 16 rows and columns.
 
-        The last axis is configuration A, B, C, D. Cells beyond the array carry no current: 1, 0,
-        1, 0. A conversion gives the code min(1023, floor(1024 ratio)). With a settling time the
-        nodes head for the new values from this cycle on. Raises SimulationError for a ratio that is
-        not finite.
+        Cells beyond the array carry no current: 1, 0, 1, 0. An ideal conversion gives the code
+        min(1023, floor(1024 ratio)). Raises SimulationError for a ratio that is not finite.
         """
         table = np.tile(READING_OFFSET, (16, 16, 1))
         table[: ratio.shape[0], : ratio.shape[1]] = ratio
         self.request("T", table.tobytes())
-
-    def set_admittance(self, siemens: Float, rows: int) -> None:
-        """Set what counts instead of the table where lines have a capacitance (`line_pf`).
-
-        siemens: `electrode_admittance` of a skin, (rows + columns, rows + columns).
-        """
-        self.request("C", bytes([rows]) + siemens.tobytes())
 
     def set(self, **settings: float | str) -> None:
         """Change settings of the simulator: firmware/sim/README.md lists them.
@@ -196,8 +185,8 @@ class SimavrLink(SerialLink):
 
     def _show(self, time_s: float) -> None:
         self.sim.set_table(self._scene.ratio(time_s))
-        admittance = electrode_admittance(self._scene.skin(time_s))
-        self.sim.set_admittance(admittance, self._scene.rows)
+        siemens = electrode_admittance(self._scene.skin(time_s))
+        self.sim.request("C", bytes([self._scene.rows]) + siemens.tobytes())
 
     def close(self) -> None:
         """See `Link.close`."""
