@@ -375,7 +375,7 @@ def readings_with_time_constant(rig: Rig, tau_us: float, **scan: Any) -> tuple[n
     table = np.tile(OTHER_RATIO, (16, 16, 1))
     table[::2] = RC_RATIO
     rig.sim.set_table(table)
-    rig.sim.set_tau_us(tau_us)
+    rig.sim.set(tau_us=tau_us)
     rig.start_scan(**scan)
     rig.run(0.02)
     rig.sim.reset_stats()

@@ -67,13 +67,6 @@ class LockstepSim(SkinSim):
         """Let a board with a pseudo-terminal run; its port should be open by then."""
         self.request("G")
 
-    def set_tau_us(self, tau_us: float) -> None:
-        """Time constant [us] with which a node settles after a change of pins; 0 is at once.
-
-        Raises SimulationError unless 0 to 1e9.
-        """
-        self.set(tau_us=tau_us)
-
     def write(self, uart_bytes: bytes) -> None:
         """Queue bytes on the line to the device; they arrive one after the other at line speed."""
         self.request("W", uart_bytes)
