@@ -267,10 +267,10 @@ def test_a_board_of_another_definition() -> None:
 @pytest.mark.parametrize("board", ["uno", "megaatmega2560"])
 def test_a_board_on_a_desk(board: str) -> None:
     """Its boot loader runs first, as its port opens; then it reads with a desk's errors."""
-    with ohmskin.open(f"simavr://{board}?desk=1&line_pf=0&node_pf=10") as skin:
+    with ohmskin.open(f"simavr://{board}?desk=1&line_pf=1&node_pf=10&scene=ghost") as skin:
         codes = [scan.codes for scan in itertools.islice(skin, 100)]
         assert skin.stats.restarts == 0
-    y = Scene().ratio(0.0)
+    y = Scene("ghost").ratio(0.0)
     lsb = 1024 * y + 2 + 2 * y + 1.5 * 4 * y * (1 - y)  # offset, gain, bow
     np.testing.assert_allclose(np.mean(codes, axis=0), lsb, atol=0.4)
 

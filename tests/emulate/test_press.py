@@ -48,15 +48,11 @@ def test_a_small_reversal_stays_within_the_loop() -> None:
 
 def test_creep_after_a_step_is_that_of_a_standard_linear_solid() -> None:
     model = replace(QUIET, play_n=0.0, creep=0.5, creep_time_s=2.0, full_contact_siemens=1e9)
-    step_s = 1e-9
-    time_s = np.concatenate([[0.0, step_s], np.linspace(0.1, 20.0, 40)])
-    force_n = np.full(42, 3.0)
-    force_n[0] = 0.0
-    rise = model.rise(time_s, force_n)
+    time_s = np.r_[0.0, 1e-9, np.linspace(0.1, 20.0, 40)]
+    rise = model.rise(time_s, np.r_[0.0, np.full(41, 3.0)])
     deep_n = (rise / 30e-6) ** (1 / 1.7)
-    np.testing.assert_allclose(
-        deep_n[1:], 3.0 * (1 + 0.5 * -np.expm1(-time_s[1:] / 2.0)) / 1.5, rtol=1e-6
-    )
+    crept_n = 3.0 * (1 + 0.5 * -np.expm1(-time_s[1:] / 2.0)) / 1.5
+    np.testing.assert_allclose(deep_n[1:], crept_n, rtol=1e-6)
 
 
 def test_creep_does_not_depend_on_the_steps_of_time() -> None:
@@ -114,8 +110,7 @@ def test_a_robot_presses_one_cell_after_another() -> None:
     assert not force_n[time_s < 2].any()
     assert ((force_n > 0).sum(axis=(1, 2)) <= 1).all()
     for cell, forces in enumerate(force_n.reshape(-1, 6).T):
-        pressed = forces > 0
-        begins = np.flatnonzero(np.diff(pressed.astype(int)) == 1)
+        begins = np.flatnonzero(np.diff((forces > 0).astype(int)) == 1)
         assert len(begins) == 6, f"cell {cell}"
         peaks = [float(part.max()) for part in np.split(forces, begins[1:])]
         assert peaks == sorted(peaks)
@@ -141,8 +136,7 @@ def test_the_board_reads_the_forces() -> None:
     scans = [m for m in BoardDecoder().feed(board.advance(20.005), 0.0) if isinstance(m, Scan)]
     assert len(scans) == 1800
     for scan in scans[::97]:
-        time_s = scan.time_us * 1e-6
-        np.testing.assert_allclose(scan.codes, quantise(scene.ratio(time_s)), atol=1)
+        np.testing.assert_allclose(scan.codes, quantise(scene.ratio(scan.time_us * 1e-6)), atol=1)
     conducts = np.array([scan.ratio[0, 0, 1] for scan in scans])
     force_n = np.array([scene.force_n(scan.time_us * 1e-6)[0, 0] for scan in scans])
     assert conducts[force_n > 6].min() > 5 * np.median(conducts[force_n < 0.1])

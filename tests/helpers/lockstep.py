@@ -9,12 +9,13 @@ import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.emulate.simavr import SkinSim
+from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from places import ROOT
 from skins import scan_order
@@ -37,10 +38,7 @@ DEFAULT_SCAN: dict[str, Any] = {
 HOLD_DTYPE = np.dtype(
     [
         ("cycle", "<u8"),
-        ("row", "u1"),
-        ("column", "u1"),
-        ("configuration", "u1"),
-        ("channel", "u1"),
+        *((name, "u1") for name in ("row", "column", "configuration", "channel")),
         ("code", "<u2"),
         ("settle_cycles", "<u4"),
     ]
@@ -155,7 +153,7 @@ class Check:
     start_cycles: NDArray[np.int64]
 
 
-class Rig:
+class Rig(Closing):
     """A board in lock-step with a host that knows what every reading must be."""
 
     def __init__(self, board: str, sim: LockstepSim | None = None) -> None:
@@ -172,10 +170,8 @@ class Rig:
         self._tables: list[NDArray[np.uint16]] = []
         self._holds: list[NDArray[np.void]] = []
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the simulator."""
         self.sim.close()
 
     def run_cycles(self, cycles: int) -> None:
