@@ -130,6 +130,8 @@ static void schedule_line(void) {
 }
 
 bool uart_host_write(const uint8_t *bytes, size_t count) {
+    if (!count)
+        return true;
     const size_t waiting = uart_host_queue();
     if (uart.queue_head) {
         memmove(uart.queue, uart.queue + uart.queue_head, waiting);
