@@ -164,6 +164,7 @@ class SimavrLink(SerialLink):
                 self._scene = scene
                 self._show(0.0)
                 super().__init__(self.sim.pty_path)
+                self.resets_board = bool(loader)
                 self.sim.request("G")  # the port is open: nothing that the board says is lost
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
