@@ -167,16 +167,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"rate_hz": 200}, "too_fast"),
 ]
 IMPOSSIBLE: list[dict[str, Any]] = [
-    {"rows": -1},
-    {"rows": 256},
+    *({"rows": rows} for rows in (-1, 256)),
     {"columns": 1000},
-    {"settle_us": -1},
-    {"settle_us": 65536},
-    {"rate_hz": -1.0},
-    {"rate_hz": 1e7},
-    {"rate_hz": 0.0001},
-    {"rate_hz": float("inf")},
-    {"rate_hz": float("nan")},
+    *({"settle_us": settle_us} for settle_us in (-1, 65536)),
+    *({"rate_hz": rate_hz} for rate_hz in (-1.0, 1e7, 0.0001, float("inf"), float("nan"))),
     {"adc_prescaler": "fast"},
 ]
 
@@ -288,21 +282,15 @@ def test_the_context_closes_on_an_exception(url: str) -> None:
         skin.stop()
 
 
-def test_a_port_can_be_opened_again(pty_board: Serve) -> None:
-    path = pty_board("emulator://4x4").path
+def test_close_stops_the_board_and_its_port_can_be_opened_again(pty_board: Serve) -> None:
+    server = pty_board("emulator://4x4")
     for round_number in range(3):
-        with ohmskin.open(path) as skin:
+        with ohmskin.open(server.path) as skin:
             assert skin.info.unit_id == round_number
             assert skin.latest().codes.shape == (4, 4, 4)
+            assert server._board.next_scan_s is not None
             skin.set_unit_id(round_number + 1)
-
-
-def test_close_stops_the_board(pty_board: Serve) -> None:
-    server = pty_board("emulator://4x4")
-    with ohmskin.open(server.path) as skin:
-        skin.latest()
-        assert server._board.next_scan_s is not None
-    until(lambda: server._board.next_scan_s is None)
+        until(lambda: server._board.next_scan_s is None)
 
 
 def test_a_board_left_scanning_is_taken_over(pty_board: Serve) -> None:

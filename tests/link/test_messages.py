@@ -67,15 +67,6 @@ def test_what_a_running_board_dropped_before_is_not_missed() -> None:
     assert decoder.stats.missed == 1
 
 
-def test_a_damaged_scan_is_missed_by_the_next() -> None:
-    decoder = BoardDecoder()
-    damaged = bytearray(scan_wire(1))
-    damaged[8] ^= 0x40
-    found = scans(decoder, hello_wire() + scan_wire(0) + bytes(damaged) + scan_wire(2))
-    assert [(s.number, s.missed) for s in found] == [(0, 0), (2, 1)]
-    assert decoder.stats.line.damaged == 1
-
-
 def test_the_board_time_does_not_wrap() -> None:
     decoder = BoardDecoder()
     stream = b"".join(
@@ -187,16 +178,3 @@ def test_a_message_has_the_fields_of_its_frame(message: type[Any], name: str) ->
 def test_values_of_a_newer_definition_have_a_name() -> None:
     wire = framing.encode(protocol.FRAMES["ack"].id, 0, bytes([0x83, 7, 200]))
     assert BoardDecoder().feed(wire, 0.0) == [Ack(0x83, 7, "unknown_200")]
-
-
-def test_reset_causes_are_named() -> None:
-    (hello,) = BoardDecoder().feed(hello_wire(reset_cause=("power_on", "watchdog")), 0.0)
-    assert isinstance(hello, Hello)
-    assert hello.reset_cause == ("power_on", "watchdog")
-
-
-def test_codes_and_ratio_of_a_scan() -> None:
-    (scan,) = scans(BoardDecoder(), scan_wire(0))
-    assert (scan.rows, scan.columns) == (1, 2)
-    np.testing.assert_array_equal(scan.codes, np.arange(8).reshape(1, 2, 4))
-    np.testing.assert_array_equal(scan.ratio, (np.arange(8).reshape(1, 2, 4) + 0.5) / 1024)
