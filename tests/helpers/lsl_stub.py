@@ -1,29 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stand-in for what examples/lsl_outlet.py uses of pylsl, where that or its library is absent."""
 
-from __future__ import annotations
-
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import ModuleType
-from typing import Final
+from typing import Final, Self
+from xml.etree.ElementTree import Element
 
 CLOCK_OFFSET_S: Final = 1000.0  # a local_clock() that is not time.monotonic()
+ENOUGH = 12  # samples, then somebody presses Ctrl-C
 
 
-@dataclass
-class XMLElement:
-    name: str
-    value: str = ""
-    children: list[XMLElement] = field(default_factory=list)
+class XMLElement(Element):
+    def append_child(self, name: str) -> Self:
+        child = type(self)(name)
+        self.append(child)
+        return child
 
-    def append_child(self, name: str) -> XMLElement:
-        self.children.append(XMLElement(name))
-        return self.children[-1]
-
-    def append_child_value(self, name: str, value: str) -> XMLElement:
+    def append_child_value(self, name: str, value: str) -> Self:
         assert isinstance(value, str)
-        self.append_child(name).value = value
+        self.append_child(name).text = value
         return self
 
 
@@ -42,17 +38,8 @@ class StreamInfo:
     def desc(self) -> XMLElement:
         return self._desc
 
-    def get_channel(self, name: str) -> list[str]:
-        (channels,) = self._desc.children
-        return [
-            child.value
-            for channel in channels.children
-            for child in channel.children
-            if child.name == name
-        ]
-
-
-ENOUGH = 12  # samples, then somebody presses Ctrl-C
+    def get_channel(self, name: str) -> list[str | None]:
+        return [value.text for value in self._desc.findall(f"channels/channel/{name}")]
 
 
 def pylsl_module(samples: list[tuple[list[float], float]], infos: list[StreamInfo]) -> ModuleType:

@@ -8,99 +8,91 @@ type, no NumPy scalar for a number, no NumPy array for a sequence. Not modelled:
 
 import time
 from array import array
-from collections.abc import Callable, Sequence
-from types import ModuleType
-from typing import Any, ClassVar
+from collections.abc import Callable
+from types import ModuleType, SimpleNamespace
+from typing import Any, ClassVar, NamedTuple
 
-_INTEGERS = {"uint8": (0, 2**8), "uint32": (0, 2**32), "int32": (-(2**31), 2**31)}
-_ARRAYS = {"float32[]": "f", "uint8[]": "B"}
+
+class Kind(NamedTuple):
+    """What a field holds at first, and whether it may hold a value."""
+
+    default: Callable[[], Any]
+    fits: Callable[[Any], bool]
+
+
+def one(kind: type) -> Kind:
+    return Kind(kind, lambda value: isinstance(value, kind))
+
+
+def integer(least: int, end: int) -> Kind:
+    return Kind(int, lambda value: isinstance(value, int) and least <= value < end)
+
+
+def numbers(typecode: str) -> Kind:
+    return Kind(
+        lambda: array(typecode),
+        lambda value: isinstance(value, array) and value.typecode == typecode,
+    )
+
+
+def many(kind: type) -> Kind:
+    return Kind(
+        list,
+        lambda value: isinstance(value, list) and all(isinstance(each, kind) for each in value),
+    )
+
+
+UINT8, UINT32, INT32 = integer(0, 2**8), integer(0, 2**32), integer(-(2**31), 2**31)
 
 
 class Message:
-    FIELDS: ClassVar[dict[str, Any]] = {}
+    FIELDS: ClassVar[dict[str, Kind]] = {}
 
     def __init__(self, **values: Any) -> None:
-        assert set(values) <= set(self.FIELDS), f"invalid arguments {set(values)}"
         for name, kind in self.FIELDS.items():
-            setattr(self, name, values.get(name, default(kind)))
+            setattr(self, name, values.pop(name, kind.default()))
+        assert not values, f"invalid arguments {values}"
 
     def __setattr__(self, name: str, value: Any) -> None:
-        kind = self.FIELDS[name]
-        assert fits(kind, value), f"field {name} must be {kind}, not {value!r}"
-        if isinstance(kind, str) and kind in _ARRAYS:
-            value = array(_ARRAYS[kind], value)
+        assert self.FIELDS[name].fits(value), f"field {name} must not be {value!r}"
         super().__setattr__(name, value)
 
 
-def default(kind: Any) -> Any:
-    if isinstance(kind, list):
-        return []
-    if isinstance(kind, type):
-        return kind()
-    return {"string": "", "bool": False}.get(kind, [] if kind in _ARRAYS else 0)
-
-
-def fits(kind: Any, value: Any) -> bool:
-    if isinstance(kind, list):
-        return is_sequence(value) and all(isinstance(each, kind[0]) for each in value)
-    if isinstance(kind, type):
-        return isinstance(value, kind)
-    if kind in _ARRAYS:
-        if isinstance(value, array):
-            return value.typecode == _ARRAYS[kind]
-        element = float if kind == "float32[]" else int
-        return is_sequence(value) and all(isinstance(each, element) for each in value)
-    if kind in _INTEGERS:
-        least, end = _INTEGERS[kind]
-        return isinstance(value, int) and least <= value < end
-    return isinstance(value, {"string": str, "bool": bool}[kind])
-
-
-def is_sequence(value: Any) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str)
-
-
-def message(name: str, /, **fields: Any) -> type[Message]:
+def message(name: str, /, **fields: Kind) -> type[Message]:
     return type(name, (Message,), {"FIELDS": fields})
 
 
-BuiltinTime = message("Time", sec="int32", nanosec="uint32")
-Header = message("Header", stamp=BuiltinTime, frame_id="string")
-MultiArrayDimension = message("MultiArrayDimension", label="string", size="uint32", stride="uint32")
-MultiArrayLayout = message("MultiArrayLayout", dim=[MultiArrayDimension], data_offset="uint32")
-Float32MultiArray = message("Float32MultiArray", layout=MultiArrayLayout, data="float32[]")
+BuiltinTime = message("Time", sec=INT32, nanosec=UINT32)
+Header = message("Header", stamp=one(BuiltinTime), frame_id=one(str))
+MultiArrayDimension = message("MultiArrayDimension", label=one(str), size=UINT32, stride=UINT32)
+MultiArrayLayout = message("MultiArrayLayout", dim=many(MultiArrayDimension), data_offset=UINT32)
+Float32MultiArray = message("Float32MultiArray", layout=one(MultiArrayLayout), data=numbers("f"))
 
 
-class PointField(
-    message("PointField", name="string", offset="uint32", datatype="uint8", count="uint32")
-):
-    INT8, UINT8, INT16, UINT16, INT32, UINT32, FLOAT32, FLOAT64 = range(1, 9)
+class PointField(message("PointField", name=one(str), offset=UINT32, datatype=UINT8, count=UINT32)):
+    FLOAT32 = 7
 
 
 PointCloud2 = message(
     "PointCloud2",
-    header=Header,
-    **dict.fromkeys(("height", "width", "point_step", "row_step"), "uint32"),
-    **dict.fromkeys(("is_bigendian", "is_dense"), "bool"),
-    fields=[PointField],
-    data="uint8[]",
+    header=one(Header),
+    **dict.fromkeys(("height", "width", "point_step", "row_step"), UINT32),
+    **dict.fromkeys(("is_bigendian", "is_dense"), one(bool)),
+    fields=many(PointField),
+    data=numbers("B"),
 )
 
 
 class Time:
     """rclpy.time.Time"""
 
-    def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
-        self.nanoseconds = round(seconds * 1e9) + nanoseconds
+    def __init__(self, *, nanoseconds: int) -> None:
+        assert isinstance(nanoseconds, int)
+        self.nanoseconds = nanoseconds
 
     def to_msg(self) -> BuiltinTime:
         sec, nanosec = divmod(self.nanoseconds, 10**9)
         return BuiltinTime(sec=sec, nanosec=nanosec)
-
-
-class Parameter:
-    def __init__(self, value: Any) -> None:
-        self.value = value
 
 
 class Ros:
@@ -115,34 +107,26 @@ class Ros:
     def modules(self) -> dict[str, ModuleType]:
         ros = self
 
-        class Publisher:
-            def __init__(self, kind: type[Message], topic: str) -> None:
-                self.kind, self.topic = kind, topic
-
-            def publish(self, message: Message) -> None:
-                assert isinstance(message, self.kind)
-                ros.published.append((self.topic, message))
-
-        class Clock:
-            def now(self) -> Time:
-                return Time(nanoseconds=time.time_ns())
-
         class Node:
             def __init__(self, node_name: str) -> None:
                 self.name = node_name
 
-            def declare_parameter(self, name: str, value: Any = None) -> Parameter:
-                return Parameter(ros.parameters.get(name, value))
+            def declare_parameter(self, name: str, value: Any = None) -> SimpleNamespace:
+                return SimpleNamespace(value=ros.parameters.get(name, value))
 
             def create_publisher(
                 self, msg_type: type[Message], topic: str, qos_profile: int
-            ) -> Publisher:
-                assert issubclass(msg_type, Message)
+            ) -> SimpleNamespace:
                 assert qos_profile > 0
-                return Publisher(msg_type, topic)
 
-            def get_clock(self) -> Clock:
-                return Clock()
+                def publish(message: Message) -> None:
+                    assert isinstance(message, msg_type)
+                    ros.published.append((topic, message))
+
+                return SimpleNamespace(publish=publish)
+
+            def get_clock(self) -> SimpleNamespace:
+                return SimpleNamespace(now=lambda: Time(nanoseconds=time.time_ns()))
 
             def destroy_node(self) -> None:
                 pass
@@ -154,7 +138,7 @@ class Ros:
         def try_shutdown() -> None:
             ros.shut_down = True
 
-        functions: dict[str, Callable[..., Any]] = {
+        rclpy = {
             "init": lambda args=None: None,
             "ok": lambda: ros.turns > 0,
             "spin_once": spin_once,
@@ -164,7 +148,7 @@ class Ros:
         messages = {"PointCloud2": PointCloud2, "PointField": PointField}
         standard = [Float32MultiArray, Header, MultiArrayDimension, MultiArrayLayout]
         return {
-            "rclpy": module("rclpy", functions),
+            "rclpy": module("rclpy", rclpy),
             "rclpy.executors": module("rclpy.executors", {"ExternalShutdownException": shutdown}),
             "rclpy.node": module("rclpy.node", {"Node": Node}),
             "rclpy.time": module("rclpy.time", {"Time": Time}),
