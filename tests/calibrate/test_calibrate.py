@@ -14,9 +14,15 @@ from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
-from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import ForceSample, load_recording
-from press_recording import HOST_BEGIN_S, SENSOR_ZERO_N, record_presses, sensor_log, write_log
+from recordings import (
+    HOST_BEGIN_S,
+    SENSOR_ZERO_N,
+    record_presses,
+    sensor_log,
+    write_log,
+    write_recording,
+)
 
 SECONDS = 44.0  # two cells of six presses
 SHAPE = (1, 2)
@@ -34,7 +40,7 @@ def scene() -> Scene:
 def made(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
     """A folder with presses.mcap and forces.csv."""
     folder = tmp_path_factory.mktemp("presses")
-    record_presses(folder / "presses.mcap", scene, SECONDS)
+    record_presses(folder / "presses.mcap", SECONDS)
     times_s, force_n = sensor_log(scene, SECONDS)
     write_log(folder / "forces.csv", times_s + SENSOR_BEGIN_S, force_n)
     return folder
@@ -91,12 +97,11 @@ def test_a_recording_and_its_forces_make_a_calibration(
 
     # The recording can hold the forces itself.
     both = tmp_path / "both.mcap"
-    times_s, force_n = sensor_log(scene, SECONDS)
-    with Recorder(both, given.hellos[0]) as recorder:
-        for scan in given.scans:
-            recorder.add(scan)
-        for time_s, force in zip(times_s, force_n, strict=True):
-            recorder.add(ForceSample(float(force), HOST_BEGIN_S + float(time_s), source="cell"))
+    samples = [
+        ForceSample(float(force), HOST_BEGIN_S + float(time_s), source="cell")
+        for time_s, force in zip(*sensor_log(scene, SECONDS), strict=True)
+    ]
+    write_recording(both, given.hellos[0], [*given.scans, *samples])
     slopes = []
     for command in (
         lambda: run("calibrate", "recording", str(both), str(out), *TOLD, *BY_OHM),
@@ -162,15 +167,11 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
     )
     given = load_recording(recording)
     edited(forces, lambda t, f: (t[t < SENSOR_BEGIN_S + 21], f[t < SENSOR_BEGIN_S + 21]))
-    for name, scans, words in (
-        ("none", [], ["none.mcap: no scan in it"]),
-        ("one", [scan for scan in given.scans if scan.time_us < 5e6], ["one.mcap"]),
-    ):
+    few = [scan for scan in given.scans if scan.time_us < 5e6]
+    for name, scans, words in (("none", [], ": no scan in it"), ("one", few, "")):
         path = tmp_path / f"{name}.mcap"
-        with Recorder(path, given.hellos[0]) as recorder:
-            for scan in scans:
-                recorder.add(scan)
-        assert_one_line(calibrate(run, (path, forces, out)), *words)
+        write_recording(path, given.hellos[0], scans)
+        assert_one_line(calibrate(run, (path, forces, out)), f"{name}.mcap{words}")
     for name, octets in (("foreign", b"no recording"), ("cut", recording.read_bytes()[:200])):
         path = tmp_path / f"{name}.mcap"
         path.write_bytes(octets)

@@ -23,8 +23,8 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link import session
-from ohmskin.record.recorder import Recorder
 from ports import Serve
+from recordings import write_recording
 
 
 @pytest.fixture
@@ -197,9 +197,7 @@ def test_ports_that_do_not_answer_are_findings(run: Run, pty_board: Serve) -> No
 @pytest.mark.parametrize("speed", [0, 1])
 def test_the_end_of_a_recording_is_no_loss(run: Run, tmp_path: Path, speed: int) -> None:
     bench, path = Bench("emulator://3x4"), tmp_path / "skin.mcap"
-    with Recorder(path, bench.info) as recorder:
-        for scan in islice(bench, 60):
-            recorder.add(scan)
+    write_recording(path, bench.info, islice(bench, 60))
     for more in ((), ("--press",)):
         answer = json.loads(run("doctor", f"replay://{path}?speed={speed}", "--json", *more).out)
         assert answer["verdict"].startswith("sound: ")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ohmskin
+from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, calibration, of_scene
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
@@ -21,6 +22,7 @@ from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
+from recordings import write_recording
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
 Record = Callable[[int, int], str]
@@ -171,12 +173,10 @@ def recorded(tmp_path: Path) -> Record:
     """A function that records so many scans of a ghost, and a tare before one of them."""
 
     def record(count: int, tare_at: int) -> str:
-        path = tmp_path / "skin.mcap"
-        with ohmskin.open(GHOST, start=False) as board, Recorder(path, board.info) as recorder:
-            for number, scan in enumerate(islice(board, count)):
-                if number == tare_at:
-                    recorder.add(Tare(scan.ratio, scan.host_time_s))
-                recorder.add(scan)
+        path, bench = tmp_path / "skin.mcap", Bench(GHOST)
+        scans = list(islice(bench, count))
+        tares = [Tare(scan.ratio, scan.host_time_s) for scan in scans[tare_at : tare_at + 1]]
+        write_recording(path, bench.info, [*scans[:tare_at], *tares, *scans[tare_at:]])
         return f"replay://{path}"
 
     return record
@@ -200,7 +200,7 @@ def test_latest_does_not_miss_a_tare_whose_scan_it_skips(recorded: Record) -> No
 
 
 def test_a_tare_at_the_end_of_a_replay_says_so(recorded: Record) -> None:
-    port = f"{recorded(5, -1)}?speed=0"
+    port = f"{recorded(5, 5)}?speed=0"
     with ohmskin.open(port, calibration=of_scene("ghost")) as board:
         assert len(list(board)) == 5
         with pytest.raises(DeviceLost, match="gives no more scans"):

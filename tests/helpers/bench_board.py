@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from ohmskin.cli.doctor import gather
 from ohmskin.doctor.examine import Evidence
+from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
@@ -16,11 +17,14 @@ from ohmskin.opening import emulated
 
 
 class Bench(Closing):
-    """An `emulator://` URL's board. Time passes only while its scans are taken: `now_s`."""
+    """A board, or that of an `emulator://` URL.
 
-    def __init__(self, url: str, now_s: float = 0.0) -> None:
-        self.board, _, self.faults = emulated(url)
-        self.name = url
+    Time passes only while its scans are taken: `now_s`.
+    """
+
+    def __init__(self, of: str | EmulatedBoard, now_s: float = 0.0) -> None:
+        self.board, _, self.faults = emulated(of) if isinstance(of, str) else (of, "", LineFaults())
+        self.name = str(of)
         self.now_s = 0.0
         self._decoder = BoardDecoder()
         self._messages: list[Message] = []

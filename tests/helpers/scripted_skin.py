@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench_board import Bench
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import readings
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
-from ohmskin.files import Closing
-from ohmskin.link import framing, protocol
 from ohmskin.link.device import Device
-from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.link.messages import Scan
 
 REST = Scene("rest", 1, 2, seed=1).skin(0.0)
 
@@ -23,14 +22,13 @@ def rise(force_n: float | Float) -> Float:
     return np.asarray(30e-6 * force_n**1.7)
 
 
-class ScriptedSkin(Closing):
+class ScriptedSkin(Bench):
     """An emulated 1x2 skin, in place of a `Device`.
 
     rise: gives the conductances (1, 2) above those of `REST` [S] at a time since the script began
     [s]: since `begin` was called. happens: what is called when, by the same clock.
     """
 
-    name = "scripted"
     mean_ratio = Device.mean_ratio
 
     def __init__(
@@ -42,40 +40,30 @@ class ScriptedSkin(Closing):
         self.begin_s = float("inf")
         self._rise = rise
         self._happens = sorted(happens, key=lambda each: each[0])
-        self._board = EmulatedBoard(self._ratio, 1, 2, rate_hz=rate_hz, noise_lsb=0.3, unit_id=7)
-        self._decoder = BoardDecoder()
-        (self.info,) = self._decoder.feed(self._board.advance(0.0), 0.0)
-        assert isinstance(self.info, Hello)
-        start = protocol.FRAMES["start"]
-        self._board.receive(framing.encode(start.id, 1, start.pack()))
+        super().__init__(
+            EmulatedBoard(self._ratio, 1, 2, rate_hz=rate_hz, noise_lsb=0.3, unit_id=7)
+        )
+        self._scans = super().__iter__()
 
     @property
-    def now_s(self) -> float:
+    def script_s(self) -> float:
         """Time since the script began."""
-        return self._board.now_s - self.begin_s
+        return self.now_s - self.begin_s
 
     def begin(self) -> None:
         """Let the script begin now."""
-        self.begin_s = self._board.now_s
+        self.begin_s = self.now_s
 
     def latest(self) -> Scan:
         """The next scan, when it is complete by the board's clock, which is the host's too."""
-        while True:
-            due_s = self._board.next_scan_s
-            while (
-                self._happens and due_s is not None and due_s - self.begin_s >= self._happens[0][0]
-            ):
-                self._happens.pop(0)[1]()
-            for message in self._decoder.feed(self._board.advance(due_s or 0.0), due_s or 0.0):
-                if isinstance(message, Scan):
-                    return message
+        due_s = self.board.next_scan_s or 0.0
+        while self._happens and due_s - self.begin_s >= self._happens[0][0]:
+            self._happens.pop(0)[1]()
+        return next(self._scans)
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan, without end."""
         return iter(self.latest, None)
-
-    def close(self) -> None:
-        """Nothing to give back."""
 
     def _ratio(self, time_s: float) -> Float:
         rise = self._rise(time_s - self.begin_s) if time_s >= self.begin_s else np.zeros((1, 2))

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import ohmskin
+from bench_board import Bench
 from calibrations import of_scene
-from ohmskin import opening
 from ohmskin.emulate.board import CLOCK_HZ
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
-from ohmskin.link import framing, protocol, session
-from ohmskin.link.messages import BoardDecoder, Scan
+from ohmskin.link import session
+from ohmskin.link.messages import Scan
 from ohmskin.opening import Boards, BoardScan
 from ports import Attach, Serve
 
@@ -89,16 +89,13 @@ class Past:
 
     def __init__(self, url: str, *begins_s: float) -> None:
         random = np.random.default_rng(1)
-        self.begins_s = begins_s
         self.scans: list[Scan] = []
         for begin_s in begins_s:
-            board, _, _ = opening.emulated(url)
-            decoder = BoardDecoder()
-            board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
-            self.info, _ = decoder.feed(board.advance(0.0), begin_s)
-            while (end_s := board.next_scan_s) is not None and end_s <= 2.0:
-                arrived_s = begin_s + end_s + random.exponential(2e-3)
-                self.scans += decoder.feed(board.advance(end_s), arrived_s)
+            bench = Bench(url)
+            self.info = bench.info
+            for scan in itertools.takewhile(lambda scan: scan.host_time_s <= 2.0, bench):
+                arrived_s = begin_s + scan.host_time_s + random.exponential(2e-3)
+                self.scans.append(replace(scan, host_time_s=arrived_s))
 
     def __iter__(self) -> Iterator[Scan]:
         return iter(self.scans)

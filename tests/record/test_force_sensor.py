@@ -308,7 +308,7 @@ class ScriptedSensor(Closing):
 
     def take(self) -> list[ForceSample]:
         """Samples until now; the sensor is not quite zeroed."""
-        before, self._taken = self._taken, int(self._skin.now_s / self.STEP_S)
+        before, self._taken = self._taken, int(self._skin.script_s / self.STEP_S)
         times_s = [self.STEP_S * step for step in range(before + 1, self._taken + 1)]
         return [ForceSample(pressed(at_s)[1] + 0.029, at_s, source="scale") for at_s in times_s]
 

@@ -4,9 +4,7 @@
 Files are read here by the `mcap` library's own readers as well, not by ours alone.
 """
 
-import errno
 import io
-import itertools
 import json
 import os
 import signal
@@ -14,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,8 +23,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 import ohmskin
+from bench_board import Bench
 from command_line import Command, Done, Run, assert_one_line, finish, well
+from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
+from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.opening import emulated
 from ohmskin.record.readings import estimate_file, load_readings
@@ -39,6 +41,7 @@ from ohmskin.record.recording import (
     load_recording,
     messages,
 )
+from recordings import write_recording
 from waiting import until
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -50,8 +53,7 @@ LATE_S = 3.0
 
 @pytest.fixture(scope="module")
 def hello() -> Hello:
-    with ohmskin.open(URL, start=False) as skin:
-        return skin.info
+    return Bench(URL).info
 
 
 @pytest.fixture
@@ -64,12 +66,6 @@ def scan(number: int, rows: int = 3, columns: int = 4, at_s: float | None = None
     codes = np.random.default_rng(number).integers(0, 1024, (rows, columns, 4)).astype(np.uint16)
     at_s = number / 400 if at_s is None else at_s
     return Scan(codes, number, 2500 * number, at_s, 0)
-
-
-def write(path: Path, hello: Hello, scans: list[Scan]) -> None:
-    with Recorder(path, hello) as recorder:
-        for each in scans:
-            recorder.add(each)
 
 
 def assert_same(found: list[Scan], expected: list[Scan], host_time: bool = True) -> None:
@@ -90,14 +86,10 @@ def replayed(path: Path, speed: float = 0) -> list[Scan]:
 
 
 def test_everything_is_read_again(path: Path, hello: Hello) -> None:
-    with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
-        scans = list(itertools.islice(skin, 50))
-        for each in scans:
-            recorder.add(each)
-        tare = Tare(np.mean([each.ratio for each in scans], axis=0), time.monotonic())
-        others = [Mark("pressed \u00fc", 1.5), ForceSample(0.25, 2.5, "scale")]
-        for other in (tare, *others):
-            recorder.add(other)
+    scans = list(islice(Bench(URL), 50))
+    tare = Tare(np.mean([each.ratio for each in scans], axis=0), 0.5)
+    others = [Mark("pressed \u00fc", 1.5), ForceSample(0.25, 2.5, "scale")]
+    write_recording(path, hello, [*scans, tare, *others])
     found = load_recording(path)
     assert not found.cut_off
     assert found.hellos == [hello]
@@ -109,7 +101,7 @@ def test_everything_is_read_again(path: Path, hello: Hello) -> None:
 def test_other_programs_read_it(path: Path, hello: Hello) -> None:
     """The library's seeking reader, with the index; each message fits its schema's properties."""
     before_ns = time.time_ns()
-    write(path, hello, [scan(n, at_s=time.monotonic()) for n in range(20)])
+    write_recording(path, hello, [scan(n, at_s=time.monotonic()) for n in range(20)])
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -279,7 +271,7 @@ def test_cut_off_at_any_byte(tmp_path: Path, hello: Hello) -> None:
 
 
 def test_damage_is_named(path: Path, hello: Hello) -> None:
-    write(path, hello, [scan(n) for n in range(5)])
+    write_recording(path, hello, [scan(n) for n in range(5)])
     octets = bytearray(path.read_bytes())
     outcomes = set()
     for at in range(0, len(octets), 7):
@@ -367,67 +359,39 @@ def test_one_thread_writes_at_a_time(
     assert_same(load_recording(path).scans, [scan(0), scan(1)])
 
 
-class FullDisk(io.FileIO):
-    """A file that takes `room` bytes and no more, the last write in part."""
-
-    room = 0
-
-    def write(self, octets: object) -> int:
-        view = memoryview(octets)  # type: ignore[arg-type]
-        fits = min(len(view), self.room - self.tell())
-        if fits <= 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return super().write(view[:fits])
-
-
-def test_a_full_disk_ends_the_recording(
-    path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = FullDisk(path, "wb")
-    file.room = 20_000
-    monkeypatch.setattr(Path, "open", lambda path, mode: io.BufferedWriter(file))
-
-    def fill() -> None:
-        with Recorder(path, hello) as recorder:
-            for number in range(10_000):
-                recorder.add(scan(number))
-                if number % 20 == 0:
-                    recorder._flush()
-
-    with pytest.raises(RecordingError, match="No space left on device; what is in"):
-        fill()
-    found = load_recording(path)
-    assert found.cut_off
-    assert len(found.scans) > 50
-    assert_same(found.scans, [scan(n) for n in range(len(found.scans))])
-    assert 15_000 < path.stat().st_size <= 20_000
-
-
-def test_a_file_that_may_not_grow_ends_the_command(path: Path, command: Command) -> None:
+def test_a_file_that_may_not_grow_ends_the_recording(path: Path, command: Command) -> None:
+    """The last write is in part, as on a full disk."""
     resource = pytest.importorskip("resource")
-    process = command("record", URL, str(path))
+    process = command("record", f"{URL}&noise=0", str(path))
     if not hasattr(resource, "prlimit"):
         pytest.skip("needs prlimit")
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
-    assert_one_line(finish(process), "recording ended after")
-    assert load_recording(path).scans
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (20_000, 20_000))
+    assert_one_line(finish(process), "recording ended after", "File too large; what is in")
+    assert path.stat().st_size == 20_000
+    found = load_recording(path)
+    assert found.cut_off
+    numbers = [each.number for each in found.scans]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert len(numbers) > 50
+    expected = quantise(Scene("multi", 3, 4, seed=3).ratio(0.0))
+    for each in found.scans:
+        np.testing.assert_array_equal(each.codes, expected)
 
 
 # -------------------------------------------------------------------------------------- replay
 
 
 def test_replay_is_the_recording_bit_for_bit(path: Path, hello: Hello) -> None:
-    with ohmskin.open(f"{URL}&drop=0.05") as skin:
-        scans = list(itertools.islice(skin, 300))
+    scans = list(islice(Bench(f"{URL}&drop=0.05"), 300))
     assert any(each.missed for each in scans)
-    write(path, hello, scans)
+    write_recording(path, hello, scans)
     assert_same(replayed(path), scans, host_time=False)
     assert_same(replayed(path, speed=4), scans, host_time=False)
 
 
 def test_a_slow_reader_of_a_fast_replay_loses_nothing(path: Path, hello: Hello) -> None:
     scans = [scan(n, rows=1, columns=1) for n in range(3000)]
-    write(path, hello, scans)
+    write_recording(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
         time.sleep(0.1)
         found = iter(skin)
@@ -440,7 +404,7 @@ def test_a_slow_reader_of_a_fast_replay_loses_nothing(path: Path, hello: Hello) 
 
 def test_latest_of_a_fast_replay_gives_each(path: Path, hello: Hello) -> None:
     scans = [scan(n) for n in range(40)]
-    write(path, hello, scans)
+    write_recording(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
         assert_same([skin.latest() for _ in scans], scans, host_time=False)
         with pytest.raises(RecordingEnded, match="played to its end"):
@@ -451,7 +415,7 @@ def test_latest_of_a_fast_replay_gives_each(path: Path, hello: Hello) -> None:
 
 
 def test_replay_takes_the_recorded_time(path: Path, hello: Hello) -> None:
-    write(path, hello, [scan(n, at_s=7 + n / 10) for n in range(6)])
+    write_recording(path, hello, [scan(n, at_s=7 + n / 10) for n in range(6)])
     begin_s = time.monotonic()
     found = replayed(path, speed=1)
     assert time.monotonic() - begin_s >= 0.5
@@ -462,7 +426,7 @@ def test_replay_shortens_long_pauses(
     path: Path, hello: Hello, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ohmskin.record.replay.LONGEST_PAUSE_S", 0.1)
-    write(path, hello, [scan(0, at_s=0), scan(1, at_s=3600), scan(2, at_s=10)])
+    write_recording(path, hello, [scan(0, at_s=0), scan(1, at_s=3600), scan(2, at_s=10)])
     begin_s = time.monotonic()
     assert len(replayed(path, speed=1)) == 3
     assert time.monotonic() - begin_s < 5
@@ -470,7 +434,7 @@ def test_replay_shortens_long_pauses(
 
 def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
     scans = [scan(n) for n in range(30)]
-    write(path, hello, scans)
+    write_recording(path, hello, scans)
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
         assert (skin.info.rows, skin.info.columns, skin.info.board) == (3, 4, "emulated")
         first = [skin.latest()]
@@ -493,25 +457,18 @@ def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
     assert numbers[-1] == 29
 
 
-def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path) -> None:
-    with ohmskin.open(URL) as skin, Recorder(path, skin.info) as recorder:
-        scans = list(itertools.islice(skin, 5))
-        for each in scans:
-            recorder.add(each)
-        recorder.add(skin.configure(rows=2))
-        later = list(itertools.islice(skin, 5))
-        for each in later:
-            recorder.add(each)
+def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) -> None:
+    scans = [scan(n, rows=3 if n < 5 else 2) for n in range(10)]
+    write_recording(path, hello, [*scans[:5], replace(hello, rows=2), *scans[5:]])
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
-        found = list(skin)
+        assert_same(list(skin), scans, host_time=False)
         assert skin.info.rows == 2
-    assert [each.codes.tolist() for each in found] == [s.codes.tolist() for s in scans + later]
     with pytest.raises(RecordingError, match=r"3x4 cells become 2x4"):
         export(load_recording(path), tmp_path / "a.npz")
 
 
 def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
-    write(path, hello, [scan(0)])
+    write_recording(path, hello, [scan(0)])
     for query in ("speed=-1", "speed=nan", "speed=fast", "baud=9600"):
         with pytest.raises(PortError, match="speed"):
             ohmskin.open(f"replay://{path}?{query}")
@@ -520,21 +477,19 @@ def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.unlink()
     beyond = scan(1)
     beyond.codes[0, 0, 0] = 1024
-    write(path, hello, [scan(0), beyond])
+    write_recording(path, hello, [scan(0), beyond])
     with pytest.raises(RecordingError, match="scan 1 has a code beyond the converter"):
         replayed(path)
 
 
 def test_a_skin_larger_than_any_board_is_replayed(path: Path, hello: Hello) -> None:
-    write(path, hello, [scan(0, rows=20)])
+    write_recording(path, hello, [scan(0, rows=20)])
     assert replayed(path)[0].codes.shape == (20, 4, 4)
 
 
 def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
     tares = [Tare(np.full((3, 4, 4), ratio), 1.0) for ratio in (0.25, 0.75)]
-    with Recorder(path, hello) as recorder:
-        for message in (scan(0), tares[0], scan(1), scan(2), tares[1], scan(3)):
-            recorder.add(message)
+    write_recording(path, hello, [scan(0), tares[0], scan(1), scan(2), tares[1], scan(3)])
     rests = [each.rest_ratio for each in replayed(path)]
     assert rests[0] is None
     assert rests[1] is rests[2]
@@ -546,16 +501,10 @@ def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Path:
-    path = tmp_path / "a.mcap"
-    with (
-        ohmskin.open("emulator://3x4?scene=rest&noise=0") as rest,
-        ohmskin.open("emulator://3x4?scene=single&noise=0") as touched,
-        Recorder(path, rest.info) as recorder,
-    ):
-        recorder.add(Tare(rest.latest().ratio, time.monotonic()))
-        for each in itertools.islice(touched, 5):
-            recorder.add(each)
+def recorded(path: Path) -> Path:
+    rest, touched = (Bench(f"emulator://3x4?scene={scene}&noise=0") for scene in ("rest", "single"))
+    tare = Tare(next(iter(rest)).ratio, 0.0)
+    write_recording(path, rest.info, [tare, *islice(touched, 5)])
     return path
 
 

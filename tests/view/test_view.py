@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 from urllib.request import urlopen
@@ -20,20 +21,20 @@ import pytest
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
-import ohmskin
+from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.link.device import Device
-from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards, server
 from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
 from ohmskin.view.panel import Panel
 from ohmskin.view.server import make_app
 from ports import Serve
+from recordings import write_recording
 from waiting import until
 
 GHOST = "emulator://8x8?scene=ghost&seed=1"
@@ -437,14 +438,9 @@ def test_a_calibration_of_another_unit_is_not_taken_unless_forced() -> None:
 
 
 def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> None:
-    path = tmp_path / "skin.mcap"
-    scene = Scene("ghost", 8, 8, seed=1)
-    with ohmskin.open(GHOST) as skin, Recorder(path, skin.info) as recorder:
-        recorder.add(Tare(scene.rest_ratio, time.monotonic()))
-        for scan in skin:
-            recorder.add(scan)
-            if recorder.scans == 30:
-                break
+    path, bench = tmp_path / "skin.mcap", Bench(GHOST)
+    tare = Tare(Scene("ghost", 8, 8, seed=1).rest_ratio, 0.0)
+    write_recording(path, bench.info, [tare, *islice(bench, 30)])
     with served(f"replay://{path}") as client, panel(client) as page:
         assert page.scan()["touched"].sum() == 3
         state = page.until_state(lambda state: state["status"] == "ended")

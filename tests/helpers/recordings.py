@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings for several test files, one of the scene "press" with what a force sensor says."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+
+from bench_board import Bench
+from ohmskin.arrays import Float
+from ohmskin.emulate.scenes import Scene
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Recorded
+
+HOST_BEGIN_S = 1000.0
+PRESSES = "emulator://1x2?scene=press&seed=1&rate=30&unit=3"
+SENSOR_HZ = 80
+SENSOR_NOISE_N = 0.02
+SENSOR_ZERO_N = 0.07
+
+
+def write_recording(path: Path, hello: Hello, messages: Iterable[Recorded]) -> None:
+    with Recorder(path, hello) as recorder:
+        for each in messages:
+            recorder.add(each)
+
+
+def record_presses(path: Path, seconds: float) -> None:
+    """Record what the board of `PRESSES` reads, with a jitter of 1 ms in host times."""
+    bench, random = Bench(PRESSES), np.random.default_rng(2)
+    hello = bench.info
+
+    def arrived(scan: Scan) -> Scan:
+        middle_s = 1e-6 * scan.time_us + 0.5 / hello.rate_hz
+        return replace(scan, host_time_s=HOST_BEGIN_S + middle_s + random.exponential(1e-3))
+
+    scans = takewhile(lambda scan: scan.host_time_s < seconds, bench)
+    write_recording(path, hello, map(arrived, scans))
+
+
+def sensor_log(scene: Scene, seconds: float) -> tuple[Float, Float]:
+    """Times [s] from the board's start and forces [N], with noise, and a zero that is off."""
+    random = np.random.default_rng(3)
+    times_s = np.arange(0, seconds, 1 / SENSOR_HZ)
+    force_n = np.array([scene.force_n(time_s).sum() for time_s in times_s])
+    return times_s, force_n + SENSOR_ZERO_N + SENSOR_NOISE_N * random.standard_normal(times_s.size)
+
+
+def write_log(path: Path, times_s: Float, force_n: Float, header: str = "time_s,force_n") -> None:
+    rows = [f"{time_s:.6f},{force:.4f}" for time_s, force in zip(times_s, force_n, strict=True)]
+    path.write_text("\n".join([header, *rows]) + "\n")
