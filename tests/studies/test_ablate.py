@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make ablate`: which constants there are, that each is put back, what the figures say."""
 
-import csv
-import json
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from command_line import Run
 from ohmskin.estimate import full_fit, joint, port_readings, prior, sparse_fit
 from studies import ablate
 from studies.ablate import OFF, Constant, Row
@@ -74,16 +68,3 @@ def test_a_resample_is_that_of_the_values_of_its_skins() -> None:
         for of in (0.5, 0.9):
             expected = np.quantile(drawn, of, method="inverted_cdf")
             assert found[of][number] == pytest.approx(expected)
-
-
-def test_ablate_writes_a_table(monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path) -> None:
-    monkeypatch.setattr(ablate, "measure", partial(ablate.measure, scenes=[SCENE]))
-    size = ("--skins", "3", "--frames", "4", "--jobs", "1", "--out", str(tmp_path))
-    code, out, err = run("ablate", "--only", "SHARE,prior.SEGMENT_STD", *size, program="studies")
-    assert code == 0
-    answer = json.loads(out.splitlines()[-1])
-    assert list(answer["moved"]) == ["prior.SEGMENT_STD", "sparse_fit.SHARE"]
-    lines = list(csv.DictReader(Path(answer["table"]).read_text().splitlines()))
-    assert {line["constant"] for line in lines} == set(answer["moved"])
-    assert "worst loss" in err
-    assert "no constant NONSENSE" in run("ablate", "--only", "NONSENSE", program="studies").err

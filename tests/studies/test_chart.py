@@ -1,29 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make chart`: the front, the table, the picture, and what interrupts them."""
+"""`make chart`: the front, the table, the picture, and what a frame can tell at best."""
 
 import csv
 import io
-import json
 import shutil
 import signal
-import sys
 import time
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from command_line import Command, Run, finish
+from command_line import Command, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.methods import METHODS
-from places import ROOT
 from skins import reference
-from studies import casadi_circuit, chart, chart_figure, chart_table, commands, published, stability
+from studies import casadi_circuit, chart, chart_figure, chart_table, published
 from studies.chart import Plan, Row, Size, pareto_front
 from waiting import until
 
@@ -215,61 +210,6 @@ def test_frames_without_touches_have_a_row_and_a_picture() -> None:
     assert (rows[0].pressed_cells, rows[0].error_percent, rows[0].limit_percent) == (0, None, None)
     assert not rows[0].on_front
     assert chart_figure.picture(rows, "a machine").startswith(b"\x89PNG")
-
-
-@pytest.fixture
-def draw(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
-    """A function that runs ``python -m studies chart ARGUMENTS`` with a tiny plan."""
-    monkeypatch.setattr(chart, "QUICK", TINY)
-    return partial(run, "chart", "--quick", program="studies")
-
-
-def test_chart_writes_picture_and_table(draw: Run, tmp_path: Path, rows: list[Row]) -> None:
-    code, out, err = draw("--out", str(tmp_path / "new"))
-    assert code == 0
-    answer = json.loads(out)
-    assert answer["quick"]
-    assert answer["fronts"]["random 2x2 10 bit"][0] == "ohm"
-    picture, table = Path(answer["picture"]), Path(answer["table"])
-    assert sorted((tmp_path / "new").iterdir()) == sorted([picture, table])
-    assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
-    assert picture.stat().st_size > 30_000
-    assert table.read_text().count("\n") == 1 + len(rows)
-    assert "matrix" in err
-
-
-def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert commands.default_folder() == ROOT / "docs"
-    monkeypatch.setattr(commands, "__file__", "/lib/python/site-packages/studies/x.py")
-    assert commands.default_folder() == Path()
-
-
-@pytest.mark.parametrize("study", [chart, stability])
-def test_without_matplotlib_nothing_is_measured(
-    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, study: ModuleType
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setattr(study, "measure", lambda *_, **__: pytest.fail("measured in vain"))
-    command = study.__name__.rpartition(".")[2]
-    code, out, err = run(command, "--quick", "--out", str(tmp_path), program="studies")
-    assert (code, out) == (2, "")
-    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
-
-
-@pytest.mark.parametrize("where", ["chart.measure", "chart_figure.picture"])
-def test_ctrl_c_leaves_the_old_files(
-    draw: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, rows: list[Row], where: str
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(chart, "measure", lambda *_: rows)
-    monkeypatch.setattr(f"studies.{where}", interrupt)
-    (tmp_path / "speed-accuracy.csv").write_text("old")
-    code, out, err = draw("--out", str(tmp_path))
-    assert (code, out) == (130, "")
-    assert "Traceback" not in err
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
 
 
 def test_ctrl_c_is_not_lost_in_ipopt(command: Command, tmp_path: Path) -> None:

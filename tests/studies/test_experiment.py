@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ohmskin experiment`: the simulated experiments with force, and what they print."""
+"""The simulated experiments with force: their skins, errors and smallest forces."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
-from typer.testing import CliRunner
 
 from ohmskin.emulate.press import PressModel
 from ohmskin.force.curve import MAX_EXPONENT
-from studies import force_commands, force_experiment, force_limits, published
+from studies import force_limits, published
 from studies.force_experiment import (
     CHOICE,
     LINE,
@@ -28,12 +25,6 @@ from studies.force_limits import ALONE, BESIDE, Detection, press_series, smalles
 from studies.force_trial import ForceTrial, Plan, surface_trial
 
 SMALL = Plan(seeds=1, presses=6, test_presses=2, frames_per_press=2)
-METHODS = ("voltage", "joint", "touch", "truth")
-TINY = (
-    Comparison(2, 2, SMALL, METHODS, ("whole",)),
-    Comparison(2, 2, replace(SMALL, frames_per_press=1), ("voltage", "truth"), ("whole",)),
-    Comparison(3, 3, replace(SMALL, test_presses=1), ("voltage", "truth"), ("whole",)),
-)
 
 
 @pytest.fixture(scope="module")
@@ -200,69 +191,6 @@ def test_a_smallest_force_follows_from_the_noise_of_readings() -> None:
 def test_the_margin_must_stay_above_zero(margin: list[float], expected: float) -> None:
     forces_n = np.array([1.0, np.sqrt(2), 2 * np.sqrt(2), 4 * np.sqrt(2)])
     assert force_limits._crossing(forces_n, np.array(margin)) == pytest.approx(expected)
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
-    monkeypatch.setattr(force_experiment, "QUICK", TINY)
-    detection = Detection(
-        seeds=1, empty_frames=40, frames=8, forces=4, methods=("voltage", "joint")
-    )
-    monkeypatch.setattr(force_commands, "QUICK_DETECTION", detection)
-    return CliRunner()
-
-
-@pytest.mark.parametrize(
-    ("command", "key"),
-    [
-        ("flat", "rows"),
-        ("curved", "rows"),
-        ("timeseries", "cross_talk"),
-        ("minimum", "smallest_forces"),
-    ],
-)
-def test_commands_write_a_picture_and_print_json(
-    quick: CliRunner, tmp_path: Path, command: str, key: str
-) -> None:
-    folder = tmp_path / "new"
-    result = quick.invoke(
-        force_commands.experiment, [command, "--quick", "--json", "--out", str(folder)]
-    )
-    assert result.exit_code == 0, result.output
-    assert result.output.count("\n") == 1
-    answer = json.loads(result.output)
-    assert answer["simulated"]
-    assert answer["quick"]
-    assert answer[key]
-    picture = Path(answer["picture"])
-    assert list(folder.iterdir()) == [picture]
-    assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
-    assert picture.stat().st_size > 20_000
-
-
-def test_tables_go_to_stderr_beside_the_papers_numbers(quick: CliRunner, tmp_path: Path) -> None:
-    result = quick.invoke(force_commands.experiment, ["flat", "--quick", "--out", str(tmp_path)])
-    assert result.exit_code == 0
-    assert result.stdout.count("\n") == 1
-    assert {"rows", "columns", "method", "pressed_below_percent"} < {
-        *json.loads(result.stdout)["best"][0]
-    }
-    assert "simulated" in result.stderr
-    assert "3.52" in result.stderr  # naive, flat, cell (1, 1)
-    assert "…" not in result.stderr
-
-
-def test_ctrl_c_leaves_the_old_picture(
-    quick: CliRunner, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(force_experiment, "measure", interrupt)
-    (tmp_path / "force-flat.png").write_text("old")
-    result = quick.invoke(force_commands.experiment, ["flat", "--out", str(tmp_path)])
-    assert result.exit_code == 130
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
 
 
 def only(rows: list[Row], **what: object) -> Row:

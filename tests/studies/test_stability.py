@@ -3,17 +3,15 @@
 
 import csv
 import io
-import json
 import os
 import signal
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from command_line import Command, Run, finish
+from command_line import Command, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.matrix import MatrixEstimator
@@ -226,26 +224,6 @@ def test_csv(rows: list[Row]) -> None:
 def test_picture_of_all_sweeps() -> None:
     rows = [Row(sweep, x, method, 4, 1, 1, 2) for sweep, x in SKINS for method in METHODS]
     assert stability_figure.picture(rows).startswith(b"\x89PNG")
-
-
-@pytest.fixture
-def sweep(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
-    """A function that runs ``python -m studies stability ARGUMENTS``, a tiny plan, here."""
-    monkeypatch.setattr(stability, "QUICK", replace(TINY, skins=1, frames=1, shape=(2, 2)))
-    return partial(run, "stability", "--quick", "--jobs", "1", program="studies")
-
-
-def test_stability_writes_picture_and_table(sweep: Run, tmp_path: Path) -> None:
-    code, out, err = sweep("--out", str(tmp_path / "new"))
-    assert code == 0
-    answer = json.loads(out.splitlines()[-1])
-    assert answer["quick"]
-    assert answer["methods"]["ohm"]["frames"] == len(SKINS)
-    picture, table = Path(answer["picture"]), Path(answer["table"])
-    assert sorted((tmp_path / "new").iterdir()) == sorted([picture, table])
-    assert picture.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
-    assert table.read_text().startswith("sweep,x,method,frames,right,flagged,wrong_unflagged\n")
-    assert "wrong and not flagged" in err
 
 
 def test_ctrl_c_leaves_the_old_files_and_no_process(command: Command, tmp_path: Path) -> None:

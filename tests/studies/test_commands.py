@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The studies as commands: what they write and print, and what interrupts them."""
+
+import csv
+import json
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from command_line import Run
+from places import ROOT
+from studies import ablate, chart, commands, force_commands, force_experiment, stability
+from studies.conditions import SWEEPS
+from studies.force_experiment import Comparison
+from studies.force_limits import Detection
+from studies.force_trial import Plan
+
+SMALL = Plan(seeds=1, presses=6, test_presses=2, frames_per_press=2)
+FEW = ("voltage", "truth")
+SURFACES = (
+    Comparison(2, 2, SMALL, ("voltage", "joint", "touch", "truth"), ("whole",)),
+    Comparison(2, 2, replace(SMALL, frames_per_press=1), FEW, ("whole",)),
+    Comparison(3, 3, replace(SMALL, test_presses=1), FEW, ("whole",)),
+)
+METHODS = ("ohm", "matrix", "joint")
+DETECTION = Detection(seeds=1, empty_frames=40, frames=8, forces=4, methods=("voltage", "joint"))
+CHART = chart.Plan(1, 8, warm_up=2, repeats=1, sizes=(chart.Size(2, 2, 3),), methods=METHODS)
+STABILITY = stability.Plan(1, 1, paper_skins=0, paper_shape=(2, 2), shape=(2, 2))
+ABLATED = ("prior.SEGMENT_STD", "sparse_fit.SHARE")
+
+
+@pytest.fixture
+def study(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
+    """A function that runs ``python -m studies ARGUMENTS``; what is quick is tiny."""
+    monkeypatch.setattr(chart, "QUICK", CHART)
+    monkeypatch.setattr(stability, "QUICK", STABILITY)
+    monkeypatch.setattr(ablate, "measure", partial(ablate.measure, scenes=["ngspice_random"]))
+    monkeypatch.setattr(force_experiment, "QUICK", SURFACES)
+    monkeypatch.setattr(force_commands, "QUICK_DETECTION", DETECTION)
+    return partial(run, program="studies")
+
+
+@pytest.fixture
+def answered(study: Run, tmp_path: Path) -> Any:
+    """A function that runs a study into a new folder: its answer, table, and stderr."""
+
+    def call(command: str) -> tuple[dict[str, Any], str, str]:
+        folder = tmp_path / "new"
+        code, out, err = study(*command.split(), "--out", str(folder))
+        assert code == 0
+        assert out.count("\n") == 1
+        answer = json.loads(out)
+        files = {Path(answer[kind]) for kind in ("picture", "table") if kind in answer}
+        assert set(folder.iterdir()) == files
+        if "picture" in answer:
+            octets = Path(answer["picture"]).read_bytes()
+            assert octets.startswith(b"\x89PNG\r\n\x1a\n")
+            assert len(octets) > 30_000
+            assert answer["quick"]
+        return answer, Path(answer["table"]).read_text() if "table" in answer else "", err
+
+    return call
+
+
+def test_chart(answered: Any) -> None:
+    answer, table, err = answered("chart --quick")
+    assert answer["fronts"]["random 2x2 10 bit"][0] == "ohm"
+    assert table.startswith("scene,source,rows,columns,bits,method,")
+    assert {line["method"] for line in csv.DictReader(table.splitlines())} > set(METHODS)
+    assert "matrix" in err
+
+
+def test_stability(answered: Any) -> None:
+    answer, table, err = answered("stability --quick --jobs 1")
+    assert answer["methods"]["ohm"]["frames"] == sum(len(each.values) for each in SWEEPS.values())
+    assert table.startswith("sweep,x,method,frames,right,flagged,wrong_unflagged\n")
+    assert "wrong and not flagged" in err
+
+
+def test_ablate(answered: Any, study: Run) -> None:
+    only = "ablate --only SHARE,prior.SEGMENT_STD"
+    answer, table, err = answered(f"{only} --skins 3 --frames 4 --jobs 1")
+    assert tuple(answer["moved"]) == ABLATED
+    assert {line["constant"] for line in csv.DictReader(table.splitlines())} == set(ABLATED)
+    assert "worst loss" in err
+    assert "no constant NONSENSE" in study("ablate", "--only", "NONSENSE").err
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("curved", "rows"), ("timeseries", "cross_talk"), ("minimum", "smallest_forces")],
+)
+def test_experiments(answered: Any, name: str, key: str) -> None:
+    answer, _, err = answered(f"experiment {name} --quick --json")
+    assert answer["simulated"]
+    assert answer[key]
+    assert err == ""
+
+
+def test_an_experiment_prints_tables_beside_the_papers_numbers(answered: Any) -> None:
+    answer, _, err = answered("experiment flat --quick")
+    assert answer["rows"]
+    assert {"rows", "columns", "method", "pressed_below_percent"} < set(answer["best"][0])
+    assert "simulated" in err
+    assert "3.52" in err  # naive, flat, cell (1, 1)
+    assert "…" not in err
+
+
+def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert commands.default_folder() == ROOT / "docs"
+    monkeypatch.setattr(commands, "__file__", "/lib/python/site-packages/studies/x.py")
+    assert commands.default_folder() == Path()
+
+
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [("chart", chart), ("stability", stability), ("experiment flat", force_experiment)],
+)
+def test_without_matplotlib_nothing_is_measured(
+    study: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, module: ModuleType
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setattr(module, "measure", lambda *_, **__: pytest.fail("measured in vain"))
+    code, out, err = study(*command.split(), "--quick", "--out", str(tmp_path))
+    assert (code, out) == (2, "")
+    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "where", "file"),
+    [
+        ("chart", "chart.measure", "speed-accuracy.csv"),
+        ("chart", "chart_figure.picture", "speed-accuracy.csv"),
+        ("experiment flat", "force_experiment.measure", "force-flat.png"),
+    ],
+)
+def test_ctrl_c_leaves_the_old_files(
+    study: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, where: str, file: str
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(chart, "measure", lambda *_: [])
+    monkeypatch.setattr(f"studies.{where}", interrupt)
+    (tmp_path / file).write_text("old")
+    code, out, err = study(*command.split(), "--quick", "--out", str(tmp_path))
+    assert (code, out) == (130, "")
+    assert "Traceback" not in err
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
