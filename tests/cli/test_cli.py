@@ -35,14 +35,10 @@ EMULATED = "emulator://4x6?scene=ghost&seed=2"
 
 def test_ports(run: Run, attach: Attach) -> None:
     attach()
-    done = run("ports")
-    assert done.code == 0
-    assert "no serial ports" in done.out
-    assert "emulator://" in done.out
+    said = well(run("ports")).out
+    assert "no serial ports" in said
+    assert "emulator://" in said
     assert json.loads(run("ports", "--json").out) == []
-
-
-def test_ports_names_the_boards_it_knows(run: Run, attach: Attach) -> None:
     boards = {"/dev/ttyACM0": "uno", "/dev/ttyACM1": "megaatmega2560", "/dev/ttyUSB1": ""}
     attach(*reversed(boards.items()))
     assert json.loads(run("ports", "--json").out) == [
@@ -282,7 +278,10 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     "impossible rate": (["info", "emulator://8x8?rate=1000"], ["too_fast"]),
     "wrong line speed": (["info", "/dev/ttyACM99?baud=9600"], ["9600", "500000"]),
     "wrong simulated board": (["info", "simavr://due"], ["due", "uno"]),
-    "another protocol": (["info", "emulator://4x4?foreign=1"], ["layout", "ohmskin flash"]),
+    "another protocol": (
+        ["info", "emulator://4x4?foreign=257"],
+        ["layout", f"0x{LAYOUT_CRC ^ 257:04X}", f"0x{LAYOUT_CRC:04X}", "ohmskin flash"],
+    ),
     "refused rows": (["configure", EMULATED, "--rows", "0"], ["bad_rows", "1..rows_max"]),
     "refused rate": (["configure", EMULATED, "--rate", "1900"], ["too_fast"]),
     "impossible rows": (["configure", EMULATED, "--rows", "-3"], ["rows is -3", "255"]),

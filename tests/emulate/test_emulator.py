@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated board, sans-IO, and that it and the firmware answer alike."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lockstep import LockstepSim, elf_of
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import PortError
+from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
@@ -21,7 +23,7 @@ from ohmskin.opening import emulated
 DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0, "adc_prescaler": 32}
 
 
-class Emulated:
+class Emulated(Closing):
     """A board; `exchange` sends to it, lets time pass, and gives what it has sent."""
 
     def __init__(self, **options: Any) -> None:
@@ -33,8 +35,11 @@ class Emulated:
         self._now_s += seconds
         return self.board.advance(self._now_s)
 
+    def close(self) -> None:
+        pass
 
-class Firmware:
+
+class Firmware(Closing):
     """The built firmware in lock-step: simulated time passes only in `exchange`."""
 
     def __init__(self, board: str) -> None:
@@ -44,6 +49,9 @@ class Firmware:
     def exchange(self, octets: bytes, seconds: float) -> bytes:
         self.sim.write(octets)
         return self.sim.run(seconds)
+
+    def close(self) -> None:
+        self.sim.close()
 
 
 class Host:
@@ -255,8 +263,7 @@ CONFIGURATIONS: list[dict[str, int]] = [
 @pytest.mark.simavr
 @pytest.mark.parametrize("board", ["uno", "megaatmega2560"])
 def test_emulator_and_firmware_answer_alike(board: str) -> None:
-    firmware = Firmware(board)
-    try:
+    with Firmware(board) as firmware:
         real, model = Host(firmware), Host(Emulated())
         results: dict[str, int] = {}
         for change in CONFIGURATIONS:
@@ -278,8 +285,6 @@ def test_emulator_and_firmware_answer_alike(board: str) -> None:
             answers = [host.send(frame_type, payload) for host in (real, model)]
             assert answers[0] == answers[1] != "ok", (frame_type, payload)
         both_in_every_state(real, model)
-    finally:
-        firmware.sim.close()
 
 
 def both_in_every_state(real: Host, model: Host) -> None:
@@ -346,7 +351,17 @@ LIMITS = {
 }
 
 
-def check_configure(host: Host, asked: dict[str, int]) -> None:
+@pytest.fixture(scope="module", params=["emulator", pytest.param("uno", marks=pytest.mark.simavr)])
+def host(request: pytest.FixtureRequest) -> Iterator[Host]:
+    with Emulated() if request.param == "emulator" else Firmware("uno") as board:
+        yield Host(board)
+
+
+@settings(max_examples=500)
+@given(requests)
+@example(DEFAULT | {"rate_mhz": 0})
+@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
+def test_any_configuration_is_taken_or_refused(host: Host, asked: dict[str, int]) -> None:
     """Refused for its first fault and without a consequence, or kept as asked for."""
     before = host.hello()
     result = host.ask("configure", **asked)
@@ -364,32 +379,6 @@ def check_configure(host: Host, asked: dict[str, int]) -> None:
     assert after.settle_us >= asked["settle_us"]
     conversion_s = 13 * asked["adc_prescaler"] / 16e6
     assert after.scan_cycles / 16e6 >= 4 * asked["rows"] * asked["columns"] * conversion_s
-
-
-@settings(max_examples=500)
-@given(requests)
-@example(DEFAULT | {"rate_mhz": 0})
-@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
-def test_the_emulator_takes_or_refuses_any_configuration(asked: dict[str, int]) -> None:
-    check_configure(Host(Emulated()), asked)
-
-
-@pytest.fixture(scope="module")
-def firmware_host() -> Any:
-    firmware = Firmware("uno")
-    yield Host(firmware)
-    firmware.sim.close()
-
-
-@pytest.mark.simavr
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(requests)
-@example(DEFAULT | {"rate_mhz": 0})
-@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
-def test_the_firmware_takes_or_refuses_any_configuration(
-    firmware_host: Host, asked: dict[str, int]
-) -> None:
-    check_configure(firmware_host, asked)
 
 
 @settings(max_examples=200)

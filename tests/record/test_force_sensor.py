@@ -191,11 +191,9 @@ def test_lines_that_are_no_numbers_are_counted(sketch: PtySensor) -> None:
         assert sensor.damaged == 3  # the text, nan, and what is no number once it is a force
 
 
-def test_a_silent_sensor(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sensor_that_falls_silent(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.2)
     with ForceSensor(sketch.path) as sensor:
-        with pytest.raises(DeviceLost, match=r"has said nothing for 0.2 s: is it the force"):
-            sensor.wait()
         sketch.print(b"\n1\n")
         samples: list[ForceSample] = []
         while not samples:
@@ -203,17 +201,6 @@ def test_a_silent_sensor(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> 
                 samples = sensor.take()
         assert len(samples) == 1
         assert until_lost(sensor) == []
-
-
-def test_a_sensor_that_prints_no_numbers(
-    sketch: PtySensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.2)
-    with ForceSensor(sketch.path, 9600) as sensor:
-        sketch.print(b"\n" + b"weight: 12 g\n" * 7)
-        until(lambda: sensor.damaged == 7)
-        with pytest.raises(DeviceLost, match=r"no numbers \(7 damaged lines\).*at 9600 baud"):
-            sensor.wait()
 
 
 def test_a_sensor_that_vanishes(sketch: PtySensor) -> None:
@@ -377,14 +364,14 @@ def test_a_display_counts_what_is_pressed(tmp_path: Path) -> None:
 
 
 @contextmanager
-def speaking(sketch: PtySensor, line: Callable[[], bytes]) -> Iterator[None]:
-    """A sensor prints lines meanwhile, until it vanishes."""
+def speaking(sketch: PtySensor, line: bytes) -> Iterator[None]:
+    """A sensor prints a line again and again meanwhile, until it vanishes."""
     done = threading.Event()
 
     def speak() -> None:
         with suppress(IndexError, OSError):
             while not done.wait(0.01):
-                sketch.print(line())
+                sketch.print(line)
 
     thread = threading.Thread(target=speak)
     thread.start()
@@ -416,7 +403,7 @@ def test_whatever_ends_a_recording_with_forces_it_is_whole(
     file = tmp_path / "own.mcap"
     arguments = ("record", "emulator://2x2", str(file), "--force-port", sketch.path)
     stop = {"sensor": sketch.vanish, "SIGTERM": lambda: os.kill(os.getpid(), signal.SIGTERM)}
-    with once_scans_are_in(file, stop[end]), speaking(sketch, lambda: b"0.1\n"):
+    with once_scans_are_in(file, stop[end]), speaking(sketch, b"0.1\n"):
         done = run(*arguments)
     if end == "sensor":
         gone = f"{sketch.path} is gone: is the force sensor still plugged in? (what came before is"
@@ -439,8 +426,9 @@ def test_sensors_that_say_nothing(
         file = str(tmp_path / "a.mcap")
         return run("record", "emulator://2x2", file, "--force-port", force_port, *options)
 
-    assert_one_line(recorded(sketch.path), "has said nothing for 0.5 s", "does its sketch print?")
-    with speaking(sketch, lambda: b"12 g\n"):
+    silent = "has said nothing for 0.5 s: is it the force"
+    assert_one_line(recorded(sketch.path), silent, "does its sketch print?")
+    with speaking(sketch, b"12 g\n"):
         done = recorded(sketch.path, "--force-baud", "9600")
     assert_one_line(done, "prints no numbers (", "damaged lines)", "at 9600 baud")
     assert_one_line(recorded("/dev/ttyNONE"), "no port /dev/ttyNONE")
