@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ohmskin
+from bench_board import Bench
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
 from ohmskin.emulate.board import EmulatorLink
@@ -18,7 +19,6 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError
 from ohmskin.link import device, framing, protocol, session
 from ohmskin.link.codes import quantise
-from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
 from ohmskin.opening import emulated
@@ -31,20 +31,28 @@ ADC = "clock_250khz"
 
 
 @pytest.mark.parametrize(
-    ("fault", "at_a_port"),
-    [
-        ("drop=0.1", False),
-        ("bitflip=1e-4", False),
-        ("garbage=0.3", False),
-        ("drop=0.02&bitflip=5e-5&garbage=0.1", False),
-        ("bitflip=1e-4&drop=0.05", True),
-    ],
+    "faults", ["drop=0.1", "bitflip=3e-4", "garbage=0.3", "drop=0.05&bitflip=3e-4&garbage=0.1"]
 )
-def test_bad_line(fault: str, at_a_port: bool, pty_board: Serve) -> None:
-    """100 scans: all that was made is counted, and each that came is the truth."""
-    url = f"emulator://8x8?scene=multi&seed=5&noise=0&rate=120&{fault}"
+def test_all_that_was_made_is_counted_and_all_that_came_is_the_truth(faults: str) -> None:
+    bench = Bench(f"emulator://2x2?scene=multi&seed=2&noise=0&rate=100&{faults}")
+    found = list(itertools.islice(bench, 5000))
+    expected = quantise(Scene("multi", 2, 2, seed=2).ratio(0.0))
+    assert (np.array([scan.codes for scan in found]) == expected).all()
+    steps = np.diff([-1, *(scan.number for scan in found)])
+    assert steps.min() > 0
+    assert [1 + scan.missed for scan in found] == steps.tolist()
+    stats = bench.stats
+    print(f"{faults}: {stats}")
+    assert stats.scans + stats.missed == found[-1].number + 1
+    assert (stats.missed > 300) == (faults != "garbage=0.3")
+    assert (stats.line.damaged > 300) == (faults != "drop=0.1")
+
+
+def test_a_bad_line_at_a_port(pty_board: Serve) -> None:
+    faults = "drop=0.05&bitflip=1e-4&garbage=0.3"
+    port = pty_board(f"emulator://8x8?scene=multi&seed=5&noise=0&rate=120&{faults}").path
     expected = quantise(Scene("multi", 8, 8, seed=5).ratio(0.0))
-    with ohmskin.open(pty_board(url).path if at_a_port else url) as skin:
+    with ohmskin.open(port) as skin:
         found = list(itertools.islice(skin, 100))
         skin.stop()
         stats = skin.stats
@@ -56,53 +64,8 @@ def test_bad_line(fault: str, at_a_port: bool, pty_board: Serve) -> None:
     assert stats.restarts == 0
     # What the iterator has seen, and what had come or gone before it began.
     assert found[0].missed <= found[0].number
-    assert stats.missed >= sum(scan.missed for scan in found)
-    assert stats.line.damaged > 0 or "bitflip" not in url
-    assert stats.missed > 0 or "drop" not in url
-    assert stats.line.damaged > 10 or "garbage" not in url
-
-
-def test_every_scan_that_was_made_is_received_or_missed() -> None:
-    """In the board's own time: 20,000 scans over a line that loses, adds and flips."""
-    board, _, faults = emulated("emulator://2x2?rate=100&seed=2&drop=0.05&bitflip=3e-4&garbage=0.1")
-    decoder = BoardDecoder()
-    host = np.random.default_rng(7)
-    decoder.feed(board.advance(0.0), 0.0)
-    board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
-    decoder.feed(board.advance(0.0), 0.0)
-    last = -1
-    for step in range(1, 20_001):
-        octets = faults.apply(board.advance(step / 100 + 1e-6), 0.0)
-        cut = int(host.integers(0, len(octets) + 1))
-        for part in (octets[:cut], octets[cut:]):
-            for message in decoder.feed(part, 0.0):
-                if isinstance(message, Scan):
-                    assert message.number > last
-                    last = message.number
-    stats = decoder.stats
-    print(f"20000 scans made: {stats}")
-    assert stats.scans + stats.missed == last + 1
-    assert last > 19_990
-    assert stats.missed > 1500
-
-
-def test_a_reset_board_goes_on_as_it_was_configured() -> None:
-    with ohmskin.open("emulator://8x8?rate=90&reset=0.7") as skin:
-        skin.set_unit_id(7)
-        skin.configure(rows=5, columns=4, rate_hz=130, settle_us=30, adc_prescaler=ADC)
-        shapes = set()
-        for scan in skin:
-            shapes.add(scan.codes.shape)
-            if skin.stats.restarts >= 3 and scan.number > 5:
-                break
-        skin.set_unit_id(8)  # asks the board what it keeps
-        info, stats = skin.info, skin.stats
-    print(f"resets every 0.7 s: {stats}")
-    assert shapes == {(5, 4, 4)}
-    assert (info.rows, info.columns, info.rate_asked_mhz) == (5, 4, 130_000)
-    assert (info.settle_asked_us, info.adc_prescaler) == (30, ADC)
-    assert info.reset_cause == ("external",)
-    assert stats.line.damaged == 0
+    assert stats.missed >= sum(scan.missed for scan in found) > 0
+    assert stats.line.damaged > 10
 
 
 @pytest.mark.simavr
@@ -117,14 +80,15 @@ def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> 
         scans = iter(skin)
         for _ in range(20):
             assert next(scans).codes.shape == (3, 7, 4)
-        link.sim.reset()
-        until = next(scan for scan in scans if skin.stats.restarts)
-        for scan in itertools.islice(scans, 20):
-            assert scan.codes.shape == (3, 7, 4)
-            assert scan.missed == 0
-        assert until.codes.shape == (3, 7, 4)
-        print(f"reset at {baud} baud: {skin.stats}")
-        assert skin.stats.restarts == 1
+        for restarts in (1, 2):
+            link.sim.reset()
+            until = next(scan for scan in scans if skin.stats.restarts == restarts)
+            for scan in itertools.islice(scans, 20):
+                assert scan.codes.shape == (3, 7, 4)
+                assert scan.missed == 0
+            assert until.codes.shape == (3, 7, 4)
+            print(f"reset at {baud} baud: {skin.stats}")
+            assert skin.stats.restarts == restarts
         assert skin.info.reset_cause == ("external",)
         assert skin.info.baud == 500_000
         skin.set_unit_id(5)  # asks the board what it keeps
@@ -197,12 +161,6 @@ READS: dict[str, Callable[[ohmskin.Device], object]] = {
     "command": lambda skin: [skin.set_unit_id(1) for _ in range(1_000_000)],
     "configure": lambda skin: [skin.configure(rows=2) for _ in range(1_000_000)],
 }
-
-
-@pytest.mark.parametrize("use", READS)
-def test_a_board_that_is_unplugged(use: str) -> None:
-    with ohmskin.open("emulator://2x2?vanish=0.6") as skin, pytest.raises(DeviceLost, match="gone"):
-        READS[use](skin)
 
 
 @pytest.mark.parametrize("use", READS)
