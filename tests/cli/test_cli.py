@@ -59,13 +59,6 @@ def test_info(run: Run) -> None:
     assert len(tested["code_min"]) == 4
 
 
-@pytest.mark.simavr
-def test_info_of_the_firmware(run: Run) -> None:
-    facts = json.loads(run("info", "simavr://uno", "--self-test", "--json").out)
-    assert (facts["board"], facts["layout_crc"]) == ("uno", LAYOUT_CRC)
-    assert facts["findings"] == []
-
-
 def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:
     path = pty_board("emulator://8x8").path
     done = well(

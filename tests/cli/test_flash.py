@@ -71,14 +71,15 @@ def board(says: str = "uno") -> FlashedBoard:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "bridge"),
+    ("arguments", "kind", "bridge", "beside"),
     [
-        ([], "uno", "uno"),
-        (["uno"], "uno", "uno"),
-        (["uno", "--port", "{}"], "uno", "uno"),
-        (["--port", "{}"], "uno", "uno"),
-        ([], "megaatmega2560", "megaatmega2560"),
-        (["uno", "--port", "{}"], "uno", ""),  # with another USB bridge
+        ([], "uno", "uno", ""),
+        (["uno"], "uno", "uno", ""),
+        (["uno", "--port", "{}"], "uno", "uno", ""),
+        (["--port", "{}"], "uno", "uno", ""),
+        ([], "megaatmega2560", "megaatmega2560", ""),
+        (["uno", "--port", "{}"], "uno", "", ""),  # with another USB bridge
+        (["megaatmega2560"], "megaatmega2560", "megaatmega2560", "uno"),  # the one of that kind
     ],
 )
 def test_it_flashes_and_hears_from_the_board(
@@ -89,9 +90,10 @@ def test_it_flashes_and_hears_from_the_board(
     arguments: list[str],
     kind: str,
     bridge: str,
+    beside: str,
 ) -> None:
     port = pty_board(board(kind)).path
-    attach(("/dev/ttyS0", ""), (port, bridge))
+    attach(("/dev/ttyS0", beside), (port, bridge))
     done = well(run("flash", *(each.format(port) for each in arguments)))
     assert f"flashing {kind} at {port}" in done.out
     assert f"{port}: {kind}, firmware 0.1.0, answers" in done.out
@@ -171,15 +173,6 @@ def test_what_is_not_clear_is_asked_and_nothing_is_written(
     attach(*ports)
     assert_one_line(run("flash", *arguments), *words)
     assert pio.arguments == []
-
-
-def test_the_one_of_that_kind_is_taken(
-    run: Run, pio: Pio, attach: Attach, pty_board: Serve
-) -> None:
-    port = pty_board(board("megaatmega2560")).path
-    attach(("/dev/ttyACM0", "uno"), (port, "megaatmega2560"))
-    assert run("flash", "megaatmega2560").code == 0
-    assert pio.arguments[-1] == port
 
 
 def failed(run: Run) -> str:

@@ -112,17 +112,6 @@ def test_rest_is_what_the_method_reads() -> None:
         Rest.of("ohm", SkinKnowledge(2, 3), "2025-03-01")
 
 
-def test_other_units_and_geometries_are_refused_unless_forced() -> None:
-    of_skin = calibration()
-    of_skin.check(7, 2, 3)
-    with pytest.raises(ValueError, match=r"of unit 7, the board is unit 8: calibrate this skin"):
-        of_skin.check(8, 2, 3)
-    with pytest.raises(ValueError, match=r"of a 2x3 skin, the board scans 3x2: calibrate this"):
-        of_skin.check(7, 3, 2)
-    of_skin.check(8, 2, 3, force=True)
-    of_skin.check(7, 3, 2, force=True)
-
-
 def cells(value: Any) -> list[list[Any]]:
     return [[value] * 3] * 2
 

@@ -73,12 +73,12 @@ def test_the_file_is_enough(tmp_path: Path) -> None:
 
 def test_another_unit_is_refused_unless_forced() -> None:
     other = of_scene("ghost", unit_id=7)
-    with pytest.raises(ValueError, match="of unit 7, the board is unit 0"):
+    with pytest.raises(ValueError, match="of unit 7, the board is unit 0: calibrate this skin"):
         ohmskin.open(GHOST, calibration=other)
     with ohmskin.open(GHOST, calibration=other, force=True) as board:
         assert len(board.latest().contacts) == 3
     for force in (False, True):
-        with pytest.raises(ValueError, match="of a 8x8 skin, the board scans 4x8"):
+        with pytest.raises(ValueError, match="of a 8x8 skin, the board scans 4x8: calibrate this"):
             ohmskin.open("emulator://4x8", calibration=of_scene("rest"), force=force)
 
 

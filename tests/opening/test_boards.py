@@ -29,7 +29,7 @@ def units(*numbers: int, rest: str = "") -> list[str]:
     return [f"emulator://8x8?unit={number}{rest}" for number in numbers]
 
 
-def test_boards_are_named_by_their_skins() -> None:
+def test_boards_are_named_by_their_skins_and_closed_together() -> None:
     with ohmskin.open_all(units(7, 3)) as skins:
         assert len(skins) == 2
         assert list(skins) == [7, 3]
@@ -38,10 +38,6 @@ def test_boards_are_named_by_their_skins() -> None:
         assert skins[7].latest().codes.shape == (8, 8, 4)
         with pytest.raises(KeyError):
             skins[1]
-
-
-def test_they_are_all_closed() -> None:
-    with ohmskin.open_all(units(1, 2)) as skins:
         devices = list(skins.values())
     for device in devices:
         with pytest.raises(DeviceLost, match=device.name.replace("?", r"\?")):
@@ -227,19 +223,17 @@ def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:
     assert largest[2] == pytest.approx(2 * largest[1], rel=0.1)
 
 
-def test_a_board_without_a_calibration_is_an_error() -> None:
-    given = [of_scene("ghost", unit_id=1), of_scene("ghost", unit_id=3)]
-    with pytest.raises(ValueError, match=r"unit=2 is unit 2, of which .* units: 1, 3"):
-        ohmskin.open_all(units(1, 2), calibrations=given)
-
-
-def test_a_calibration_of_another_size_names_the_port() -> None:
-    with pytest.raises(ValueError, match=r"emulator://4x4\?unit=1: .* 8x8 skin"):
-        ohmskin.open_all(["emulator://4x4?unit=1"], calibrations=[of_scene("ghost", unit_id=1)])
-
-
-def test_two_calibrations_of_one_unit_are_refused(tmp_path: Path) -> None:
-    one, path = of_scene("ghost", unit_id=1), tmp_path / "new.json"
-    replace(one, date="2025-04-01").save(path)
-    with pytest.raises(ValueError, match="two calibrations are of unit 1"):
-        ohmskin.open_all(units(1), calibrations=[one, path])
+@pytest.mark.parametrize(
+    ("urls", "calibrated", "words"),
+    [
+        (units(1, 2), (1, 3), r"unit=2 is unit 2, of which .* units: 1, 3"),
+        (units(1), (1, 1), "two calibrations are of unit 1"),
+        (["emulator://4x4?unit=1"], (1,), r"emulator://4x4\?unit=1: .* 8x8 skin"),
+    ],
+)
+def test_calibrations_of_other_boards_are_refused(
+    urls: list[str], calibrated: tuple[int, ...], words: str
+) -> None:
+    given = [of_scene("ghost", unit_id=unit) for unit in calibrated]
+    with pytest.raises(ValueError, match=words):
+        ohmskin.open_all(urls, calibrations=given)

@@ -11,14 +11,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import uvicorn
 
 from calibrations import half_doubtful, of_scene
-from command_line import ENVIRONMENT
+from command_line import ENVIRONMENT, Done, finish
 from ohmskin.record.recording import load_recording
 from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.server import make_app
@@ -33,33 +34,23 @@ LIMIT_MS = 15_000
 Panel = Any  # a locator of Playwright's, which is imported only where there is a browser
 
 
-class Server:
-    """``ohmskin view`` as a process; without boards until a page opens one."""
+class Server(NamedTuple):
+    folder: Path
+    url: str
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self.folder = folder
-        self.process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "ohmskin", "view"),
-                *("--http-port", "0", "--no-browser", *arguments),
-            ],
-            cwd=folder,
-            env=ENVIRONMENT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        self.url = self.process.stdout.readline().strip()
 
-    def end(self) -> tuple[int, str]:
-        self.process.send_signal(signal.SIGINT)
-        _, err = self.process.communicate(timeout=30)
-        return self.process.returncode, err
-
-    def kill(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.communicate()
+@contextmanager
+def serving(folder: Path, *arguments: str) -> Iterator[Server]:
+    """``ohmskin view`` as a process, without boards until a page opens one; Ctrl-C ends it."""
+    call = [sys.executable, "-m", "ohmskin", "view", "--http-port", "0", "--no-browser"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*call, *arguments], cwd=folder, env=ENVIRONMENT, **pipes) as process:
+        try:
+            yield Server(folder, process.stdout.readline().strip())
+            process.send_signal(signal.SIGINT)
+            assert finish(process) == Done(0, "", "")
+        finally:
+            process.kill()
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +58,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("view")
     of_scene("ghost").save(folder / "skin.json")
     half_doubtful("ghost", unit_id=7).save(folder / "doubtful.json")
-    running = Server(folder, "--calibration", "skin.json", "--calibration", "doubtful.json")
-    try:
-        yield running
-        assert running.end() == (0, "")
-    finally:
-        running.kill()
+    with serving(folder, "--calibration", "skin.json", "--calibration", "doubtful.json") as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
@@ -374,20 +361,15 @@ def test_a_page_with_a_token(browser: Any) -> None:
         listening.close()
 
 
-def test_ctrl_c_leaves_a_whole_recording(
-    browser: Any, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    running = Server(tmp_path, GHOST)
-    request.addfinalizer(running.kill)
-    page = browser.new_page()
-    request.addfinalizer(page.close)
-    page.set_default_timeout(LIMIT_MS)
-    page.goto(running.url)
-    panel = page.get_by_role("region", name=GHOST, exact=True)
-    panel.get_by_role("button", name="Record").click()
-    has_text(panel, ".file", r"[1-9]\d* scans")
-    assert running.end() == (0, "")
-    has_text(panel, ".status", "out of reach")
+def test_ctrl_c_leaves_a_whole_recording(browser: Any, tmp_path: Path) -> None:
+    with browser.new_page() as page:
+        page.set_default_timeout(LIMIT_MS)
+        with serving(tmp_path, GHOST) as server:
+            page.goto(server.url)
+            panel = page.get_by_role("region", name=GHOST, exact=True)
+            panel.get_by_role("button", name="Record").click()
+            has_text(panel, ".file", r"[1-9]\d* scans")
+        has_text(panel, ".status", "out of reach")
     (path,) = tmp_path.glob("*.mcap")
     recording = load_recording(path)
     assert not recording.cut_off
