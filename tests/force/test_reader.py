@@ -78,8 +78,8 @@ def test_another_unit_is_refused_unless_forced() -> None:
     with ohmskin.open(GHOST, calibration=other, force=True) as board:
         assert len(board.latest().contacts) == 3
     for force in (False, True):
-        with pytest.raises(ValueError, match="of a 8x8 skin, the board scans 4x8: calibrate this"):
-            ohmskin.open("emulator://4x8", calibration=of_scene("rest"), force=force)
+        with pytest.raises(ValueError, match="of a 8x8 skin, the board scans 4x16: calibrate this"):
+            ohmskin.open("emulator://4x16", calibration=of_scene("rest"), force=force)
 
 
 def test_tare_is_refused_while_something_touches_the_skin() -> None:
