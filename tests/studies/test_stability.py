@@ -8,6 +8,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import joblib
 import numpy as np
 import pytest
 
@@ -162,14 +163,8 @@ def test_frames_before_are_read_and_not_judged() -> None:
     assert [frame.afresh for frame in build("before", "none").frames] == [True, True, True]
 
 
-def test_the_results_do_not_depend_on_the_number_of_processes(rows: list[Row]) -> None:
-    two = stability.measure(tiny_tasks(), jobs=2)
-    assert stability.csv_text(two) == stability.csv_text(rows)
-
-
-def test_joblib_backend_of_the_caller_is_used(rows: list[Row]) -> None:
-    import joblib
-
+def test_the_results_do_not_depend_on_processes_or_threads(rows: list[Row]) -> None:
+    assert stability.measure(tiny_tasks(), jobs=2) == rows
     with joblib.parallel_backend("threading", n_jobs=2):
         assert stability.measure(tiny_tasks()) == rows
 

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
+from unittest.mock import AsyncMock
 from urllib.request import urlopen
 
 import anyio
@@ -603,21 +604,12 @@ def test_without_the_extra_it_says_what_to_install() -> None:
     assert_one_line(python("-c", program, "view"), "pip install 'ohmskin[view]'")
 
 
-class GoneSocket:
+def gone_socket(error: Exception) -> AsyncMock:
     """The server's end of a websocket that can be written to no more."""
-
-    def __init__(self, error: Exception) -> None:
-        self.error = error
-
-    async def accept(self) -> None:
-        pass
-
-    async def send_text(self, text: str) -> None:
-        raise self.error
-
-    async def receive(self) -> Message:
-        await anyio.sleep_forever()
-        return {}
+    socket = AsyncMock(WebSocket)
+    socket.send_text.side_effect = error
+    socket.receive.side_effect = anyio.sleep_forever
+    return socket
 
 
 @pytest.mark.parametrize("error", [WebSocketDisconnect(), WebSocketDisconnected("gone")])
@@ -627,6 +619,6 @@ def test_a_page_that_is_gone_ends_its_panel_and_hides_no_fault(
     with ViewedBoards([GHOST], folder=tmp_path) as boards:
         board = boards.get(0)
         assert board is not None
-        anyio.run(Panel(board, cast("WebSocket", GoneSocket(error))).serve)
+        anyio.run(Panel(board, gone_socket(error)).serve)
         with pytest.raises(ExceptionGroup):
-            anyio.run(Panel(board, cast("WebSocket", GoneSocket(RuntimeError("a fault")))).serve)
+            anyio.run(Panel(board, gone_socket(RuntimeError("a fault"))).serve)
