@@ -179,8 +179,7 @@ def test_hum_is_not_seen_in_noise_or_in_other_tones() -> None:
 
 def rest_of(url: str) -> RestScans:
     read = evidence(url)
-    rest = RestScans.of(read.board, read.scans)
-    return rest
+    return RestScans.of(read.board, read.scans)
 
 
 def test_noisy_lines_and_cells_are_named() -> None:

@@ -154,10 +154,10 @@ def test_an_existing_file_is_left_alone(tmp_path: Path, path: Path, hello: Hello
     ],
 )
 def test_the_record_loop(
-    tmp_path: Path, hello: Hello, limits: dict[str, Any], scans: int, tared: slice | None
+    path: Path, hello: Hello, limits: dict[str, Any], scans: int, tared: slice | None
 ) -> None:
     """Its board is configured anew after ten scans."""
-    path, board = tmp_path / "a.mcap", SimpleNamespace(info=hello)
+    board = SimpleNamespace(info=hello)
     given = [scan(n, rows=3 if n < 10 else 2) for n in range(20)]
     seen: list[int] = []
 
@@ -179,8 +179,8 @@ def test_the_record_loop(
         np.testing.assert_allclose(found.tares[0].rest_ratio, expected, rtol=1e-12)
 
 
-def test_a_closed_recording_takes_no_more(tmp_path: Path, hello: Hello) -> None:
-    recorder = Recorder(tmp_path / "a.mcap", hello)
+def test_a_closed_recording_takes_no_more(path: Path, hello: Hello) -> None:
+    recorder = Recorder(path, hello)
     recorder.close()
     recorder.close()
     with pytest.raises(RecordingError, match="closed"):
@@ -292,8 +292,7 @@ def foreign(path: Path, topic: str, content: object) -> None:
         writer.finish()
 
 
-def test_an_old_recording_does_not_say_how_long_a_slot_is(tmp_path: Path, hello: Hello) -> None:
-    path = tmp_path / "old.mcap"
+def test_an_old_recording_does_not_say_how_long_a_slot_is(path: Path, hello: Hello) -> None:
     content = {**asdict(hello), "host_time_s": 1.0}
     del content["slot_cycles"]
     readings = hello.rows * hello.columns * 4
@@ -303,17 +302,13 @@ def test_an_old_recording_does_not_say_how_long_a_slot_is(tmp_path: Path, hello:
         assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
 
 
-def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
+def test_foreign_files(tmp_path: Path, path: Path) -> None:
     path.write_bytes(b"")
-    with pytest.raises(RecordingError, match="cut off"):
-        load_recording(path)
+    assert "cut off" in outcome(path)
     path.write_bytes(os.urandom(5000))
-    with pytest.raises(RecordingError, match="no MCAP file"):
-        load_recording(path)
-    with pytest.raises(RecordingError, match="No such file"):
-        load_recording(tmp_path / "none.mcap")
-    with pytest.raises(RecordingError, match="directory"):
-        load_recording(tmp_path)
+    assert "no MCAP file" in outcome(path)
+    assert "No such file" in outcome(tmp_path / "none.mcap")
+    assert "directory" in outcome(tmp_path)
     head = {"number": 1, "time_us": 1, "host_time_s": 1, "missed": 0}
     for topic, content, reason in (
         ("/camera", {}, "no recording of a skin"),
@@ -325,9 +320,7 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
         ("/skin/scan", {**head, "rows": 10**9, "columns": 9, "codes": []}, "no 10000"),
     ):
         foreign(path, topic, content)
-        with pytest.raises(RecordingError, match=reason) as refusal:
-            load_recording(path)
-        assert str(refusal.value).startswith(str(path))
+        assert reason in outcome(path)
 
 
 class AddedMeanwhile(io.FileIO):
