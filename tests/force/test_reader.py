@@ -64,13 +64,6 @@ def test_voltage_is_a_method() -> None:
     )
 
 
-def test_the_file_is_enough(tmp_path: Path) -> None:
-    path = tmp_path / "skin.json"
-    of_scene("ghost").save(path)
-    with ohmskin.open(GHOST, calibration=path) as board:
-        assert len(board.latest().contacts) == 3
-
-
 def test_another_unit_is_refused_unless_forced() -> None:
     other = of_scene("ghost", unit_id=7)
     with pytest.raises(ValueError, match="of unit 7, the board is unit 0: calibrate this skin"):

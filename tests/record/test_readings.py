@@ -93,11 +93,6 @@ def test_frames_of_one_skin_each_are_estimated_each_afresh() -> None:
     np.testing.assert_array_equal(warm["cell_siemens"], cold["cell_siemens"])
 
 
-def test_an_unknown_method_is_refused() -> None:
-    with pytest.raises(ValueError, match="choose one of ohm"):
-        estimate_file(Readings(np.full((1, 2, 2, 4), 0.5)), "magic")
-
-
 GOOD = np.full((2, 3, 4, 4), 0.5)
 
 
