@@ -153,8 +153,9 @@ void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
 void stop_slots() {
     TCCR1B = 0;
     TIMSK1 = 0;
-    // The converter stays on, because its first conversion after that takes twice as long.
-    ADCSRA = static_cast<uint8_t>((ADCSRA & ~(_BV(ADATE) | _BV(ADIE))) | _BV(ADIF));
+    // The converter stays on, because its first conversion after that takes twice as long. ADSC
+    // would start one more, if one ends just now.
+    ADCSRA = static_cast<uint8_t>((ADCSRA & ~(_BV(ADATE) | _BV(ADSC))) | _BV(ADIF));
     pins_set(0, 0, 0);  // no current through the skin
 }
 

@@ -88,7 +88,8 @@ FOUND = {
     "8x8?noise=3": ("noise", "whole skin"),
     "8x8?hum=50": ("hum", "whole skin"),
     "8x8?hum=60&hum_lsb=1": ("hum", "whole skin"),
-    "8x8?tau_us=10": ("settling", "whole skin"),
+    # Where all cells are alike, only the drive's change leaves something to settle.
+    "8x8?tau_us=10": ("settling", "cell (0, 0)"),
     "8x8?scene=single": ("touched", "cell (4, 4)"),
     "3x1?short_rows=0,2": ("short_rows", "rows 0 and 2"),
     "2x6?short_rows=0,1": ("short_rows", "rows 0 and 1"),
@@ -104,7 +105,7 @@ FOUND = {
     "1x1?ref_top=36000": ("reference_ratio", "reference resistors"),
     "1x1?hum=50": ("hum", "whole skin"),
     "16x16?hum=60": ("hum", "whole skin"),
-    "16x16?tau_us=8": ("settling", "whole skin"),
+    "16x16?tau_us=8": ("settling", "cell (0, 0)"),
     "1x1?noise=2": ("noise", "whole skin"),
     "1x1?scene=single": ("touched", "cell (0, 0)"),
     "4x4?scene=ghost": ("touched", "cells (1, 1), (1, 2), (2, 1)"),

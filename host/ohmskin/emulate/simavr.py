@@ -58,7 +58,7 @@ class SkinSim(Closing):
         for path, made_by in ((PROGRAM, "make sim"), (elf, "make firmware")):
             if not path.is_file():
                 raise FileNotFoundError(f"{path} is missing: run '{made_by}' in a checkout")
-        options = ["--bootloader", bootloader, *(["--pty"] if pty else [])]
+        options = pty * ["--pty"] + bool(bootloader) * ["--bootloader", bootloader]
         command = [str(PROGRAM), "--board", board, *options, str(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
         pipe = subprocess.PIPE
