@@ -65,7 +65,7 @@ format: setup ## put Python and C++ sources into the common format
 	$(BIN)/ruff format
 	$(BIN)/clang-format -i $(C_FILES)
 
-firmware: setup ## build the firmware for both boards
+firmware: setup ## build the firmware for all boards
 	$(BIN)/pio run
 
 test-firmware: setup ## unit tests of the firmware: on this machine and in simulated AVRs
