@@ -21,11 +21,12 @@ $(PIO_STAMP): $(STAMP) $(shell find tools/platformio_offline -name '*.py' -o -na
 endif
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+HEX := host/ohmskin/firmware
 C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-host demo test check docs format firmware test-firmware check-firmware sim \
+.PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware check-firmware sim \
         test-host chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-force bench-view \
         bench-boards clean distclean
 
@@ -67,6 +68,13 @@ format: setup ## put Python and C++ sources into the common format
 
 firmware: setup ## build the firmware for all boards
 	$(BIN)/pio run
+
+# The copies go: a later wheel would carry an old firmware.
+wheel: firmware ## build dist/ohmskin-*.whl with the firmware of all boards, to flash without a checkout
+	mkdir -p $(HEX)
+	for board in uno nano megaatmega2560; do cp .pio/build/$$board/firmware.hex $(HEX)/$$board.hex || exit; done
+	$(BIN)/hatchling build -t wheel
+	rm -r $(HEX)
 
 test-firmware: setup ## unit tests of the firmware: on this machine and in simulated AVRs
 	$(BIN)/pio test -e native -e uno_sim -e mega_sim

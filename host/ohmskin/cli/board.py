@@ -16,14 +16,20 @@ from rich.console import Console
 from rich.table import Table
 
 import ohmskin
-from ohmskin.emulate.simavr import BOARDS
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.base import NO_WIRES, WireOhm
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import SerialPort, serial_ports
 
+# avrdude's names of chip and programmer; PlatformIO's names of the boot loaders: speed [baud].
+_BOARDS: Final = {
+    "uno": ("atmega328p", "arduino", {"uno": 115200}),
+    "nano": ("atmega328p", "arduino", {"nano": 115200, "nano_old": 57600}),
+    "megaatmega2560": ("atmega2560", "wiring", {"megaatmega2560": 115200}),
+}
 _ROOT: Final = Path(__file__).parents[3]
+_FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # in a wheel alone
 # A flashed board is in its boot loader for up to 3 s, and its port may be gone meanwhile [s].
 REBOOT_S: Final = 5.0
 _RETRY_S: Final = 0.2
@@ -134,30 +140,50 @@ def configure(
 
 
 def flash(
-    board: Annotated[str, typer.Argument(help=" | ".join(BOARDS))] = "",
+    board: Annotated[str, typer.Argument(help=" | ".join(_BOARDS))] = "",
     port: Annotated[str, typer.Option(help="serial port of the board")] = "",
 ) -> None:
-    """Build the firmware, write it to a board, and check that it answers.
+    """Write the firmware to a board, and check that it answers.
 
-    Needs a checkout and PlatformIO. Without arguments: to the one board that is attached.
+    In a checkout, PlatformIO builds it; an installed wheel has it, and needs avrdude. Without
+    arguments: to the one board that is attached.
     """
     board, port = _chosen(board, port, serial_ports())
-    if not (_ROOT / "platformio.ini").is_file():
-        raise OhmskinError("the firmware is not here: run this in a checkout of the repository")
-    pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
-    if pio is None:
-        raise OhmskinError("PlatformIO is not installed: pip install 'ohmskin[flash]'")
-    command = [pio, "run", "-d", str(_ROOT), "-e", board, "-t", "upload", "--upload-port", port]
     packages = _ROOT / ".pio" / "core"  # where `make setup` puts them
     environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
-    _out.print(f"flashing {board} at {port}", markup=False)
     before = {each.path for each in serial_ports()}
-    if subprocess.run(command, env=environment | os.environ).returncode:
-        raise OhmskinError(f"flashing {board} at {port} failed: its last lines above say why")
+    for baud, command in _uploads(board, port).items():
+        _out.print(f"flashing {board} at {port}, {baud} baud", markup=False)
+        if not subprocess.run(command, env=environment | os.environ).returncode:
+            break
+    else:
+        raise OhmskinError(f"flashing {board} at {port} failed: the lines above say why")
     found, hello = _answer(board, port, before)
-    if hello.board != board:
+    if hello.board != ("uno" if board == "nano" else board):  # the same chip, and the same wiring
         raise OhmskinError(f"{found} answers as '{hello.board}', not as {board}: flash that one")
     _out.print(f"{found}: {board}, firmware {hello.version}, answers", markup=False)
+
+
+def _uploads(board: str, port: str) -> dict[int, list[str]]:
+    """The command that writes the firmware to a board, by the speed of the boot loader [baud]."""
+    chip, programmer, loaders = _BOARDS[board]
+    if (_ROOT / "platformio.ini").is_file():
+        pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
+        if pio is None:
+            raise OhmskinError("no PlatformIO: run 'pip install .[flash]' in the checkout")
+        upload = [pio, "run", "-d", str(_ROOT), "-t", "upload", "--upload-port", port, "-e"]
+        return {baud: [*upload, name] for name, baud in loaders.items()}
+    firmware, avrdude = _FIRMWARE / f"{board}.hex", shutil.which("avrdude")
+    if not firmware.is_file():
+        raise OhmskinError("no firmware is in this package: take the wheel of 'make wheel'")
+    if avrdude is None:
+        raise OhmskinError(
+            "no avrdude: apt install avrdude, brew install avrdude, or put the Arduino IDE's on PATH"
+        )
+    config = Path(avrdude).parents[1] / "etc" / "avrdude.conf"  # the Arduino IDE's: it must be told
+    upload = [avrdude, *(["-C", str(config)] if config.is_file() else []), "-p", chip, "-D"]
+    upload += ["-c", programmer, "-P", port, "-U", f"flash:w:{firmware}:i", "-b"]
+    return {baud: [*upload, str(baud)] for baud in loaders.values()}
 
 
 def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str]:
@@ -165,25 +191,24 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
 
     :raises PortError: that is not clear.
     """
-    if board and board not in BOARDS:
-        raise PortError(f"no board '{board}': there are {', '.join(BOARDS)}")
-    meant = [each for each in attached if port in ("", each.path)]
-    fit = [each for each in meant if each.board in ((board,) if board else BOARDS)]
-    if not port and len(fit) > 1:
-        listed = ", ".join(f"{each.path} ({each.board})" for each in fit)
-        raise PortError(f"{len(fit)} boards are attached: say --port: {listed}")
+    if board and board not in _BOARDS:
+        raise PortError(f"no board '{board}': there are {', '.join(_BOARDS)}")
+    real = os.path.realpath(port)  # a link of udev's has no USB id of its own
+    meant = [each for each in attached if not port or os.path.realpath(each.path) == real]
+    if port and not meant and not os.path.exists(port):
+        raise PortError(f"no port {port}", "'ohmskin ports' lists the ports there are")
+    fit = [each for each in meant if each.board in ((board,) if board else _BOARDS)]
     if len(fit) == 1:
         return fit[0].board, fit[0].path
-    other = next((each for each in meant if each.board), None)
-    if port and other is not None:
-        raise PortError(f"{port} is a {other.board}, not a {board}: say which you mean")
-    if not (board and port):
-        listed = ", ".join(each.path for each in meant) or "there is none"
-        raise PortError(
-            f"no {board or 'known board'} is found by its USB id: say which board is where: "
-            f"ohmskin flash {' | '.join(BOARDS)} --port PORT: {listed}"
-        )
-    return board, port
+    if port and meant and meant[0].board:
+        raise PortError(f"{port} is a {meant[0].board}, not a {board}: say which you mean")
+    if board and port:
+        return board, port
+    seen = ", ".join(f"{each.path} ({each.board or each.description or '?'})" for each in meant)
+    raise PortError(
+        f"{len(fit) or 'no'} {board or 'known'} boards are found by their USB ids: say which is "
+        f"where: ohmskin flash {' | '.join(_BOARDS)} --port PORT: {seen or 'there is no port'}"
+    )
 
 
 def _answer(board: str, port: str, before: set[str]) -> tuple[str, Hello]:

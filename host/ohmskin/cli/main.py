@@ -21,7 +21,7 @@ _COMMANDS: Final = {
     "board.info": "Say what board is at PORT and how it scans.",
     "board.configure": "Change how the board scans; what is not given stays. Lasts until its "
     "reset, or --save.",
-    "board.flash": "Build the firmware, write it to a board, and check that it answers.",
+    "board.flash": "Write the firmware to a board, and check that it answers.",
     "stream.stream": "Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it.",
     "view.view": "Show skins live on a page in the browser: heat map, contacts, tare, recording.",
     "calibrate.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
