@@ -57,7 +57,10 @@ def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Pat
         *("tests/data/README.md", "docs/calibrate.md", "tools/setup.sh", "LICENSE"),
     ):
         assert needed in names
-    run(*build, "-t", "wheel", place=tmp_path / sdist.name.removesuffix(".tar.gz"))
+    source = tmp_path / sdist.name.removesuffix(".tar.gz")
+    (source / "host/ohmskin/firmware").mkdir()  # as `make wheel` does
+    (source / "host/ohmskin/firmware/uno.hex").touch()
+    run(*build, "-t", "wheel", place=source)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         packed = archive.namelist()
@@ -79,3 +82,5 @@ def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Pat
     assert "no ghost" in out
     assert "0 missed, 0 damaged" in out
     run(binaries / "python", "-c", IMPORT_ALL, place=elsewhere)
+    has_firmware = "from ohmskin.cli import board; assert (board._FIRMWARE / 'uno.hex').is_file()"
+    run(binaries / "python", "-c", has_firmware, place=elsewhere)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ohmskin flash`: which board and port it means, what it runs, and how it knows that it worked.
 
-PlatformIO is a script that writes down its arguments; the board is emulated at a pseudo-terminal.
+PlatformIO, in a checkout, and avrdude, in a wheel, are scripts that write down their arguments; the
+board is emulated at a pseudo-terminal.
 """
 
 import os
@@ -34,33 +35,39 @@ class FlashedBoard(EmulatedBoard):
         super()._send(name, tail, **values)
 
 
-class Pio:
-    """A ``pio`` that notes its arguments, then does what `upload` says, and ends with `code`."""
+class Writer:
+    """The ``pio`` or ``avrdude`` that notes its arguments, and fails at some."""
 
-    def __init__(self, place: Path) -> None:
-        self._noted = place / "noted"
-        self._script = place / "pio"
-        self.end_with(0)
+    def __init__(self, name: str, place: Path) -> None:
+        self.name, self._noted, self._script = name, place / "noted", place / name
+        self.fail_at("nothing")
 
-    def end_with(self, code: int, then: str = "") -> None:
+    def fail_at(self, pattern: str) -> None:
         self._script.write_text(
-            f"#!/bin/sh\nprintf '%s\\n' \"$@\" > {self._noted}\n"
-            f"echo core=$PLATFORMIO_CORE_DIR\n{then}\nexit {code}\n"
+            f"#!/bin/sh\nprintf '%s\\n' \"$*\" >> {self._noted}\n"
+            f'case "$*" in {pattern}) exit 1; esac\n'
         )
         self._script.chmod(0o755)
 
     @property
-    def arguments(self) -> list[str]:
+    def calls(self) -> list[str]:
         return self._noted.read_text().splitlines() if self._noted.exists() else []
 
 
-@pytest.fixture(autouse=True)
-def pio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pio:
+@pytest.fixture(autouse=True, params=["pio", "avrdude"])
+def writer(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Writer:
     place = tmp_path / "bin"
     place.mkdir()
     monkeypatch.setattr(sys, "executable", str(place / "python"))
     monkeypatch.setenv("PATH", f"{place}:/usr/bin:/bin")
-    return Pio(place)
+    if request.param == "avrdude":
+        monkeypatch.setattr(flash_command, "_ROOT", tmp_path)
+        monkeypatch.setattr(flash_command, "_FIRMWARE", tmp_path)
+        for name in ("uno", "nano", "megaatmega2560"):
+            (tmp_path / f"{name}.hex").touch()
+    return Writer(request.param, place)
 
 
 def board(says: str = "uno") -> FlashedBoard:
@@ -71,34 +78,52 @@ def board(says: str = "uno") -> FlashedBoard:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "bridge", "beside"),
+    ("arguments", "kind", "bridge", "other"),
     [
         ([], "uno", "uno", ""),
         (["uno"], "uno", "uno", ""),
         (["uno", "--port", "{}"], "uno", "uno", ""),
         (["--port", "{}"], "uno", "uno", ""),
         ([], "megaatmega2560", "megaatmega2560", ""),
+        (["megaatmega2560"], "megaatmega2560", "megaatmega2560", "uno"),
         (["uno", "--port", "{}"], "uno", "", ""),  # with another USB bridge
-        (["megaatmega2560"], "megaatmega2560", "megaatmega2560", "uno"),  # the one of that kind
+        (["nano", "--port", "{}"], "nano", "", "uno"),
     ],
 )
 def test_it_flashes_and_hears_from_the_board(
     run: Run,
-    pio: Pio,
+    writer: Writer,
     attach: Attach,
     pty_board: Serve,
+    tmp_path: Path,
     arguments: list[str],
     kind: str,
     bridge: str,
-    beside: str,
+    other: str,
 ) -> None:
-    port = pty_board(board(kind)).path
-    attach(("/dev/ttyS0", beside), (port, bridge))
+    port = pty_board(board("uno" if kind == "nano" else kind)).path
+    attach(("/dev/ttyS0", other), (port, bridge))
     done = well(run("flash", *(each.format(port) for each in arguments)))
-    assert f"flashing {kind} at {port}" in done.out
+    assert f"flashing {kind} at {port}, 115200 baud" in done.out
     assert f"{port}: {kind}, firmware 0.1.0, answers" in done.out
-    expected = ["run", "-d", str(ROOT), "-e", kind, "-t", "upload", "--upload-port", port]
-    assert pio.arguments == expected
+    # As Arduino's boards.txt has it.
+    chip = "atmega2560 -D -c wiring" if kind == "megaatmega2560" else "atmega328p -D -c arduino"
+    assert writer.calls == [
+        f"run -d {ROOT} -t upload --upload-port {port} -e {kind}"
+        if writer.name == "pio"
+        else f"-p {chip} -P {port} -U flash:w:{tmp_path}/{kind}.hex:i -b 115200"
+    ]
+
+
+def test_an_old_boot_loader_of_a_nano_is_tried_next(
+    run: Run, writer: Writer, attach: Attach, pty_board: Serve
+) -> None:
+    port = pty_board(board()).path
+    attach((port, ""))
+    writer.fail_at("*nano|*115200")
+    assert "57600 baud" in well(run("flash", "nano", "--port", port)).out
+    tried = {"pio": ["nano", "nano_old"], "avrdude": ["115200", "57600"]}[writer.name]
+    assert [call.split()[-1] for call in writer.calls] == tried
 
 
 def test_the_board_may_take_its_time_to_boot(run: Run, attach: Attach, pty_board: Serve) -> None:
@@ -108,7 +133,7 @@ def test_the_board_may_take_its_time_to_boot(run: Run, attach: Attach, pty_board
 
 
 def test_the_port_may_be_gone_for_a_while(
-    run: Run, pio: Pio, attach: Attach, pty_board: Serve, tmp_path: Path
+    run: Run, writer: Writer, attach: Attach, pty_board: Serve, tmp_path: Path
 ) -> None:
     port, link = pty_board(board()).path, tmp_path / "ttyACM0"
     attach((str(link), "uno"))
@@ -136,16 +161,21 @@ def test_the_port_may_come_back_by_another_name(
 
 UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {
     "nothing attached": ([], [], ["uno", "megaatmega2560", "--port"]),
-    "no such board": (["due"], [], ["no board 'due'", "uno, megaatmega2560"]),
+    "no such board": (["due"], [], ["no board 'due'", "uno, nano, megaatmega2560"]),
     "two boards": (
         [],
         [("/dev/ttyACM0", "uno"), ("/dev/ttyACM1", "megaatmega2560")],
-        ["2 boards", "--port", "/dev/ttyACM0 (uno)", "/dev/ttyACM1 (megaatmega2560)"],
+        ["2 known boards", "--port", "/dev/ttyACM0 (uno)", "/dev/ttyACM1 (megaatmega2560)"],
     ),
     "two of the board": (
         ["uno"],
         [("/dev/ttyACM0", "uno"), ("/dev/ttyACM1", "uno")],
-        ["2 boards", "--port", "/dev/ttyACM0", "/dev/ttyACM1"],
+        ["2 uno boards", "--port", "/dev/ttyACM0", "/dev/ttyACM1"],
+    ),
+    "no such port": (
+        ["uno", "--port", "/dev/ttyACM9"],
+        [("/dev/ttyACM0", "uno")],
+        ["no port /dev/ttyACM9", "ohmskin ports"],
     ),
     "the other board": (
         ["uno", "--port", "/dev/ttyACM1"],
@@ -155,24 +185,24 @@ UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {
     "only an unknown bridge": (
         ["uno"],
         [("/dev/ttyUSB0", ""), ("/dev/ttyUSB1", "")],
-        ["no uno is found", "--port", "/dev/ttyUSB0, /dev/ttyUSB1"],
+        ["no uno boards", "--port", "/dev/ttyUSB0 (?), /dev/ttyUSB1 (?)"],
     ),
     "an unknown bridge, no board": (
         ["--port", "/dev/ttyUSB0"],
         [("/dev/ttyUSB0", "")],
-        ["/dev/ttyUSB0", "say which board is", "uno | megaatmega2560"],
+        ["/dev/ttyUSB0", "say which is where", "uno | nano | megaatmega2560"],
     ),
 }
 
 
 @pytest.mark.parametrize("what", UNCLEAR)
 def test_what_is_not_clear_is_asked_and_nothing_is_written(
-    what: str, run: Run, pio: Pio, attach: Attach
+    what: str, run: Run, writer: Writer, attach: Attach
 ) -> None:
     arguments, ports, words = UNCLEAR[what]
     attach(*ports)
     assert_one_line(run("flash", *arguments), *words)
-    assert pio.arguments == []
+    assert writer.calls == []
 
 
 def failed(run: Run) -> str:
@@ -183,9 +213,9 @@ def failed(run: Run) -> str:
     return done.err
 
 
-def test_a_failed_upload_is_said(run: Run, pio: Pio, attach: Attach) -> None:
+def test_a_failed_upload_is_said(run: Run, writer: Writer, attach: Attach) -> None:
     attach(("/dev/ttyACM0", "uno"))
-    pio.end_with(1)
+    writer.fail_at("*")
     assert "flashing uno at /dev/ttyACM0 failed" in failed(run)
 
 
@@ -210,18 +240,31 @@ def test_another_board_at_the_port_is_said(run: Run, attach: Attach, pty_board: 
     assert "answers as 'megaatmega2560', not as uno" in failed(run)
 
 
-def test_without_platformio_it_says_how_to_get_it(
-    run: Run, attach: Attach, monkeypatch: pytest.MonkeyPatch
+def test_a_link_to_another_board_is_seen(run: Run, attach: Attach, tmp_path: Path) -> None:
+    attach((str(tmp_path / "ttyACM0"), "megaatmega2560"))
+    (tmp_path / "skin").symlink_to(tmp_path / "ttyACM0")
+    assert_one_line(run("flash", "nano", "--port", str(tmp_path / "skin")), "is a megaatmega2560")
+
+
+def test_what_is_missing_is_said_and_how_to_get_it(
+    run: Run, writer: Writer, attach: Attach, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attach(("/dev/ttyACM0", "uno"))
     monkeypatch.setenv("PATH", os.devnull)
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    assert_one_line(run("flash"), "pip install 'ohmskin[flash]'")
+    avrdude = ["apt install avrdude", "brew install avrdude", "the Arduino IDE's"]
+    assert_one_line(run("flash"), *(["pip install"] if writer.name == "pio" else avrdude))
+    for place in ("_ROOT", "_FIRMWARE"):
+        monkeypatch.setattr(flash_command, place, Path("/nowhere"))
+    assert_one_line(run("flash"), "no firmware", "make wheel")
 
 
-def test_without_a_checkout_it_says_so(
-    run: Run, attach: Attach, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_the_arduino_ides_avrdude_is_told_its_configuration(
+    run: Run, writer: Writer, attach: Attach, pty_board: Serve, tmp_path: Path
 ) -> None:
-    attach(("/dev/ttyACM0", "uno"))
-    monkeypatch.setattr(flash_command, "_ROOT", tmp_path)
-    assert_one_line(run("flash"), "run this in a checkout")
+    attach((pty_board(board()).path, "uno"))
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "etc" / "avrdude.conf").touch()
+    well(run("flash"))
+    told = writer.calls[0].startswith(f"-C {tmp_path}/etc/avrdude.conf -p ")
+    assert told == (writer.name == "avrdude")
