@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ohmskin flash`: which board and port it means, what it runs, and how it knows that it worked.
 
-PlatformIO, in a checkout, and avrdude, in a wheel, are scripts that write down their arguments; the
-board is emulated at a pseudo-terminal.
+PlatformIO and avrdude are scripts that note their arguments; the board is at a pseudo-terminal.
 """
 
 import os
