@@ -22,11 +22,11 @@ from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import SerialPort, serial_ports
 
-# avrdude's names of chip and programmer; PlatformIO's names of the boot loaders: speed [baud].
+# avrdude's options, and the boot loaders: PlatformIO's name, speed [baud]. An attempt takes 5 s.
 _BOARDS: Final = {
-    "uno": ("atmega328p", "arduino", {"uno": 115200}),
-    "nano": ("atmega328p", "arduino", {"nano": 115200, "nano_old": 57600}),
-    "megaatmega2560": ("atmega2560", "wiring", {"megaatmega2560": 115200}),
+    "uno": ("-p atmega328p -c arduino", {"uno": 115200}),
+    "nano": ("-p atmega328p -c arduino -x attempts=2", {"nano": 115200, "nano_old": 57600}),
+    "megaatmega2560": ("-p atmega2560 -c wiring", {"megaatmega2560": 115200}),
 }
 _ROOT: Final = Path(__file__).parents[3]
 _FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # in a wheel alone
@@ -166,7 +166,7 @@ def flash(
 
 def _uploads(board: str, port: str) -> dict[int, list[str]]:
     """The command that writes the firmware to a board, by the speed of the boot loader [baud]."""
-    chip, programmer, loaders = _BOARDS[board]
+    options, loaders = _BOARDS[board]
     if (_ROOT / "platformio.ini").is_file():
         pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
         if pio is None:
@@ -178,11 +178,11 @@ def _uploads(board: str, port: str) -> dict[int, list[str]]:
         raise OhmskinError("no firmware is in this package: take the wheel of 'make wheel'")
     if avrdude is None:
         raise OhmskinError(
-            "no avrdude: apt install avrdude, brew install avrdude, or put the Arduino IDE's on PATH"
+            "no avrdude: apt install avrdude, brew install avrdude, or the Arduino IDE's on PATH"
         )
     config = Path(avrdude).parents[1] / "etc" / "avrdude.conf"  # the Arduino IDE's: it must be told
-    upload = [avrdude, *(["-C", str(config)] if config.is_file() else []), "-p", chip, "-D"]
-    upload += ["-c", programmer, "-P", port, "-U", f"flash:w:{firmware}:i", "-b"]
+    upload = [avrdude, *(["-C", str(config)] if config.is_file() else []), *options.split()]
+    upload += ["-D", "-P", port, "-U", f"flash:w:{firmware}:i", "-b"]
     return {baud: [*upload, str(baud)] for baud in loaders.values()}
 
 
