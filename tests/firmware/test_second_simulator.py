@@ -40,6 +40,12 @@ def rig(request: pytest.FixtureRequest, rng: np.random.Generator) -> Iterator[Ri
         yield rig
 
 
+@pytest.mark.simavr  # for the built firmware
+def test_a_nano_gets_what_an_uno_gets() -> None:
+    uno, nano = (elf_of(each).with_suffix(".hex").read_bytes() for each in ("uno", "nano"))
+    assert uno == nano
+
+
 @pytest.mark.parametrize("rate_mhz", [90_000, 120_000, 0])
 def test_codes_times_and_settling(rig: Rig, rng: np.random.Generator, rate_mhz: int) -> None:
     """Circuits that change; their references differ, so no two configurations read alike."""

@@ -170,7 +170,7 @@ def _uploads(board: str, port: str) -> dict[int, list[str]]:
     if (_ROOT / "platformio.ini").is_file():
         pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
         if pio is None:
-            raise OhmskinError("no PlatformIO: run 'pip install .[flash]' in the checkout")
+            raise OhmskinError("no PlatformIO: run pip install '.[flash]' in the checkout")
         upload = [pio, "run", "-d", str(_ROOT), "-t", "upload", "--upload-port", port, "-e"]
         return {baud: [*upload, name] for name, baud in loaders.items()}
     firmware, avrdude = _FIRMWARE / f"{board}.hex", shutil.which("avrdude")
