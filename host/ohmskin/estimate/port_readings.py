@@ -108,10 +108,10 @@ class PortReader:
         """Currents of checked readings (R, C, 4), and what is wrong with them."""
         current = current_from_ratio(ratio, *self._ref_ohm)
         residual = ratio - ratio_from_current(current, *self._ref_ohm)
-        for pair in ((0, 3), (1, 2)):
-            # Currents do not show a node's offset: its two readings have it with opposite signs.
-            offset = np.median(residual[..., pair].mean(axis=2))
-            residual[..., pair] -= np.clip(offset, -MOST_OFFSET, MOST_OFFSET)
+        # Currents do not show a node's offset: its two readings, A and D, B and C, have it alike.
+        both = 0.5 * (residual[..., :2] + residual[..., :1:-1]).reshape(-1, 2)
+        offset = np.partition(both, len(both) // 2, axis=0)[len(both) // 2, [0, 1, 1, 0]]
+        residual -= np.minimum(np.maximum(offset, -MOST_OFFSET), MOST_OFFSET)
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])

@@ -3,7 +3,6 @@
 
 import errno
 import os
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
@@ -64,10 +63,8 @@ class SerialLink:
             )
         except (serial.SerialException, OSError, ValueError) as exc:
             raise PortError(*_explain(path, exc)) from exc
-        # Its line DTR does that. A pseudo-terminal has no such lines.
-        self.resets_board = False
-        with suppress(OSError):
-            self.resets_board = self._port.dsr is not None
+        # Its line DTR does that; a pseudo-terminal has no such lines.
+        self.resets_board = not os.path.realpath(path).startswith("/dev/pts/")
 
     def read(self) -> bytes:
         """See `Link.read`: waits for one byte, then takes all there are."""
