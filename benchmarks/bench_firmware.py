@@ -22,6 +22,16 @@ cpu_percent           cycles in which the main loop found nothing to do are idle
                       interrupts included. cpu_percent_max: with the shortest slots.
 settle_us_min_max     as settle_us_min, at rate 0.
 lost_scans, ...       of all runs together.
+wrong_late_converter  readings that came and are wrong where conversions take 1 to 32 cycles longer
+                      than the data sheet says, at 90 Hz and with the shortest slots of each ADC
+                      clock; a scan that is dropped and counted is right.
+capacitor_error_lsb_90hz, capacitor_error_lsb_max_rate
+                      largest error of a reading by 14 pF of sample capacitor and 100 pF at a node
+                      of 30 kOhm, after a reading of the scale's other end, at 90 Hz and rate 0.
+lines_error_lsb_90hz  error of a cell's current, rms over the skin: three corners at 5 kOhm, 30 pF a
+                      line, charged through the cells; _100pf: with 100 pF.
+opens_s               time to open a board (Uno, old Nano; Mega) behind its real boot loader, in real
+                      time, that is reset 0 to 1.8 s after its port was opened: the longest.
 wrong_second_simulator, readings_second_simulator
                       the same as wrong and readings, in avr8js (firmware/second_sim), 8x8: a third
                       each at 90 Hz, 120 Hz and rate 0.
@@ -38,6 +48,7 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -48,10 +59,26 @@ from typing import Any
 import numpy as np
 
 from lockstep import BOARDS, CPU_HZ, Rig, elf_of
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import READING_SIGN, Skin, electrode_admittance
+from ohmskin.circuit.skin import readings as readings_of
+from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.link import protocol
+from ohmskin.link.session import Session
 from second_simulator import SecondSim
 
 READINGS_WANTED = 1_000_000
+ADC_CLOCKS = ("clock_500khz", "clock_250khz", "clock_125khz")
+# Three of a rectangle's corners at 5 kOhm, the rest at 1 MOhm, no wires.
+_CELLS = np.full((8, 8), 1e-6)
+_CELLS[[2, 2, 5], [2, 5, 2]] = 1 / 5e3
+THREE_CORNERS = Skin(_CELLS, np.zeros((8, 8)), np.zeros((8, 8)))
+# Boards, and boot loaders that they are sold with: the second is an old Nano's.
+_OLD_NANO = (
+    "/usr/share/arduino/hardware/arduino/avr/bootloaders/atmega/ATmegaBOOT_168_atmega328.hex"
+)
+LOADERS = (("uno", "board"), ("uno", _OLD_NANO), ("megaatmega2560", "board"))
 READINGS_WANTED_SECOND = 20_000
 
 
@@ -132,6 +159,80 @@ def _measure_second(board: str, rng: np.random.Generator) -> dict[str, int]:
     return {"wrong_second_simulator": wrong, "readings_second_simulator": readings}
 
 
+def _measure_late(board: str, rng: np.random.Generator) -> dict[str, int]:
+    """Readings where conversions take longer than the data sheet says, and how many are wrong."""
+    readings = wrong = 0
+    scans = [{"rate_mhz": 0, "settle_us": 1, "adc_prescaler": clock} for clock in ADC_CLOCKS]
+    for scan in [{"rate_mhz": 90_000}, *scans]:
+        for late in (1, 2, 8, 32):
+            with Rig(board) as rig:
+                rig.run(0.05)
+                rig.randomize(rng)
+                codes = rig._tables[-1][:8, :8]
+                rig.sim.set(late_cycles=late)
+                rig.start_scan(**scan)
+                rig.run(0.2)
+                readings += sum(each.codes.size for each in rig.scans)
+                wrong += sum(int((each.codes != codes).sum()) for each in rig.scans)
+    return {"wrong_late_converter": wrong, "readings_late_converter": readings}
+
+
+def _errors_lsb(board: str, ratio: Float, scan: dict[str, int], **settings: float) -> Float:
+    """Codes of an 8x8 skin with these settings of the simulator, less those without [LSB]."""
+    codes = []
+    for each in ({}, settings):
+        with Rig(board) as rig:
+            rig.sim.set_table(ratio)
+            rig.sim.set(**each)
+            if "line_pf" in each:
+                siemens = electrode_admittance(THREE_CORNERS)
+                rig.sim.request("C", bytes([8]) + siemens.tobytes())
+            rig.run(0.05)
+            rig.start_scan(**scan)
+            rig.run(0.15)
+            codes.append(rig.scans[-1].codes.astype(int))
+    return codes[1] - codes[0]
+
+
+def _measure_nodes(board: str) -> dict[str, float]:
+    """What the sample capacitor and the lines' capacitances do to readings [LSB]."""
+    opposite = np.tile([1.0, 0.0, 1.0, 0.0], (16, 16, 1))
+    found = {}
+    for name, rate_mhz in (("90hz", 90_000), ("max_rate", 0)):
+        error = _errors_lsb(board, opposite, {"rate_mhz": rate_mhz}, sample_pf=14, node_pf=100)
+        found[f"capacitor_error_lsb_{name}"] = float(np.abs(error).max())
+    for name, line_pf in (("", 30), ("_100pf", 100)):
+        lines = {"line_pf": line_pf, "cell_pf": 2, "node_pf": 50}
+        error = _errors_lsb(board, readings_of(THREE_CORNERS), {}, **lines)
+        current = (error * READING_SIGN).mean(axis=2)
+        found[f"lines_error_lsb_90hz{name}"] = round(float(np.sqrt((current**2).mean())), 2)
+    return found
+
+
+def _opens_s(board: str, loader: str, reset_s: float) -> float:
+    """Time to open a board behind its boot loader that is reset so long after its port is [s]."""
+    link = SimavrLink(board, Scene(), settings={"bootloader": loader})
+    reset = threading.Timer(reset_s, link.sim.request, ["X"])
+    started_s = time.monotonic()
+    reset.start()
+    try:
+        Session(link).close()
+    finally:
+        reset.cancel()
+    return time.monotonic() - started_s
+
+
+def measure_opening() -> dict[str, float]:
+    """The longest time to open a board [s], in real time: by board, the Nano among the Unos."""
+    phases = [(board, loader, 0.2 * n) for board, loader in LOADERS for n in range(10)]
+    found: dict[str, float] = {}
+    for board, loader, reset_s in phases:
+        print(f"{board}: opening, reset after {reset_s:.1f} s", file=sys.stderr, flush=True)
+        taken_s = round(_opens_s(board, loader, reset_s), 2)
+        found[board] = max(found.get(board, 0.0), taken_s)
+    return found
+
+
 def measure(board: str) -> dict[str, Any]:
     """All figures of one board, as the JSON line has them."""
     rng = np.random.default_rng(BOARDS.index(board))
@@ -148,7 +249,7 @@ def measure(board: str) -> dict[str, Any]:
         large = _measure_run(rig, rng, READINGS_WANTED // 5, "rate 0, 16x16")
         rig.start_scan(rate_mhz=0, settle_us=1)
         shortest = _measure_run(rig, rng, READINGS_WANTED, "shortest slots")
-    second = _measure_second(board, rng)
+    second = _measure_second(board, rng) | _measure_late(board, rng) | _measure_nodes(board)
     flash, ram = _sizes(elf_of(board))
     runs = (normal, fastest, large, shortest)
     return {
@@ -205,6 +306,12 @@ BARS = (
     Bar("readings_second_simulator", ">= 20,000", lambda x: x >= READINGS_WANTED_SECOND),
     Bar("settle_us_min", ">= 20", lambda x: x >= 20),
     Bar("settle_us_min_max", ">= 20", lambda x: x >= 20),
+    Bar("wrong_late_converter", "0", lambda x: x == 0),
+    Bar("capacitor_error_lsb_90hz", "<= 0.5", lambda x: x <= 0.5),
+    Bar("capacitor_error_lsb_max_rate", "<= 0.5", lambda x: x <= 0.5),
+    Bar("lines_error_lsb_90hz", "<= 1.2", lambda x: x <= 1.2),
+    Bar("lines_error_lsb_90hz_100pf", "<= 6", lambda x: x <= 6),
+    Bar("opens_s", "<= 8", lambda x: x <= 8),
     Bar("lost_scans", "0", lambda x: x == 0),
     Bar("damaged_frames", "0", lambda x: x == 0),
     Bar("unanswered_commands", "0", lambda x: x == 0),
@@ -232,6 +339,8 @@ def report(figures: dict[str, dict[str, Any]]) -> bool:
 def main() -> int:
     with ProcessPoolExecutor(len(BOARDS)) as pool:
         figures = dict(zip(BOARDS, pool.map(measure, BOARDS), strict=True))
+    for board, opens_s in measure_opening().items():
+        figures[board]["opens_s"] = opens_s
     all_met = report(figures)
     print(json.dumps(figures))
     return 0 if all_met else 1

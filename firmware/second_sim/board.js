@@ -202,6 +202,10 @@ class Board {
     stats() {
         return { cycles: this.cpu.cycles, ...this.counters };
     }
+
+    restartCounters() {
+        for (const name in this.counters) if (name !== "resets") this.counters[name] = 0;
+    }
 }
 
 // When the counter reached compare B: avr8js notices after an instruction of several cycles.

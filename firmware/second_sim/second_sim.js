@@ -52,6 +52,7 @@ const OPERATIONS = {
     T: (board, content) => {
         board.table.forEach((_, i) => (board.table[i] = content.readDoubleLE(8 * i)));
     },
+    Z: (board) => board.restartCounters(),
     S: (board) => Buffer.from(JSON.stringify(board.stats())),
     L: (board, content) => holdLog(board, content[0]),
     E: (board) => Buffer.from(board.eeprom.memory),

@@ -8,12 +8,13 @@ import pytest
 
 from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import Scene
+from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
 from ohmskin.record.readings import estimate_file
 from skins import reference, ten_bits, told
-from studies.trials import bent_trial, random_trial, skin_at_rest, touch, trial_of
+from studies.trials import bent_trial, finger_trial, random_trial, skin_at_rest, touch, trial_of
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 1), (4, 5), (8, 8)])
@@ -185,6 +186,21 @@ def test_a_fingertip_on_a_skin_whose_wires_nobody_knows(method: str) -> None:
     assert np.median(error / truth[pressed]) < 0.025
     assert np.quantile(error / truth[pressed], 0.9) < 0.07
     assert np.mean(error < 4 * out["cell_siemens_std"][pressed]) > 0.99
+
+
+@pytest.mark.parametrize("seed", [1, 3, 7])
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_two_fingertips_over_much_of_a_skin_whose_wires_nobody_knows(
+    method: str, seed: int
+) -> None:
+    """With rest more likely than a touch, long wires and few hard touches gave up to 1.5."""
+    trial = finger_trial(8, 8, 20, 2000 + seed)
+    assert trial.pressed.mean() > 0.3
+    knowledge = replace(trial.rounded(10).knowledge(0), nominal_wire_ohm=NO_WIRES)
+    estimator, rest = make_estimator(method, knowledge), trial.rest.cell_siemens
+    for ratio, truth in zip(trial.rounded(10).ratio, trial.cell_siemens, strict=True):
+        found = estimator.estimate(ratio).cell_siemens
+        assert (found - rest).sum() / (truth - rest).sum() == pytest.approx(1, abs=0.1)
 
 
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
