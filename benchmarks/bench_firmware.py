@@ -30,8 +30,8 @@ capacitor_error_lsb_90hz, capacitor_error_lsb_max_rate
                       of 30 kOhm, after a reading of the scale's other end, at 90 Hz and rate 0.
 lines_error_lsb_90hz  error of a cell's current, rms over the skin: three corners at 5 kOhm, 30 pF a
                       line, charged through the cells; _100pf: with 100 pF.
-opens_s               time to open a board (Uno, old Nano; Mega) behind its real boot loader, in real
-                      time, that is reset 0 to 1.8 s after its port was opened: the longest.
+opens_s               longest time to open a board (Uno, old Nano; Mega) behind its real boot loader
+                      that is reset 0 to 1.8 s after its port was opened, in real time.
 wrong_second_simulator, readings_second_simulator
                       the same as wrong and readings, in avr8js (firmware/second_sim), 8x8: a third
                       each at 90 Hz, 120 Hz and rate 0.
@@ -178,9 +178,13 @@ def _measure_late(board: str, rng: np.random.Generator) -> dict[str, int]:
 
 
 def _errors_lsb(board: str, ratio: Float, scan: dict[str, int], **settings: float) -> Float:
-    """Codes of an 8x8 skin with these settings of the simulator, less those without [LSB]."""
+    """Codes of an 8x8 skin with these settings of the simulator, less those without [LSB].
+
+    Means over a second: with noise, steps of codes average out.
+    """
     codes = []
-    for each in ({}, settings):
+    noise = {name: settings[name] for name in {"noise_lsb"} & settings.keys()}
+    for each in (noise, settings):
         with Rig(board) as rig:
             rig.sim.set_table(ratio)
             rig.sim.set(**each)
@@ -189,9 +193,9 @@ def _errors_lsb(board: str, ratio: Float, scan: dict[str, int], **settings: floa
                 rig.sim.request("C", bytes([8]) + siemens.tobytes())
             rig.run(0.05)
             rig.start_scan(**scan)
-            rig.run(0.15)
-            codes.append(rig.scans[-1].codes.astype(int))
-    return codes[1] - codes[0]
+            rig.run(1.0)
+            codes.append(np.mean([scan.codes for scan in rig.scans[2:]], axis=0))
+    return np.asarray(codes[1] - codes[0])
 
 
 def _measure_nodes(board: str) -> dict[str, float]:
@@ -202,7 +206,7 @@ def _measure_nodes(board: str) -> dict[str, float]:
         error = _errors_lsb(board, opposite, {"rate_mhz": rate_mhz}, sample_pf=14, node_pf=100)
         found[f"capacitor_error_lsb_{name}"] = float(np.abs(error).max())
     for name, line_pf in (("", 30), ("_100pf", 100)):
-        lines = {"line_pf": line_pf, "cell_pf": 2, "node_pf": 50}
+        lines = {"line_pf": line_pf, "cell_pf": 2, "node_pf": 50, "noise_lsb": 0.5}
         error = _errors_lsb(board, readings_of(THREE_CORNERS), {}, **lines)
         current = (error * READING_SIGN).mean(axis=2)
         found[f"lines_error_lsb_90hz{name}"] = round(float(np.sqrt((current**2).mean())), 2)
