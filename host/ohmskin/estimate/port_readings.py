@@ -115,7 +115,7 @@ class PortReader:
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
-        own, rounding = square / _DEGREES, self._ratio_std**2
+        own, rounding = square / (_DEGREES - 2.0 / square.size), self._ratio_std**2
         most = _MOST_USUAL * max(rounding, typical / _DEGREES)
         usual = float(own[own <= most].mean())
         alike = max(0.0, 1.0 - usual / (2.0 * rounding)) * self._current_std**2
