@@ -76,3 +76,10 @@ def test_ctrl_c_during_an_import_is_ctrl_c_and_no_error_of_the_import() -> None:
         import_something()
     with pytest.raises(SystemExit, match="130"):
         run(import_something, "ohmskin")
+
+
+def test_ctrl_c_that_was_handled_does_not_end_the_process_as_a_signal() -> None:
+    """Python remembers one that falls into an executed text, as of a dataclass."""
+    handled = "try: exec('raise KeyboardInterrupt')\nexcept KeyboardInterrupt: pass\n"
+    program = f"from ohmskin.cli import main\nmain.run = lambda *_: exec({handled!r})\nmain.main()"
+    assert python("-c", program).code == 0

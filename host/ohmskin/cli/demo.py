@@ -26,8 +26,6 @@ from ohmskin.opening import emulated
 
 _URL: Final = "emulator://8x8?scene=ghost&seed=1"
 _METHODS: Final = ("ohm", "joint")
-# Where nothing says how wide the output is, three tables stand side by side [characters].
-_WIDTH: Final = 160
 _out = Console()
 
 EPILOGS: Final = {
@@ -63,7 +61,7 @@ def demo(
         for method, estimate in zip(_METHODS, found[-1], strict=True)
     ]
     title = f"scene '{scene.name}', simulated {board.rows}x{board.columns} skin"
-    out = _out if _out.is_terminal else Console(width=_WIDTH)
+    out = _out if _out.is_terminal else Console(width=160)  # three tables side by side
     out.print(f"{title}: cell conductance in microsiemens")
     out.print(Columns([conductances(cell_siemens, name) for name, cell_siemens, _ in views]))
     for (name, _, touched), estimates in zip(views[1:], zip(*found, strict=True), strict=True):

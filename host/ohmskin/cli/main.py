@@ -5,6 +5,7 @@ A command's module is imported when the command is run, or asked for its help.
 """
 
 import sys
+from collections import namedtuple
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final
@@ -78,7 +79,12 @@ app = TyperGroup(
 
 def main() -> None:
     """Run the command line; the process's exit code says how it went."""
-    run(app, "ohmskin")
+    try:
+        run(app, "ohmskin")
+    finally:
+        # Ctrl-C that falls into a text that is executed, such as a dataclass's, ends Python as a
+        # signal does, handled or not, unless one more such text comes after it.
+        namedtuple("Cleared", "")
 
 
 def run(commands: Callable[..., Any], program: str) -> None:

@@ -37,8 +37,6 @@ KNOWN_N: Final = 0.1
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 # Time between two pictures in a terminal [s]; every scan is counted all the same.
 DISPLAY_EVERY_S: Final = 0.1
-# What is printed of a contact.
-_OF_CONTACT: Final = ("identity", "row", "column", "force_n", "force_n_std")
 
 
 def stream(
@@ -116,9 +114,10 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
             if reader.has_forces:
                 line["force_n"] = _numbers(found.force_n)
                 line["force_n_std"] = _numbers(found.force_n_std)
+                of_contact = ("identity", "row", "column", "force_n", "force_n_std")
                 line["contacts"] = [
-                    {name: _numbers(getattr(contact, name)) for name in _OF_CONTACT}
-                    for contact in found.contacts
+                    {name: _numbers(getattr(each, name)) for name in of_contact}
+                    for each in found.contacts
                 ]
         try:
             print(json.dumps(line), flush=True)  # noqa: T201

@@ -15,10 +15,8 @@ _WHERE: Final = {
     "touch": ("joint", "TouchEstimator"),
     "voltage": ("ohm", "VoltageEstimator"),
 }
-# Its levels are no conductances.
-VOLTAGE: Final = "voltage"
-# All that a force can be read by.
-LEVEL_METHODS: Final = tuple(_WHERE)
+VOLTAGE: Final = "voltage"  # its levels are no conductances
+LEVEL_METHODS: Final = tuple(_WHERE)  # all that a force can be read by
 # All that estimate conductances of their own.
 METHODS: Final = tuple(name for name in LEVEL_METHODS if name != VOLTAGE)
 
