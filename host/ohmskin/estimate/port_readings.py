@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame's readings to one current per port, and what no touches can make of a skin.
 
-Symbols: y (R, C, 4) readings, s their standard deviation; I, I_rest (R, C) port currents per Vdd,
-of this frame and of the rest readings, and s_I theirs [S].
+Symbols: y (R, C, 4) readings, s their standard deviation; o the offset of each sense node, median
+of its cells; I, I_rest (R, C) port currents per Vdd, now and at rest, and s_I theirs [S].
 
-    v_cell = sum_k (y_k - y_k(I))^2 / 3       one current, four readings; v is the usual cell's
+    v_cell = sum_k (y_k - o_k - y_k(I))^2 / (3 - 2 / RC)      v is that of the usual cell
     s_I^2 = max(v_cell, v) / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2
 
 Without noise, the four readings of a cell round alike: they agree, and their mean is no better than
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 _DEGREES: Final = READINGS_PER_CELL - 1
 # Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
 _MOST_USUAL: Final = 9.0
-MOST_OFFSET: Final = 0.008  # of a sense node, ratio to Vdd: a larger one is a fault
+MOST_OFFSET: Final = 0.008  # of a sense node, ratio to Vdd: what is above it counts as noise
 # Disagreement of a cell's readings, root of its mean square, ratio to Vdd: of most cells, of one.
 DISAGREE_ALL: Final = 0.016
 DISAGREE_ONE: Final = 0.03
