@@ -157,20 +157,34 @@ def jump_trial(rows: int, columns: int, touches: int, frames: int, seed: int) ->
     return trial_of(trial.rest, jumped)
 
 
-def finger_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
-    """Soft fingertips that move in circles: one on skins of an even seed, else two."""
+def finger_trial(
+    rows: int,
+    columns: int,
+    frames: int,
+    seed: int,
+    *,
+    sigma_cells: tuple[float, float] = (FINGER_CELLS, FINGER_CELLS),
+    peak_siemens: tuple[float, float] = FINGER_SIEMENS,
+    wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+) -> Trial:
+    """Soft fingertips that move in circles: one on skins of an even seed, else two.
+
+    sigma_cells, peak_siemens: least and most of each fingertip. wire_ohm: a segment of each layer.
+    """
     random = np.random.default_rng(seed)
-    rest = skin_at_rest(rows, columns, random)
+    rest = skin_at_rest(rows, columns, random, wire_ohm=wire_ohm)
     row, column = np.indices((rows, columns))
     cells = np.repeat(rest.cell_siemens[None], frames, axis=0)
     for _ in range(1 + seed % 2):
-        peak = np.exp(random.uniform(*np.log(FINGER_SIEMENS)))
+        peak = np.exp(random.uniform(*np.log(peak_siemens)))
         middle = random.uniform(0.3, 0.7, 2) * (rows - 1, columns - 1)
         radius = random.uniform(0.1, 0.3) * (min(rows, columns) - 1)
         start = random.uniform(0, 2 * np.pi)
+        low, high = sigma_cells
+        sigma = random.uniform(low, high) if low < high else low
         for number, cell in enumerate(cells):
             angle = start + 2 * np.pi * number / FINGER_FRAMES
             away = (row - middle[0] - radius * np.cos(angle)) ** 2
             away = away + (column - middle[1] - radius * np.sin(angle)) ** 2
-            cell += peak * np.exp(-away / (2 * FINGER_CELLS**2))
+            cell += peak * np.exp(-away / (2 * sigma**2))
     return trial_of(rest, [replace(rest, cell_siemens=cell) for cell in cells])

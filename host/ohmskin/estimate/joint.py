@@ -85,13 +85,11 @@ class JointEstimator(Estimator):
         if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)
         start = self._start(prior, ports, touches)
-        crowd = CROWDED * start.size
-        unsure = prior.touches(start) > crowd and self._belief.is_vague()
-        expected = prior.unsure() if unsure else prior
+        expected = prior.unsure() if prior.is_soft(start, self._shape) else prior
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.cell)
         message = self._doubt(expected, fit)
-        if not (ports.fault or message or self._touches > crowd):
+        if not (ports.fault or message or self._touches > CROWDED * start.size):
             self._learn(fit)
         return self._solution(ports, fit, message)
 

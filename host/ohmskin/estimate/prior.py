@@ -46,7 +46,10 @@ HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
 UNLIMITED_STD: Final = 3.0  # what is not known of such a cell
 HIDDEN: Final = 0.3  # a rise that must not go unnoticed
-CROWDED: Final = 0.3  # share of touched cells: above it, rest is no more likely than a touch
+# Under soft fingertips rest is no more likely than a touch: above this share of touched cells, where
+# the rises of neighbours correlate by more than this.
+CROWDED: Final = 0.3
+SOFT: Final = 0.5
 
 UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
 UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a factor of two
@@ -85,6 +88,17 @@ class CellPrior:
     def touches(self, log_ohm: Float) -> int:
         """Number of touched cells."""
         return int(np.count_nonzero(self.rise(log_ohm) > TOUCHED))
+
+    def is_soft(self, log_ohm: Float, shape: tuple[int, int]) -> bool:
+        """Whether cells (RC,) rise as under soft fingertips: many of them, neighbours alike.
+
+        Differences of neighbours have 2 (1 - c) times the variance of single cells, c their
+        correlation.
+        """
+        rise = (self.expected - log_ohm).reshape(shape)
+        apart = np.concatenate([np.diff(rise, axis=axis).ravel() for axis in (0, 1)])
+        alike = apart @ apart < 2.0 * (1.0 - SOFT) * rise.var() * apart.size
+        return bool(alike and self.touches(log_ohm) > CROWDED * log_ohm.size)
 
     def unsure(self) -> "CellPrior":
         """What is expected where rest is no more likely: any cell, of the level at rest."""
@@ -151,10 +165,6 @@ class WireBelief:
     def std(self) -> float:
         """Standard deviation of the log of the layer that is known less."""
         return float(np.linalg.norm(self._root, axis=1).max())
-
-    def is_vague(self) -> bool:
-        """Whether the wires are hardly better known than if nothing was told of them."""
-        return self.std() > 0.5 * (LAYER_STD + UNKNOWN_LAYER_STD)
 
     def learned(self) -> tuple[float, float, float]:
         """A `WireOhm`: mean segments of the layers [ohm], deviation of the log of both together."""
