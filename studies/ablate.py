@@ -64,6 +64,7 @@ OFF: Final[dict[str, float]] = {
     "prior.REACH": 1e-3,
     "prior.CLOSE": 1e-3,
     "prior.CROWDED": np.inf,
+    "prior.SOFT": 1.0,
     "sparse_fit.MOST_PER_LINE": np.inf,
     "sparse_fit.DEMAND": 0.0,
     "sparse_fit.SHARE": 0.0,

@@ -46,10 +46,9 @@ HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0  # the hardest touch
 TOUCHED: Final = 2.0  # deviations of the prior: further from rest, a cell's force is unknown
 UNLIMITED_STD: Final = 3.0  # what is not known of such a cell
 HIDDEN: Final = 0.3  # a rise that must not go unnoticed
-# Under soft fingertips rest is no more likely than a touch: above this share of touched cells, where
-# the rises of neighbours correlate by more than this.
-CROWDED: Final = 0.3
-SOFT: Final = 0.5
+# Under soft fingertips, rest is no more likely than a touch: many cells rise, neighbours alike.
+CROWDED: Final = 0.3  # share of touched cells: above it, they are many
+SOFT: Final = 0.5  # correlation of the rises of neighbours: above it, they are alike
 
 UNKNOWN_WIRE_OHM: Final = 150.0  # a segment of a layer whose nominal value is not known
 UNKNOWN_LAYER_STD: Final = 0.7  # what all segments of such a layer share: a factor of two
