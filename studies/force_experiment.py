@@ -27,12 +27,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.emulate.press import PressModel
 from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import METHODS, VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.force.regression import ForceRegression, fit_power
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
+from studies.press import PressModel
 from studies.trials import PAPER_METHODS
 
 Progress = Callable[[int, int], None]

@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
-from ohmskin.emulate.press import PressModel
 from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.link import protocol
@@ -27,6 +26,7 @@ from studies.force_trial import (
     Plan,
     knowledge_of,
 )
+from studies.press import PressModel
 from studies.trials import skin_at_rest
 
 SHAPE: Final = (2, 2)

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard
-from ohmskin.emulate.press import LEAVE_S, PressModel, robot_presses
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link import protocol
 from ohmskin.link.framing import encode
 from ohmskin.link.messages import BoardDecoder, Scan
+from studies.press import LEAVE_S, PressModel, robot_presses
 from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest
 
 NOISE_LSB: Final = 0.3  # as emulated boards have it

@@ -17,6 +17,7 @@ from ohmskin.force.reader import SkinReader
 from ohmskin.record.recording import ForceSample, load_recording
 from recordings import (
     HOST_BEGIN_S,
+    PRESSES,
     SENSOR_ZERO_N,
     record_presses,
     sensor_log,
@@ -25,23 +26,17 @@ from recordings import (
 )
 
 SECONDS = 44.0  # two cells of six presses
-SHAPE = (1, 2)
 SENSOR_BEGIN_S = 70_000.0
 TOLD = ("--indenter-mm2", "80", "--wires", f"{TOP_WIRE_OHM},{BOTTOM_WIRE_OHM}")
 BY_OHM = ("--rest", "1.5", "--method", "ohm")  # the fastest
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene("press", *SHAPE, seed=1)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, scene: Scene) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with presses.mcap and forces.csv."""
     folder = tmp_path_factory.mktemp("presses")
     record_presses(folder / "presses.mcap", SECONDS)
-    times_s, force_n = sensor_log(scene, SECONDS)
+    times_s, force_n = sensor_log(SECONDS)
     write_log(folder / "forces.csv", times_s + SENSOR_BEGIN_S, force_n)
     return folder
 
@@ -63,7 +58,7 @@ def calibrate(run: Run, presses: tuple[Path, Path, Path], *more: str) -> Done:
 
 
 def test_a_recording_and_its_forces_make_a_calibration(
-    run: Run, presses: tuple[Path, Path, Path], scene: Scene, tmp_path: Path
+    run: Run, presses: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     recording, _, out = presses
     done = well(calibrate(run, presses))
@@ -78,15 +73,15 @@ def test_a_recording_and_its_forces_make_a_calibration(
     assert found.nominal_wire_ohm.both == pytest.approx((100.0, 200.0), rel=0.3)
     assert "wires, as presses tell: " in done.out
     assert not found.model.pooled.any()
-    rest_siemens = scene.skin(0.0).cell_siemens
+    rest_siemens = PRESSES.skin(0.0).cell_siemens
     np.testing.assert_allclose(found.rest.level, rest_siemens, rtol=0.1)
-    np.testing.assert_allclose(found.rest.ratio, scene.rest_ratio, atol=1e-3)
+    np.testing.assert_allclose(found.rest.ratio, PRESSES.rest_ratio, atol=1e-3)
 
     # What the calibration makes of the same skin, against what pressed it.
     given = load_recording(recording)
     reader = SkinReader(given.hellos[0], found)
     scans = [reader.read(scan) for scan in given.scans[::3]]
-    true_n = np.array([scene.force_n(1e-6 * scan.time_us) for scan in scans])
+    true_n = np.array([PRESSES.force_n(1e-6 * scan.time_us) for scan in scans])
     force_n = np.array([scan.force_n for scan in scans])
     pressed = true_n > 0.3
     assert np.sqrt(np.mean((force_n - true_n)[pressed] ** 2)) < 0.15 * true_n.max()
@@ -99,7 +94,7 @@ def test_a_recording_and_its_forces_make_a_calibration(
     both = tmp_path / "both.mcap"
     samples = [
         ForceSample(float(force), HOST_BEGIN_S + float(time_s), source="cell")
-        for time_s, force in zip(*sensor_log(scene, SECONDS), strict=True)
+        for time_s, force in zip(*sensor_log(SECONDS), strict=True)
     ]
     write_recording(both, given.hellos[0], [*given.scans, *samples])
     slopes = []

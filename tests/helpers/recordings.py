@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings for several test files, one of the scene "press" with what a force sensor says."""
+"""Recordings for several test files, one of presses with what a force sensor says."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -10,13 +10,13 @@ import numpy as np
 
 from bench_board import Bench
 from ohmskin.arrays import Float
-from ohmskin.emulate.scenes import Scene
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recorded
+from press_scene import PressScene
 
 HOST_BEGIN_S = 1000.0
-PRESSES = "emulator://1x2?scene=press&seed=1&rate=30&unit=3"
+PRESSES = PressScene(1, 2, seed=1)
 SENSOR_HZ = 80
 SENSOR_NOISE_N = 0.02
 SENSOR_ZERO_N = 0.07
@@ -29,8 +29,9 @@ def write_recording(path: Path, hello: Hello, messages: Iterable[Recorded]) -> N
 
 
 def record_presses(path: Path, seconds: float) -> None:
-    """Record what the board of `PRESSES` reads, with a jitter of 1 ms in host times."""
-    bench, random = Bench(PRESSES), np.random.default_rng(2)
+    """Record what a board reads of `PRESSES`, with a jitter of 1 ms in host times."""
+    board = PRESSES.board(rate_hz=30.0, unit_id=3, seed=1, noise_lsb=0.3)
+    bench, random = Bench(board), np.random.default_rng(2)
     hello = bench.info
 
     def arrived(scan: Scan) -> Scan:
@@ -41,11 +42,11 @@ def record_presses(path: Path, seconds: float) -> None:
     write_recording(path, hello, map(arrived, scans))
 
 
-def sensor_log(scene: Scene, seconds: float) -> tuple[Float, Float]:
+def sensor_log(seconds: float) -> tuple[Float, Float]:
     """Times [s] from the board's start and forces [N], with noise, and a zero that is off."""
     random = np.random.default_rng(3)
     times_s = np.arange(0, seconds, 1 / SENSOR_HZ)
-    force_n = np.array([scene.force_n(time_s).sum() for time_s in times_s])
+    force_n = np.array([PRESSES.force_n(time_s).sum() for time_s in times_s])
     return times_s, force_n + SENSOR_ZERO_N + SENSOR_NOISE_N * random.standard_normal(times_s.size)
 
 

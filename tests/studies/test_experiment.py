@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from ohmskin.emulate.press import PressModel
 from ohmskin.force.curve import MAX_EXPONENT
 from studies import force_limits, published
 from studies.force_experiment import (
@@ -23,6 +22,7 @@ from studies.force_experiment import (
 )
 from studies.force_limits import ALONE, BESIDE, Detection, press_series, smallest_forces
 from studies.force_trial import ForceTrial, Plan, surface_trial
+from studies.press import PressModel
 
 SMALL = Plan(seeds=1, presses=6, test_presses=2, frames_per_press=2)
 

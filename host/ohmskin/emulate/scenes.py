@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SkinFaults
-from ohmskin.emulate.press import LEAVE_S, PressModel, robot_presses
 
 # Medians of an untouched cell and of the wire segments of rows and of columns [ohm], in the range
 # of a knitted skin. Single ones are spread log-normally, by this share.
@@ -33,7 +32,6 @@ SCENES: Final = {
     "multi": "five touches at places drawn from the seed",
     "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
     "moving": "one fingertip on a closed curve over the whole skin, once in 4 s",
-    "press": "a robot presses cell after cell, six times each with 0.4 to 8 N, 20 s a cell, once",
 }
 # The scene "moving": its period, the radius of the fingertip's pressure and its peak.
 _MOVING_PERIOD_S: Final = 4.0
@@ -45,12 +43,6 @@ _CORNERS_HELD_S: Final = 1.5
 _CORNER_OHM: Final = (5e3, 8e3, 6e3)
 _TREMBLE: Final = 0.05
 _TREMBLE_HZ: Final = (3.1, 4.7, 6.1)
-# The scene "press": time before the first press, peak forces and their relative spread to either
-# side, and the step of time at which a press is simulated.
-_UNTOUCHED_S: Final = 2.0
-_PEAKS_N: Final = (0.5, 0.9, 1.5, 2.6, 4.4, 7.3)
-_PEAK_SPREAD: Final = 0.1
-_PRESS_STEP_S: Final = 0.01
 
 
 class Scene:
@@ -79,7 +71,7 @@ class Scene:
         self.name = name
         self.rows = rows
         self.columns = columns
-        self.moves = name in ("corners", "moving", "press")
+        self.moves = name in ("corners", "moving")
         self.faults = faults or SkinFaults()
         self.faults.check(rows, columns)
         random = np.random.default_rng(seed)
@@ -89,7 +81,6 @@ class Scene:
 
         self._rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
         self._touches = self._place(random)
-        self._robot = _Robot(rows, columns, seed) if name == "press" else None
         self._still_ratio = lru_cache(maxsize=1)(lambda: self.faults.readings(self.skin(0.0)))
 
     @property
@@ -99,23 +90,12 @@ class Scene:
 
     def skin(self, time_s: float) -> Skin:
         """Every resistance of the skin at a time."""
-        if self._robot is not None:
-            touch = self._robot.touch(time_s)[0]
-        elif self.name == "corners":
+        if self.name == "corners":
             touch = self._corners(time_s)
         else:
             touch = self._finger(time_s) if self.moves else self._touches
         touched = replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
         return self.faults.damaged(touched)
-
-    def force_n(self, time_s: float) -> Float:
-        """Force on every cell in the scene "press" [N], shape (rows, columns).
-
-        :raises ValueError: other scenes press with conductances, and no force is known.
-        """
-        if self._robot is None:
-            raise ValueError(f"no force is known in the scene '{self.name}': take 'press'")
-        return self._robot.touch(time_s)[1]
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
         """Cells whose conductance a touch raises by 1 uS or more, shape (rows, columns)."""
@@ -164,33 +144,3 @@ class Scene:
 def _two_of(count: int) -> tuple[int, int]:
     """Two lines well apart, a quarter in from the edges where there is room."""
     return count // 4, count - 1 - count // 4
-
-
-class _Robot:
-    """Forces and rises of the scene "press": one cell after the other is pressed."""
-
-    def __init__(self, rows: int, columns: int, seed: int) -> None:
-        self._shape = (rows, columns)
-        random = np.random.default_rng([seed, rows, columns])
-        starts_s = [_UNTOUCHED_S]
-        self._histories: list[tuple[Float, Float, Float]] = []
-        for _ in range(rows * columns):
-            lift = 1 + _PEAK_SPREAD * random.uniform(-1, 1, len(_PEAKS_N))
-            knots_s, knots_n = robot_presses(_PEAKS_N * lift, random, starts_s[-1])
-            starts_s.append(float(knots_s[-1]) + LEAVE_S)
-            times_s = np.arange(starts_s[-2], starts_s[-1], _PRESS_STEP_S)
-            forces_n = np.interp(times_s, knots_s, knots_n)
-            # Each cell has its own model: one of all cells would take 64 times the memory.
-            model = PressModel(seed=int(random.integers(1 << 32)))
-            self._histories.append((times_s, forces_n, model.rise(times_s, forces_n)))
-        self._starts_s = np.array(starts_s)
-
-    def touch(self, time_s: float) -> tuple[Float, Float]:
-        """Rises [S] and forces [N] at a time, each (rows, columns)."""
-        rise, force_n = np.zeros(self._shape), np.zeros(self._shape)
-        cell = int(np.searchsorted(self._starts_s, time_s, side="right")) - 1
-        if 0 <= cell < rise.size:
-            times_s, forces_n, rises = self._histories[cell]
-            force_n.flat[cell] = np.interp(time_s, times_s, forces_n)
-            rise.flat[cell] = np.interp(time_s, times_s, rises)
-        return rise, force_n

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The press model, against analytic answers and its own claims about shape; the scene "press"."""
+"""The press model, against analytic answers and its own claims; a skin that follows it."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ohmskin.emulate.press import PressModel
-from ohmskin.emulate.scenes import Scene
 from ohmskin.link.codes import quantise
 from ohmskin.link.framing import encode
 from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.link.protocol import FRAMES
-from ohmskin.opening import emulated
+from press_scene import PressScene
+from studies.press import PressModel
 
 QUIET = PressModel(noise=0.0, drift=0.0, gain_spread=0.0, exponent_spread=0.0)
 NO_CREEP = replace(QUIET, creep=0.0)
@@ -104,7 +103,7 @@ def test_cells_differ_and_a_seed_repeats() -> None:
 
 
 def test_a_robot_presses_one_cell_after_another() -> None:
-    scene = Scene("press", 2, 3, seed=5)
+    scene = PressScene(2, 3, seed=5)
     time_s = np.arange(0, 130, 0.05)
     force_n = np.array([scene.force_n(t) for t in time_s])
     assert not force_n[time_s < 2].any()
@@ -121,17 +120,17 @@ def test_a_robot_presses_one_cell_after_another() -> None:
 
 def test_the_scene_answers_the_same_whenever_asked() -> None:
     asked = [30.0, 4.0, 30.0, 3.0, 3.6]
-    scene, other = (Scene("press", 2, 2, seed=1) for _ in range(2))
+    scene, other = (PressScene(2, 2, seed=1) for _ in range(2))
     first = [scene.ratio(t) for t in asked]
     np.testing.assert_array_equal(first, [other.ratio(t) for t in asked])
     np.testing.assert_array_equal(first[0], first[2])
-    assert (Scene("press", 2, 2, seed=2).ratio(3.6) != first[4]).any()
+    assert (PressScene(2, 2, seed=2).ratio(3.6) != first[4]).any()
 
 
 def test_the_board_reads_the_forces() -> None:
-    """Through the port's URL: what is pressed conducts, and the scan says when it was."""
-    board, _, _ = emulated("emulator://2x2?scene=press&seed=1&noise=0")
-    scene = Scene("press", 2, 2, seed=1)
+    """What is pressed conducts, and the scan says when it was."""
+    scene = PressScene(2, 2, seed=1)
+    board = scene.board()
     board.receive(encode(FRAMES["start"].id, 0, FRAMES["start"].pack()))
     scans = [m for m in BoardDecoder().feed(board.advance(20.005), 0.0) if isinstance(m, Scan)]
     assert len(scans) == 1800
@@ -140,8 +139,3 @@ def test_the_board_reads_the_forces() -> None:
     conducts = np.array([scan.ratio[0, 0, 1] for scan in scans])
     force_n = np.array([scene.force_n(scan.time_us * 1e-6)[0, 0] for scan in scans])
     assert conducts[force_n > 6].min() > 5 * np.median(conducts[force_n < 0.1])
-
-
-def test_scenes_without_forces_say_so() -> None:
-    with pytest.raises(ValueError, match="scene 'ghost': take 'press'"):
-        Scene("ghost", 2, 2).force_n(1.0)

@@ -22,11 +22,8 @@ G      (n, R, C)     rise of the cell's conductance above rest                  
                 d slow (a press repeated does not give the same)
 
 u(e) is the unloading branch. It lies h above the loading branch at a large force and meets it at no
-force, so that a cell without force returns to no rise. k and b differ between cells, log-normally.
-
-The defaults fit the shape of public measurements of one cell; docs/force.md compares them, and says
-what was chosen. Not modelled are a force below which the layers do not touch, and pressure that
-spreads to neighbours.
+force. k and b differ between cells, log-normally. docs/force.md says where the defaults are from.
+Not modelled: a force below which the layers do not touch, and pressure that spreads to neighbours.
 
 [BS] Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, section 2.4.
 [Findley] Findley, Lai and Onaran, "Creep and Relaxation of Nonlinear Viscoelastic Materials", 1976.
