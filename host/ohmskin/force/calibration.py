@@ -21,11 +21,9 @@ kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
 
-Forces are `model.predict` of levels above `untouched.level`. The error of rest is in every press
-alike, so the curves hold it already.
-
-Numbers are written so that they are read back bit for bit. A file from elsewhere is data: its size,
-its fields, their types, shapes and ranges are checked before anything is made of them.
+Forces are `model.predict` of levels above `untouched.level`. Numbers are read back bit for bit. A
+file from elsewhere is data: its size, its fields, their types, shapes and ranges are checked before
+anything is made of them.
 """
 
 import json
@@ -136,28 +134,23 @@ class Calibration:
         return self.rest if self.tare is None else self.tare
 
     def check(self, unit_id: int, rows: int, columns: int, *, force: bool = False) -> None:
-        """Raise ValueError unless this calibration is of this board's skin, or `force` is given.
+        """Raise ValueError unless this calibration is of this board's skin.
 
-        Forced onto another number of cells it passes here, but `model.predict` refuses the arrays.
+        force: the unit may be another one.
         """
-        if force:
-            return
         if (rows, columns) != (self.rows, self.columns):
             raise ValueError(
                 f"this calibration is of a {self.rows}x{self.columns} skin, the board scans "
                 f"{rows}x{columns}: calibrate this skin"
             )
-        if unit_id != self.unit_id:
+        if unit_id != self.unit_id and not force:
             raise ValueError(
                 f"this calibration is of unit {self.unit_id}, the board is unit {unit_id}: "
                 "calibrate this skin, or force it if the same skin has a new board"
             )
 
     def save(self, path: PathName) -> None:
-        """Write a file that is either complete or not there: a temporary file, then a rename.
-
-        Raises ValueError if it cannot be written.
-        """
+        """Write the file whole or not at all. Raises ValueError if it cannot be written."""
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
         for name in ("unit_id", "date", "method", "rows", "columns", "indenter_area_m2"):
             content[name] = getattr(self, name)
@@ -214,8 +207,12 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
     content.setdefault("wire_log_std", None)  # files of before have none
     known = {"format", "schema", "rows", "columns", *_PLAIN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
-    _require_fields(content, known)
+    of_before = {"intercept", "intercept_std"} & content.keys()
+    _require_fields(content, known | of_before)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
+    for name in of_before:
+        if np.any(_array(name, content[name], shape)):
+            raise ValueError(f"{name} is not 0: curves go through rest: calibrate this skin")
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
     wires = (
         None if content[name] is None else _value(name, content[name], float) for name in _WIRES

@@ -27,9 +27,8 @@ class Contact:
 
     identity: the same number for as long as the contact lasts, from 1. row, column: the centre,
     sum of F_e position_e / sum of F_e over its cells e, in cell units (0: centre of the first).
-    force_n: sum of F_e [N]; force_n_std: the sum of the cells' standard deviations. These cells
-    share wires, and their errors may all have one sign: no deviation of force_n can be larger.
-    cells: shape (R, C), which cells it covers.
+    force_n: sum of F_e [N]; force_n_std: the sum of the cells' standard deviations, because these
+    cells share wires, and their errors may all have one sign. cells: which it covers, (R, C).
     """
 
     identity: int

@@ -10,22 +10,20 @@ x      (R, C)  rise above rest: conductance g - g_rest, or the reading's (`volta
 F      (R, C)  force normal to the skin                                                N
 a      (R, C)  `slope`                                                                 N / x^b
 b      (R, C)  `exponent`, 1 where the cell is linear                                  1
-c      (R, C)  `intercept`; `regression` learns none: 0                                N
-K      (2, 2)  covariance of a cell's two free coefficients: (a, c), or (a, b)
+K              covariance of a cell's free coefficients: a, or (a, b)
 s0     (R, C)  `residual_std`: scatter of presses about the curve at no force          N
 s1     (R, C)  `residual_share`: how that grows with force                             1
 dx     (R, C)  standard deviation of x                                                 as x
 ====== ======= ======================================================================= ==========
 
-    linear  F = a x + c   (section IV.G of the paper; c = 0 makes an untouched cell report no force)
+    linear  F = a x       (section IV.G of the paper, but an untouched cell reports no force)
     power   F = a x^b     (x < 0 counts as 0)
 
 Standard deviation of a force, with J the derivatives of F by the cell's free coefficients:
 
     F_std^2 = d^2 + s0^2 + (s1 F)^2 + J K J^T ,     d = max(F(x + dx) - F(x), F(x) - F(x - dx)) .
 
-For a line d = a dx. For x^b with b < 1 the differential is infinite at rest, the difference is not.
-`regression` learns the curves.
+For x^b with b < 1 the differential is infinite at rest, the difference is not.
 """
 
 from dataclasses import dataclass, fields
@@ -47,12 +45,11 @@ MAX_EXPONENT: Final = 5.0
 class ForceModel:
     """The curve of every cell, each array (R, C); symbols and units in the module's table.
 
-    kind: "linear" or "power". slope, exponent, intercept and their standard errors (0: fixed).
-    correlation: of the errors of slope and of the other free coefficient.
-    residual_std, residual_share: s0 and s1; NaN where nothing tells them. pooled: the cell has no
-    curve of its own but the skin's. held_out_rmse: error on presses not fitted [N], of pooled cells
-    on cells not fitted; NaN where nothing tells it. Raises ValueError, naming the array, for what
-    no fit gives.
+    kind: "linear" or "power". slope, exponent and their standard errors (0: fixed). correlation: of
+    these two errors. pooled: the cell has no curve of its own but the skin's. residual_std,
+    residual_share: s0 and s1; held_out_rmse: error on presses not fitted [N], of pooled cells on
+    cells not fitted. These three are NaN where nothing tells them.
+    Raises ValueError, naming the array, for what no fit gives.
     """
 
     kind: NDArray[np.str_]
@@ -60,8 +57,6 @@ class ForceModel:
     slope_std: Float
     exponent: Float
     exponent_std: Float
-    intercept: Float
-    intercept_std: Float
     correlation: Float
     residual_std: Float
     residual_share: Float
@@ -79,49 +74,39 @@ class ForceModel:
         power = self.kind == POWER
         require("kind", power | (self.kind == LINEAR), f"neither {LINEAR} nor {POWER}")
         require("slope", (self.slope > 0) & np.isfinite(self.slope), "not above 0")
-        require("intercept", np.isfinite(self.intercept), "not finite")
         require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
         inside = (self.exponent >= MIN_EXPONENT) & (self.exponent <= MAX_EXPONENT)
         require("exponent", inside, f"not in {MIN_EXPONENT:g}..{MAX_EXPONENT:g}")
-        for name in ("slope_std", "exponent_std", "intercept_std"):
+        for name in ("slope_std", "exponent_std"):
             std = getattr(self, name)
             require(name, np.isfinite(std) & (std >= 0), "not finite and >= 0")
         for name in ("residual_std", "residual_share", "held_out_rmse"):
             known = getattr(self, name)
             require(name, np.isnan(known) | (np.isfinite(known) & (known >= 0)), "negative or inf")
-        for name, fixed in (("exponent", 1), ("exponent_std", 0)):
-            good = power | (getattr(self, name) == fixed)
-            require(name, good, f"not {fixed}, as of a linear cell")
-        for name in ("intercept", "intercept_std"):
-            require(name, ~power | (getattr(self, name) == 0), "not 0, as of a power law")
+        require("exponent", power | (self.exponent == 1), "not 1, as of a linear cell")
+        require("exponent_std", power | (self.exponent_std == 0), "not 0, as of a linear cell")
 
     def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
         """Force and its standard deviation [N], each (R, C), of rises above rest (R, C).
 
         No force is below 0; the standard deviation is that before the cut. It is NaN where
-        `rise_std` is (the method gives none), and where the scatter is unknown: in cells without
-        data when one cell alone was pressed, say. Raises ValueError, naming the cell, for a shape
-        or a value that cannot be.
+        `rise_std` is (the method gives none), and where the scatter is unknown. Raises ValueError,
+        naming the cell, for a shape or a value that cannot be.
         """
         x, dx = (np.asarray(each, dtype=np.float64) for each in (rise, rise_std))
         for name, array in (("rise", x), ("rise_std", dx)):
-            if array.shape != self.kind.shape:
-                raise ValueError(
-                    f"{name} has shape {array.shape}, this calibration {self.kind.shape}"
-                )
+            if array.shape != (shape := self.kind.shape):
+                raise ValueError(f"{name} has shape {array.shape}, this calibration {shape}")
         require("rise", np.isfinite(x), "not finite")
         require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
         of_rise = spread(self, x, np.nan_to_num(dx))
-        power = self.kind == POWER
         above = np.maximum(x, 0.0)
-        safe = np.where(above > 0, above, 1.0)
+        logarithm = np.log(np.where(above > 0, above, 1.0))
         powered = above**self.exponent
-        by_slope = np.where(power, powered, x) * self.slope_std
-        by_other = np.where(
-            power, self.slope * powered * np.log(safe) * self.exponent_std, self.intercept_std
-        )
+        by_slope = np.where(self.kind == POWER, powered, x) * self.slope_std
+        by_exponent = self.slope * powered * logarithm * self.exponent_std
         # The two nearly cancel in a power law, whose slope is that at 1 S: far from any press.
-        of_fit = by_slope**2 + by_other**2 + 2 * self.correlation * by_slope * by_other
+        of_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
         reported_n = np.maximum(force_by(self, x), 0.0)
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
         variance = of_rise**2 + scatter + np.maximum(of_fit, 0.0)
@@ -140,15 +125,13 @@ class Curve:
     correlation: float = 0.0
     exponent: float = 1.0
     exponent_std: float = 0.0
-    intercept: float = 0.0
-    intercept_std: float = 0.0
     held_out_rmse: float = np.nan
 
 
 def force_by(curve: ForceModel | Curve, x: Float) -> Float:
     """F of the module's equations [N], before forces below 0 are cut, shape of x."""
     power = curve.slope * np.maximum(x, 0.0) ** curve.exponent
-    return np.where(np.asarray(curve.kind) == POWER, power, curve.slope * x + curve.intercept)
+    return np.where(np.asarray(curve.kind) == POWER, power, curve.slope * x)
 
 
 def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:

@@ -45,9 +45,8 @@ class ForceScan(Scan):
 
     force_n, force_n_std: normal force of each cell and its standard deviation, (R, C) [N]; NaN
     where `ForceModel.predict` has none, and everywhere without a calibration. contacts: touched
-    cells that adjoin; without a calibration the rise of their conductance [S] takes the place of
-    their force. estimate: what all of this is from; its ``message`` says where the readings cannot
-    be trusted.
+    cells that adjoin; without a calibration their force is the rise of their conductance [S].
+    estimate: what all of this is from; its ``message`` says why readings cannot be trusted.
     """
 
     force_n: Float
@@ -71,8 +70,8 @@ class SkinReader:
     method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
     rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration.
 
-    A recorded tare (`Scan.rest_ratio`) and a tare taken by `tare` both become the rest; the later
-    one counts. Scans are read by one thread; all else may be called from any thread.
+    Of recorded tares (`Scan.rest_ratio`) and those taken by `tare`, the latest is the rest. Scans
+    are read by one thread; all else may be called from any thread.
 
     :raises ValueError: no such method, or the board scans other cells than were calibrated.
     """
@@ -140,11 +139,10 @@ class SkinReader:
         if self._calibration is None:
             return None
         calibration = replace(self._calibration, nominal_wire_ohm=self._taught[0].wires())
-        if (tare := self.rest) is calibration.untouched:
-            return calibration
-        if isinstance(tare, Untouched):
-            tare = Rest.of(calibration.method, self._knowledge(tare), tare.date)
-        return replace(calibration, tare=None if tare is calibration.rest else tare)
+        rest = self.rest
+        if isinstance(rest, Untouched):
+            rest = Rest.of(calibration.method, self._knowledge(rest), rest.date)
+        return replace(calibration, tare=None if rest is calibration.rest else rest)
 
     def use(self, method: str) -> None:
         """Go on with another method, from the next scan on. Raises ValueError for no such."""
@@ -152,9 +150,9 @@ class SkinReader:
         self._wanted = method
 
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
-        """Take these readings (R, C, 4) for the rest, from the next scan on.
+        """Take these readings (R, C, 4) for the rest. Returns what a `Recorder` keeps.
 
-        force: even if cells seem touched: rest may have drifted. Returns what a `Recorder` keeps.
+        force: even if cells seem touched: rest may have drifted.
 
         :raises TareRefused: something touches the skin.
         """
@@ -280,9 +278,7 @@ class CalibratedSkin(Closing):
             return self._reader.read(scan)
 
     def tare(self, seconds: float = TARE_S, *, force: bool = False) -> Tare:
-        """Take the mean of the coming scans, of so many seconds, for the skin's rest.
-
-        force, and what is returned: see `SkinReader.tare`.
+        """`SkinReader.tare` with the mean of the coming scans, of so many seconds.
 
         :raises TareRefused: something touches the skin.
         :raises DeviceLost: as `Device.mean_ratio`.

@@ -28,19 +28,17 @@ errors:
 
     l = -1/2 log(s^2 v) - (F - f(x))^2 / (2 s^2 v)
 
-so that a newton at 8 N weighs as much as the scatter there lets it. A power law is taken where l is
-higher by more than the standard error of that difference over presses (the rule of one standard
-error, Breiman et al. 1984). How presses scatter is a property of the textile: growing scatter is
-taken for all cells if their l together is higher by two standard errors.
+A power law is taken where l is higher by more than the standard error of that difference over
+presses (the rule of one standard error, Breiman et al. 1984). How presses scatter is a property of
+the textile: growing scatter is taken for all cells if their l together is higher by two standard
+errors.
 
 s comes from few presses, so that of a force is the standard deviation of Student's t with n - p
-degrees of freedom: s^2 (n - p) / (n - p - 2). Where the dx of presses are known, the mean of
-d^2 / v over them is taken off, because predicting adds it again. Where presses have several rows,
-s is at least that of held-out presses. For cells that nobody pressed, it is at least that of
-held-out cells.
+degrees of freedom: s^2 (n - p) / (n - p - 2). The mean of d^2 / v over the presses is taken off,
+because predicting adds it again. s is at least that of held-out presses, if they have several rows,
+and for cells that nobody pressed that of held-out cells.
 """
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from itertools import product
 from typing import Any, Final, NamedTuple, Self
@@ -48,7 +46,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Bool, Float
+from ohmskin.arrays import Float
 from ohmskin.force.curve import (
     LINEAR,
     MAX_EXPONENT,
@@ -98,16 +96,23 @@ class ForceRegression:
         """Learn from n rows, in each of which one cell alone is touched.
 
         cells (n,): flat indices, row * columns + column. rise and rise_std (n,): of that cell [S,
-        or 1 for `voltage`]. force_n (n,) [N]. shape: (R, C). press (n,): an integer for each press,
-        shared by the rows recorded during it. They resemble one another, so they are held out
-        together; absent, each row is a press.
+        or 1 for `voltage`]. force_n (n,) [N]. shape: (R, C). press (n,): an integer for each press;
+        its rows are alike, so they are held out together. Absent, each row is a press.
 
         A cell keeps a curve of its own from 5 presses on, if its force varies and rises with x; the
         others take the curve of all presses, with the error it shows on cells not fitted.
         Standard errors of coefficients suppose independent rows. Raises ValueError, naming the row,
         for bad values; for fewer than 5 presses, for forces all the same or that fall with x.
         """
-        rows = _checked(cells, rise, force_n, shape, rise_std, press)
+        size = np.size(force_n)
+        rows = _Rows(
+            x=_array("rise", rise, size),
+            force=_array("force_n", force_n, size),
+            dx=_array("rise_std", np.zeros(size) if rise_std is None else rise_std, size),
+            cell=_array("cells", cells, size, np.intp),
+            press=_array("press", np.arange(size) if press is None else press, size, np.intp),
+        )
+        _check(rows, shape)
         of_skin = _curve_of_skin(rows)
         own = _curves_of_cells(rows)
         every_cell = range(shape[0] * shape[1])
@@ -118,7 +123,11 @@ class ForceRegression:
         }
         pooled = np.array([cell not in own for cell in every_cell]).reshape(shape)
         self.model_ = ForceModel(**arrays, pooled=pooled)
-        self.message_ = _pooled_message(pooled, np.unique(rows.cell), of_skin)
+        self.message_ = ""
+        if pooled.any():
+            self.message_ = f"{pooled.sum()} of {pooled.size} cells take the curve of all presses"
+            if np.isnan(of_skin.residual_std):
+                self.message_ += ": how far they are off is unknown"
         return self
 
 
@@ -161,20 +170,6 @@ def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
     grows = _is_clear(gains, SCATTER_ERRORS)
     curves = {cell: trial.best(grows) for cell, trial in trials.items()}
     return {cell: curve for cell, curve in curves.items() if curve is not None}
-
-
-def _pooled_message(pooled: Bool, pressed: NDArray[np.intp], skin: Curve) -> str:
-    """Which cells have no curve of their own. pressed: flat indices of those with presses."""
-    if not pooled.any():
-        return ""
-    message = f"{pooled.sum()} of {pooled.size} cells take the curve of all presses"
-    if pressed.size == 1:
-        message += f", all on cell {divmod(int(pressed[0]), pooled.shape[1])}"
-    unknown = np.isnan(skin.residual_std)
-    return f"{message}: how far they are off is unknown" if unknown else message
-
-
-# ------------------------------------------------------------------------------- one curve's fit
 
 
 def fit_line(x: Float, force: Float, v: Float | float = 1.0) -> Curve | None:
@@ -244,13 +239,7 @@ def _square(residual: Float, weight: Float, coefficients: int) -> float:
     return float(weight @ residual**2) / freedom if freedom > 0 else 0.0
 
 
-_FITS: Final[dict[str, Callable[[Float, Float, Float], Curve | None]]] = {
-    LINEAR: fit_line,
-    POWER: fit_power,
-}
-
-
-# ----------------------------------------------------------------------- which curve predicts best
+_FITS: Final = {LINEAR: fit_line, POWER: fit_power}
 
 
 class _Trial:
@@ -268,6 +257,7 @@ class _Trial:
         self._floor_n = FLOOR_SHARE * float(rows.force.max())  # F0
         self._v = {False: np.ones_like(rows.force), True: rows.force**2 + self._floor_n**2}
         self._errors: dict[tuple[str, bool], Float] = {}
+        self._likelihoods: dict[tuple[str, bool], Float] = {}  # logarithms, of each group
         parts = min(parts, self._groups)
         # Shuffled, for the forces of successive presses often follow a pattern of their own.
         fold = np.random.default_rng(0).permutation(self._groups)[self._group] % parts
@@ -280,6 +270,7 @@ class _Trial:
                     error[out] = rows.force[out] - np.maximum(force_by(curve, rows.x[out]), 0.0)
             if np.isfinite(error).all():
                 self._errors[kind, grows] = error
+                self._likelihoods[kind, grows] = self._log_likelihood(error, self._v[grows])
 
     def best(self, grows: bool, *, of_skin: bool = False) -> Curve | None:
         """The kind that predicts held-out groups better, with s; None where no curve rises.
@@ -310,26 +301,24 @@ class _Trial:
     def gain_of_growing(self) -> Float:
         """Log likelihood gained by scatter that grows, of each group; empty if unknown."""
         constant, growing = ((self._kinds(grows)[0], grows) for grows in (False, True))
-        known = constant in self._errors and growing in self._errors
-        return self._gain(growing, constant) if known else np.empty(0)
+        if constant not in self._errors or growing not in self._errors:
+            return np.empty(0)
+        return self._likelihoods[growing] - self._likelihoods[constant]
 
     def _kinds(self, grows: bool) -> list[str]:
         """The better kind first; a line of unknown error, if none is known."""
         known = [kind for kind in _FITS if (kind, grows) in self._errors]
-        if len(known) == 2 and _is_clear(self._gain((POWER, grows), (LINEAR, grows)), 1):
-            known.reverse()
+        if len(known) == 2:
+            gain = self._likelihoods[POWER, grows] - self._likelihoods[LINEAR, grows]
+            return [POWER, LINEAR] if _is_clear(gain, 1) else known
         return known or [LINEAR]
 
-    def _gain(self, one: tuple[str, bool], other: tuple[str, bool]) -> Float:
-        gain = self._log_likelihood(one) - self._log_likelihood(other)
-        return np.asarray(np.bincount(self._group, gain) / np.bincount(self._group))
-
-    def _log_likelihood(self, candidate: tuple[str, bool]) -> Float:
-        """l of the module's equation, (n,)."""
-        error, v = self._errors[candidate], self._v[candidate[1]]
+    def _log_likelihood(self, error: Float, v: Float) -> Float:
+        """l of the module's equation, mean of each group."""
         least = _LEAST_SHARE**2 * float(np.mean(self._rows.force**2 / v))
         v = v * max(float(np.mean(error**2 / v)), least)
-        return np.asarray(-0.5 * np.log(v) - 0.5 * error**2 / v)
+        of_rows = -0.5 * np.log(v) - 0.5 * error**2 / v
+        return np.asarray(np.bincount(self._group, of_rows) / np.bincount(self._group))
 
 
 def _is_clear(gain: Float, errors: float) -> bool:
@@ -341,32 +330,9 @@ def _rms(values: Float) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-# ---------------------------------------------------------------------------- what `fit` is given
-
-
-def _checked(
-    cells: ArrayLike,
-    rise: ArrayLike,
-    force_n: ArrayLike,
-    shape: tuple[int, int],
-    rise_std: ArrayLike | None,
-    press: ArrayLike | None,
-) -> _Rows:
-    """The arguments of `ForceRegression.fit` as arrays. Raises ValueError as it does."""
-    if min(shape) < 1:
-        raise ValueError(f"a skin has at least 1x1 cells, not {shape[0]}x{shape[1]}")
-    size = np.size(force_n)
-    if not size:
-        raise ValueError("force_n is empty: there are no presses")
-    rows = _Rows(
-        x=_array("rise", rise, size),
-        force=_array("force_n", force_n, size),
-        dx=_array("rise_std", np.zeros(size) if rise_std is None else rise_std, size),
-        cell=_array("cells", cells, size, np.intp),
-        press=_array("press", np.arange(size) if press is None else press, size, np.intp),
-    )
-    hint = "0 or more: zero the force sensor, or leave the row out"
-    require_rows("force_n", rows.force, rows.force >= 0, hint)
+def _check(rows: _Rows, shape: tuple[int, int]) -> None:
+    """Raise ValueError as `ForceRegression.fit`."""
+    require_rows("force_n", rows.force, rows.force >= 0, "0 or more: zero the force sensor")
     require_rows("rise_std", rows.dx, rows.dx >= 0, "0 or more")
     on_skin = (rows.cell >= 0) & (rows.cell < shape[0] * shape[1])
     require_rows("cells", rows.cell, on_skin, f"one of a {shape[0]}x{shape[1]} skin")
@@ -374,16 +340,15 @@ def _checked(
     if number < MIN_PRESSES:
         raise ValueError(f"too few presses: {number}, {MIN_PRESSES} are needed")
     if np.ptp(rows.force) == 0:
-        raise ValueError(f"all {size} forces are {rows.force[0]:g} N: press with different forces")
-    return rows
+        forces = f"all {rows.force.size} forces are {rows.force[0]:g} N"
+        raise ValueError(f"{forces}: press with different forces")
 
 
 def _array(name: str, values: ArrayLike, size: int, dtype: Any = np.float64) -> Any:
     array = np.asarray(values)
     if array.shape != (size,):
         raise ValueError(f"{name} has shape {array.shape}, it must be {(size,)}")
-    kinds, what = ("iu", "integers") if dtype is np.intp else ("iuf", "numbers")
-    if array.dtype.kind not in kinds:
-        raise ValueError(f"{name} holds {array.dtype}, it must hold {what}")
+    if array.size and not np.can_cast(array.dtype, dtype, "same_kind"):
+        raise ValueError(f"{name} holds {array.dtype}, it must hold {np.dtype(dtype)}")
     require_rows(name, array, np.isfinite(array), "finite")
     return array.astype(dtype)
