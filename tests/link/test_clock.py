@@ -104,12 +104,11 @@ def test_a_board_that_restarts_begins_anew(pause_s: float) -> None:
     assert np.diff(found_s).min() > 0
 
 
-@pytest.mark.parametrize("step_s", [0.3, -0.3])
-def test_a_clock_that_steps_is_followed(step_s: float) -> None:
-    """Late: the simulator has dropped time. Early: the host was asleep, its clock stood still."""
+def test_a_clock_that_steps_is_followed() -> None:
+    """The host was asleep, and its clock stood still."""
     random = np.random.default_rng(6)
     board_s = np.arange(40 * HZ) / HZ
-    true_s = START_S + board_s + np.where(board_s > 20, step_s, 0.0)
+    true_s = START_S + board_s + np.where(board_s > 20, -0.3, 0.0)
     found_s, _ = mapped(board_s, true_s + random.exponential(1e-3, board_s.size))
     assert np.abs(found_s - true_s)[board_s > 25].max() < 2e-3
 

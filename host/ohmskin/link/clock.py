@@ -23,9 +23,9 @@ points are on time. A line of least squares would move with the load of the mach
 
 A delay that all scans have in common cannot be seen and is part of h.
 
-[Moon1999]: S. B. Moon, P. Skelly, D. Towsley, "Estimation and removal of clock skew from network
-delay measurements", INFOCOM 1999. [Zhang2002]: L. Zhang, Z. Liu, C. H. Xia, "Clock synchronization
-algorithms for network measurements", INFOCOM 2002.
+[Moon1999]: Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
+measurements". [Zhang2002]: Zhang, Liu, Xia, "Clock synchronization algorithms for network
+measurements". Both INFOCOM.
 """
 
 import math
@@ -46,10 +46,8 @@ from ohmskin.link.messages import Hello, Scan
 WINDOW_S: Final = 30.0
 # Largest |q - 1|: a ceramic resonator is up to 0.5 % off, a crystal 0.01 %.
 MAX_RATE_ERROR: Final = 0.006
-# A scan that comes this much before h shows that a clock has stepped [s]. So do scans that come
-# this much after h for `STEP_AFTER_S`.
+# A scan that comes this much before h shows that a clock has stepped [s].
 STEP_S: Final = 0.05
-STEP_AFTER_S: Final = 2.0
 # Of each block of so much board time only the earliest point is kept [s].
 _BLOCK_S: Final = 0.25
 # A better line takes effect within this time [s], so that times never jump or go back.
@@ -87,11 +85,10 @@ def reading_offsets_s(board: Hello) -> Float:
 def line_delay_s(scan: Scan, board: Hello) -> float:
     """Time from a scan's end to its last byte at the end of a serial line [s], without USB.
 
-    The board sends a COBS block when it knows the block's last byte, because the length comes
-    first. Up to 254 bytes (5 ms at 500 kbaud) wait for the next zero in the codes, so what a skin
-    shows moves the arrival of its scans. The delay is the maximum over all blocks of (time from the
-    scan's end until the block is known + time that the line takes from this block on). It leaves
-    out the up to 10 ms for which frames wait where scans come faster than the line carries them.
+    A COBS block begins with its length, so up to 254 bytes (5 ms at 500 kbaud) wait for the next
+    zero in the codes: what a skin shows moves the arrival of its scans. The delay is the maximum
+    over all blocks of (time from the scan's end until the block is known + time that the line takes
+    from this block on). It leaves out that frames may wait for those before them.
     """
     if board.board == "emulated":
         # An emulated board sends a whole scan at the end of its period.
@@ -128,30 +125,29 @@ def _below(points: Collection[_Point], rate: float) -> _Line:
     """The line below points (u, t) with rising u [Zhang2002]. rate: that of a single point."""
     hull: list[_Point] = []
     for u_s, t_s in points:
-        while len(hull) > 1 and _turns_right(hull[-2], hull[-1], (u_s, t_s)):
+        while len(hull) > 1 and _slope(hull[-2], hull[-1]) >= _slope(hull[-2], (u_s, t_s)):
             hull.pop()
         hull.append((u_s, t_s))
     mean_s = math.fsum(u_s for u_s, _ in points) / len(points)
-    for (u_s, t_s), (next_u_s, next_t_s) in pairwise(hull):
-        rate = (next_t_s - t_s) / (next_u_s - u_s)
-        if next_u_s >= mean_s:
+    for begin, end in pairwise(hull):
+        rate = _slope(begin, end)
+        if end[0] >= mean_s:
             break
     rate = min(max(rate, 1 - MAX_RATE_ERROR), 1 + MAX_RATE_ERROR)
     u_s, t_s = min(hull, key=lambda point: point[1] - rate * point[0])
     return _Line(rate, u_s, t_s)
 
 
-def _turns_right(a: _Point, b: _Point, c: _Point) -> bool:
-    """Whether b is on or above the line from a to c."""
-    return (b[0] - a[0]) * (c[1] - a[1]) <= (c[0] - a[0]) * (b[1] - a[1])
+def _slope(a: _Point, b: _Point) -> float:
+    return (b[1] - a[1]) / (b[0] - a[0])
 
 
 class BoardClock:
     """Learns the clock of a board from scan after scan.
 
-    It follows a restart of the board at once. It also follows a clock that steps, after
-    `STEP_AFTER_S` if the step makes scans late. Otherwise times are smooth: what it learns shifts
-    only later times, over a second.
+    It follows a restart of the board at once, and a clock that steps so that scans come early: the
+    host was asleep. Otherwise times are smooth: what it learns shifts only later times, over a
+    second.
     """
 
     def __init__(self) -> None:
@@ -159,7 +155,6 @@ class BoardClock:
         self._points: deque[_Point] = deque()  # the earliest of each block
         self._block_u_s = self._last_u_s = 0.0  # begin of the last block; the last time
         self._slew_s, self._slew_from_s = 0.0, 0.0
-        self._late_since_s: float | None = None
         self._lates_s: deque[float] = deque(maxlen=_JITTER_SCANS)
         self.jitter_s = math.nan
         """95 % of the last 2048 scans came at most this much after h [s]; at first NaN."""
@@ -170,11 +165,11 @@ class BoardClock:
         Calls come in the order of the board's clock. A time that goes back is a restart.
         """
         u_s, t_s = 1e-6 * time_us, host_time_s
-        if self._line is None or u_s <= self._last_u_s or self._steps(u_s, t_s):
+        late_s = 0.0 if self._line is None else t_s - self._line.at(u_s)
+        if self._line is None or u_s <= self._last_u_s or late_s < -STEP_S:
             self._restart(u_s, t_s)
             return
         self._last_u_s = u_s
-        late_s = t_s - self._line.at(u_s)
         self._lates_s.append(max(late_s, 0.0))
         ends_block = u_s - self._block_u_s >= _BLOCK_S
         if ends_block:
@@ -206,17 +201,6 @@ class BoardClock:
         self._points = deque([(u_s, t_s)])
         self._last_u_s = self._block_u_s = u_s
         self._slew_s = 0.0
-        self._late_since_s = None
-
-    def _steps(self, u_s: float, t_s: float) -> bool:
-        assert self._line is not None
-        late_s = t_s - self._line.at(u_s)
-        if late_s < STEP_S:
-            self._late_since_s = None
-            return late_s < -STEP_S
-        if self._late_since_s is None:
-            self._late_since_s = t_s
-        return t_s - self._late_since_s > STEP_AFTER_S
 
     def _learn(self, u_s: float) -> None:
         assert self._line is not None
@@ -230,8 +214,8 @@ class BoardClock:
 def scan_times_s(scans: list[Scan]) -> Float:
     """Times of recorded scans on the host's clock [s], (n,), without the jitter of their arrival.
 
-    All are late by the same time, about that of a scan. Every 15 s of each run of the board's clock
-    there is a knot with the h of the 30 s around it; between knots, times are interpolated.
+    All are late by about a scan. Every 15 s of each run of the board's clock there is a knot with
+    the h of the 30 s around it; between knots, times are interpolated.
     """
     host_s = np.array([scan.host_time_s for scan in scans])
     board_s = 1e-6 * np.array([scan.time_us for scan in scans])
