@@ -26,7 +26,7 @@ from ohmskin.circuit.skin import (
     Skin,
     readings,
 )
-from ohmskin.emulate.faults import cut, joined_readings
+from ohmskin.emulate.faults import OPEN_OHM, joined_readings
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
@@ -94,6 +94,13 @@ def converted(exact: Float, random: Random | None = None, noise_lsb: float = 0.0
 def shorted_readings(skin: Skin, first: int, second: int) -> Float:
     """`circuit.readings`, electrodes `first` and `second` (rows first) joined by 0.1 ohm."""
     return joined_readings(skin, [(first, second)])
+
+
+def cut(skin: Skin, layer: str, line: int, place: int = 0) -> Skin:
+    """`skin` with segment `place` of a row ("top") or column ("bottom") open; 0: all of it."""
+    wires = {"top": skin.top_wire_ohm.copy(), "bottom": skin.bottom_wire_ohm.copy()}
+    wires[layer][(line, place) if layer == "top" else (place, line)] = OPEN_OHM
+    return replace(skin, top_wire_ohm=wires["top"], bottom_wire_ohm=wires["bottom"])
 
 
 def _case(

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A skin board without hardware: ``emulator://8x8?scene=ghost&seed=1``.
 
-`EmulatedBoard` speaks the board's side of the protocol, without input, output or a clock of its
-own. `receive` takes bytes from the host; `advance` lets time pass and returns the bytes that the
-board has sent by then. `EmulatorLink` runs a board in real time behind the interface of a port,
-`PtyServer` at a pseudo-terminal, which programs can open like a serial port.
+`EmulatedBoard` speaks the board's side of the protocol, sans-IO: `receive` takes bytes from the
+host, `advance` lets time pass and returns what was sent. `EmulatorLink` and `PtyServer` run it in
+real time, as a `Link` and at a pseudo-terminal.
 
 Not modelled:
 

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can be wrong with an emulated board's line and skin, to see that a host finds it.
 
-`LineFaults` change the bytes that the board sends. Of `SkinFaults`, those of resistances change a
-`Skin` (`SkinFaults.damaged`). Shorted lines join electrodes of its network (`joined_readings`). Hum
-and slow settling change each reading at its own instant (`SkinFaults.sampled`).
+`LineFaults` change the bytes that the board sends. `SkinFaults` change resistances (`damaged`),
+join electrodes (`readings`), or change each reading at its own instant (`sampled`).
 
 A fault has the name of an option of ``emulator://``. Beside its type stand the kind of its values
-and what ``ohmskin emulate --help`` says of it. Without the option there is no such fault.
+and what ``ohmskin emulate --help`` says of it.
 """
 
 import math
@@ -20,6 +19,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
+    DEFAULT_REF_OHM,
     READING_SENSES_TOP,
     Skin,
     electrode_admittance,
@@ -58,8 +58,7 @@ def _pair(text: str) -> Pair:
 
 Share = Annotated[float, _Kind(float, lambda share: 0 <= share <= 1, "a share, from 0 to 1")]
 Amount = Annotated[float, _Kind(float, lambda amount: 0 <= amount < math.inf, "0 or more")]
-Factor = Annotated[float, _Kind(float, lambda factor: 0 < factor < math.inf, "above 0")]
-Ohm = Annotated[float | None, _Kind(float, lambda ohm: 0 < ohm < math.inf, "above 0")]
+Positive = Annotated[float, _Kind(float, lambda number: 0 < number < math.inf, "above 0")]
 Line = Annotated[int | None, _Kind(int, lambda line: True, "a number")]
 Lines = Annotated[
     Pair | None, _Kind(_pair, lambda pair: pair[0] != pair[1], "two different numbers, as 1,2")
@@ -85,9 +84,6 @@ def faults_of(faults: type[FaultsT], options: Mapping[str, str], **others: Any) 
             if name not in others or not kind.can_be(others[name]):
                 raise ValueError(f"{name} must be {kind.words}, not '{options[name]}'")
     return faults(**others)
-
-
-# ---------------------------------------------------------------------------------- of the line
 
 
 @dataclass
@@ -137,9 +133,6 @@ class LineFaults:
 LINE_FAULTS: Final = {name: text for name, (_, text) in _options(LineFaults).items()}
 
 
-# ---------------------------------------------------------------------------------- of the skin
-
-
 @dataclass(frozen=True)
 class SkinFaults:
     """Faults of the skin by the names in `SKIN_FAULTS`."""
@@ -150,9 +143,9 @@ class SkinFaults:
     short_columns: Annotated[Lines, "two columns, as 2,3, that touch each other"] = None
     dead: Annotated[Cell, "row and column, as 1,2, of a cell that never conducts"] = None
     saturated: Annotated[Cell, "row and column, as 1,2, of a cell whose layers are shorted"] = None
-    ref_top: Annotated[Ohm, "true ohms of the rows' reference resistor; hello says 30000"] = None
-    ref_bottom: Annotated[Ohm, "the same of the columns"] = None
-    wires: Annotated[Factor, "factor on all wires"] = 1.0
+    ref_top: Annotated[Positive, "true ohms of the rows' reference resistor"] = DEFAULT_REF_OHM
+    ref_bottom: Annotated[Positive, "the same of the columns; hello says 30000"] = DEFAULT_REF_OHM
+    wires: Annotated[Positive, "factor on all wires"] = 1.0
     hum: Annotated[Amount, "hertz of the mains that every reading picks up"] = 0.0
     hum_lsb: Annotated[Amount, "amplitude of the hum in LSB, 3 unless told"] = 3.0
     tau_us: Annotated[Amount, "microseconds of the sense nodes' time constant of settling"] = 0.0
@@ -179,17 +172,12 @@ class SkinFaults:
             cell[self.dead] = 0.0
         if self.saturated is not None:
             cell[self.saturated] = SHORT_SIEMENS
-        hurt = replace(
-            skin,
-            cell_siemens=cell,
-            top_wire_ohm=self.wires * skin.top_wire_ohm,
-            bottom_wire_ohm=self.wires * skin.bottom_wire_ohm,
-            ref_top_ohm=skin.ref_top_ohm if self.ref_top is None else self.ref_top,
-            ref_bottom_ohm=skin.ref_bottom_ohm if self.ref_bottom is None else self.ref_bottom,
-        )
+        top_ohm, bottom_ohm = self.wires * skin.top_wire_ohm, self.wires * skin.bottom_wire_ohm
         if self.open_row is not None:
-            hurt = cut(hurt, "top", self.open_row)
-        return hurt if self.open_column is None else cut(hurt, "bottom", self.open_column)
+            top_ohm[self.open_row, 0] = OPEN_OHM
+        if self.open_column is not None:
+            bottom_ohm[0, self.open_column] = OPEN_OHM
+        return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom)
 
     def readings(self, damaged: Skin) -> Float:
         """Exact readings (R, C, 4) of a skin that `damaged` has made, with its lines shorted."""
@@ -202,10 +190,9 @@ class SkinFaults:
     def sampled(self, ratio: Float, start_s: float, slot_s: float, settle_s: float) -> Float:
         """What the converter reads of a scan with settled readings `ratio` (R, C, 4), same shape.
 
-        The scan starts at start_s and takes one reading a slot, in the order of the link. A node
-        that would settle to the voltages x[n], slot by slot, has in slot n the voltage
-        v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau), with an equal scan before this one. Hum
-        adds hum_lsb sin(2 pi hum t) at the reading's own time t.
+        The scan starts at start_s, with one reading a slot. A node that would settle to x[n] has
+        in slot n the voltage v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau), with an equal scan
+        before this one. Hum adds hum_lsb sin(2 pi hum t) at the reading's own time t.
         """
         read = in_scan_order(ratio)
         if self.tau_us:
@@ -233,13 +220,6 @@ def _settled(voltage: Float, kept: float) -> Float:
     for _ in range(2):
         settled = list(accumulate(goals, lambda v, x: x + (v - x) * kept, initial=settled[-1]))[1:]
     return np.array(settled)
-
-
-def cut(skin: Skin, layer: str, line: int, place: int = 0) -> Skin:
-    """`skin` with segment `place` of a row ("top") or column ("bottom") open; 0: all of it."""
-    wires = {"top": skin.top_wire_ohm.copy(), "bottom": skin.bottom_wire_ohm.copy()}
-    wires[layer][(line, place) if layer == "top" else (place, line)] = OPEN_OHM
-    return replace(skin, top_wire_ohm=wires["top"], bottom_wire_ohm=wires["bottom"])
 
 
 def joined_readings(skin: Skin, joints: Iterable[Pair]) -> Float:

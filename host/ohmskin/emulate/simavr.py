@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The built firmware in an AVR simulator, in real time, as a `Link`: ``simavr://uno?scene=ghost``.
 
-The simulator `skinsim` (firmware/sim) is a separate program, which `SkinSim` starts and talks to
-over two pipes. It runs the firmware unchanged, with a skin at its pins.
-
+The simulator `skinsim` is a separate program, which `SkinSim` starts and talks to over two pipes.
 firmware/sim/README.md lists settings, and what is not modelled: above all crystal tolerance, and
 everything on the USB side of the UART.
 """
