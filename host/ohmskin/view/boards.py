@@ -9,13 +9,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
-from functools import cached_property
 from itertools import count, takewhile
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -52,62 +51,47 @@ _skin_of: Final = attrgetter(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """One scan of a page. raw: by the method `ohm`, what the electrodes read, ghosts included.
+class Shown(NamedTuple):
+    """One scan of a page: its number, and what the page is sent.
 
-    method: that of `found`. has_forces: there are newtons. missed: scans, since the connection was
-    made. rate_hz: the board's scan rate [Hz]. recorded: scans in the recording that goes on, if one
-    does.
+    ==============  ==================================================================
+    4 bytes         length of the header, little-endian
+    header          JSON, padded with spaces to a multiple of 4 bytes
+    planes          those that the header names, each R x C float32, little-endian, by row
+    ==============  ==================================================================
     """
 
-    found: ForceScan
-    raw: Estimate
-    method: str
-    has_forces: bool
-    missed: int
-    rate_hz: float
-    recorded: int
+    number: int
+    message: bytes
 
-    @cached_property
-    def message(self) -> bytes:
-        """The bytes of it.
 
-        ==============  ==================================================================
-        4 bytes         length of the header, little-endian
-        header          JSON, padded with spaces to a multiple of 4 bytes
-        planes          those that the header names, each R x C float32, little-endian, by row
-        ==============  ==================================================================
-        """
-        planes: dict[str, Float | Bool] = {
-            "raw": self.raw.cell_siemens,
-            "raw_touched": self.raw.touched,
-            "siemens": self.found.estimate.cell_siemens,
-            "siemens_std": self.found.estimate.cell_siemens_std,
-            "touched": self.found.estimate.touched,
-        }
-        if self.has_forces:
-            planes |= {"force": self.found.force_n, "force_std": self.found.force_n_std}
-        scan, estimate = self.found, self.found.estimate
-        content = {
-            "scan": scan.number,
-            "host_time_s": scan.host_time_s,
-            "rows": scan.rows,
-            "columns": scan.columns,
-            "planes": list(planes),
-            "method": self.method,
-            "chi2": _number(estimate.chi2),
-            "estimate_s": estimate.seconds,
-            "text": estimate.message,
-            "rate_hz": self.rate_hz,
-            "missed": self.missed,
-            "recorded": self.recorded,
-            "contacts": [list(map(_number, _numbers_of(each))) for each in scan.contacts],
-        }
-        header = json.dumps(content, allow_nan=False).encode()
-        header += b" " * (-len(header) % 4)
-        values = np.stack(list(planes.values())).astype("<f4")
-        return struct.pack("<I", len(header)) + header + values.tobytes()
+def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, **more: Any) -> Shown:
+    """raw: by the method `ohm`, what the electrodes read, ghosts included. more: of the header."""
+    estimate = scan.estimate
+    planes: dict[str, Float | Bool] = {
+        "raw": raw.cell_siemens,
+        "raw_touched": raw.touched,
+        "siemens": estimate.cell_siemens,
+        "siemens_std": estimate.cell_siemens_std,
+        "touched": estimate.touched,
+    }
+    if has_forces:
+        planes |= {"force": scan.force_n, "force_std": scan.force_n_std}
+    content = more | {
+        "scan": scan.number,
+        "host_time_s": scan.host_time_s,
+        "rows": scan.rows,
+        "columns": scan.columns,
+        "planes": list(planes),
+        "chi2": _number(estimate.chi2),
+        "estimate_s": estimate.seconds,
+        "text": estimate.message,
+        "contacts": [list(map(_number, _numbers_of(each))) for each in scan.contacts],
+    }
+    header = json.dumps(content, allow_nan=False).encode()
+    header += b" " * (-len(header) % 4)
+    values = np.stack(list(planes.values())).astype("<f4")
+    return Shown(scan.number, struct.pack("<I", len(header)) + header + values.tobytes())
 
 
 def _number(value: float) -> float | None:
@@ -149,8 +133,7 @@ class _Recording(Closing):
 class ViewedBoard(Closing):
     """The board at `port`, whether it is there or not. All but `shown` and `state` may wait.
 
-    calibrations: the one of its unit is taken; with `force`, that of any. folder: where recordings
-    go.
+    calibrations: the one of its unit is taken; with `force`, that of any. folder: of recordings.
     """
 
     def __init__(
@@ -201,9 +184,8 @@ class ViewedBoard(Closing):
     def use(self, method: str) -> str:
         """Estimate by another method. Commands return what was done, and raise why it was not."""
         _, reader = self._there()
-        if method not in _methods(reader):
-            methods = ", ".join(_methods(reader))
-            raise ValueError(f"no method '{method[:40]}': there are {methods}")
+        if method not in (known := _methods(reader)):
+            raise ValueError(f"no method '{method[:40]}': there are {', '.join(known)}")
         reader.use(method)
         self._changed()
         return f"method {method}"
@@ -215,7 +197,7 @@ class ViewedBoard(Closing):
         """
         with self._one_at_a_time():
             skin, reader = self._there()
-            self._record_rest(reader.tare(skin.mean_ratio(TARE_S), force=force))
+            self._add(reader.tare(skin.mean_ratio(TARE_S), force=force))
         lasts = "; 'ohmskin tare' makes one that lasts" if reader.force_method else ""
         return f"tared, until this program ends{lasts}"
 
@@ -223,7 +205,7 @@ class ViewedBoard(Closing):
         """Return to the rest before the last tare."""
         with self._one_at_a_time():
             if (rest := self._there()[1].undo_tare()) is not None:
-                self._record_rest(rest)
+                self._add(rest)
         return "the tare is undone: rest is as it was before"
 
     def record(self) -> str:
@@ -248,12 +230,11 @@ class ViewedBoard(Closing):
 
     def mark(self, text: str) -> str:
         """Set a mark in the recording."""
-        recording, text = self._running(), text.strip()
-        if recording is None:
-            raise OhmskinError("a mark goes into a recording: start one first")
+        text = text.strip()
         if not 0 < len(text) <= _LONGEST_MARK:
             raise OhmskinError(f"a mark is a text of 1 to {_LONGEST_MARK} characters")
-        recording.recorder.add(Mark(text, time.monotonic()))
+        if not self._add(Mark(text, time.monotonic())):
+            raise OhmskinError("a mark goes into a recording: start one first")
         return f"marked: {text}"
 
     def _there(self) -> tuple[Device, SkinReader]:
@@ -276,9 +257,11 @@ class ViewedBoard(Closing):
         recording = self._recording
         return None if recording is None or recording.text else recording
 
-    def _record_rest(self, rest: Tare) -> None:
+    def _add(self, kept: Tare | Mark) -> bool:
+        """Add it to the recording that goes on; whether one does."""
         if (recording := self._running()) is not None:
-            recording.recorder.add(rest)
+            recording.recorder.add(kept)
+        return recording is not None
 
     def _new_file(self, unit_id: int) -> Path:
         stem = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
@@ -322,14 +305,13 @@ class ViewedBoard(Closing):
                         step_us = max(scan.time_us - newest_us, 0)
                         seen_us += min(step_us, MEMORY_US // 2)
                         newest_us = scan.time_us
-                        self.shown = Shown(
-                            reader.read(replace(scan, time_us=seen_us)),
-                            raw.estimate(scan.ratio),
-                            reader.method,
-                            reader.has_forces,
-                            skin.stats.missed,
-                            skin.info.rate_hz,
-                            0 if running is None else running.recorder.scans,
+                        found = reader.read(replace(scan, time_us=seen_us))
+                        self.shown = _shown(
+                            *(found, raw.estimate(scan.ratio), reader.has_forces),
+                            method=reader.method,
+                            missed=skin.stats.missed,
+                            rate_hz=skin.info.rate_hz,
+                            recorded=0 if running is None else running.recorder.scans,
                         )
                     self._say("scanning")
             finally:

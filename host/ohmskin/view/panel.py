@@ -2,10 +2,9 @@
 """One panel of a page: a websocket over which a board is shown and commanded.
 
 To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes: `Shown.message`).
-The newest scan is sent, and no other before the page has acknowledged it. So nothing queues up on
-the way, however slow page or network are. From the page come texts, whose ``do`` is a command of
-`Panel._asked`, "ack" with ``scan``, or "clock" with ``page_ms``, to which the answer tells the
-host's clock.
+The newest scan is sent, and no other before the page has acknowledged it, so nothing queues up.
+From the page come texts, whose ``do`` is a command of `Panel._asked`, "ack" with ``scan``, or
+"clock" with ``page_ms``, to which the answer tells the host's clock.
 """
 
 import asyncio
@@ -71,7 +70,7 @@ class Panel:
                 said = state
                 await self._say("state", **state)
             if shown is not None and shown is not self._sent and self._awaited is None:
-                self._sent, self._awaited = shown, shown.found.number
+                self._sent, self._awaited = shown, shown.number
                 await self._socket.send_bytes(shown.message)
 
     async def _say(self, kind: str, **content: Any) -> None:

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The server of the page: a few files, the list of boards, a websocket for each panel.
 
-It answers its own page alone, from this machine or with the token. A page of another site must
-neither read the skin nor command it. A browser says in ``Origin`` which page asks, and in ``Host``
-which name it asked for: a foreign name that was made to lead here (DNS rebinding) is refused, and
-so is a foreign page. On other addresses than loopback there are names that nobody here can know;
-there the token in the address takes the place of the check of ``Host``.
+It answers its own page alone, from this machine or with the token. A browser says in ``Origin``
+which page asks, and in ``Host`` which name it asked for: a foreign page is refused, and so is a
+foreign name that was made to lead here (DNS rebinding). On other addresses than loopback there are
+names that nobody here can know; there the token takes the place of the check of ``Host``.
 """
 
 import ipaddress
