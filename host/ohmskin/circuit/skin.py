@@ -25,9 +25,8 @@ Equations. With x the cell currents and V the electrode potentials,
     rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] ,     I = 1 / (rho + R_top + R_bottom) .
 
 This is Kirchhoff's law on the network of 2RC nodes with the wire nodes eliminated: along a chain,
-cells j and k share the wire up to the nearer of them, so K is a sum of segments. It needs half the
-unknowns of the node Laplacian, and open cells (g = 0) and wires of zero ohm need no special value.
-Everything is in SI units: the matrix that is factorised, 1 + sqrt(g) K sqrt(g), has none.
+cells j and k share the wire up to the nearer of them, so K is a sum of segments. Open cells (g = 0)
+and wires of zero ohm need no special value. What is factorised is 1 + sqrt(g) K sqrt(g).
 """
 
 from dataclasses import dataclass
@@ -58,8 +57,7 @@ class Skin:
     """Every resistance of the circuit: cells (R, C) [S], wire segments (R, C) [ohm], references.
 
     `top_wire_ohm[i, j]` ends at T[i, j], `bottom_wire_ohm[i, j]` at B[i, j]; index 0 along the
-    stripe is the segment from the electrode. Zero conductance is an open cell, zero wires are
-    allowed, both exactly. Arrays are copied and read-only.
+    stripe is the segment from the electrode. Zeros are exact. Arrays are copied and read-only.
     Raises ValueError for other shapes, values that are negative or not finite, references not > 0.
     """
 
@@ -161,8 +159,7 @@ def electrode_admittance(skin: Skin) -> Float:
 def port_resistance_ohm(skin: Skin) -> Float:
     """rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] [ohm], shape (R, C), all other electrodes floating.
 
-    One factorisation of RC unknowns with R+C right-hand sides gives all ports. A port that no
-    chain of cells connects (all of them open) is inf.
+    A port that no chain of cells connects (all of them open) is inf.
     """
     rows = skin.shape[0]
     part = _connected_parts(skin.cell_siemens)
@@ -214,11 +211,9 @@ class PortCircuit:
     """Ports of a skin whose cells conduct (g > 0), in row-major order, and what moves them.
 
     port_ohm: rho (RC,). The others are slopes, d rho / d log r_e = r_e i_e^2 [ohm], i_e the current
-    through resistance e. The adjoint of a resistive network is the network itself (Tellegen): the
-    currents that give rho give its derivative as well, so one factorisation of RC unknowns and R+C
-    right-hand sides are enough for all RC x 3RC derivatives: a port's currents are those of its row
-    less those of its column. Cells (R, C) [S], wires (R, C) [ohm], or one number where all segments
-    of their layer are alike.
+    through resistance e (Tellegen): the currents that give rho give all RC x 3RC derivatives. A
+    port's currents are those of its row less those of its column. Cells (R, C) [S], wires (R, C)
+    [ohm], or one number where all segments of their layer are alike.
     """
 
     def __init__(self, cell_siemens: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire) -> None:
@@ -314,9 +309,8 @@ def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) 
 def current_std(ratio_std: float, ref_top_ohm: float, ref_bottom_ohm: float) -> float:
     """Standard deviation of `current_from_ratio` [S]: ratio_std * sum_k R_k / sum_k R_k^2.
 
-    The sum is linear, not quadratic, because rounding errors do not average out: without other
-    noise D is 1 - A, C is 1 - B, and with equal references B equals D, so all four round alike.
-    For other noise this is an upper bound (too large by 2 at most).
+    The sum is linear, not quadratic, because without other noise all four readings round alike. For
+    other noise this is an upper bound (too large by 2 at most).
     """
     reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
     return float(ratio_std * np.sum(reference) / np.sum(reference**2))

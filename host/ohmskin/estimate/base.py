@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every estimator is told, what it answers, and the steps they share.
 
-An estimator turns the readings of one frame, shape (R, C, 4), into cell conductances. A method
-derives from `Estimator` and writes `_solve`; checking the readings, timing, and deciding which
-cells are touched happen here, so that all methods do them alike.
+A method derives from `Estimator` and writes `_solve`. Checking the readings, timing, and deciding
+which cells are touched happen here, so that all methods do them alike.
 """
 
 import time
@@ -121,14 +120,13 @@ class SkinKnowledge:
 class Estimate:
     """The answer for one frame, with its evidence.
 
-    cell_siemens, cell_siemens_std (R, C) [S]: rounding is uniform, not normal: about 58 % of cells
-    lie within one standard deviation and 98 % within two. The deviation covers the readings' noise,
-    not what the method neglects. It is NaN where the method gives none.
-    level, level_std (R, C): what a force is read from. They equal cell_siemens and
-    cell_siemens_std [S] for all methods but `voltage` [1].
+    cell_siemens, cell_siemens_std (R, C) [S]: the deviation covers the readings' noise, not what
+    the method neglects: about 58 % of cells lie within one, 98 % within two, because rounding is
+    uniform. It is NaN where the method gives none.
+    level, level_std (R, C): what a force is read from: the same, but for `voltage` [1].
     touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C): NaN where the method estimates no wires.
-    chi2: the sum of the squared residuals of all readings over the variance of one, divided by
-    their number. It is about 1 or less when the model holds.
+    chi2: mean of the squared residuals of all readings over the variance of one. It is about 1 or
+    less when the model holds.
     message: empty if the method converged and the readings can be trusted, else why not.
     seconds: wall time of this frame.
     """
@@ -215,9 +213,8 @@ class Estimator(ABC):
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
         A cell is touched when g - g_rest > max(0.5e-6 S, 4 sqrt(std^2 + std_rest^2)), std the one
-        downwards. g_rest is this method's own answer to `rest_ratio`; without one it is the median
-        over the cells of this frame, which supposes that less than half of them are touched (one
-        cell alone then never is). A standard deviation of NaN counts as none.
+        downwards, NaN as 0. g_rest is this method's own answer to `rest_ratio`; without one it is
+        the median of this frame, which supposes that less than half of the cells are touched.
         Raises ValueError for another shape, or for a reading that is no number in 0..1.
         """
         known = self.knowledge

@@ -91,8 +91,7 @@ def voltage_squared(impedance: Float, rows: int) -> Float:
 class MatrixEstimator(Estimator):
     """No wires, all cells at once. Starts from the previous frame, or from `ohm` if that is nearer.
 
-    Converged: the chi-square cannot fall by more than 1e-4 (see `CHI2_TOLERANCE`). Not converged:
-    40 iterations did not suffice, or no step lowers the chi-square although one should.
+    Converged: within 40 iterations the chi-square cannot fall by more than `CHI2_TOLERANCE`.
     Standard deviations are the roots of the diagonal of (J^T J)^-1 at the solution, also for a
     cell that ends on a bound, times the root of |r|^2 / RC where that exceeds 1.
     """
@@ -124,8 +123,8 @@ class MatrixEstimator(Estimator):
 class CellFit:
     """One frame's minimisation. cell (R, C) [S]; message: why it did not converge, or empty.
 
-    It starts from the cells of the frame `before`, or from those of `ohm` if they are nearer.
-    It ends where a step lowers the chi-square by less than `tolerance`.
+    It starts from the cells of the frame `before`, or from those of `ohm` if they are nearer, and
+    ends where a step lowers the chi-square by less than `tolerance`.
     """
 
     def __init__(

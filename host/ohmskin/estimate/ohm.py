@@ -13,7 +13,6 @@ voltage over the reference resistors, and for all else it is `ohm`.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
@@ -70,14 +69,11 @@ class VoltageEstimator(OhmEstimator):
         return level, np.full_like(level, self.knowledge.ratio_std)
 
 
-def voltage_level(ratio: ArrayLike) -> Float:
+def voltage_level(ratio: Float) -> Float:
     """The mean voltage over the reference resistors: (..., 4) [V/Vdd] to (...) [1].
 
     It is the mean over the configurations of sign (y - offset), and it grows with the cell's
     conductance. All four readings round alike, so its standard deviation is that of one reading
-    (`SkinKnowledge.ratio_std`). Raises ValueError for another shape.
+    (`SkinKnowledge.ratio_std`).
     """
-    readings = np.asarray(ratio, dtype=np.float64)
-    if readings.ndim < 1 or readings.shape[-1] != READING_SIGN.size:
-        raise ValueError(f"ratio has shape {readings.shape}, it must end in {READING_SIGN.size}")
-    return np.asarray((readings - READING_OFFSET) @ READING_SIGN / READING_SIGN.size)
+    return np.asarray((ratio - READING_OFFSET) @ READING_SIGN / READING_SIGN.size)

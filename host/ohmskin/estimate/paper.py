@@ -20,30 +20,24 @@ x              20 N^2       all states: cells in column-major order, A to D for 
 y              4N           the readings in the order of the states
 ============== ============ ==================================================================
 
-Each state has 2N + 1 equality constraints. With currents written as voltage differences over
-resistances (Ohm's law), Kirchhoff's current law holds at each of the 2N nodes; and the measurement:
-the sensed electrode is at y, and the current through its reference resistor enters the skin,
+Each state has 2N + 1 equality constraints: Kirchhoff's current law at 2N nodes, and its reading,
 
     A:  (y - V^t[i,0]) / R^t[i,0] = (1 - y) / R_top ,
 
 B, C and D alike with the electrode and the supply exchanged. The other selected electrode is
 reached through R^b[0,j] + R_bottom. All are multiplied by the reference resistor: they are ratios.
 
-    Cost_f = sum over cells   |AP - BP|^2 + |CP - DP|^2
-    Cost_c = sum over consecutive cells and over k   |kQ - kQ'|^2 ,   Q = R^t, R^b, R^c
-    Cost_r = sum over states   |R^t|^2 + |R^b|^2
-    minimised: alpha Cost_f + beta Cost_c + lambda Cost_r
-
-The costs are in megohm as the paper has them; only the variables are logarithms. Every state has
-resistances of its own: reported is their mean over all 4N states. CasADi writes the program, Ipopt
-solves it. Source: section IV.D to IV.G of the paper. docs/paper.md says which readings of the text
-were taken and why, and what can be expected of the answers.
+The costs are in megohm; only the variables are logarithms. Reported is the mean of the resistances
+over all 4N states. Source: section IV.D to IV.G of the paper. docs/paper.md defines the costs, and
+says how the text is interpreted and what can be expected of the answers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import zip_longest
 from typing import Any, ClassVar, Final, NamedTuple
 
 import casadi
@@ -96,32 +90,26 @@ _IPOPT: Final[dict[str, Any]] = {
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
 }
-# More options, by where a solution starts from. From a simulated circuit, the barrier is weak, so
-# that the answer stays near it. From another program's solution, it is as usual. From this one's
-# solution of the frame before, with its multipliers, those of bounds that do not hold stay as weak
-# as they were, or the states drift.
-Options = tuple[tuple[str, Any], ...]
-_FROM_CIRCUIT: Final[Options] = (("bound_mult_init_val", 1e-6),)
-_FROM_STEP: Final[Options] = ()
-_FROM_BEFORE: Final[Options] = (
-    ("warm_start_init_point", "yes"),
-    ("warm_start_mult_bound_push", 1e-6),
-)
+# More options, by where a solution starts from: near a simulated circuit, the barrier is weak. From
+# the solution of the frame before, with its multipliers, those of bounds that do not hold stay as
+# weak as they were, or the states drift.
+_STARTS: Final[dict[str, dict[str, Any]]] = {
+    "circuit": {"bound_mult_init_val": 1e-6},
+    "step": {},
+    "before": {"warm_start_init_point": "yes", "warm_start_mult_bound_push": 1e-6},
+}
 
 
 class Step(NamedTuple):
-    """One step of Algorithm 1. weights: alpha, beta and lambda of its objective."""
+    """One step of Algorithm 1. weights: of Cost_f, Cost_c and Cost_r. start: see `_STARTS`."""
 
     number: int
     weights: tuple[float, float, float]
-    options: Options
+    start: str
 
 
-STEP_3: Final = Step(3, (1e6, 1e6, 0.0), _FROM_CIRCUIT)
-STEP_4: Final = Step(4, (1.0, 1.0, 1e9), _FROM_STEP)
-
-
-# -------------------------------------------------------------------------------- the estimators
+STEP_3: Final = Step(3, (1e6, 1e6, 0.0), "circuit")
+STEP_4: Final = Step(4, (1.0, 1.0, 1e9), "step")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +117,7 @@ class _Answer:
     """One frame solved: its readings, each step's optimum, the mean circuit and its readings."""
 
     ratio: Float
-    optima: tuple[Optimum, ...]
+    optima: Sequence[Optimum]
     skin: Skin
     model_ratio: Float
 
@@ -151,11 +139,9 @@ class PaperEstimator(Estimator):
     changed by more than 0.02 since, and otherwise as Algorithm 1 says. Good: converged, and all
     resistances are below 10 megohm. A frame whose warm start ends otherwise is solved again from
     step 2, and where that fails too, from the cells that `matrix` finds.
-    Converged: Ipopt succeeded in the last step (300 iterations, tolerance 1e-6, circuit laws to
-    1e-9 of Vdd), the readings are such that some circuit of the allowed resistances gives them, and
-    the reported mean circuit gives them to 1e-3 of Vdd. `iterations` is the sum over all that was
-    solved. The paper gives no uncertainty: standard deviations are NaN.
-    Raises ValueError for more than 64 cells.
+    Converged: Ipopt succeeded in the last step, some circuit of the allowed resistances gives the
+    readings, and the reported mean circuit gives them to 1e-3 of Vdd. `iterations`: of all that was
+    solved. Standard deviations are NaN. Raises ValueError for more than 64 cells.
     """
 
     steps: ClassVar[tuple[Step, ...]]
@@ -188,12 +174,12 @@ class PaperEstimator(Estimator):
         ratio = ratio_from_current(current, known.ref_top_ohm, known.ref_bottom_ohm)
         before, answers = self._previous, []
         if before is not None and np.abs(ratio - before.ratio).max() < _JUMP_RATIO:
-            answers.append(self._answer(ratio, before.optima))
+            answers.append(self._answer(ratio, before.optima[0].x, before.optima))
         if not answers or not answers[0].is_good_start:
-            answers.append(self._answer(ratio, (), 1.0 / current - known.ref_ohm))
+            answers.append(self._afresh(ratio, 1.0 / current - known.ref_ohm))
             if not answers[-1].is_good_start:
                 fit = CellFit(replace(ports, current=current), known.ref_ohm, None)
-                answers.append(self._answer(ratio, (), 1.0 / fit.cell))
+                answers.append(self._afresh(ratio, 1.0 / fit.cell))
         # A good one if there is any; of several, the one that gives the readings best.
         answer = min(answers, key=lambda each: (not each.is_good_start, each.misfit_ratio))
         self._previous = answer if answer.is_good_start else None
@@ -217,27 +203,24 @@ class PaperEstimator(Estimator):
             bottom_wire_ohm=found.bottom_wire_ohm,
         )
 
-    def _answer(
-        self, ratio: Float, previous: tuple[Optimum, ...], cell_ohm: Float | None = None
-    ) -> _Answer:
-        """Steps 2 to the last one from these cells, or from the optima of the previous frame."""
-        known = self.knowledge
+    def _afresh(self, ratio: Float, cell_ohm: Float) -> _Answer:
+        """Algorithm 1 from step 2 on, with these cells."""
+        cell_megohm = cell_ohm / OHM_PER_MEGOHM
+        x = initial_states(cell_megohm, self._reference_megohm, self.start_wire_megohm)
+        return self._answer(ratio, x)
+
+    def _answer(self, ratio: Float, x: Float, before: Sequence[Optimum] = ()) -> _Answer:
+        """Each step from the states x of the one before it, or of its own in the frame before."""
         optima: list[Optimum] = []
-        for place, step in enumerate(self.steps):
-            before = previous[place] if previous else None
-            if before is not None:
-                x = before.x
-            elif optima:
-                x = optima[-1].x
-            else:
-                assert cell_ohm is not None
-                cell_megohm = cell_ohm / OHM_PER_MEGOHM
-                x = initial_states(cell_megohm, self._reference_megohm, self.start_wire_megohm)
-            optima.append(self._program.solve(ratio, self._reference_megohm, step, x, before))
+        for step, own in zip_longest(self.steps, before):
+            x = x if own is None else own.x
+            optima.append(self._program.solve(ratio, self._reference_megohm, step, x, own))
+            x = optima[-1].x
+        known = self.knowledge
         layers = optima[-1].megohm.mean(axis=0).reshape(3, known.columns, known.rows)
         top, bottom, cell = (OHM_PER_MEGOHM * layer.T for layer in layers)
         skin = Skin(1.0 / cell, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
-        return _Answer(ratio, tuple(optima), skin, readings(skin))
+        return _Answer(ratio, optima, skin, readings(skin))
 
     def _feasible(self, current: Float) -> tuple[Float, str]:
         """The currents (R, C) [S] within what some circuit allows; which one was not, if any."""
@@ -267,9 +250,6 @@ class RegularizedEstimator(PaperEstimator):
     steps = (STEP_3, STEP_4)
 
 
-# ------------------------------------------------------------------------------------- step 2
-
-
 def initial_states(
     cell_megohm: Float, reference_megohm: tuple[float, float], wire_megohm: float
 ) -> Float:
@@ -295,9 +275,6 @@ def initial_states(
     for k in range(READINGS_PER_CELL):
         states[:, k, 3 * cell.size :] = high_top if TOP_IS_HIGH[k] else 1.0 - high_top
     return states.reshape(READINGS_PER_CELL * cell.size, 5 * cell.size)
-
-
-# -------------------------------------------------------------------------------- the program
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,10 +324,7 @@ class Program:
             "g": casadi.vertcat(*(state.laws for state in states)),
             "p": casadi.vertcat(y, references, weights),
         }
-        self._solvers = {
-            options: _make_solver(problem, dict(options))
-            for options in (_FROM_CIRCUIT, _FROM_STEP, _FROM_BEFORE)
-        }
+        self._solvers = {start: _make_solver(problem, more) for start, more in _STARTS.items()}
         is_resistance = np.arange(5 * cells) < 3 * cells
         least = np.where(is_resistance, np.log(MIN_MEGOHM), -np.inf)
         most = np.where(is_resistance, np.log(MAX_MEGOHM), np.inf)
@@ -379,7 +353,7 @@ class Program:
         if previous is not None:
             arguments["lam_x0"] = previous.bound_multipliers
             arguments["lam_g0"] = previous.constraint_multipliers
-        solver = self._solvers[step.options if previous is None else _FROM_BEFORE]
+        solver = self._solvers[step.start if previous is None else "before"]
         # Column-major: rows run fastest, then columns.
         y = ratio.transpose(1, 0, 2).ravel()
         found = solver(
@@ -407,9 +381,9 @@ def program_for(rows: int, columns: int) -> Program:
 def _make_solver(problem: dict[str, Any], more: dict[str, Any]) -> Any:
     options = {f"ipopt.{name}": value for name, value in (_IPOPT | more).items()}
     # Sensitivities to the parameters (lam_p) are not needed, and warn where Ipopt gave up.
-    silent = ("print_time", "show_eval_warnings", "error_on_fail", "calc_lam_p")
-    quiet = dict.fromkeys(silent, False)
-    return casadi.nlpsol("paper", "ipopt", problem, options | quiet)
+    for name in ("print_time", "show_eval_warnings", "error_on_fail", "calc_lam_p"):
+        options[name] = False
+    return casadi.nlpsol("paper", "ipopt", problem, options)
 
 
 class _State:
