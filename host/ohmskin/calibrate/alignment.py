@@ -15,19 +15,14 @@ r      (K,)    Pearson's correlation of x and y over those points               
 G      (K,)    score, -n/2 log(1 - r^2) where r > 0, else 0                               1
 ====== ======= ========================================================================= ==========
 
-Edges: conductance grows with force, but with another power and gain in each cell, and it creeps on
-while the force rests. Both are therefore compressed, log(1 + z / (0.2 z_99)) with their own 99th
-percentile z_99, so that strong and weak presses count alike. Then both are differentiated: creep,
-drift and the zero are slow, while a press begins and ends in both at once. The derivative is that
-of a Gaussian of 50 ms: a shorter one sees more noise, a longer one sees more creep.
+Edges: both are compressed, log(1 + z / (0.2 z_99)) with their own 99th percentile z_99, so that
+strong and weak presses count alike. Then both are differentiated by a Gaussian of 50 ms: creep,
+drift and the zero are slow, while a press begins and ends in both at once.
 
 At each lag r is normalised by what both share there, without gaps, so a large press wins at no lag
-by its size. G is the log-likelihood ratio of "x is a multiple of y and noise" to "x is noise". By r
-alone two short stretches that are alike by chance would win. A parabola through G about its maximum
-gives the offset between grid points.
-
-`tests/calibrate/test_alignment.py` prints the error for simulated skins that creep. A delay inside
-the force sensor, such as that of its filter, is part of the offset.
+by its size. G is the log-likelihood ratio of "x is a multiple of y and noise" to "x is noise": by r
+alone, two short stretches that are alike by chance would win. A delay inside the force sensor, such
+as that of its filter, is part of the offset.
 """
 
 from dataclasses import dataclass
@@ -75,17 +70,14 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     scan_time_s (n,): the middle of each scan by any clock [s], increasing. rise (n,): of the whole
     skin above rest, summed over cells [S]. Two clocks whose rates differ are aligned on average.
 
-    Raises ValueError for bad arrays; if nothing was pressed; if both did not run together for 15 s
-    and for half of the shorter one; if nothing fits (r < 0.6); and if another offset fits nearly as
-    well, as with presses that repeat evenly.
+    Raises ValueError for bad arrays; if nothing was pressed; if both ran together for too short; if
+    nothing fits; and if another offset fits nearly as well, as with presses that repeat evenly.
     """
     time_s, rises = (np.asarray(each, dtype=np.float64) for each in (scan_time_s, rise))
     good = np.isfinite(rises) & (np.diff(time_s, prepend=-np.inf) > 0)
     if not good.all():
-        raise ValueError(
-            f"scan {int(np.argmin(good))}: its rise is not finite, or its time is not later than "
-            "that of the scan before it"
-        )
+        scan = int(np.argmin(good))
+        raise ValueError(f"scan {scan}: its rise is not finite, or its time not after the last")
     x, in_x = _edges(time_s, rises, "the skin's rise")
     y, in_y = _edges(log.time_s, log.force_n, "the force")
     r, shared = correlations(x, in_x, y, in_y)

@@ -2,7 +2,7 @@
 """Leads a person from press to press: which one is wanted next, and when it is read. Sans-IO."""
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
@@ -52,8 +52,8 @@ class Step(NamedTuple):
     wanted: the press that is wanted, or was read and is to be taken off; None when all are done.
     cells: what is pressed. change: of the rise from one half of the window to the other, relative;
     None before a whole window. rise: mean conductance of the cell above rest over the window [S],
-    if this scan completes the press; else None. rise_std: standard error of that mean, from the
-    scatter of the scans [S]; what all of them share, such as rounding, is not in it.
+    if this scan completes the press; else None. rise_std: standard error of that mean [S], from the
+    scatter of the scans.
     """
 
     state: State
@@ -74,16 +74,13 @@ def pressed_cells(rise: Float, touched: Bool) -> Cells:
 
 def still_wanted(wanted: Iterable[Press], read: Iterable[Press]) -> list[Press]:
     """What is wanted and not read yet, in order. Each press read counts once."""
-    left, missing = list(read), []
+    left = Counter((cell, round(force_n, 9)) for cell, force_n in read)
+    missing = []
     for press in wanted:
-        on_cell = (each for each in left if each.cell == press.cell)
-        alike = (
-            each for each in on_cell if math.isclose(each.force_n, press.force_n, rel_tol=1e-6)
-        )
-        if (found := next(alike, None)) is None:
+        alike = (press.cell, round(press.force_n, 9))
+        if left[alike] <= 0:
             missing.append(press)
-        else:
-            left.remove(found)
+        left[alike] -= 1
     return missing
 
 
@@ -114,23 +111,19 @@ class Guide:
     ======== ======================================= ==============================================
     state    on the skin, for certain                goes on to
     ======== ======================================= ==============================================
-    PUT      nothing                                 HOLD or WRONG, when something is put on it
-    HOLD     the wanted cell alone                   TAKE_OFF when it is steady: the press is read;
-                                                     PUT or WRONG when it is no longer so
-    WRONG    another cell, or several                HOLD or PUT, when it is no longer so
+    PUT      nothing                                 HOLD or WRONG
+    HOLD     the wanted cell alone                   TAKE_OFF when it is steady, else PUT or WRONG
+    WRONG    another cell, or several                HOLD or PUT
     TAKE_OFF what was read, or anything              PUT of the next or DONE, when nothing is
     DONE     anything                                nothing: all were read
     ======== ======================================= ==============================================
 
-    For certain: for `CERTAIN_S`, see `OnSkin`; scans that differ for less are left out. Steady:
-    with the rises x (n,) of the last `WINDOW_S`, at least `MIN_SCANS`, and their mean m,
+    For certain: see `OnSkin`. Steady: with the rises x (n,) of the last `WINDOW_S`, at least
+    `MIN_SCANS`, and their mean m,
 
-        v = mean((x[i+1] - x[i])^2) / 2            the noise from scan to scan, which averages out
-        |mean of half 2 - mean of half 1| <= `MAX_CHANGE` m + 2 sqrt(4 v / n)
-        var(x) - v <= (`MAX_SCATTER` m)^2
-
-    v is the estimate of von Neumann (1941), which a slow change hardly enters. The first condition
-    sees creep and a load that still comes, the second one sees what goes to and fro.
+        v = mean((x[i+1] - x[i])^2) / 2            the noise from scan to scan (von Neumann, 1941)
+        |mean of half 2 - mean of half 1| <= `MAX_CHANGE` m + 2 sqrt(4 v / n)     it does not creep
+        var(x) - v <= (`MAX_SCATTER` m)^2                             it does not go to and fro
     """
 
     def __init__(self, wanted: Sequence[Press]) -> None:

@@ -2,10 +2,9 @@
 """From presses of single cells, in scans or in a table, to the calibration of a skin.
 
 A scan belongs to the cell that rises most above rest, if that cell is touched. Consecutive scans of
-one cell are a press. Where its rise falls to a fifth in between, they are several presses.
-
-Two kinds of scans are left out: those of a run of less than `MIN_SCANS`, and those in which another
-cell rises by more than `SECOND_SHARE` of the first, for nothing tells how two cells share a force.
+one cell, `MIN_SCANS` at least, are a press; where the rise falls to a fifth in between, several.
+Scans in which another cell rises by more than `SECOND_SHARE` of the first are left out, for nothing
+tells how two cells share a force.
 """
 
 from collections.abc import Callable, Iterable
@@ -182,10 +181,9 @@ def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]
 class Calibrator:
     """Makes the calibration of one skin.
 
-    board: that scans it. rest_ratio: readings (R, C, 4) of the untouched skin. method: what its
-    cells are estimated by. indenter_area_m2: area that it is pressed with [m^2]. nominal_wire_ohm:
-    as far as it is known. estimator: by that method. rest_level (R, C): what it shows of the
-    untouched skin [S, or 1 for `voltage`].
+    board: that scans it. rest_ratio: readings (R, C, 4) of the untouched skin. method: that of
+    `estimator`. indenter_area_m2: area that it is pressed with [m^2]. rest_level (R, C): what the
+    estimator shows of the untouched skin [S, or 1 for `voltage`].
     """
 
     board: Hello
@@ -200,9 +198,7 @@ class Calibrator:
         self.rest_level = self.estimator.rest_level()
 
     def measure(
-        self,
-        scans: list[Scan],
-        progress: Callable[[Iterable[Scan]], Iterable[Scan]] = iter,
+        self, scans: list[Scan], progress: Callable[[Iterable[Scan]], Iterable[Scan]] = iter
     ) -> LevelHistory:
         """What all scans show above rest. progress: passes them on, one after another.
 

@@ -109,9 +109,8 @@ class Device(Closing):
     def _wait_for_scan(self, ready: Callable[[], bool], limit_s: float | None = None) -> None:
         limit_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz if limit_s is None else limit_s
         if not self._wait(ready, limit_s):
-            raise DeviceLost(
-                f"{self.name} has said nothing for {limit_s:.1f} s: unplug and plug it"
-            )
+            silent = f"{self.name} has said nothing for {limit_s:.1f} s"
+            raise DeviceLost(f"{silent}: unplug and plug it")
         self._changed.notify_all()  # a replay may go on
 
     def mean_ratio(self, seconds: float) -> Float:
@@ -119,18 +118,16 @@ class Device(Closing):
 
         :raises DeviceLost: the board went away, or there are no more scans.
         """
-        ratios: list[Float] = []
-        first_us = 0
+        scans: list[Scan] = []
         for scan in self:
-            if ratios and scan.ratio.shape != ratios[0].shape:
-                ratios.clear()  # somebody has configured the board
-            first_us = first_us if ratios else scan.time_us
-            ratios.append(scan.ratio)
-            if scan.time_us - first_us >= 1e6 * seconds:
+            if scans and scan.codes.shape != scans[0].codes.shape:
+                scans.clear()  # somebody has configured the board
+            scans.append(scan)
+            if scan.time_us - scans[0].time_us >= 1e6 * seconds:
                 break
-        if not ratios:
+        if not scans:
             raise DeviceLost(f"{self.name} gives no more scans")
-        return np.asarray(np.mean(ratios, axis=0))
+        return np.asarray(np.mean([scan.ratio for scan in scans], axis=0))
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already."""

@@ -95,9 +95,7 @@ class ForceSensor(Closing):
         return self._decoder.damaged
 
     def take(self) -> list[ForceSample]:
-        """The samples since the last call, in order, their times rising. Never waits.
-
-        There are at most `QUEUE_SAMPLES`; `dropped` counts the older ones that had to go.
+        """The samples since the last call, `QUEUE_SAMPLES` at most, times rising. Never waits.
 
         :raises DeviceLost: there are none, and the sensor has gone, or has printed no number for
             `SILENCE_S`.
@@ -121,15 +119,14 @@ class ForceSensor(Closing):
             raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_S:
             return
-        if not self._octets:
-            raise DeviceLost(
-                f"{self.path} has said nothing for {SILENCE_S:g} s: is it the force sensor's port, "
-                "and does its sketch print?"
-            )
-        raise DeviceLost(
-            f"{self.path} prints no numbers ({self.damaged} damaged lines): it must print one "
-            f"number a line and nothing else; does its sketch print at {self._baud} baud?"
+        trouble = (
+            f"prints no numbers ({self.damaged} damaged lines): it must print one number a line "
+            f"and nothing else; does its sketch print at {self._baud} baud?"
         )
+        if not self._octets:
+            asked = "is it the force sensor's port, and does its sketch print?"
+            trouble = f"has said nothing for {SILENCE_S:g} s: {asked}"
+        raise DeviceLost(f"{self.path} {trouble}")
 
     def _read(self) -> None:
         try:

@@ -22,7 +22,6 @@ iterations (F), seconds (F).
 """
 
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -39,16 +38,10 @@ from ohmskin.files import PathName, naming, whole_file
 MAX_ARRAY_BYTES: Final = 200_000_000
 # The estimators' matrices grow with the square: 4096 cells make 134 MB.
 MAX_CELLS: Final = 4096
-
-_UNREADABLE = (
-    OSError,
-    EOFError,
-    ValueError,
-    MemoryError,
-    OverflowError,
-    RuntimeError,  # an encrypted member; its subclass NotImplementedError: an odd compression
-    zipfile.BadZipFile,
-    zlib.error,
+# What is told of each frame, in this order.
+_OUT: Final = (
+    *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched", "top_wire_ohm", "bottom_wire_ohm"),
+    *("converged", "message", "chi2", "iterations", "seconds"),
 )
 
 
@@ -94,25 +87,23 @@ class Readings:
 
     def knowledge(self, frame: int) -> SkinKnowledge:
         """What an estimator is told before it reads `frame`."""
-        rest = self.rest_ratio
+        wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
         return SkinKnowledge(
             rows=self.ratio.shape[1],
             columns=self.ratio.shape[2],
             ref_top_ohm=self.ref_top_ohm,
             ref_bottom_ohm=self.ref_bottom_ohm,
             adc_bits=self.adc_bits,
-            rest_ratio=rest[frame] if rest is not None and rest.ndim == 4 else rest,
-            nominal_wire_ohm=WireOhm(
-                _of_frame(self.nominal_top_wire_ohm, frame),
-                _of_frame(self.nominal_bottom_wire_ohm, frame),
-            ),
+            rest_ratio=_of_frame(self.rest_ratio, frame, 3),
+            nominal_wire_ohm=WireOhm(*(_of_frame(wire_ohm, frame, 0) for wire_ohm in wires)),
         )
 
 
-def _of_frame(per_frame: Float | None, frame: int) -> float | None:
-    if per_frame is None:
+def _of_frame(array: Float | None, frame: int, ndim: int) -> Any:
+    """An array of `ndim` dimensions, or what one with frames before them holds of this frame."""
+    if array is None:
         return None
-    return float(per_frame[frame] if per_frame.ndim else per_frame)
+    return array[frame] if array.ndim > ndim else array[()]
 
 
 def load_readings(path: PathName) -> Readings:
@@ -130,7 +121,7 @@ def load_readings(path: PathName) -> Readings:
                     info = present.get(f"{name}.npy")
                     if info is not None:
                         arrays[name] = _read_array(archive, info)
-        except _UNREADABLE as error:
+        except Exception as error:  # damage may raise nearly anything in zipfile, zlib and numpy
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise ValueError(f"{name} cannot be read: {reason}") from error
         if "ratio" not in arrays:
@@ -180,19 +171,11 @@ def estimate_file(
         elif cold:
             estimator.reset()
         estimates.append(estimator.estimate(ratio))
-    names = (
-        *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched"),
-        *("top_wire_ohm", "bottom_wire_ohm", "converged", "message", "chi2", "iterations"),
-        "seconds",
-    )
-    return {name: np.array([getattr(each, name) for each in estimates]) for name in names}
+    return {name: np.array([getattr(each, name) for each in estimates]) for name in _OUT}
 
 
 def save_arrays(path: PathName, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write an .npz that is either complete or not there: a temporary file, then a rename.
-
-    Raises ValueError if it cannot be written, or for an array of Python objects.
-    """
+    """Write an .npz, as `whole_file`. Raises ValueError also for an array of Python objects."""
     for name, array in arrays.items():
         if array.dtype.hasobject:
             raise ValueError(f"{name} holds Python objects, which no .npz of ours may")
