@@ -27,7 +27,7 @@ C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware check-firmware sim \
-        test-host chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-force bench-view \
+        test-host chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-desk bench-force bench-view \
         bench-boards clean distclean
 
 help: ## list the targets
@@ -116,6 +116,9 @@ bench-estimators: setup-host ## measure the estimators: time, error, stated unce
 
 bench-fingers: setup-host ## measure fingertips where nobody knows the wires, and the paper's method
 	$(ONE_THREAD) PYTHONPATH=. $(BIN)/python benchmarks/bench_fingers.py
+
+bench-desk: setup firmware sim ## measure estimates from a board as unkind as one on a desk, simulated
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_desk.py
 
 bench-force: setup-host ## measure the way from scan to force: time, ten minutes live, replay
 	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_force.py

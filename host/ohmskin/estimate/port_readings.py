@@ -7,6 +7,18 @@ of its cells; I, I_rest (R, C) port currents per Vdd, now and at rest, and s_I t
     v_cell = sum_k (y_k - o_k - y_k(I))^2 / (3 - 2 / RC)      v is that of the usual cell
     s_I^2 = max(v_cell, v) / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2
 
+Lines that float charge through the skin until they have settled, from the row as far as that
+conducts to them, and from the column. So the currents at both ends differ, by 2 q on average over
+both polarities, and the mean of all four is wrong. With I_row the sum of the row's other port
+currents, and I_column of the column's, it is corrected by
+
+    q (I_row - I_column) / (I_row + I_column) .
+
+What is left of that, and the converter's curve, stay from frame to frame, while noise changes.
+Where the change since the frame before, or rounding, is much less, v_n < SLOW v,
+
+    s_I^2 = (v_n + SLOW_SHARE^2 max(0, v_cell - v_n)) / sum R_k^2 + ...
+
 Without noise, the four readings of a cell round alike: they agree, and their mean is no better than
 one. Noise makes them disagree and round differently. Where v is the variance s^2 of rounding twice,
 their errors are independent. (Exact at both ends; between them, s_I is 1.0 to 1.2 times too large.)
@@ -37,6 +49,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
     READING_OFFSET,
+    READING_SENSES_TOP,
     READING_SIGN,
     READINGS_PER_CELL,
     Skin,
@@ -51,10 +64,17 @@ if TYPE_CHECKING:
     from ohmskin.estimate.base import SkinKnowledge
 
 _DEGREES: Final = READINGS_PER_CELL - 1
+# Sign of a reading in what the other lines draw: more at the top node, less at the bottom one.
+_DRAWN: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
 # Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
 _MOST_USUAL: Final = 9.0
 MOST_OFFSET: Final = 0.008  # of a sense node, ratio to Vdd: what is above it counts as noise
+# A disagreement that stays from frame to frame comes from lines that charge slowly, or from the
+# converter's curve: share of it that is in the current (measured in firmware/sim, preset `desk`).
+SLOW_SHARE: Final = 0.12
+SLOW: Final = 0.25  # share of the variance that changes: with less, most of it stays
 # Disagreement of a cell's readings, root of its mean square, ratio to Vdd: of most cells, of one.
+_MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
 DISAGREE_ALL: Final = 0.016
 DISAGREE_ONE: Final = 0.03
 DISAGREE_OVER_NOISE: Final = 6.0
@@ -101,7 +121,8 @@ class PortReader:
             self._rest_fault = self._fault_at_rest(rest)
 
     def reset(self) -> None:
-        """Forget which lines the frames before have shown apart."""
+        """Forget the frames before: the last, and which lines they have shown apart."""
+        self._residual: Float | None = None
         self._alike_frames = [np.asarray(ALIKE_FRAMES), np.asarray(ALIKE_FRAMES)]
 
     def read(self, ratio: Float) -> PortReadings:
@@ -112,19 +133,34 @@ class PortReader:
         both = 0.5 * (residual[..., :2] + residual[..., :1:-1]).reshape(-1, 2)
         offset = np.partition(both, len(both) // 2, axis=0)[len(both) // 2, [0, 1, 1, 0]]
         residual -= np.minimum(np.maximum(offset, -MOST_OFFSET), MOST_OFFSET)
+        drawn = (residual * _DRAWN / reference_ohm(*self._ref_ohm)).mean(axis=2)
+        by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
+        more = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
+        current -= drawn * np.minimum(np.maximum(more, -1.0), 1.0)
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
         own, rounding = square / (_DEGREES - 2.0 / square.size), self._ratio_std**2
         most = _MOST_USUAL * max(rounding, typical / _DEGREES)
         usual = float(own[own <= most].mean())
-        alike = max(0.0, 1.0 - usual / (2.0 * rounding)) * self._current_std**2
-        std = np.sqrt(np.maximum(own, usual) / self._ref_square + alike)
+        noise, variance = usual, np.maximum(own, usual)
+        if (changing := max(self._noise(residual), 2.0 * rounding)) < SLOW * usual:
+            noise, variance = changing, changing + SLOW_SHARE**2 * np.maximum(own - changing, 0.0)
+        alike = max(0.0, 1.0 - noise / (2.0 * rounding)) * self._current_std**2
+        std = np.sqrt(variance / self._ref_square + alike)
         fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
         found = PortReadings(ratio, current, std)
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
         return replace(found, fault=fault) if fault else found
+
+    def _noise(self, residual: Float) -> float:
+        """Variance of a reading [1], from what has changed since the frame before."""
+        before, self._residual = self._residual, residual
+        if before is None:
+            return np.inf
+        change = ((residual - before) ** 2).sum(axis=2)
+        return float(np.median(change)) / (2.0 * _MEDIAN_CHI2)
 
     def _disagreement(
         self, current: Float, std: Float, ratio: Float, square: Float, typical: float

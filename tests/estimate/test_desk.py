@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates from what the built firmware reads in simavr, on a board as unkind as one on a desk."""
+
+import numpy as np
+import pytest
+
+from desk import DeskSkin, desk_skin
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import make_estimator
+
+
+@pytest.fixture(scope="module")
+def skins() -> list[DeskSkin]:
+    return [desk_skin(seed, 8) for seed in range(3)]
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_errors_are_small_and_stated(skins: list[DeskSkin], method: str) -> None:
+    """Lines that have not settled make single readings err by 30 LSB, and currents by little."""
+    error, stated = [], []
+    for skin in skins:
+        known = SkinKnowledge(
+            8, 8, adc_bits=10, rest_ratio=skin.rest_ratio, nominal_wire_ohm=WireOhm(100.0, 200.0)
+        )
+        estimator = make_estimator(method, known)
+        for truth, ratios in zip(skin.frames, skin.ratios, strict=True):
+            *_, found = (estimator.estimate(ratio) for ratio in ratios)
+            assert found.converged
+            pressed = truth.cell_siemens > 1.5 * skin.rest.cell_siemens
+            error.append(np.abs(found.cell_siemens / truth.cell_siemens - 1)[pressed])
+            stated.append((found.cell_siemens_std / truth.cell_siemens)[pressed])
+    errors, stds = np.concatenate(error), np.concatenate(stated)
+    assert np.median(errors) < 0.015
+    assert np.mean(errors < 4 * stds) > 0.98
+    assert np.median(stds / errors) < 5  # 10 where all of a disagreement counts as noise

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans of touched skins that the built firmware reads in simavr, on a board as on a desk."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lockstep import Rig
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, electrode_admittance, readings
+from ohmskin.link.codes import ratio_from_codes
+from studies.trials import skin_at_rest, touch
+
+REST_SCANS, SCANS = 20, 3
+TOUCHES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class DeskSkin:
+    """rest: the untouched skin; rest_ratio: mean of its scans. frames: skins, each touched anew.
+
+    ratios: of each frame, three scans, (3, R, C, 4).
+    """
+
+    rest: Skin
+    rest_ratio: Float
+    frames: list[Skin]
+    ratios: list[Float]
+
+
+def desk_skin(seed: int, frames: int, **settings: float) -> DeskSkin:
+    """8x8 at 90 Hz, Uno: the preset `desk` of firmware/sim, with these settings instead of its own.
+
+    Offset and gain of the converter are within 2 LSB, its bow within 1.5, drawn from the seed.
+    """
+    random = np.random.default_rng([77, seed])
+    converter = dict(zip(("offset_lsb", "gain_lsb"), random.uniform(-2, 2, 2), strict=True))
+    converter |= {"inl_lsb": random.uniform(-1.5, 1.5), "seed": seed}
+    rest = skin_at_rest(8, 8, random)
+    skins = [touch(rest, int(random.integers(1, TOUCHES + 1)), random) for _ in range(frames)]
+    with Rig("uno") as rig:
+        rig.sim.set(desk=1)
+        rig.sim.set(**converter | settings)
+        rig.run(0.3)
+        _show(rig, rest)
+        rig.start_scan()
+        rig.sim.hold_log(False)
+        rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
+        ratios = []
+        for skin in skins:
+            _show(rig, skin)
+            ratios.append(ratio_from_codes(_scans(rig, SCANS)))
+    return DeskSkin(rest, rest_ratio, skins, ratios)
+
+
+def _show(rig: Rig, skin: Skin) -> None:
+    rig.sim.set_table(readings(skin))
+    rig.sim.request("C", bytes([skin.shape[0]]) + electrode_admittance(skin).tobytes())
+
+
+def _scans(rig: Rig, count: int) -> NDArray[Any]:
+    """So many scans of the skin as it is: those under way are left out."""
+    rig.scans.clear()
+    while len(rig.scans) < count + 2:
+        rig.run(0.012)
+    return np.array([scan.codes for scan in rig.scans[2 : count + 2]])
