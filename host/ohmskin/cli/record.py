@@ -102,7 +102,7 @@ def record(
             )
         except DeviceLost as exc:
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
-    done = f"{recorder.scans} scans, missed {recorder.missed}, {file.stat().st_size} bytes"
+    done = f"{recorder.scans} scans, missed {recorder.missed}, {recorder.size} bytes"
     if sensor is not None:
         done += f", {recorder.forces} forces"
         done += f", {sensor.damaged} lines that are no numbers" if sensor.damaged else ""

@@ -35,13 +35,15 @@ from ohmskin.record.recording import (
 
 # A recording that is killed lacks at most what came in so long [s].
 FLUSH_EVERY_S: Final = 0.5
+# A record of an MCAP file begins with its kind and 8 bytes of its length.
+_HEAD_SIZE: Final = 9
 
 
 class Recorder(Closing):
-    """Writes a recording, from any thread, until it is closed or the disk is full.
+    """Writes a recording, from any thread, until it is closed, removed, or the disk is full.
 
     board: what the board says of itself, which comes first. scans, missed, forces: counts of what
-    was added. board, tare, force: the newest that was added.
+    was added. size: bytes of the file. board, tare, force: the newest that was added.
 
     :raises RecordingError: the file is there already, or cannot be written. From then on nothing
         more is written, and what was written before can be read.
@@ -50,6 +52,7 @@ class Recorder(Closing):
     def __init__(self, path: PathName, board: Hello) -> None:
         self.path = Path(path)
         self.scans = self.missed = self.forces = 0
+        self.size = self._readable = 0
         self.board = board
         self.tare: Tare | None = None
         self.force: ForceSample | None = None
@@ -62,6 +65,7 @@ class Recorder(Closing):
             raise RecordingError(f"{path} is there already: choose another name") from None
         except OSError as exc:
             raise RecordingError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+        self._links = os.fstat(self._file.fileno()).st_nlink
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._writer = Writer(self._file, chunk_size=LARGEST_RECORD // 4)
         self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
@@ -110,21 +114,32 @@ class Recorder(Closing):
             if self._closed.is_set():
                 raise RecordingError(f"{self.path}: the recording is closed")
             self._writer.add_message(self._channels[name], log_ns, octets, log_ns, number)
-        match message:
-            case Hello():
-                self.board = message
-            case Scan():
-                self.scans += 1
-                self.missed += message.missed
-            case Tare():
-                self.tare = message
-            case ForceSample():
-                self.force = message
-                self.forces += 1
+            match message:
+                case Hello():
+                    self.board = message
+                case Scan():
+                    self.scans += 1
+                    self.missed += message.missed
+                case Tare():
+                    self.tare = message
+                case ForceSample():
+                    self.force = message
+                    self.forces += 1
 
     def _flush(self) -> None:
         with self._writing():
             self._writer.flush()  # type: ignore[no-untyped-call]
+            self._kept()
+
+    def _kept(self) -> None:
+        """Count what reached the file, if there still is one."""
+        self._readable, self.size = self.scans, self._file.tell()
+        if os.fstat(self._file.fileno()).st_nlink < self._links:
+            self._failure = RecordingError(
+                f"{self.path}: recording ended: somebody has removed the file, and {self.scans} "
+                "scans with it: record to a new one"
+            )
+            raise self._failure
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -135,9 +150,16 @@ class Recorder(Closing):
             try:
                 yield
             except OSError as exc:
+                with suppress(OSError), self.path.open("rb") as file:
+                    # The last chunk may be whole, and only the index after it cut off.
+                    file.seek(self.size)
+                    head = file.read(_HEAD_SIZE)
+                    end = self.size + _HEAD_SIZE + int.from_bytes(head[1:], "little")
+                    if len(head) == _HEAD_SIZE and end <= os.fstat(file.fileno()).st_size:
+                        self._readable = self.scans
                 self._failure = RecordingError(
-                    f"{self.path}: recording ended after {self.scans} scans: "
-                    f"{exc.strerror or exc}; what is in the file can be read"
+                    f"{self.path}: recording ended: {exc.strerror or exc}; {self._readable} scans "
+                    "are in the file and can be read"
                 )
                 raise self._failure from exc
 
@@ -162,6 +184,7 @@ class Recorder(Closing):
             with self._writing():
                 self._writer.finish()  # type: ignore[no-untyped-call]
                 self._file.flush()
+                self._kept()
                 os.fsync(self._file.fileno())
         finally:
             with suppress(OSError):  # what did not fit still does not

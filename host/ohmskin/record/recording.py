@@ -51,8 +51,16 @@ from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
 # A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
 LARGEST_RECORD: Final = 16_000_000
+# A tare of `MAX_CELLS` cells is 0.4 MB.
+_LARGEST_MESSAGE: Final = 1_000_000
+# Chunks of a recording unpack to at most so many times the file's bytes, besides `_SMALL` of them.
+# Codes without noise pack best, 115 times.
+_MOST_UNPACKED: Final = 200
+_SMALL: Final = 1_000_000
 _LARGEST_CODE: Final = 0xFFFF
 _LARGEST_COUNTER: Final = (1 << 63) - 1
+# Of zstd, which takes powers of two.
+_LARGEST_WINDOW: Final = 1 << 24
 # What `export` writes.
 FORMATS: Final = (".npz", ".csv")
 # What both formats have of each scan, besides its readings.
@@ -200,13 +208,41 @@ class _Bounded:
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
-        self._left = os.fstat(file.fileno()).st_size
+        self._size = self._left = os.fstat(file.fileno()).st_size
+        self._may_unpack = _SMALL
 
     def read(self, size: int) -> bytes:
         if size > self._left:
             raise EndOfFile
         self._left -= size
+        self._may_unpack += _MOST_UNPACKED * size
         return self._file.read(size)
+
+    def unpacked(self, chunk: Chunk) -> list[McapRecord]:
+        """The records of a chunk, where its true size is the one it states, and no bomb's."""
+        size = chunk.uncompressed_size
+        self._may_unpack -= size
+        if size > LARGEST_RECORD or self._may_unpack < 0:
+            raise ValueError(
+                f"damaged: {self._size} bytes that unpack to more than {_MOST_UNPACKED} times as "
+                f"many, or to more than {LARGEST_RECORD} at once: no recorder writes that"
+            )
+        match chunk.compression:
+            case "zstd":
+                unpacker = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW)
+                octets = unpacker.stream_reader(chunk.data).read(size + 1)
+            case "lz4":
+                octets = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+            case "":
+                octets = chunk.data
+            case other:
+                raise ValueError(f"damaged: a chunk that is packed as {other:.40}")
+        if len(octets) != size:
+            raise ValueError(f"damaged: a chunk that states {size} bytes has not as many")
+        try:
+            return breakup_chunk(replace(chunk, compression="", data=octets), validate_crc=True)
+        except EndOfFile as exc:  # of the chunk: the file goes on
+            raise ValueError(f"damaged: {exc}") from exc
 
 
 def _records(file: _Bounded) -> Iterator[McapRecord]:
@@ -216,7 +252,7 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
     try:
         for record in reader.records:
             first = False
-            yield from _unpacked(record) if isinstance(record, Chunk) else [record]
+            yield from file.unpacked(record) if isinstance(record, Chunk) else [record]
             if isinstance(record, Footer):
                 return
     except EndOfFile:
@@ -226,22 +262,9 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
         raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
 
 
-def _unpacked(chunk: Chunk) -> list[McapRecord]:
-    """The records in a chunk. Its header alone does not say how much memory they take."""
-    size = chunk.uncompressed_size
-    if chunk.compression == "zstd":
-        size = max(size, zstandard.frame_content_size(chunk.data))
-    elif chunk.compression == "lz4":
-        size = max(size, int(lz4.frame.get_frame_info(chunk.data)["content_size"]))
-    if size > LARGEST_RECORD:
-        raise ValueError("damaged: a chunk larger than any recorder writes")
-    try:
-        return breakup_chunk(chunk, validate_crc=True)
-    except EndOfFile as exc:  # of the chunk: the file goes on
-        raise ValueError(f"damaged: {exc}") from exc
-
-
 def _message(name: str, octets: bytes) -> Recorded:
+    if len(octets) > _LARGEST_MESSAGE:
+        raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
