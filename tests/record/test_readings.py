@@ -181,6 +181,24 @@ def test_an_array_over_the_limit_is_not_unpacked(
     assert path.stat().st_size < 10_000
     with pytest.raises(ValueError, match=r"ratio cannot be read: 819\d\d\d bytes, more than"):
         load_readings(path)
+    # Numbers of one byte take eight when they are computed with.
+    np.savez_compressed(path, ratio=np.zeros((100, 16, 16, 4), np.uint8))
+    with pytest.raises(
+        ValueError, match="ratio cannot be read: 819200 bytes as float64, more than"
+    ):
+        load_readings(path)
+
+
+def test_frames_that_are_right_are_not_checked_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """200 MB of 1x1 cells took a minute."""
+    checked: list[object] = []
+    monkeypatch.setattr(
+        readings_module, "check_ratio", lambda ratio, *_, **name: checked.append(name)
+    )
+    ratio = np.full((500, 1, 1, 4), 0.5)
+    ratio[321, 0, 0, 2] = np.nan
+    Readings(ratio)
+    assert checked == [{"name": "ratio, frame 321,"}]
 
 
 def test_a_header_that_promises_more_than_the_file_holds_is_refused(tmp_path: Path) -> None:

@@ -66,8 +66,9 @@ class Readings:
                 f"ratio has {frames} frames of {rows}x{columns} cells: at least 1 frame and "
                 f"1 to {MAX_CELLS} cells"
             )
-        for frame, ratio in enumerate(self.ratio):
-            check_ratio(ratio, rows, columns, name=f"ratio, frame {frame},")
+        good = ((self.ratio >= 0) & (self.ratio <= 1)).all(axis=(1, 2, 3))
+        for frame in np.flatnonzero(~good).tolist():
+            check_ratio(self.ratio[frame], rows, columns, name=f"ratio, frame {frame},")
         rest = self.rest_ratio
         if rest is not None and rest.ndim == 4 and len(rest) != frames:
             raise ValueError(f"rest_ratio has {len(rest)} frames, ratio {frames}")
@@ -140,7 +141,9 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Float:
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"it holds {array.dtype}, not real numbers")
-    return array.astype(np.float64)
+    if 8 * array.size > MAX_ARRAY_BYTES:
+        raise ValueError(f"{8 * array.size} bytes as float64, more than {MAX_ARRAY_BYTES}")
+    return array.astype(np.float64, copy=False)
 
 
 def _scalar(name: str, array: Float) -> float | int:
