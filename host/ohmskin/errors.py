@@ -37,6 +37,10 @@ class ProtocolMismatch(OhmskinError):
     """The board was built from another protocol definition."""
 
 
+class ProtocolError(OhmskinError):
+    """The board says what no board can: its firmware is broken, or it is none of ours."""
+
+
 class CommandRefused(OhmskinError):
     """The board refused a command, and nothing has changed.
 

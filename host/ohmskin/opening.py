@@ -72,6 +72,7 @@ def open(
     :raises PortError: the port is unknown, busy or not permitted, or the URL is wrong.
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
+    :raises ProtocolError: the board says what cannot be.
     :raises RecordingError: the recording of a ``replay://`` port cannot be read.
     :raises ValueError: the calibration cannot be read, or is of another unit or geometry.
     """

@@ -24,11 +24,16 @@ class SteppedLink:
     def run(self, seconds: float) -> None:
         """Let time pass; return when the host has decoded all that the board has sent by then."""
         with self._changed:
+            self.say(seconds)
+            self._changed.wait_for(lambda: self._is_read and not self._octets)
+
+    def say(self, seconds: float) -> None:
+        """Let time pass; return at once, for a host that ends by what it hears."""
+        with self._changed:
             end_s = self._now_s + seconds
             while (due_s := self._board.next_scan_s) is not None and due_s <= end_s:
                 self._advance(due_s)
             self._advance(end_s)
-            self._changed.wait_for(lambda: self._is_read and not self._octets)
 
     def _advance(self, now_s: float) -> None:
         self._now_s = now_s

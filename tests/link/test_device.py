@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import pytest
 
 import ohmskin
 from ohmskin.emulate.scenes import Scene
-from ohmskin.errors import CommandRefused, DeviceLost, PortError
+from ohmskin.errors import CommandRefused, DeviceLost, PortError, ProtocolError
 from ohmskin.link import device, framing, protocol
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
@@ -437,3 +438,80 @@ def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch)
         other.join()
     assert early == [False]
     assert written.is_set()
+
+
+# ------------------------------------------------------------------------ boards that are broken
+
+
+def lying(link: SteppedLink, **fields: Any) -> SteppedLink:
+    """A board whose `hello` has these fields, whatever it does."""
+    board = link._board
+    send = board._send
+
+    def send_lie(name: str, tail: bytes = b"", /, **values: Any) -> None:
+        send(name, tail, **(values | fields if name == "hello" else values))
+
+    board._send = send_lie  # type: ignore[method-assign]
+    board.reset()
+    return link
+
+
+IMPOSSIBLE_HELLO = (
+    "rows 0, rows 17, rows 255, columns 0, columns 17, readings_per_cell 0, readings_per_cell 2, "
+    "adc_bits 12, ref_top_ohm 0, ref_bottom_ohm 0, clock_hz 0, scan_cycles 0, scan_cycles 1, "
+    "scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, adc_prescaler 7"
+)
+
+
+@pytest.mark.parametrize("said", IMPOSSIBLE_HELLO.split(", "))
+def test_a_board_that_says_what_cannot_be(said: str) -> None:
+    name, value = said.split()
+    text = {"adc_prescaler": "adc_prescaler unknown_7", "scan_cycles 1": "slot_cycles "}
+    with pytest.raises(ProtocolError, match=f"hello says {text.get(name) or text.get(said, said)}"):
+        Session(lying(SteppedLink("emulator://4x4"), **{name: int(value)}))
+
+
+def test_a_board_that_says_what_cannot_be_while_it_scans() -> None:
+    link = SteppedLink("emulator://4x4?rate=100")
+    with Session(link) as skin:
+        scans = iter(skin)
+        lying(link, scan_cycles=0)
+        link.say(0.1)
+        with pytest.raises(ProtocolError, match="hello says scan_cycles 0"):
+            list(scans)
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+def test_scans_of_another_size_than_hello_says(keeps: bool) -> None:
+    """A board that was reset, and has not heard how to scan, is told again; one is broken."""
+    link = SteppedLink("emulator://4x4?rate=100")
+    with Session(link) as skin:
+        scans = iter(skin)
+        link.run(0.1)
+        link._board._settings["rows"] = 2
+        if keeps:
+            link._board._settings = MappingProxyType(link._board._settings)  # type: ignore[assignment]
+            link._board._execute = lambda name, values: "ok"  # type: ignore[method-assign]
+        link.run(0.1)
+        link.run(0.1)
+        unknown = skin.stats.unknown
+        assert unknown == 20 if keeps else 1 <= unknown <= 10
+        found = take(scans, skin.stats.scans - unknown)
+        assert {scan.codes.shape for scan in found} == {(4, 4, 4)}
+        if keeps:
+            time.sleep(1.1)
+            link.say(0.1)
+            with pytest.raises(ProtocolError, match="hello says 4x4 cells, its scans have 2x4"):
+                next(scans)
+
+
+def test_a_defect_in_the_reading_thread_is_told_to_who_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    link = SteppedLink("emulator://4x4")
+    with Session(link) as skin:
+        scans = iter(skin)
+        monkeypatch.setattr(link, "read", lambda: 1 // 0)
+        with pytest.raises(DeviceLost, match=r"defect of this program.*ZeroDivisionError") as lost:
+            list(scans)
+        assert isinstance(lost.value.__cause__, ZeroDivisionError)

@@ -309,7 +309,7 @@ def test_an_old_recording_does_not_say_how_long_a_slot_is(path: Path, hello: Hel
         assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
 
 
-def test_foreign_files(tmp_path: Path, path: Path) -> None:
+def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_bytes(b"")
     assert "cut off" in outcome(path)
     path.write_bytes(os.urandom(5000))
@@ -317,11 +317,16 @@ def test_foreign_files(tmp_path: Path, path: Path) -> None:
     assert "No such file" in outcome(tmp_path / "none.mcap")
     assert "directory" in outcome(tmp_path)
     head = {"number": 1, "time_us": 1, "host_time_s": 1, "missed": 0}
+    known = {**asdict(hello), "host_time_s": 1}
     for topic, content, reason in (
         ("/camera", {}, "no recording of a skin"),
         ("/skin/mark", {"host_time_s": 1.0, "text": ""}, "no board says hello"),
         ("/skin/hello", {"host_time_s": 1}, "layout_crc"),
         ("/skin/hello", [1], "no JSON object"),
+        ("/skin/hello", {**known, "columns": 0}, "hello: columns is 0"),
+        ("/skin/hello", {**known, "scan_cycles": 0}, "hello: scan_cycles is 0"),
+        ("/skin/hello", {**known, "ref_top_ohm": 0}, "hello: ref_top_ohm is 0"),
+        ("/skin/hello", {**known, "rows": 10**9}, "hello: no 1000000000x4 cells"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [1] * 5}, "5 codes"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [-1] * 4}, "range"),
         ("/skin/scan", {**head, "rows": 10**9, "columns": 9, "codes": []}, "no 10000"),

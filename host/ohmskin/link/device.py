@@ -267,6 +267,17 @@ class Device(Closing):
                     self._stats.overflowed += 1
             self._changed.notify_all()
 
+    def _run(self, work: Callable[[], None]) -> None:
+        """Do the work of the thread that publishes. Who waits gets to know what ends it."""
+        try:
+            work()
+        except OhmskinError as exc:
+            self._fail(exc)
+        except Exception as exc:
+            failure = DeviceLost(f"{self.name}: a defect of this program, report it: {exc!r}")
+            failure.__cause__ = exc
+            self._fail(failure)
+
     def _fail(self, error: OhmskinError) -> None:
         """Say why no more scans come. Whoever waits, now or later, gets this error."""
         with self._changed:

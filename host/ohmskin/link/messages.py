@@ -16,6 +16,8 @@ _COUNTER_SPAN = 1 << 32
 _DROPPED_SPAN = 1 << 16
 # The first field of `hello` is the same in every definition [bytes].
 _LAYOUT_CRC_SIZE = 2
+# The slowest scan, of the largest skin at the longest settle time, takes 3.2 s.
+_LONGEST_SCAN_S = 10
 # A ceramic resonator is up to 0.5 % off.
 _RATE_ERROR = 0.005
 
@@ -57,6 +59,24 @@ class Hello:
     def rate_hz(self) -> float:
         """Scan rate that the board keeps [Hz]: clock_hz / scan_cycles."""
         return self.clock_hz / self.scan_cycles
+
+    def impossible(self) -> str:
+        """A field and what no board of this protocol says in it, ``"rows 0"``; ``""`` for none."""
+        limits, slots = protocol.CONSTANTS, self.rows * self.columns * self.readings_per_cell
+        can_be = {
+            "rows": 1 <= self.rows <= limits["rows_max"],
+            "columns": 1 <= self.columns <= limits["columns_max"],
+            "readings_per_cell": self.readings_per_cell == protocol.READINGS_PER_CELL,
+            "adc_bits": self.adc_bits == protocol.ADC_BITS,
+            "ref_top_ohm": self.ref_top_ohm > 0,
+            "ref_bottom_ohm": self.ref_bottom_ohm > 0,
+            "clock_hz": self.clock_hz > 0,
+            "scan_cycles": 0 < self.scan_cycles <= _LONGEST_SCAN_S * self.clock_hz,
+            "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,
+            "adc_prescaler": self.adc_prescaler in protocol.ENUMS["adc_prescaler"].values,
+        }
+        odd = [f"{name} {getattr(self, name)}" for name, can in can_be.items() if not can]
+        return odd[0] if odd else ""
 
 
 @dataclass(frozen=True)

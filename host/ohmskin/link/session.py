@@ -7,7 +7,14 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
-from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError, ProtocolMismatch
+from ohmskin.errors import (
+    CommandRefused,
+    DeviceLost,
+    DeviceSilent,
+    OhmskinError,
+    ProtocolError,
+    ProtocolMismatch,
+)
 from ohmskin.link import framing, protocol
 from ohmskin.link.device import COMMAND_TRIES, Device, configuration
 from ohmskin.link.messages import (
@@ -37,6 +44,7 @@ _COMMAND_TIMEOUT_S = 1.0
 # A scanning board that sends no valid frame for so long is asked who it is, and again later [s].
 _SPEED_LOST_S = 2.5
 _ASK_AGAIN_S = 6.5
+_BROKEN: Final = "its firmware is broken: flash it with 'ohmskin flash'"
 
 
 class Session(Device):
@@ -46,6 +54,7 @@ class Session(Device):
 
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
+    :raises ProtocolError: the board says what cannot be.
     :raises DeviceLost: the port went away meanwhile.
     """
 
@@ -56,7 +65,9 @@ class Session(Device):
         self._acks: dict[int, Ack] = {}
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0
-        self._thread = threading.Thread(target=self._read, name=f"read {link.name}", daemon=True)
+        self._odd_s: float | None = None  # time of the first of scans that are not as hello says
+        work, name = (self._read,), f"read {link.name}"
+        self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
         self._thread.start()
         try:
             self._connect()
@@ -134,28 +145,32 @@ class Session(Device):
 
     def _read(self) -> None:
         heard_s = time.monotonic()
-        try:
-            while not self._closing:
-                chunk = self._link.read()
-                now_s = time.monotonic()
-                with self._changed:
-                    messages = self._decoder.feed(chunk, now_s)
-                    for message in messages:
-                        self._keep(message)
-                    if messages:
-                        heard_s = now_s
-                        self._changed.notify_all()
-                if self._want_scans and now_s - heard_s > _SPEED_LOST_S:
-                    # A board that was reset is back at its default speed.
-                    heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
-                    self._link.set_baud(protocol.CONSTANTS["baud_default"])
-                    self._send("get_hello")
-        except OhmskinError as exc:
-            self._fail(exc)
+        while not self._closing:
+            chunk = self._link.read()
+            now_s = time.monotonic()
+            with self._changed:
+                messages = self._decoder.feed(chunk, now_s)
+                for message in messages:
+                    self._keep(message)
+                if messages:
+                    heard_s = now_s
+                    self._changed.notify_all()
+            if self._want_scans and now_s - heard_s > _SPEED_LOST_S:
+                # A board that was reset is back at its default speed.
+                heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
+                self._link.set_baud(protocol.CONSTANTS["baud_default"])
+                self._send("get_hello")
 
     def _keep(self, message: Message) -> None:
         match message:
+            case Hello() if odd := message.impossible():
+                raise ProtocolError(
+                    f"{self.name}: the board's hello says {odd}, which cannot be", _BROKEN
+                )
+            case Scan() if self._want_scans and not self._is_as_told(message):
+                self._stats.unknown += 1
             case Scan():
+                self._odd_s = None
                 self._publish(message)
             case Ack():
                 self._acks[message.command_sequence] = message
@@ -165,7 +180,7 @@ class Session(Device):
                 # It was reset: bring it back to where it was.
                 self._stats.restarts += 1
                 before = self.info
-                self._send("configure", **configuration(before))
+                self._scan_anew()
                 self._hello = replace(
                     before,
                     unit_id=message.unit_id,
@@ -173,14 +188,34 @@ class Session(Device):
                     settings=message.settings,
                     reset_cause=message.reset_cause,
                 )
-                self._send("start")
             case Hello():
                 self._hello = message
             case ForeignHello():
-                self._fail(
-                    ProtocolMismatch(
-                        f"{self.name}: board speaks layout 0x{message.layout_crc:04X}, this host "
-                        f"0x{protocol.LAYOUT_CRC:04X}",
-                        "flash it with 'ohmskin flash'",
-                    )
+                raise ProtocolMismatch(
+                    f"{self.name}: board speaks layout 0x{message.layout_crc:04X}, this host "
+                    f"0x{protocol.LAYOUT_CRC:04X}",
+                    "flash it with 'ohmskin flash'",
                 )
+
+    def _is_as_told(self, scan: Scan) -> bool:
+        """Whether a scan has the cells of `info`. If not, the board is told once more, and has to
+        do it in time: after a reset, the command for that may have been damaged.
+        """
+        board = self.info
+        if (scan.rows, scan.columns) == (board.rows, board.columns):
+            return True
+        if self._odd_s is None:
+            self._odd_s = scan.host_time_s
+            self._scan_anew()
+        elif scan.host_time_s > self._odd_s + _COMMAND_TIMEOUT_S + 2 / board.rate_hz:
+            raise ProtocolError(
+                f"{self.name}: the board's hello says {board.rows}x{board.columns} cells, its "
+                f"scans have {scan.rows}x{scan.columns}",
+                _BROKEN,
+            )
+        return False
+
+    def _scan_anew(self) -> None:
+        self._send("stop")
+        self._send("configure", **configuration(self.info))
+        self._send("start")

@@ -283,8 +283,11 @@ def _hello(values: dict[str, Any]) -> Hello:
     del values["host_time_s"]
     values["reset_cause"] = tuple(map(str, values["reset_cause"]))
     hello = Hello(**values)
-    if not hello.clock_hz or not hello.scan_cycles:
-        raise ValueError("hello: a board without a clock")
+    for name in ("rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "clock_hz", "scan_cycles"):
+        if not getattr(hello, name):
+            raise ValueError(f"hello: {name} is 0")
+    if hello.rows * hello.columns > MAX_CELLS:
+        raise ValueError(f"hello: no {hello.rows}x{hello.columns} cells")
     if hello.slot_cycles:
         return hello
     # Where no settle time was asked for, readings fill a scan, in slots of at most 60,000 cycles.

@@ -59,7 +59,8 @@ class Replay(Device):
         self._hello = hello
         self._running = self._closing = False
         self._last: tuple[float, float] | None = None  # when a scan was due, and was recorded [s]
-        self._thread = threading.Thread(target=self._play, name=f"play {path}", daemon=True)
+        work, named = (self._play,), f"play {path}"
+        self._thread = threading.Thread(target=self._run, args=work, name=named, daemon=True)
         self._thread.start()
 
     def _command(self, name: str, **values: protocol.Value) -> None:
@@ -87,22 +88,19 @@ class Replay(Device):
 
     def _play(self) -> None:
         rest_ratio, end = None, "where it was cut off"
-        try:
-            for message in self._messages:
-                if isinstance(message, Hello | Scan) and not self._wait_for(message):
-                    return
-                match message:
-                    case Scan():
-                        self._play_scan(replace(message, rest_ratio=rest_ratio))
-                    case Hello():
-                        self._hello = message
-                    case Tare():
-                        rest_ratio = message.rest_ratio
-                    case None:
-                        end = "its end"
-            self._fail(RecordingEnded(f"{self.name} has been played to {end}"))
-        except RecordingError as exc:
-            self._fail(exc)
+        for message in self._messages:
+            if isinstance(message, Hello | Scan) and not self._wait_for(message):
+                return
+            match message:
+                case Scan():
+                    self._play_scan(replace(message, rest_ratio=rest_ratio))
+                case Hello():
+                    self._hello = message
+                case Tare():
+                    rest_ratio = message.rest_ratio
+                case None:
+                    end = "its end"
+        raise RecordingEnded(f"{self.name} has been played to {end}")
 
     def _play_scan(self, scan: Scan) -> None:
         if int(scan.codes.max()) >> protocol.ADC_BITS:
