@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever is saved: the file is whole, or the old one."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +37,39 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
     with pytest.raises(ValueError if said else type(error), match=said):
         SAVERS[what](path)
     assert [each.read_text() for each in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize("what", SAVERS)
+def test_links_and_permissions_are_kept(tmp_path: Path, what: str) -> None:
+    (tmp_path / "far").mkdir()
+    file, link = tmp_path / "far" / "file", tmp_path / "link"
+    file.write_text("old")
+    file.chmod(0o600)
+    link.symlink_to("far/file")
+    SAVERS[what](link)
+    assert str(link.readlink()) == "far/file"
+    assert "old" not in file.read_text(errors="replace")
+    assert file.stat().st_mode & 0o777 == 0o600
+    new = tmp_path / "new"
+    SAVERS[what](new)
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert new.stat().st_mode == plain.stat().st_mode
+
+
+def test_nothing_that_is_no_file_is_replaced(tmp_path: Path) -> None:
+    """As root, a device could be."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe: cannot be written: it is no file"):
+        save_whole({pipe: b"new"})
+    assert pipe.is_fifo()
+
+
+def test_a_link_in_place_of_the_file_beside_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / f".file.{os.getpid()}.part").symlink_to(tmp_path / "other")
+    with pytest.raises(ValueError, match="file: cannot be written: File exists"):
+        save_whole({tmp_path / "file": b"new"})
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize("what", SAVERS)

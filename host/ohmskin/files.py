@@ -3,6 +3,7 @@
 
 import csv
 import os
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -39,13 +40,18 @@ def read_bounded(path: PathName, most_bytes: int) -> bytes:
 def whole_file(path: PathName) -> Iterator[BinaryIO]:
     """A file to write beside `path`, which takes its place at the end if nothing was raised.
 
-    Raises ValueError, which names the path, if it cannot be written.
+    It keeps the permissions of the file that was there, and a link leads to it as before. Raises
+    ValueError, which names the path, if it cannot be written, or is there and no file.
     """
-    target = Path(path)
+    target = Path(os.path.realpath(path))
     partial = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
+        if target.exists() and not target.is_file():
+            raise OSError("it is no file")
         try:
-            with partial.open("wb") as file:
+            with partial.open("xb") as file:
+                if target.exists():
+                    shutil.copymode(target, partial)
                 yield file
                 file.flush()
                 os.fsync(file.fileno())

@@ -142,7 +142,7 @@ def _baud(options: dict[str, str]) -> int | None:
     known = (protocol.CONSTANTS["baud_default"], protocol.CONSTANTS["baud_fast"])
     if text is None:
         return None
-    if not text.isdecimal() or int(text) not in known:
+    if text not in map(str, known):
         raise PortError(f"baud={text}: a board knows {known[0]} and {known[1]}")
     return int(text)
 

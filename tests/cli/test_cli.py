@@ -260,8 +260,10 @@ READINGS = str(DATA / "random_4x6.npz")
 WRONG: dict[str, tuple[list[str], list[str]]] = {
     "unknown port": (["info", "/dev/ttyACM99"], ["no port /dev/ttyACM99", "ohmskin ports"]),
     "empty port": (["info", ""], ["no port"]),
-    "no serial port": (["info", "/dev/null"], ["/dev/null"]),
-    "a folder": (["info", "/tmp"], ["/tmp"]),
+    "no serial port": (["info", "/dev/null"], ["/dev/null is no serial port", "ohmskin ports"]),
+    "a folder": (["info", "/tmp"], ["/tmp is no serial port", "ohmskin ports"]),
+    "a number that is too large": (["info", "emulator://8x8?rate=1e308"], ["times a second"]),
+    "a number that is too long": (["info", "/dev/null?baud=" + "9" * 5000], ["500000"]),
     "wrong scheme": (["info", "usb://1"], ["usb://", "emulator://"]),
     "wrong size": (["info", "emulator://big"], ["8x8"]),
     "impossible rate": (["info", "emulator://8x8?rate=1000"], ["too_fast"]),

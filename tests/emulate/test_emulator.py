@@ -9,6 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import ohmskin
 from lockstep import LockstepSim, elf_of
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
@@ -185,6 +186,9 @@ def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
         ("emulator://8x8?rate=", "float"),
         ("emulator://8x8?noise=nan", "noise"),
         ("emulator://8x8?noise=-1", "noise"),
+        ("emulator://8x8?noise=1e308", "noise must be from 0 to 1024"),
+        ("emulator://8x8?rate=1e308", "times a second"),
+        ("emulator://8x8?readings=/dev/zero", "no option 'readings'"),
         ("emulator://8x8?drop=1.5", "drop"),
         ("emulator://8x8?drop=nan", "drop"),
         ("emulator://8x8?stall=-1", "stall"),
@@ -389,3 +393,14 @@ def test_no_frame_upsets_the_emulator(sent: list[tuple[int, bytes]]) -> None:
     for frame_type, payload in sent:
         assert host.send(frame_type, payload) in results
     assert host.hello().layout_crc == protocol.LAYOUT_CRC
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize(
+    ("option", "reason"),
+    [("elf=/etc/passwd", "^no setting 'elf'"), ("bootloader=/dev/null", "is no Intel hex file")],
+)
+def test_the_simulator_takes_no_file_for_firmware(option: str, reason: str) -> None:
+    with pytest.raises(PortError, match=reason) as refused:
+        ohmskin.open(f"simavr://uno?{option}")
+    assert "\n" not in str(refused.value)

@@ -116,10 +116,15 @@ def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
         ("dead=0,5", "no column 5"),
         ("dead=a,b", "two numbers"),
         ("open_row=x", "a number, not 'x'"),
-        ("ref_top=0", "above 0"),
-        ("wires=nan", "above 0"),
-        ("hum=-50", "0 or more"),
-        ("tau_us=inf", "0 or more"),
+        ("ref_top=0", "from 1e-06 to"),
+        ("wires=nan", "from 1e-06 to"),
+        ("hum=-50", "0, or from 1e-06 to"),
+        ("tau_us=inf", "0, or from 1e-06 to"),
+        # Finite, but the arithmetic would overflow.
+        ("wires=1e308", "wires must be"),
+        ("ref_top=1e308", "ref_top must be"),
+        ("hum=1e308&hum_lsb=1e308", "hum must be"),
+        ("reset=1e-320", "reset must be"),
     ],
 )
 def test_wrong_faults_are_refused(option: str, reason: str) -> None:

@@ -14,6 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock
+from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import anyio
@@ -42,6 +43,7 @@ GHOST = "emulator://8x8?scene=ghost&seed=1"
 REST = "emulator://8x8?scene=rest&seed=1"
 HOST = "127.0.0.1:8765"
 ORIGIN = f"http://{HOST}"
+TOKEN = "secret"
 PAGE = Path(server.__file__).parent / "page"
 LIMIT_S = 60.0  # a server that says nothing for so long hangs, on a busy machine too
 TARE_S = 0.3
@@ -126,8 +128,9 @@ def served(
     folder: Path = Path(),
     force: bool = False,
 ) -> Iterator[TestClient]:
-    app = make_app(ViewedBoards(ports, calibrations, folder, force=force), "127.0.0.1")
+    app = make_app(ViewedBoards(ports, calibrations, folder, force=force), "127.0.0.1", TOKEN)
     with TestClient(app, base_url=ORIGIN) as client:
+        client.params = {"token": TOKEN}
         yield client
 
 
@@ -467,10 +470,21 @@ BAD = [
     *("", "{", "null", "3", '"tare"', "[]", '{"do": 1}', '{"do": "reboot"}', "[" * 4000, "é"),
     *('{"do": "ack"}', '{"do": "ack", "scan": "1"}', '{"do": "clock", "page_ms": "x"}'),
     *('{"do": "clock", "page_ms": 1e999}', '{"do": "clock", "page_ms": NaN}'),
+    '{"do": "clock", "page_ms": -1' + "0" * 400 + "}",
     *('{"do": "tare"}', '{"do": "tare", "force": 1}', '{"do": "mark"}'),
     *('{"do": "mark", "text": null}', '{"do": "method", "method": []}'),
     '{"do": "method", "method": "__class__"}',
 ]
+
+
+def test_a_number_that_python_does_not_read_is_no_board() -> None:
+    with served(REST) as client:
+        for number in ("9" * 10, "9" * 5000, "\u0663"):
+            assert client.delete(f"/boards/{number}", headers={"origin": ORIGIN}).is_client_error
+            assert client.get(f"/boards/{number}").status_code == 404
+            assert_refused(client, f"/boards/{number}", host=HOST, origin=ORIGIN)
+        with panel(client) as page:
+            page.scan()
 
 
 def test_bad_messages_are_refused_without_harm() -> None:
@@ -524,17 +538,20 @@ def test_nobody_commands_without_saying_who_asks() -> None:
         assert_refused(client, host=HOST)
 
 
-def test_beyond_loopback_the_token_is_asked_for() -> None:
+@pytest.mark.parametrize(("address", "host"), [("0.0.0.0", "lab.example:8765"), ("::1", HOST)])
+def test_the_token_is_asked_for(address: str, host: str) -> None:
+    """On loopback too, where every user of this machine reaches the page."""
     boards = ViewedBoards([REST])
-    host = "lab.example:8765"
     headers = {"host": host, "origin": f"http://{host}"}
-    with TestClient(make_app(boards, "0.0.0.0", "secret"), base_url=f"http://{host}") as client:
+    with TestClient(make_app(boards, address, TOKEN), base_url=f"http://{host}") as client:
         for path in ("/", "/boards", "/ports"):
             assert client.get(path).status_code == 403
             assert client.get(f"{path}?token=").status_code == 403
             assert client.get(f"{path}?token=secre").status_code == 403
             assert client.get(f"{path}?token=secret").status_code == 200
         assert client.get("/page.js").status_code == 200  # the page asks for it without
+        for change in (client.post, client.delete):
+            assert change("/boards/0", headers=headers).status_code == 403
         for wrong in ("", "?token=", "?token=%C3%A9"):
             assert_refused(client, f"/boards/0{wrong}", **headers)
         assert_refused(client, "/boards/0?token=secret", host=host, origin="http://evil.example")
@@ -565,11 +582,14 @@ def test_the_page_is_small_and_asks_no_other_host() -> None:
 def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) -> None:
     process = command("view", REST, "--http-port", "0", "--no-browser")
     url = process.stdout.readline().strip()
-    port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)/", url)[1])  # type: ignore[index]
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})", url)
+    port = int(found[1])  # type: ignore[index]
     if Path("/proc/net/tcp").exists():
         assert listening(process.pid) == {("127.0.0.1", port)}
     with urlopen(url) as page:
         assert page.status == 200
+    with pytest.raises(HTTPError, match="403"):
+        urlopen(url.partition("?")[0])
     process.send_signal(signal.SIGINT)
     assert finish(process) == Done(0, "", "")
 

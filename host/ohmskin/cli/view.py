@@ -28,7 +28,7 @@ def view(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     host: Annotated[
-        str, typer.Option(help="address to listen at; another than loopback asks for a token")
+        str, typer.Option(help="address to listen at; by default, this machine alone reaches it")
     ] = "127.0.0.1",
     http_port: Annotated[
         int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")
@@ -39,8 +39,9 @@ def view(
 ) -> None:
     """Show skins live on a page in the browser: heat map, contacts, tare, recording.
 
-    Only this machine reaches the page, unless --host says otherwise. Recordings go to the current
-    folder. Ctrl-C ends it; a recording is whole then.
+    Only this machine reaches the page, unless --host says otherwise, and only by the address that
+    is printed, with its token. Recordings go to the current folder. Ctrl-C ends it; a recording is
+    whole then.
     """
     try:
         from ohmskin.view import server

@@ -80,8 +80,8 @@ class EmulatedBoard:
         layout_crc: int = protocol.LAYOUT_CRC,
         sampled: Sampled | None = None,
     ) -> None:
-        if not 0 <= noise_lsb < float("inf"):
-            raise ValueError(f"noise must be 0 or more, not {noise_lsb}")
+        if not 0 <= noise_lsb <= 1 << protocol.ADC_BITS:
+            raise ValueError(f"noise must be from 0 to {1 << protocol.ADC_BITS}, not {noise_lsb}")
         self._ratio_at = ratio_at
         self._sampled = sampled
         self._skin_shape = (rows, columns)

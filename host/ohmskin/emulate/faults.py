@@ -8,7 +8,6 @@ A fault has the name of an option of ``emulator://``. Beside its type stand the 
 and what ``ohmskin emulate --help`` says of it.
 """
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -57,8 +56,11 @@ def _pair(text: str) -> Pair:
 
 
 Share = Annotated[float, _Kind(float, lambda share: 0 <= share <= 1, "a share, from 0 to 1")]
-Amount = Annotated[float, _Kind(float, lambda amount: 0 <= amount < math.inf, "0 or more")]
-Positive = Annotated[float, _Kind(float, lambda number: 0 < number < math.inf, "above 0")]
+# Numbers beyond these stand for no skin and no line; arithmetic with them would overflow.
+_ABOVE_0: Final = _Kind(float, lambda n: 1e-6 <= n <= 1e9, "from 1e-6 to 1e9")
+_OR_0: Final = _Kind(float, lambda n: n == 0 or _ABOVE_0.can_be(n), "0, or from 1e-6 to 1e9")
+Amount = Annotated[float, _OR_0]
+Positive = Annotated[float, _ABOVE_0]
 Line = Annotated[int | None, _Kind(int, lambda line: True, "a number")]
 Lines = Annotated[
     Pair | None, _Kind(_pair, lambda pair: pair[0] != pair[1], "two different numbers, as 1,2")

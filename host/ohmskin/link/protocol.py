@@ -165,7 +165,7 @@ def rate_mhz(rate_hz: float) -> int:
     :raises ValueError: it is not finite, or so small that it would be rounded to 0, which means as
         fast as possible.
     """
-    if not abs(rate_hz) < float("inf") or (rate_hz and not round(rate_hz * 1000)):
+    if not abs(rate_hz * 1000) < float("inf") or (rate_hz and not round(rate_hz * 1000)):
         raise ValueError(f"no board scans {rate_hz} times a second")
     return round(rate_hz * 1000)
 

@@ -108,7 +108,7 @@ def _explain(path: str, exc: Exception) -> tuple[str, str]:
             "on Linux run 'sudo usermod -aG dialout $USER' and log in again; on Windows close the "
             "other program that uses it",
         )
-    if number in (errno.ENOTTY, errno.EINVAL):
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
         return f"{path} is no serial port", "'ohmskin ports' lists the ports there are"
     return f"cannot open {path}: {text}", ""
 

@@ -12,7 +12,6 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from math import isfinite
 from typing import Any, Final
 
 import anyio
@@ -23,6 +22,7 @@ from ohmskin.errors import OhmskinError, TareRefused
 from ohmskin.view.boards import Shown, ViewedBoard
 
 _GONE: Final = 4001  # close code: the board was closed, by this page or another
+_MOST_MS: Final = 1e15  # of a page's clock
 _Command = Callable[[], str]
 
 
@@ -93,8 +93,8 @@ class Panel:
                     if number == self._awaited:
                         self._awaited = None
                         self._news.set()
-                case {"do": "clock", "page_ms": int() | float() as page_ms} if isfinite(page_ms):
-                    await self._say("clock", page_ms=page_ms, host_s=time.monotonic())
+                case {"do": "clock", "page_ms": int() | float() as at_ms} if abs(at_ms) < _MOST_MS:
+                    await self._say("clock", page_ms=at_ms, host_s=time.monotonic())
                 case _:
                     command = self._asked(message)
                     if command is None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The server of the page: a few files, the list of boards, a websocket for each panel.
 
-It answers its own page alone, from this machine or with the token. A browser says in ``Origin``
-which page asks, and in ``Host`` which name it asked for: a foreign page is refused, and so is a
-foreign name that was made to lead here (DNS rebinding). On other addresses than loopback there are
-names that nobody here can know; there the token takes the place of the check of ``Host``.
+It answers its own page alone, with the token that is in the address: other users of this machine
+must neither read the skin nor command it, and no page of another site must. A browser says in
+``Origin`` which page asks, and in ``Host`` which name it asked for: a foreign page is refused, and
+so is, on loopback, a foreign name that was made to lead here (DNS rebinding).
 """
 
 import ipaddress
@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 import anyio
 import uvicorn
 from starlette.applications import Starlette
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.datastructures import MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import HTTPConnection, Request
@@ -53,7 +54,14 @@ _HEADERS: Final = {
 _READS: Final = ("GET", "HEAD")
 
 
-def make_app(boards: ViewedBoards, host: str, token: str | None = None) -> Starlette:
+class _BoardNumber(IntegerConvertor):
+    regex = "[0-9]{1,9}"  # Python reads no number of thousands of digits
+
+
+register_url_convertor("board", _BoardNumber())
+
+
+def make_app(boards: ViewedBoards, host: str, token: str) -> Starlette:
     """The page of `boards`, which closes them at its end. host, token: see `Guard`."""
 
     async def ports(request: Request) -> Response:
@@ -99,8 +107,8 @@ def make_app(boards: ViewedBoards, host: str, token: str | None = None) -> Starl
             Route("/ports", ports),
             Route("/boards", list_boards, methods=["GET"]),
             Route("/boards", add_board, methods=["POST"]),
-            Route("/boards/{number:int}", remove_board, methods=["DELETE"]),
-            WebSocketRoute("/boards/{number:int}", panel),
+            Route("/boards/{number:board}", remove_board, methods=["DELETE"]),
+            WebSocketRoute("/boards/{number:board}", panel),
             Route("/{path:path}", StaticFiles(directory=_PAGE, html=True)),
         ],
         middleware=[Middleware(Guard, host=host, token=token, public=public)],
@@ -134,11 +142,10 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
                 "--http-port; 0 is any that is free"
             ) from exc
         with listening:
-            token = None if _is_loopback(host) else secrets.token_urlsafe(16)
+            token = secrets.token_urlsafe(16)
             name = socket.gethostname() if host in ("0.0.0.0", "::") else host
             name = f"[{name}]" if ":" in name else name
-            query = "" if token is None else f"?token={token}"
-            started(f"http://{name}:{listening.getsockname()[1]}/{query}")
+            started(f"http://{name}:{listening.getsockname()[1]}/?token={token}")
             config = uvicorn.Config(
                 make_app(boards, host, token),
                 ws="wsproto",
@@ -165,16 +172,16 @@ def _is_loopback(host: str) -> bool:
 class Guard:
     """ASGI middleware that refuses strangers.
 
-    host: the address listened at. token: what has to be in the query; None: on loopback, where the
-    name in ``Host`` is checked instead. Its port is not: it is another one through an SSH tunnel.
-    public: paths that need no token, because a page asks for its own parts without one.
+    host: the address listened at; on loopback, the name in ``Host`` must be one of this machine.
+    Its port is not checked: it is another one through an SSH tunnel. token: what has to be in the
+    query. public: paths that need no token, because a page asks for its own parts without one.
     """
 
-    def __init__(self, app: ASGIApp, host: str, token: str | None, public: Collection[str]) -> None:
+    def __init__(self, app: ASGIApp, host: str, token: str, public: Collection[str]) -> None:
         self._app = app
         self._public = public
-        self._token = token
-        self._names = {host, "localhost", "127.0.0.1", "::1"}
+        self._token = token.encode()
+        self._names = {host, "localhost", "127.0.0.1", "::1"} if _is_loopback(host) else None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer 403 to a stranger, and let everybody else through."""
@@ -194,12 +201,11 @@ class Guard:
     def _refusal(self, scope: Scope) -> str:
         asked = HTTPConnection(scope)
         host, origin = asked.headers.get("host", ""), asked.headers.get("origin")
-        if self._token is None:
-            if _name(host) not in self._names:
-                return "this page is at 127.0.0.1, and by no other name"
-        elif scope["path"] not in self._public:
+        if self._names is not None and _name(host) not in self._names:
+            return "this page is at 127.0.0.1, and by no other name"
+        if scope["path"] not in self._public:
             given = asked.query_params.get("token", "")
-            if not secrets.compare_digest(given.encode(), self._token.encode()):
+            if not secrets.compare_digest(given.encode(), self._token):
                 return "open the address that 'ohmskin view' has printed, with its token"
         changes = scope["type"] == "websocket" or scope["method"] not in _READS
         if (changes or origin is not None) and origin != f"http://{host}":

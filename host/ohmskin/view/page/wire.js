@@ -9,7 +9,7 @@ const CLOSED = 4001; // the board was closed, and does not come back
 export const token = new URLSearchParams(location.search).get("token");
 
 export function address(path) {
-  return token === null ? path : `${path}?token=${encodeURIComponent(token)}`;
+  return `${path}?token=${encodeURIComponent(token ?? "")}`;
 }
 
 export function decode(buffer) {
