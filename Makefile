@@ -22,12 +22,12 @@ endif
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEX := host/ohmskin/firmware
-C_FILES = $(shell find firmware -name '*.c' -o -name '*.cpp' -o -name '*.h')
+C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware check-firmware sim \
-        test-host chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-desk bench-force bench-view \
+        test-host fuzz chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-desk bench-force bench-view \
         bench-boards clean distclean
 
 help: ## list the targets
@@ -87,6 +87,17 @@ sim: setup ## build the simulator that runs the firmware on an emulated skin
 
 test-host: setup firmware sim ## pytest, a process a core
 	$(ONE_THREAD) $(BIN)/pytest --numprocesses auto --dist loadfile
+
+FUZZED := build/fuzz/frame_reader
+READER := firmware/src/core/frame_reader
+$(FUZZED): fuzz/frame_reader.cpp $(READER).cpp $(READER).h
+	mkdir -p $(@D)
+	$(CXX) -std=c++11 -O1 -g -Wall -Wextra -Werror -fsanitize=address,undefined \
+		-fno-sanitize-recover=all -I firmware/src -I protocol fuzz/frame_reader.cpp $(READER).cpp -o $@
+
+fuzz: setup $(FUZZED) ## fuzz all that comes from outside, ten minutes (SECURITY.md)
+	$(FUZZED) 2000000 $$(date +%s)
+	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python -m fuzz 600
 
 STUDY := $(ONE_THREAD) PYTHONPATH=. $(BIN)/python -m studies
 

@@ -499,8 +499,7 @@ def test_scans_of_another_size_than_hello_says(keeps: bool) -> None:
         found = take(scans, skin.stats.scans - unknown)
         assert {scan.codes.shape for scan in found} == {(4, 4, 4)}
         if keeps:
-            time.sleep(1.1)
-            link.say(0.1)
+            link.say(1)
             with pytest.raises(ProtocolError, match="hello says 4x4 cells, its scans have 2x4"):
                 next(scans)
 

@@ -271,12 +271,10 @@ class Device(Closing):
         """Do the work of the thread that publishes. Who waits gets to know what ends it."""
         try:
             work()
-        except OhmskinError as exc:
-            self._fail(exc)
         except Exception as exc:
-            failure = DeviceLost(f"{self.name}: a defect of this program, report it: {exc!r}")
-            failure.__cause__ = exc
-            self._fail(failure)
+            defect = DeviceLost(f"{self.name}: a defect of this program, report it: {exc!r}")
+            defect.__cause__ = exc
+            self._fail(exc if isinstance(exc, OhmskinError) else defect)
 
     def _fail(self, error: OhmskinError) -> None:
         """Say why no more scans come. Whoever waits, now or later, gets this error."""

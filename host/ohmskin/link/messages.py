@@ -18,6 +18,8 @@ _DROPPED_SPAN = 1 << 16
 _LAYOUT_CRC_SIZE = 2
 # The slowest scan, of the largest skin at the longest settle time, takes 3.2 s.
 _LONGEST_SCAN_S = 10
+# Through a larger one the converter's input would leak [ohm]; the wiring has 30 kOhm.
+_MOST_REF_OHM = 10_000_000
 # A ceramic resonator is up to 0.5 % off.
 _RATE_ERROR = 0.005
 
@@ -68,8 +70,8 @@ class Hello:
             "columns": 1 <= self.columns <= limits["columns_max"],
             "readings_per_cell": self.readings_per_cell == protocol.READINGS_PER_CELL,
             "adc_bits": self.adc_bits == protocol.ADC_BITS,
-            "ref_top_ohm": self.ref_top_ohm > 0,
-            "ref_bottom_ohm": self.ref_bottom_ohm > 0,
+            "ref_top_ohm": 0 < self.ref_top_ohm <= _MOST_REF_OHM,
+            "ref_bottom_ohm": 0 < self.ref_bottom_ohm <= _MOST_REF_OHM,
             "clock_hz": self.clock_hz > 0,
             "scan_cycles": 0 < self.scan_cycles <= _LONGEST_SCAN_S * self.clock_hz,
             "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,

@@ -44,6 +44,8 @@ _COMMAND_TIMEOUT_S = 1.0
 # A scanning board that sends no valid frame for so long is asked who it is, and again later [s].
 _SPEED_LOST_S = 2.5
 _ASK_AGAIN_S = 6.5
+# So many scans of another size may be on their way when the board is told how to scan.
+_MOST_ODD: Final = 100
 _BROKEN: Final = "its firmware is broken: flash it with 'ohmskin flash'"
 
 
@@ -65,7 +67,7 @@ class Session(Device):
         self._acks: dict[int, Ack] = {}
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0
-        self._odd_s: float | None = None  # time of the first of scans that are not as hello says
+        self._odd = 0  # scans, one after the other, that are not as hello says
         work, name = (self._read,), f"read {link.name}"
         self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
         self._thread.start()
@@ -164,13 +166,11 @@ class Session(Device):
     def _keep(self, message: Message) -> None:
         match message:
             case Hello() if odd := message.impossible():
-                raise ProtocolError(
-                    f"{self.name}: the board's hello says {odd}, which cannot be", _BROKEN
-                )
+                said = f"hello says {odd}, which cannot be"
+                raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
             case Scan() if self._want_scans and not self._is_as_told(message):
                 self._stats.unknown += 1
             case Scan():
-                self._odd_s = None
                 self._publish(message)
             case Ack():
                 self._acks[message.command_sequence] = message
@@ -198,22 +198,15 @@ class Session(Device):
                 )
 
     def _is_as_told(self, scan: Scan) -> bool:
-        """Whether a scan has the cells of `info`. If not, the board is told once more, and has to
-        do it in time: after a reset, the command for that may have been damaged.
-        """
-        board = self.info
-        if (scan.rows, scan.columns) == (board.rows, board.columns):
-            return True
-        if self._odd_s is None:
-            self._odd_s = scan.host_time_s
+        """Whether a scan has the cells of `info`. A board that has not is told once more."""
+        told, sent = (self.info.rows, self.info.columns), (scan.rows, scan.columns)
+        self._odd = 0 if sent == told else self._odd + 1
+        if self._odd == 1:
             self._scan_anew()
-        elif scan.host_time_s > self._odd_s + _COMMAND_TIMEOUT_S + 2 / board.rate_hz:
-            raise ProtocolError(
-                f"{self.name}: the board's hello says {board.rows}x{board.columns} cells, its "
-                f"scans have {scan.rows}x{scan.columns}",
-                _BROKEN,
-            )
-        return False
+        elif self._odd > _MOST_ODD:
+            said = f"hello says {told[0]}x{told[1]} cells, its scans have {sent[0]}x{sent[1]}"
+            raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
+        return not self._odd
 
     def _scan_anew(self) -> None:
         self._send("stop")

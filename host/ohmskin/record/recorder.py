@@ -153,9 +153,8 @@ class Recorder(Closing):
                 with suppress(OSError), self.path.open("rb") as file:
                     # The last chunk may be whole, and only the index after it cut off.
                     file.seek(self.size)
-                    head = file.read(_HEAD_SIZE)
-                    end = self.size + _HEAD_SIZE + int.from_bytes(head[1:], "little")
-                    if len(head) == _HEAD_SIZE and end <= os.fstat(file.fileno()).st_size:
+                    size = int.from_bytes(file.read(_HEAD_SIZE)[1:], "little")
+                    if self.size + _HEAD_SIZE + size <= os.fstat(file.fileno()).st_size:
                         self._readable = self.scans
                 self._failure = RecordingError(
                     f"{self.path}: recording ended: {exc.strerror or exc}; {self._readable} scans "

@@ -59,8 +59,6 @@ _MOST_UNPACKED: Final = 200
 _SMALL: Final = 1_000_000
 _LARGEST_CODE: Final = 0xFFFF
 _LARGEST_COUNTER: Final = (1 << 63) - 1
-# Of zstd, which takes powers of two.
-_LARGEST_WINDOW: Final = 1 << 24
 # What `export` writes.
 FORMATS: Final = (".npz", ".csv")
 # What both formats have of each scan, besides its readings.
@@ -208,7 +206,7 @@ class _Bounded:
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
-        self._size = self._left = os.fstat(file.fileno()).st_size
+        self._left = os.fstat(file.fileno()).st_size
         self._may_unpack = _SMALL
 
     def read(self, size: int) -> bytes:
@@ -222,21 +220,16 @@ class _Bounded:
         """The records of a chunk, where its true size is the one it states, and no bomb's."""
         size = chunk.uncompressed_size
         self._may_unpack -= size
-        if size > LARGEST_RECORD or self._may_unpack < 0:
-            raise ValueError(
-                f"damaged: {self._size} bytes that unpack to more than {_MOST_UNPACKED} times as "
-                f"many, or to more than {LARGEST_RECORD} at once: no recorder writes that"
-            )
-        match chunk.compression:
-            case "zstd":
-                unpacker = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW)
-                octets = unpacker.stream_reader(chunk.data).read(size + 1)
-            case "lz4":
-                octets = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
-            case "":
-                octets = chunk.data
-            case other:
-                raise ValueError(f"damaged: a chunk that is packed as {other:.40}")
+        if size > LARGEST_RECORD:
+            raise ValueError("damaged: a chunk larger than any recorder writes")
+        if self._may_unpack < 0:
+            raise ValueError(f"damaged: it unpacks to over {_MOST_UNPACKED} times its size")
+        octets = chunk.data
+        if chunk.compression == "zstd":
+            unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_RECORD)
+            octets = unpacker.stream_reader(octets).read(size + 1)
+        elif chunk.compression == "lz4":
+            octets = lz4.frame.LZ4FrameDecompressor().decompress(octets, size + 1)
         if len(octets) != size:
             raise ValueError(f"damaged: a chunk that states {size} bytes has not as many")
         try:

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m fuzz [SECONDS [TARGET...]]``: fuzz the targets, guided by coverage, each its share.
+
+It ends with the first input that raises, takes more than a second, or more than 500 MB. What
+atheris finds on its way is kept in build/fuzz. An input that broke something goes into
+fuzz/corpus/TARGET: every run begins with that, and `make test` runs it.
+"""
+
+import subprocess
+import sys
+from itertools import count
+from pathlib import Path
+
+CORPUS = Path(__file__).parent / "corpus"
+FOUND = Path("build/fuzz")
+MOST_MB = 500
+MOST_S = 1
+
+
+def fuzz(target: str, seconds: int) -> None:
+    """Fuzz in this process, which libFuzzer ends."""
+    import atheris
+
+    with atheris.instrument_imports(include=["ohmskin"]):
+        from fuzz.targets import TARGETS, seeds
+
+    folder = FOUND / target
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, seed in zip(count(), seeds()[target]):
+        (folder / f"seed{number}").write_bytes(seed)
+    kept = [str(CORPUS / target)] if (CORPUS / target).is_dir() else []
+    options = (f"-max_total_time={seconds}", f"-timeout={MOST_S}", f"-rss_limit_mb={MOST_MB}")
+    more = (
+        "-seed=1",
+        "-max_len=20000",
+        "-print_final_stats=1",
+        f"-artifact_prefix={FOUND}/broken-{target}-",
+    )
+    atheris.Setup([sys.argv[0], *options, *more, str(folder), *kept], TARGETS[target])
+    atheris.Fuzz()
+
+
+def main() -> None:
+    """Fuzz each target in a process of its own."""
+    match sys.argv[1:]:
+        case ["--one", target, seconds]:
+            fuzz(target, int(seconds))
+            return
+        case [seconds, *named]:
+            pass
+        case _:
+            seconds, named = "600", []
+    from fuzz.targets import TARGETS
+
+    for target in named or TARGETS:
+        share = max(int(seconds) // len(named or TARGETS), 1)
+        print(f"{target}: {share} s", flush=True)
+        call = [sys.executable, "-m", "fuzz", "--one", target, str(share)]
+        done = subprocess.run(call, stderr=subprocess.PIPE, text=True, errors="replace")
+        if done.returncode:
+            sys.exit(f"{done.stderr[-6000:]}\n{target}: see {FOUND}/broken-{target}-*")
+        stats = [line.split()[-1] for line in done.stderr.splitlines() if line.startswith("stat::")]
+        print(f"{target}: {stats[0]} inputs, slowest below {MOST_S} s, {stats[-1]} MB", flush=True)
+
+
+if __name__ == "__main__":
+    main()

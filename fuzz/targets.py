@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is fuzzed: each target takes bytes, and lets no exception out but a defect.
+
+A target's inputs begin with a byte that says how the rest is meant, so that mutations reach what
+lies behind checksums and packing. `seeds` gives inputs that are right, to begin with.
+"""
+
+import atexit
+import json
+import shutil
+import struct
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from calibrations import calibration
+from ohmskin.calibrate.tables import load_force_log, load_press_table
+from ohmskin.errors import PortError, RecordingError
+from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.force.calibration import load_calibration
+from ohmskin.link import framing, protocol
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
+from ohmskin.link.device import configuration
+from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.opening import emulated
+from ohmskin.record.force_sensor import ForceLineDecoder
+from ohmskin.record.readings import load_readings
+from ohmskin.record.recording import SCHEMAS, TOPIC, export, load_recording
+
+Target = Callable[[bytes], None]
+# Readers take names of files. They are made here: in memory, where there is a place for that.
+_MEMORY = Path("/dev/shm")
+_FOLDER = Path(tempfile.mkdtemp(dir=_MEMORY if _MEMORY.is_dir() else None))
+atexit.register(shutil.rmtree, _FOLDER)
+_PACKED = tuple(CompressionType)
+_KINDS = tuple(SCHEMAS)
+_FRAMES = tuple(protocol.FRAMES_BY_ID)
+
+
+def one_line(error: Exception) -> None:
+    """A text for people."""
+    assert str(error)
+    assert "\n" not in str(error), str(error)
+
+
+def file_of(octets: bytes, suffix: str = "") -> Path:
+    path = _FOLDER / f"input{suffix}"
+    path.write_bytes(octets)
+    return path
+
+
+# ---------------------------------------------------------------------------------------- frames
+
+
+def _stretches(octets: bytes) -> Iterator[bytes]:
+    """Each is a byte of its kind, two of its length, and what is framed, or comes as it is."""
+    at = 0
+    while at + 3 <= len(octets):
+        kind, size = struct.unpack_from("<BH", octets, at)
+        content = octets[at + 3 : at + 3 + size]
+        at += 3 + size
+        if kind < len(_FRAMES):
+            content = framing.encode(_FRAMES[kind], at, content)
+        yield content
+
+
+def _stretch(kind: int, content: bytes) -> bytes:
+    return struct.pack("<BH", kind, len(content)) + content
+
+
+def frames(octets: bytes) -> None:
+    """What a board sends, decoded, and all that is computed from its `hello`."""
+    decoder, clock, board = BoardDecoder(), BoardClock(), None
+    for number, stretch in enumerate(_stretches(octets)):
+        for message in decoder.feed(stretch, number / 100):
+            if isinstance(message, Hello) and not message.impossible():
+                board = message
+                protocol.FRAMES["configure"].pack(**configuration(board))
+                assert board.rate_hz >= 0.1
+            if isinstance(message, Scan):
+                assert message.codes.shape[0] * message.codes.shape[1] <= 256
+            if isinstance(message, Scan) and board is not None:
+                end_us = message.time_us + 1e6 * scan_s(board)
+                clock.add(end_us, message.host_time_s - line_delay_s(message, board))
+                assert np.isfinite(clock.host_s(end_us))
+                if message.codes.shape[:2] == (board.rows, board.columns):
+                    make_estimator("ohm", SkinKnowledge.of(board)).estimate(message.ratio)
+
+
+def forces(octets: bytes) -> None:
+    """What a force sensor prints."""
+    decoder = ForceLineDecoder()
+    for at in range(0, len(octets), 7):
+        assert np.isfinite(decoder.feed(octets[at : at + 7])).all()
+
+
+# ----------------------------------------------------------------------------------------- files
+
+
+def recordings(octets: bytes) -> None:
+    """A recording. 0 to 2: messages, a line each, packed so; else the file as it is."""
+    how, path = octets[:1], file_of(octets[1:], ".mcap")
+    if how and how[0] < len(_PACKED):
+        with path.open("wb") as file:
+            writer = Writer(file, compression=_PACKED[how[0]])
+            writer.start()
+            schema = writer.register_schema("x", "jsonschema", b"{}")
+            known = [writer.register_channel(TOPIC + name, "json", schema) for name in _KINDS]
+            for line in octets[1:].split(b"\n"):
+                if line:
+                    writer.add_message(known[line[0] % len(known)], 0, line[1:], 0)
+            writer.finish()
+    try:
+        recording = load_recording(path)
+        for suffix in (".npz", ".csv"):
+            with suppress(RecordingError):
+                export(recording, path.with_suffix(suffix))
+                if suffix == ".npz":
+                    with suppress(ValueError):  # a rest from elsewhere may be out of range
+                        load_readings(path.with_suffix(suffix))
+    except RecordingError as error:
+        one_line(error)
+
+
+def readings(octets: bytes) -> None:
+    """A readings file."""
+    with suppress(ValueError):
+        load_readings(file_of(octets, ".npz"))
+
+
+def calibrations(octets: bytes) -> None:
+    """A calibration: what is read can be used, and is saved as it was read."""
+    try:
+        known = load_calibration(path := file_of(octets, ".json"))
+    except ValueError as error:
+        one_line(error)
+        return
+    level = known.untouched.level
+    known.model.predict(0.1 * level, 0.01 * level)
+    known.save(path)
+    saved = path.read_bytes()
+    load_calibration(path).save(path)
+    assert path.read_bytes() == saved
+
+
+def tables(octets: bytes) -> None:
+    """A table of presses, or a log of forces."""
+    path = file_of(octets, ".csv")
+    for load in (load_press_table, load_force_log):
+        try:
+            load(path)
+        except ValueError as error:
+            one_line(error)
+
+
+def urls(octets: bytes) -> None:
+    """The options of an emulated board."""
+    text = octets.decode(errors="replace")
+    with suppress(PortError):  # its text repeats what was typed
+        board, _, faults = emulated("emulator://2x2?" + text)
+        board.heard(faults, 0.01)
+
+
+TARGETS: dict[str, Target] = {
+    each.__name__: each
+    for each in (frames, forces, recordings, readings, calibrations, tables, urls)
+}
+
+
+def seeds() -> dict[str, Sequence[bytes]]:
+    """Inputs that are right, of each target."""
+    board, _, _ = emulated("emulator://2x3?scene=multi")
+    decoder = framing.Decoder()
+    sent = decoder.feed(board.advance(0.0))
+    start = protocol.FRAMES["start"]
+    board.receive(framing.encode(start.id, 0, b""))
+    sent += decoder.feed(board.advance(0.05))
+    stream = b"".join(_stretch(_FRAMES.index(each.type), each.payload) for each in sent)
+    found = [
+        m for raw in sent for m in BoardDecoder().feed(framing.encode(raw.type, 0, raw.payload), 0)
+    ]
+    hello = next(m for m in found if isinstance(m, Hello))
+    scan = next(m for m in found if isinstance(m, Scan))
+    size = {"rows": 2, "columns": 3}
+    said = {
+        "hello": asdict(hello),
+        "scan": {
+            "number": 1,
+            "time_us": 9,
+            "missed": 0,
+            **size,
+            "codes": scan.codes.ravel().tolist(),
+        },
+        "tare": {**size, "rest_ratio": scan.ratio.ravel().round(3).tolist()},
+        "mark": {"text": "here"},
+        "force": {"force_n": 1.5, "source": "x"},
+    }
+    lines = b"\n".join(
+        bytes([_KINDS.index(name)]) + json.dumps({"host_time_s": 1.0, **content}).encode()
+        for name, content in said.items()
+    )
+    recordings(b"\0" + lines)
+    calibration(scan.ratio).save(_FOLDER / "input.json")
+    recorded, out = (_FOLDER / f"input{suffix}" for suffix in (".mcap", ".npz"))
+    presses = "row,column,force_n,conductance\n" + "0,1,1.5,2e-5\n" * 3
+    log = "time_s,force_n\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(12))
+    return {
+        "frames": [stream, _stretch(255, board.advance(0.2))],
+        "forces": [b"1.5\r\n-2 N\n\n3e-1N\nabc\n"],
+        "recordings": [
+            *(bytes([how]) + lines for how in range(len(_PACKED))),
+            b"\xff" + recorded.read_bytes(),
+        ],
+        "readings": [out.read_bytes()],
+        "calibrations": [(_FOLDER / "input.json").read_bytes()],
+        "tables": [presses.encode(), log.encode()],
+        "urls": [
+            b"scene=ghost&seed=3&noise=1",
+            b"rate=100&wires=2&hum=50&dead=0,1&drop=0.5&reset=1",
+        ],
+    }

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The short run of `make fuzz`: what once broke something, and some thousand seeded mutations."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from command_line import ENVIRONMENT
+from fuzz.__main__ import CORPUS
+from fuzz.mutate import mutated
+from fuzz.targets import TARGETS, seeds
+from places import ROOT
+
+# Mutations of each target: about a second.
+COUNTS = {"frames": 800, "recordings": 500, "readings": 500, "urls": 500}
+SEEDS = seeds()
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_nothing_from_outside_raises(target: str) -> None:
+    kept = [file.read_bytes() for file in sorted((CORPUS / target).glob("*"))]
+    inputs = [*SEEDS[target], *kept, b""]
+    for octets in [*inputs, *mutated(inputs, COUNTS.get(target, 1500), seed=1)]:
+        try:
+            TARGETS[target](octets)
+        except Exception as error:
+            error.add_note(f"input: {octets!r}")
+            raise
+
+
+def test_every_kept_input_has_its_target() -> None:
+    assert {folder.name for folder in CORPUS.iterdir()} <= set(TARGETS)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="needs atheris")
+def test_make_fuzz_runs(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests/helpers"), ENVIRONMENT["PYTHONPATH"]])
+    done = subprocess.run(
+        [sys.executable, "-m", "fuzz", "2", "urls"],
+        cwd=tmp_path,
+        env=ENVIRONMENT | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.splitlines()[1].split()[1]) > 100
+    assert list((tmp_path / "build/fuzz/urls").iterdir())
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+def test_the_firmware_s_frame_reader_agrees_with_an_oracle(tmp_path: Path) -> None:
+    """Under AddressSanitizer and UndefinedBehaviorSanitizer."""
+    program = tmp_path / "frame_reader"
+    subprocess.run(["make", "-s", "-C", ROOT, f"FUZZED={program}", program], check=True)
+    subprocess.run([program, "200000", "1"], check=True)
