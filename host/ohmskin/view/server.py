@@ -7,9 +7,9 @@ must neither read the skin nor command it, and no page of another site must. A b
 so is, on loopback, a foreign name that was made to lead here (DNS rebinding).
 """
 
-import ipaddress
 import json
 import mimetypes
+import re
 import secrets
 import socket
 from collections.abc import AsyncIterator, Callable, Collection
@@ -17,7 +17,6 @@ from contextlib import asynccontextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
 
 import anyio
 import uvicorn
@@ -51,6 +50,7 @@ _HEADERS: Final = {
     "referrer-policy": "no-referrer",  # the address may hold the token
     "cache-control": "no-store",  # a page of one version never meets a server of another
 }
+_LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 _READS: Final = ("GET", "HEAD")
 
 
@@ -159,16 +159,6 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
             uvicorn.Server(config).run(sockets=[listening])
 
 
-def _is_loopback(host: str) -> bool:
-    """Whether nobody but this machine reaches that address."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 class Guard:
     """ASGI middleware that refuses strangers.
 
@@ -181,7 +171,7 @@ class Guard:
         self._app = app
         self._public = public
         self._token = token.encode()
-        self._names = {host, "localhost", "127.0.0.1", "::1"} if _is_loopback(host) else None
+        self._is_far = host not in _LOOPBACK
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer 403 to a stranger, and let everybody else through."""
@@ -201,7 +191,8 @@ class Guard:
     def _refusal(self, scope: Scope) -> str:
         asked = HTTPConnection(scope)
         host, origin = asked.headers.get("host", ""), asked.headers.get("origin")
-        if self._names is not None and _name(host) not in self._names:
+        name = re.sub(r":\d*$", "", host).strip("[]").lower()
+        if not self._is_far and name not in _LOOPBACK:
             return "this page is at 127.0.0.1, and by no other name"
         if scope["path"] not in self._public:
             given = asked.query_params.get("token", "")
@@ -211,10 +202,3 @@ class Guard:
         if (changes or origin is not None) and origin != f"http://{host}":
             return "only this page itself may ask that"
         return ""
-
-
-def _name(host: str) -> str | None:
-    try:
-        return urlsplit(f"//{host}").hostname
-    except ValueError:
-        return None
