@@ -19,6 +19,7 @@ OUTSIDE = {
     "ARCHITECTURE.md": "architecture.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "protocol/FRAMES.md": "frames.md",
     **{f"examples/{path.name}": f"examples/{path.name}" for path in ROOT.glob("examples/*.*")},
 }

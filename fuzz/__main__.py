@@ -58,7 +58,10 @@ def main() -> None:
         call = [sys.executable, "-m", "fuzz", "--one", target, str(share)]
         done = subprocess.run(call, stderr=subprocess.PIPE, text=True, errors="replace")
         if done.returncode:
-            sys.exit(f"{done.stderr[-6000:]}\n{target}: see {FOUND}/broken-{target}-*")
+            said = [
+                line for line in done.stderr.splitlines() if line[:1] != "#" and "INFO" not in line
+            ]
+            sys.exit("\n".join([*said, f"{target}: see {FOUND}/broken-{target}-*"]))
         stats = [line.split()[-1] for line in done.stderr.splitlines() if line.startswith("stat::")]
         print(f"{target}: {stats[0]} inputs, slowest below {MOST_S} s, {stats[-1]} MB", flush=True)
 

@@ -53,7 +53,10 @@ class Page:
 PAGES = [
     Page(path)
     for path in (
-        *(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md")),
+        *(
+            ROOT / name
+            for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md")
+        ),
         *sorted(DOCS.glob("*.md")),
         *sorted(ROOT.glob("examples/*.md")),
     )

@@ -324,6 +324,7 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
         ("/skin/hello", {"host_time_s": 1}, "layout_crc"),
         ("/skin/hello", [1], "no JSON object"),
         ("/skin/hello", {**known, "columns": 0}, "hello: columns is 0"),
+        ("/skin/hello", {**known, "adc_bits": 80}, "adc bits must be an integer from 1 to 16"),
         ("/skin/hello", {**known, "scan_cycles": 0}, "hello: scan_cycles is 0"),
         ("/skin/hello", {**known, "ref_top_ohm": 0}, "hello: ref_top_ohm is 0"),
         ("/skin/hello", {**known, "rows": 10**9}, "hello: no 1000000000x4 cells"),

@@ -45,7 +45,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, save_table
-from ohmskin.link.codes import ratio_from_codes
+from ohmskin.link.codes import check_adc_bits, ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
@@ -276,6 +276,7 @@ def _hello(values: dict[str, Any]) -> Hello:
     del values["host_time_s"]
     values["reset_cause"] = tuple(map(str, values["reset_cause"]))
     hello = Hello(**values)
+    check_adc_bits(hello.adc_bits)
     for name in ("rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "clock_hz", "scan_cycles"):
         if not getattr(hello, name):
             raise ValueError(f"hello: {name} is 0")
