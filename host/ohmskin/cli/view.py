@@ -39,9 +39,8 @@ def view(
 ) -> None:
     """Show skins live on a page in the browser: heat map, contacts, tare, recording.
 
-    Only this machine reaches the page, unless --host says otherwise, and only by the address that
-    is printed, with its token. Recordings go to the current folder. Ctrl-C ends it; a recording is
-    whole then.
+    Only this machine reaches it, unless --host says otherwise, at the address that is printed.
+    Recordings go to the current folder. Ctrl-C ends it; a recording is whole then.
     """
     try:
         from ohmskin.view import server

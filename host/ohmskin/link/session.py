@@ -44,9 +44,11 @@ _COMMAND_TIMEOUT_S = 1.0
 # A scanning board that sends no valid frame for so long is asked who it is, and again later [s].
 _SPEED_LOST_S = 2.5
 _ASK_AGAIN_S = 6.5
-# So many scans of another size may be on their way when the board is told how to scan.
-_MOST_ODD: Final = 100
-_BROKEN: Final = "its firmware is broken: flash it with 'ohmskin flash'"
+_BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
+
+
+def _size(of: Hello | Scan) -> str:
+    return f"{of.rows}x{of.columns}"
 
 
 class Session(Device):
@@ -67,7 +69,6 @@ class Session(Device):
         self._acks: dict[int, Ack] = {}
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0
-        self._odd = 0  # scans, one after the other, that are not as hello says
         work, name = (self._read,), f"read {link.name}"
         self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
         self._thread.start()
@@ -168,8 +169,9 @@ class Session(Device):
             case Hello() if odd := message.impossible():
                 said = f"hello says {odd}, which cannot be"
                 raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
-            case Scan() if self._want_scans and not self._is_as_told(message):
-                self._stats.unknown += 1
+            case Scan() if self._want_scans and _size(message) != _size(self.info):
+                said = f"hello says {_size(self.info)} cells, its scans have {_size(message)}"
+                raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
             case Scan():
                 self._publish(message)
             case Ack():
@@ -180,7 +182,7 @@ class Session(Device):
                 # It was reset: bring it back to where it was.
                 self._stats.restarts += 1
                 before = self.info
-                self._scan_anew()
+                self._send("configure", **configuration(before))
                 self._hello = replace(
                     before,
                     unit_id=message.unit_id,
@@ -188,6 +190,7 @@ class Session(Device):
                     settings=message.settings,
                     reset_cause=message.reset_cause,
                 )
+                self._send("start")
             case Hello():
                 self._hello = message
             case ForeignHello():
@@ -196,19 +199,3 @@ class Session(Device):
                     f"0x{protocol.LAYOUT_CRC:04X}",
                     "flash it with 'ohmskin flash'",
                 )
-
-    def _is_as_told(self, scan: Scan) -> bool:
-        """Whether a scan has the cells of `info`. A board that has not is told once more."""
-        told, sent = (self.info.rows, self.info.columns), (scan.rows, scan.columns)
-        self._odd = 0 if sent == told else self._odd + 1
-        if self._odd == 1:
-            self._scan_anew()
-        elif self._odd > _MOST_ODD:
-            said = f"hello says {told[0]}x{told[1]} cells, its scans have {sent[0]}x{sent[1]}"
-            raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
-        return not self._odd
-
-    def _scan_anew(self) -> None:
-        self._send("stop")
-        self._send("configure", **configuration(self.info))
-        self._send("start")

@@ -21,7 +21,6 @@ from typing import Final
 import anyio
 import uvicorn
 from starlette.applications import Starlette
-from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.datastructures import MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import HTTPConnection, Request
@@ -54,13 +53,6 @@ _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 _READS: Final = ("GET", "HEAD")
 
 
-class _BoardNumber(IntegerConvertor):
-    regex = "[0-9]{1,9}"  # Python reads no number of thousands of digits
-
-
-register_url_convertor("board", _BoardNumber())
-
-
 def make_app(boards: ViewedBoards, host: str, token: str) -> Starlette:
     """The page of `boards`, which closes them at its end. host, token: see `Guard`."""
 
@@ -83,12 +75,16 @@ def make_app(boards: ViewedBoards, host: str, token: str) -> Starlette:
         except ValueError as exc:
             return JSONResponse({"error": str(exc)}, 400)
 
+    def number_of(asked: HTTPConnection) -> int:
+        """Not by `int`, which refuses thousands of digits. -1: there is none."""
+        return next((n for n in tuple(boards) if str(n) == asked.path_params["number"]), -1)
+
     async def remove_board(request: Request) -> Response:
-        await anyio.to_thread.run_sync(boards.remove, request.path_params["number"])
+        await anyio.to_thread.run_sync(boards.remove, number_of(request))
         return Response(status_code=204)
 
     async def panel(connection: WebSocket) -> None:
-        board = boards.get(connection.path_params["number"])
+        board = boards.get(number_of(connection))
         if board is None:
             await connection.close()
         else:
@@ -107,8 +103,8 @@ def make_app(boards: ViewedBoards, host: str, token: str) -> Starlette:
             Route("/ports", ports),
             Route("/boards", list_boards, methods=["GET"]),
             Route("/boards", add_board, methods=["POST"]),
-            Route("/boards/{number:board}", remove_board, methods=["DELETE"]),
-            WebSocketRoute("/boards/{number:board}", panel),
+            Route("/boards/{number}", remove_board, methods=["DELETE"]),
+            WebSocketRoute("/boards/{number}", panel),
             Route("/{path:path}", StaticFiles(directory=_PAGE, html=True)),
         ],
         middleware=[Middleware(Guard, host=host, token=token, public=public)],
