@@ -33,8 +33,8 @@ from ohmskin.record.recording import (
     Tare,
 )
 
-# A recording that is killed lacks at most what came in so long [s].
-FLUSH_EVERY_S: Final = 0.5
+# A recording that is killed lacks what came in so long, and while that was written [s]: below 0.5.
+FLUSH_EVERY_S: Final = 0.4
 # A record of an MCAP file begins with its kind and 8 bytes of its length.
 _HEAD_SIZE: Final = 9
 
