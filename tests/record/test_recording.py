@@ -14,6 +14,7 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -418,10 +419,14 @@ def test_a_file_that_is_removed_ends_the_recording(
         other.replace(path)
     else:
         path.unlink()
-    until(lambda: not recorder._flusher.is_alive(), LATE_S)
-    for use in (lambda: recorder.add(scan(1)), recorder.close):
-        with pytest.raises(RecordingError, match="has removed the file, and 1 scans"):
-            use()
+    refused = partial(pytest.raises, RecordingError, match="has removed the file, and 1 scans")
+    try:
+        until(lambda: not recorder._flusher.is_alive(), LATE_S)
+        with refused():
+            recorder.add(scan(1))
+    finally:
+        with refused():
+            recorder.close()
     assert [each.read_text() for each in path.parent.iterdir()] == ["mine"] * replaced
 
 
