@@ -41,6 +41,9 @@ CalibrationLike = Calibration | PathName
 
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
+# Options of ``emulator://`` that are no faults, and of ``simavr://`` that are no settings.
+_OF_BOARD = ("scene", "plate", "seed", "rate", "noise", "unit", "foreign")
+_NOT_OF_SIMULATOR = ("scene", "plate", "baud")
 
 
 @overload
@@ -108,7 +111,7 @@ def _device(url: str) -> Device:
         size, baud = f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}", _baud(settings)
         with _wrong(url):
             scene = _scene(size, settings)
-            own = {name: settings[name] for name in settings if name not in ("scene", "baud")}
+            own = {name: settings[name] for name in settings if name not in _NOT_OF_SIMULATOR}
             return Session(SimavrLink(place, scene, url, own), baud)
     if scheme == "replay":
         from ohmskin.record.replay import Replay
@@ -170,7 +173,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
     scheme, place, query = _parts(url)
     if scheme != "emulator":
         raise PortError(f"{url} is not emulated: write emulator://8x8")
-    known = ("scene", "seed", "rate", "noise", "unit", "foreign", *SKIN_FAULTS, *LINE_FAULTS)
+    known = (*_OF_BOARD, *SKIN_FAULTS, *LINE_FAULTS)
     options = _options(url, query, *known)
     with _wrong(url):
         seed = int(options.get("seed", 0))
@@ -189,6 +192,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
 
 
 def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None) -> Scene:
+    from ohmskin.circuit.plate import load_plate
     from ohmskin.emulate.scenes import Scene
 
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", size)
@@ -199,7 +203,9 @@ def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None)
     if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
         raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not {size}")
     seed = int(options.get("seed", 0))
-    return Scene(options.get("scene", "rest"), rows, columns, seed=seed, faults=faults)
+    plate = load_plate(options["plate"]) if "plate" in options else None
+    name = options.get("scene", "rest")
+    return Scene(name, rows, columns, seed=seed, faults=faults, plate=plate)
 
 
 # ------------------------------------------------------------------------------ several boards

@@ -356,6 +356,7 @@ OPTIONS = {
     "view": ["--calibration", "--force", "--host", "--http-port", "--no-browser", "PORT"],
     "calibrate": ["recording", "sensor", "table", "weights"],
     "doctor": ["--calibration", "--wires", "--json", "PORT"],
+    "verify": ["--wires", "--seconds", "--picture", "--json", "--cell-percent", "PORT", "PLATE"],
     "tare": ["--seconds", "--undo", "--force", "PORT"],
     "estimate": ["--method", "--out", "--cold", *METHODS],
     "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],

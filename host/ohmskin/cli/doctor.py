@@ -2,7 +2,7 @@
 """``ohmskin doctor``: one page of findings about the skin board at a port."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,9 +23,11 @@ from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
+from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import latency_timer
 
 WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
+CLOCK_S: Final = 1.0  # [s] A look by another ADC clock takes this long: it tells noise alone.
 LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
 _UNANSWERED: Final = {
@@ -38,6 +40,7 @@ _UNANSWERED: Final = {
 _out = Console(soft_wrap=True, markup=False, highlight=False)
 # Says what is being done, and before it what a person is asked to press, if anything.
 Tell = Callable[..., None]
+Watch = Callable[[Iterable[Scan], float], Iterable[Scan]]
 
 
 def doctor(
@@ -84,7 +87,7 @@ def doctor(
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201
     else:
-        _print(page)
+        print_page(page)
     if into is not None and wire_ohm is not None:
         _keep_wires(diagnosis, wire_ohm, into)
     if diagnosis.worse:
@@ -137,8 +140,14 @@ def gather(
     wire_ohm: tuple[float, float] | None = None,
     *,
     press: bool = False,
+    seconds: float | None = None,
+    clocks: bool = False,
+    watch: Watch = lambda scans, seconds: scans,
 ) -> Evidence:
     """What `examine` goes by, as far as the board lets. Leaves the board as it was.
+
+    seconds: how long the first look takes; None: `REST_S`. clocks: whether to scan by each ADC
+    clock, too. watch: passes on the scans of so many seconds.
 
     :raises ValueError: somebody would be asked to press a skin of one row or column.
     """
@@ -152,12 +161,17 @@ def gather(
         tell("self-test")
         with suppress(errors.CommandRefused):  # a recording has none
             evidence.report = device.self_test()
-        tell(f"scanning the untouched skin for {REST_S} s")
-        _scan(device, evidence.scans, REST_S)
+        seconds = REST_S if seconds is None else seconds
+        tell(f"scanning {'the plate' if clocks else 'the untouched skin'} for {seconds:g} s")
+        _scan(device, evidence.scans, seconds, watch)
         evidence.board = device.info
         tell("scanning with a longer settle time")
         with suppress(errors.CommandRefused):
-            _scan_settled(device, evidence)
+            _scan_settled(device, evidence, watch)
+        if clocks:
+            tell("scanning by other ADC clocks")
+            with suppress(errors.CommandRefused):
+                _scan_clocks(device, evidence, watch)
         if presses is not None:
             evidence.presses = presses
             _scan_presses(device, presses, tell)
@@ -169,25 +183,47 @@ def gather(
     return evidence
 
 
-def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
-    for scan in device:
+@contextmanager
+def put_back(device: Device) -> Iterator[None]:
+    """Let the board stand still and then scan as before, however the body ends."""
+    board = device.info
+    device.stop()
+    try:
+        yield
+    finally:
+        device.stop()
+        device.configure(
+            rows=board.rows,
+            columns=board.columns,
+            rate_hz=board.rate_asked_mhz / 1000,
+            settle_us=board.settle_asked_us,
+            adc_prescaler=board.adc_prescaler,
+        )
+
+
+def _scan(device: Device, scans: list[Scan], seconds: float, watch: Watch) -> None:
+    for scan in watch(device, seconds):
         scans.append(scan)
         elapsed_s = scan.host_time_s - scans[0].host_time_s
         if elapsed_s >= seconds * (1 if len(scans) >= LEAST_SCANS else LONGEST):
             return
 
 
-def _scan_settled(device: Device, evidence: Evidence) -> None:
-    board, other = evidence.board, comparison(evidence.board)
-    if other is None:
-        return
-    device.stop()
-    try:
-        evidence.settled = (device.configure(settle_us=other[0], rate_hz=other[1]), [])
-        _scan(device, evidence.settled[1], SETTLED_S)
-    finally:
-        device.stop()
-        device.configure(rate_hz=board.rate_asked_mhz / 1000, settle_us=board.settle_asked_us)
+def _scan_settled(device: Device, evidence: Evidence, watch: Watch) -> None:
+    other = comparison(evidence.board)
+    if other is not None:
+        with put_back(device):
+            evidence.settled = (device.configure(settle_us=other[0], rate_hz=other[1]), [])
+            _scan(device, evidence.settled[1], SETTLED_S, watch)
+
+
+def _scan_clocks(device: Device, evidence: Evidence, watch: Watch) -> None:
+    """As fast as each clock lets: a slow one does not reach the rate of the board."""
+    with put_back(device):
+        for clock in ENUMS["adc_prescaler"].values:
+            device.stop()
+            evidence.clocks.append((device.configure(adc_prescaler=clock, rate_hz=0), []))
+            _scan(device, evidence.clocks[-1][1], CLOCK_S, watch)
 
 
 def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
@@ -220,7 +256,7 @@ def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _print(page: dict[str, Any]) -> None:
+def print_page(page: dict[str, Any]) -> None:
     """What `as_object` has, for people."""
     show = _out.print
     show(f"{page['port']}: {page['verdict']}")

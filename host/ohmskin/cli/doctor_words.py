@@ -55,6 +55,15 @@ def _words(finding: Finding) -> dict[str, Any]:
         case Kind.REFERENCE_RATIO:
             nominal, off = values["ref_top_ohm"] / values["ref_bottom_ohm"], values["off_percent"]
             return {"nominal_ratio": nominal, "percent": abs(off), "low": off < 0}
+        case Kind.OPEN_JOINT | Kind.BRIDGE | Kind.WRONG_RESISTOR:
+            plate_ohm, told = values["plate_ohm"], kilohm(values["cell_ohm"])
+            return {"cell": told, "plate": plate_ohm and kilohm(plate_ohm)}
+        case Kind.LINEARITY:
+            bad = values["readings"]
+            told = "; ".join(f"{name}: {line_in_words(values['lines'][name])}" for name in bad)
+            return {"names": ", ".join(bad), "told": told}
+        case Kind.ADC_NOISE:
+            return {"told": ", ".join(f"{c}: {lsb:.2f} LSB" for c, lsb in values["clocks"].items())}
         case Kind.RESTARTED:
             return {"last": ", ".join(values["causes"]) or "unknown"}
         case Kind.LOSS:
@@ -66,6 +75,17 @@ def _words(finding: Finding) -> dict[str, Any]:
             top, bottom = nominal_ohm = values["nominal_ohm"]
             return {"told": _ohm(values["share"], nominal_ohm), "top": top, "bottom": bottom}
     return {}
+
+
+def kilohm(ohm: float) -> str:
+    """A resistance with three digits or more."""
+    return f"{ohm / 1e3:#.4g} kOhm"
+
+
+def line_in_words(line: dict[str, float]) -> str:
+    """The line that is fitted to the readings of a configuration."""
+    told = "slope {slope:.4f}, offset {offset_lsb:+.2f} LSB, residual {residual_lsb:.2f} LSB"
+    return told.format(**line)
 
 
 def named(place: Place) -> str:

@@ -29,6 +29,7 @@ _COMMANDS: Final = {
     "touch it.",
     "doctor.doctor": "Say what is wrong with the skin board at PORT, and what to do. Touch "
     "nothing meanwhile.",
+    "verify.verify": "Compare the board at PORT with a plate of known resistors.",
     "record.estimate": "Estimate every cell of every frame of a readings file.",
     "record.record": "Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a "
     "mark.",

@@ -8,6 +8,7 @@ A skin that is touched is not at fault: touched cells are told and left out, and
 is not judged.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -34,7 +35,8 @@ class Evidence:
     scans: as the board is configured. settled: what the board said of itself with a longer settle
     time, and its scans. stats: of the connection. lost: why the board went away meanwhile.
     wire_ohm: nominal wires of a segment, top and bottom. presses: of the same skin, after all else.
-    latency: the USB bridge's timer [ms] and the file that sets it.
+    latency: the USB bridge's timer [ms] and the file that sets it. clocks: what the board said of
+    itself with each ADC clock, and its scans. loss: so large a share of missing scans is no fault.
     """
 
     board: Hello
@@ -47,37 +49,11 @@ class Evidence:
     latency: tuple[int, str] | None = None
     host_version: str = ""
     lost: str = ""
+    clocks: list[tuple[Hello, list[Scan]]] = field(default_factory=list)
+    loss: float = 0.0
 
 
-def examine(evidence: Evidence) -> Diagnosis:
-    """All findings, and the figures behind them."""
-    board, stats = evidence.board, evidence.stats
-    usual = RestScans.of(board, evidence.scans)
-    rates_hz = None if usual is None else _rates_hz(evidence.scans)
-    diagnosis = Diagnosis()
-    diagnosis.measured = {
-        "board": board.board,
-        "unit_id": board.unit_id,
-        "rows": board.rows,
-        "columns": board.columns,
-        "scans": len(evidence.scans),
-        "missed": stats.missed,
-        "dropped_by_board": stats.dropped_by_board,
-        "damaged": stats.line.damaged,
-        "restarts": stats.restarts,
-        "rate_hz": None if rates_hz is None else round(rates_hz[0], 3),
-    }
-    _examine_board(evidence, diagnosis)
-    _examine_line(evidence, rates_hz, diagnosis)
-    if usual is not None:
-        with one_blas_thread:
-            _examine_skin(evidence, usual, diagnosis)
-    order = list(Kind)
-    diagnosis.findings.sort(key=lambda finding: order.index(finding.kind))
-    return diagnosis
-
-
-def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
+def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
     """Adds what the scans show: signal, circuit, and the wires if somebody pressed and nothing
     hides them. Wires are at fault only if nominal ones were told.
     """
@@ -100,6 +76,37 @@ def _examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) ->
     for each in diagnosis.pressed or ():
         if each.differs and evidence.wire_ohm is not None:
             diagnosis.add(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
+
+
+def examine(
+    evidence: Evidence,
+    of_scans: Callable[[Evidence, RestScans, Diagnosis], None] = examine_skin,
+) -> Diagnosis:
+    """All findings, and the figures behind them. of_scans: adds what the scans show."""
+    board, stats = evidence.board, evidence.stats
+    usual = RestScans.of(board, evidence.scans)
+    rates_hz = None if usual is None else _rates_hz(evidence.scans)
+    diagnosis = Diagnosis()
+    diagnosis.measured = {
+        "board": board.board,
+        "unit_id": board.unit_id,
+        "rows": board.rows,
+        "columns": board.columns,
+        "scans": len(evidence.scans),
+        "missed": stats.missed,
+        "dropped_by_board": stats.dropped_by_board,
+        "damaged": stats.line.damaged,
+        "restarts": stats.restarts,
+        "rate_hz": None if rates_hz is None else round(rates_hz[0], 3),
+    }
+    _examine_board(evidence, diagnosis)
+    _examine_line(evidence, rates_hz, diagnosis)
+    if usual is not None:
+        with one_blas_thread:
+            of_scans(evidence, usual, diagnosis)
+    order = list(Kind)
+    diagnosis.findings.sort(key=lambda finding: order.index(finding.kind))
+    return diagnosis
 
 
 def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
@@ -126,12 +133,13 @@ def _examine_line(
     board, stats, add = evidence.board, evidence.stats, diagnosis.add
     if stats.restarts:
         add(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
-    if stats.missed or (rates_hz is None and not stats.restarts):
+    made = stats.scans + stats.missed
+    if stats.missed > evidence.loss * made or (rates_hz is None and not stats.restarts):
         add(
             Kind.LOSS,
             received=len(evidence.scans),
             missed=stats.missed,
-            made=stats.scans + stats.missed,
+            made=made,
             dropped_by_board=stats.dropped_by_board,
             rate_hz=board.rate_hz,
         )

@@ -25,6 +25,7 @@ class Severity(StrEnum):
 
 
 _FAULT, _WARNING, _NOTE = Severity
+_CELLS: Final = "worst cell_ohm plate_ohm off_percent most_percent"  # of resistors of a plate
 
 
 class Kind(Enum):
@@ -45,8 +46,14 @@ class Kind(Enum):
     SHORT_COLUMNS = "short_columns", _FAULT, ""
     DEAD_CELL = "dead_cell", _FAULT, "percent_of_usual"
     SATURATED_CELL = "saturated_cell", _FAULT, "cell_ohm rest_megohm"
+    SWAPPED_LINES = "swapped_lines", _FAULT, ""
+    OPEN_JOINT = "open_joint", _FAULT, _CELLS
+    BRIDGE = "bridge", _FAULT, _CELLS
+    WRONG_RESISTOR = "wrong_resistor", _FAULT, _CELLS
+    REFERENCE_VALUE = "reference_value", _FAULT, "ohm nominal_ohm off_percent most_percent"
     REFERENCE_RATIO = "reference_ratio", _FAULT, "ratio off_percent ref_top_ohm ref_bottom_ohm"
     SETTLING = "settling", _FAULT, "change_lsb most_lsb settle_us longer_us needed_us"
+    LINEARITY = "linearity", _FAULT, "readings lines most"
     RESET_CAUSE = "reset_cause", _WARNING, "cause"
     RESTARTED = "restarted", _WARNING, "restarts causes"
     LOSS = "loss", _WARNING, "received missed made dropped_by_board rate_hz"
@@ -55,6 +62,7 @@ class Kind(Enum):
     RATE = "rate", _WARNING, "rate_hz asked_hz"
     HUM = "hum", _WARNING, "mains_hz amplitude_lsb most_lsb rate_hz seen_hz"
     NOISE = "noise", _WARNING, "noise_lsb sound_lsb adc_lsb"
+    ADC_NOISE = "adc_noise", _WARNING, "clocks most_lsb"
     WIRES = "wires", _WARNING, "share nominal_ohm"
     TOUCHED = "touched", _NOTE, "moves"
     VERSION = "version", _NOTE, "firmware host"

@@ -330,8 +330,13 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     return longer_us, max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
 
 
-def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis) -> bool:
-    """Adds to a diagnosis how means change with a longer settle time. Returns whether they do."""
+def examine_settling(
+    usual: RestScans, settled: RestScans, diagnosis: Diagnosis, most_lsb: float = UNSETTLED_LSB
+) -> bool:
+    """Adds to a diagnosis how means change with a longer settle time, if by more than `most_lsb`.
+
+    Returns whether they do.
+    """
     settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
     diagnosis.measured["settling_lsb"] = 0.0
     if longer_us <= NOT_LONGER * settle_us:
@@ -341,7 +346,7 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
     in_mean = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
     clear = change - CLEAR_STDS * np.maximum(scatter, SETTLED_NOISE_LSB) * in_mean
     diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
-    cells = (clear > UNSETTLED_LSB).any(axis=2)
+    cells = (clear > most_lsb).any(axis=2)
     if not cells.any():
         return False
     # A node that is left with e of its swing S after a slot t settles with tau = t / ln(S / e).
@@ -353,7 +358,7 @@ def examine_settling(usual: RestScans, settled: RestScans, diagnosis: Diagnosis)
         Kind.SETTLING,
         WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
         change_lsb=float(change.max()),
-        most_lsb=UNSETTLED_LSB,
+        most_lsb=most_lsb,
         settle_us=settle_us,
         longer_us=longer_us,
         needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),

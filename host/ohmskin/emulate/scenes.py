@@ -50,7 +50,8 @@ class Scene:
 
     Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns). faults: what is
     wrong with the skin; an `EmulatedBoard` adds those that depend on the instant of a reading.
-    `moves`: whether touches change with time.
+    plate: conductances (R, C) of resistors on wires of no resistance [S], in place of the untouched
+    skin. `moves`: whether touches change with time.
 
     :raises ValueError: no such scene, or a skin too small for it or for the faults.
     """
@@ -63,6 +64,7 @@ class Scene:
         *,
         seed: int = 0,
         faults: SkinFaults | None = None,
+        plate: Float | None = None,
     ) -> None:
         if name not in SCENES:
             raise ValueError(f"no scene '{name}': there are {', '.join(SCENES)}")
@@ -80,6 +82,11 @@ class Scene:
             return middle * np.exp(_SPREAD * random.standard_normal((rows, columns)))
 
         self._rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
+        if plate is not None:
+            if plate.shape != (rows, columns):
+                size = "x".join(map(str, plate.shape))
+                raise ValueError(f"the plate has {size} cells, the skin {rows}x{columns}")
+            self._rest = Skin(plate, np.zeros_like(plate), np.zeros_like(plate))
         self._touches = self._place(random)
         self._still_ratio = lru_cache(maxsize=1)(lambda: self.faults.readings(self.skin(0.0)))
 

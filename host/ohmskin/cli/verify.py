@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin verify``: a board against a reference plate, known resistors at its crossings."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
+
+import ohmskin
+from ohmskin.circuit.plate import load_plate
+from ohmskin.circuit.skin import CONFIGURATIONS
+from ohmskin.cli.board import Port, Wires, wires_of
+from ohmskin.cli.doctor import as_object, gather, print_page, put_back
+from ohmskin.cli.doctor_words import line_in_words
+from ohmskin.doctor.examine import examine
+from ohmskin.doctor.plate import PlateExam, Tolerance
+from ohmskin.files import whole_file
+from ohmskin.link.messages import Scan
+
+_MOST: Final = Tolerance()
+_out = Console(soft_wrap=True, markup=False, highlight=False)
+
+
+def _most(what: str) -> Any:
+    return typer.Option(min=0.0, help=f"most {what}", rich_help_panel="Tolerances")
+
+
+def verify(
+    port: Port,
+    plate: Annotated[
+        Path, typer.Argument(help="ohms at each crossing (.csv), 'open' where no resistor is")
+    ],
+    wires: Wires = "0,0",
+    seconds: Annotated[float, typer.Option(min=0.5, help="so long losses are counted")] = 60.0,
+    picture: Annotated[Path | None, typer.Option(help="PNG to write")] = None,
+    json_file: Annotated[
+        str, typer.Option("--json", help="file for all figures, to attach to a bug report; -: here")
+    ] = "",
+    cell_percent: Annotated[
+        float, _most("error of a cell: 1 % of a resistor, 2 % of multiplexers and converter")
+    ] = _MOST.cell_percent,
+    reference_percent: Annotated[
+        float, _most("error of a reference: 1 % of itself, the rest of the converter")
+    ] = _MOST.reference_percent,
+    slope: Annotated[
+        float, _most("error of a reading's slope: a gain error of 2 LSB, a bow of 1.5")
+    ] = _MOST.slope,
+    offset_lsb: Annotated[
+        float, _most("offset: 2 LSB, and 2 of gain, by the data sheet; half a code; noise")
+    ] = _MOST.offset_lsb,
+    residual_lsb: Annotated[
+        float, _most("distance of a reading from its line: a bow of 1.5 LSB, rounding")
+    ] = _MOST.residual_lsb,
+    settling_lsb: Annotated[
+        float, _most("change with more time: 30 pF a line and 100 pF a node make 3")
+    ] = _MOST.settling_lsb,
+    noise_lsb: Annotated[
+        float, _most("noise of a reading: twice that of a sound converter")
+    ] = _MOST.noise_lsb,
+    loss: Annotated[float, _most("share of lost scans: a sound line loses none")] = _MOST.loss,
+) -> None:
+    """Compare the board at PORT with a plate of known resistors.
+
+    Finds wrong resistors, swapped lines, wrong references, readings that are not linear or not
+    settled, noise by ADC clock, and lost scans. Leaves the board as it was. Exit code 0: all is
+    within the tolerances; 1: something is not.
+    """
+    limits = (slope, offset_lsb, residual_lsb, settling_lsb, noise_lsb, loss)
+    tolerance = Tolerance(cell_percent, reference_percent, *limits)
+    exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
+    with ohmskin.open(port, start=False) as device, put_back(device):
+        rows, columns = exam.plate.shape
+        rate_hz = device.info.rate_asked_mhz / 1000
+        device.configure(rows=rows, columns=columns, rate_hz=rate_hz)
+        bar = Console(stderr=True)
+
+        def watch(scans: Iterable[Scan], seconds: float) -> Iterable[Scan]:
+            total, hidden = seconds * device.info.rate_hz, not bar.is_terminal
+            return track(scans, "scanning", total, console=bar, transient=True, disable=hidden)
+
+        evidence = gather(device, seconds=seconds, clocks=True, watch=watch)
+    evidence.loss = loss
+    diagnosis = examine(evidence, exam.examine)
+    page = as_object(port, diagnosis)
+    everything = page | {"hello": evidence.board, "exam": exam.as_object()}
+    if json_file == "-":
+        print(json.dumps(everything, default=asdict))  # noqa: T201
+    else:
+        print_page(page)
+        _print_exam(exam)
+    if json_file not in ("", "-"):
+        with whole_file(json_file) as file:
+            file.write(json.dumps(everything, default=asdict).encode())
+    if picture is not None:
+        _save_picture(picture, exam, f"{port}: {page['verdict']}")
+    if diagnosis.worse:
+        raise SystemExit(1)
+
+
+def _print_exam(exam: PlateExam) -> None:
+    """Readings, noise, and the error of each resistor, for people."""
+    for name, line in exam.lines.items():
+        _out.print(f"reading {name:<10}  {line_in_words(line)}")
+    for clock, noise_lsb in exam.noise_lsb.items():
+        _out.print(f"{clock:<18}  noise {noise_lsb:.2f} LSB")
+    _out.print("\nerror of each resistor in percent, row by row:")
+    for row in exam.error_percent:
+        _out.print("".join("      ." if np.isnan(each) else f"{each:7.2f}" for each in row))
+
+
+def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
+    """A PNG of what the board reads of the plate.
+
+    :raises ValueError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+        from matplotlib.patches import Rectangle
+    except ImportError as exc:
+        raise ValueError("no picture: it needs matplotlib: pip install 'ohmskin[plot]'") from exc
+    size = 8 if max(exam.plate.shape) <= 8 else 5  # of letters
+    most, crossings = exam.tolerance, range(max(exam.plate.shape))
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    figure.suptitle(title, wrap=True)
+    (of_cells, of_lines), (of_settling, of_noise) = figure.subplots(2, 2)
+    for axes, values, limit, name, colours in (
+        (of_cells, exam.error_percent, most.cell_percent, "error of each resistor [%]", "RdBu_r"),
+        (of_settling, exam.settling_lsb, most.settling_lsb, "change if settled [LSB]", "Oranges"),
+    ):
+        least = -2 * limit if axes is of_cells else 0.0
+        image = axes.imshow(values, cmap=colours, vmin=least, vmax=2 * limit)
+        figure.colorbar(image, ax=axes, extend="both" if least else "max", shrink=0.85)
+        axes.set(title=name, xlabel="column", ylabel="row")
+        axes.set(xticks=crossings[: values.shape[1]], yticks=crossings[: values.shape[0]])
+        for (row, column), value in np.ndenumerate(values):
+            colour = "white" if abs(value) > 1.4 * limit else "black"
+            text = "" if np.isnan(value) else f"{value:.1f}" if abs(value) < 99.5 else "open"
+            is_wrong = axes is of_cells and bool(exam.wrong[row, column])
+            text = text or "bridge" * is_wrong
+            edge = {"edgecolor": "black", "zorder": 2} if is_wrong else {"edgecolor": "0.9"}
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, **edge))
+            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=size)
+    for k, name in enumerate(CONFIGURATIONS):
+        x, y = exam.predicted_lsb[..., k].ravel(), exam.shown_lsb[..., k].ravel()
+        of_lines.plot(x, y - x, "o+x."[k], label=name, markersize=6, fillstyle="none")
+    of_lines.set(title="reading less prediction [LSB]", xlabel="current by the circuit [LSB]")
+    of_lines.legend(title="reading")
+    clocks = [clock.removeprefix("clock_") for clock in exam.noise_lsb]
+    of_noise.bar(clocks, list(exam.noise_lsb.values()), width=0.5)
+    of_noise.axhline(most.noise_lsb, color="0.6", linestyle="--", linewidth=1)
+    of_noise.set(title="noise of a reading [LSB]", xlabel="ADC clock")
+    figure.savefig(path, dpi=110)
