@@ -28,6 +28,8 @@ from ohmskin.link.serial_port import latency_timer
 
 WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
 CLOCK_S: Final = 1.0  # [s] A look by another ADC clock takes this long: it tells noise alone.
+TURNS: Final = 5  # [looks] So often each settle time is had while corners are pressed.
+TURN_S: Final = 0.3  # [s] Such a look takes this long: a hand drifts in more.
 LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
 _UNANSWERED: Final = {
@@ -175,6 +177,8 @@ def gather(
         if presses is not None:
             evidence.presses = presses
             _scan_presses(device, presses, tell)
+            with suppress(errors.CommandRefused):
+                _scan_pressed(device, evidence, tell)
     except errors.RecordingEnded:
         pass  # all of the recording was read
     except errors.DeviceLost as exc:
@@ -201,7 +205,9 @@ def put_back(device: Device) -> Iterator[None]:
         )
 
 
-def _scan(device: Device, scans: list[Scan], seconds: float, watch: Watch) -> None:
+def _scan(
+    device: Device, scans: list[Scan], seconds: float, watch: Watch = lambda scans, seconds: scans
+) -> None:
     for scan in watch(device, seconds):
         scans.append(scan)
         elapsed_s = scan.host_time_s - scans[0].host_time_s
@@ -235,6 +241,20 @@ def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
         if presses.done or scan.host_time_s - begin_s >= WAIT_S:
             return
         tell(*words.guidance(presses))
+
+
+def _scan_pressed(device: Device, evidence: Evidence, tell: Tell) -> None:
+    """While the last corners are pressed: as usual and with a longer settle time, by turns."""
+    board, other = evidence.board, comparison(evidence.board)
+    if other is None or evidence.presses is None or not evidence.presses.done:
+        return
+    tell("comparing settle times", "keep pressing")
+    usual = (board.settle_asked_us, board.rate_asked_mhz / 1000)
+    with put_back(device):
+        for settle_us, rate_hz in TURNS * (usual, other):
+            device.stop()
+            evidence.pressed.append((device.configure(settle_us=settle_us, rate_hz=rate_hz), []))
+            _scan(device, evidence.pressed[-1][1], TURN_S)
 
 
 # ----------------------------------------------------------------------------------- the page

@@ -37,6 +37,7 @@ class Evidence:
     wire_ohm: nominal wires of a segment, top and bottom. presses: of the same skin, after all else.
     latency: the USB bridge's timer [ms] and the file that sets it. clocks: what the board said of
     itself with each ADC clock, and its scans. loss: so large a share of missing scans is no fault.
+    pressed: while corners are pressed, as configured and with a longer settle time, by turns.
     """
 
     board: Hello
@@ -51,6 +52,7 @@ class Evidence:
     lost: str = ""
     clocks: list[tuple[Hello, list[Scan]]] = field(default_factory=list)
     loss: float = 0.0
+    pressed: list[tuple[Hello, list[Scan]]] = field(default_factory=list)
 
 
 def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
@@ -63,6 +65,8 @@ def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> 
     if settled is not None and not moves and examine_settling(usual, settled, diagnosis):
         scans = settled
     wire_ohm, presses = evidence.wire_ohm or WIRE_OHM, evidence.presses
+    if presses is not None:
+        presses.examine_settling(evidence.pressed, diagnosis)
     rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
     touched, wrong = examine_circuit(rest, diagnosis)
     touched = touched if touched.any() else moved

@@ -52,7 +52,7 @@ class Kind(Enum):
     WRONG_RESISTOR = "wrong_resistor", _FAULT, _CELLS
     REFERENCE_VALUE = "reference_value", _FAULT, "ohm nominal_ohm off_percent most_percent"
     REFERENCE_RATIO = "reference_ratio", _FAULT, "ratio off_percent ref_top_ohm ref_bottom_ohm"
-    SETTLING = "settling", _FAULT, "change_lsb most_lsb settle_us longer_us needed_us"
+    SETTLING = "settling", _FAULT, "change_lsb most_lsb settle_us longer_us needed_us pressed"
     LINEARITY = "linearity", _FAULT, "readings lines most"
     RESET_CAUSE = "reset_cause", _WARNING, "cause"
     RESTARTED = "restarted", _WARNING, "restarts causes"

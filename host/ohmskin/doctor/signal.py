@@ -347,20 +347,35 @@ def examine_settling(
     clear = change - CLEAR_STDS * np.maximum(scatter, SETTLED_NOISE_LSB) * in_mean
     diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
     cells = (clear > most_lsb).any(axis=2)
-    if not cells.any():
-        return False
+    if cells.any():
+        place = WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells)
+        add_settling(usual, settled, diagnosis, place, float(change.max()), most_lsb)
+    return bool(cells.any())
+
+
+def add_settling(
+    usual: RestScans,
+    settled: RestScans,
+    diagnosis: Diagnosis,
+    place: Place,
+    change_lsb: float,
+    most_lsb: float,
+    pressed: bool = False,
+) -> None:
+    """Add that readings change with a longer settle time, and the one that is long enough."""
     # A node that is left with e of its swing S after a slot t settles with tau = t / ln(S / e).
     swing = float(np.ptp(settled.mean, axis=2).max())
-    remnant = min(float(change.max()), 0.9 * swing)
+    remnant = min(change_lsb, 0.9 * swing)
     slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
+    settle_us = usual.board.settle_us
     needed_us = settle_us + 1e6 * slot_s(usual.board) * (slots - 1)
     diagnosis.add(
         Kind.SETTLING,
-        WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells),
-        change_lsb=float(change.max()),
+        place,
+        change_lsb=change_lsb,
         most_lsb=most_lsb,
         settle_us=settle_us,
-        longer_us=longer_us,
+        longer_us=settled.board.settle_us,
         needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
+        pressed=pressed,
     )
-    return True

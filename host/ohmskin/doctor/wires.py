@@ -49,8 +49,8 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit, current_from_ratio, current_std
-from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Place, WireShare
-from ohmskin.doctor.signal import Rest, rounding_std_lsb
+from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
+from ohmskin.doctor.signal import Rest, RestScans, add_settling, rounding_std_lsb
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
@@ -74,6 +74,10 @@ PRESS_S: Final = 1.0  # [s] Corners are held this long, so that scans even the n
 PRESSED_SIEMENS: Final = 2e-5  # [S] A firm press conducts more: 20 times a cell at rest.
 FOURTH_SHARE: Final = 0.5  # [1] No other cell conducts more than this share of the weakest corner.
 HELD_SHARE: Final = 0.5  # [1] Corners with less than this share of the most scans were passed by.
+LEAST_HELD: Final = 5  # [scans] Fewer scans of a look at pressed corners do not count.
+PRESSED_LSB: Final = (
+    4.0  # [LSB] 30 pF a line and 100 pF a node change readings by less (simulated).
+)
 MOST_STEPS: Final = 20  # [steps] A fit that converges takes fewer.
 LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
 CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
@@ -161,6 +165,40 @@ class CornerScans:
         if self.hold and len(self._codes[corners]) >= PRESS_S * self._board.rate_hz:
             self.hold, self.again, self.done = False, True, self.again
             self._first, self.wanted = corners, moved_across(corners)
+
+    def examine_settling(
+        self, looks: Sequence[tuple[Hello, list[Scan]]], diagnosis: Diagnosis
+    ) -> None:
+        """Add how readings change with a longer settle time while the same corners are pressed.
+
+        looks: by turns as usual and with the longer time, so that what drifts does not count.
+        """
+        means: defaultdict[Corners, list[list[Float]]] = defaultdict(lambda: [[], []])
+        for turn, (_, scans) in enumerate(looks):
+            codes = defaultdict(list)
+            for scan in scans:
+                corners = pressed_corners(self._matrix.estimate(scan.ratio).cell_siemens)
+                if corners is not None:
+                    codes[corners].append(scan.codes)
+            for corners, held in codes.items():
+                if len(held) >= LEAST_HELD:
+                    means[corners][turn % 2].append(np.mean(held, axis=0))
+        both = [each for each in means.values() if min(map(len, each)) >= 2]
+        two = [RestScans.of(*look) for look in looks[:2]]
+        if not both or two[0] is None or two[1] is None:
+            return
+        changes = []
+        for usual, longer in both:
+            scatter = np.var(usual, axis=0, ddof=1) / len(usual)
+            scatter += np.var(longer, axis=0, ddof=1) / len(longer)
+            change = np.abs(np.mean(usual, axis=0) - np.mean(longer, axis=0)).max()
+            changes.append((change - CLEAR_STDS * scatter.max() ** 0.5, change))
+        clear, most = map(float, max(changes))
+        diagnosis.measured["settling_pressed_lsb"] = round(max(clear, 0.0), 2)
+        if clear > PRESSED_LSB:
+            others = [each for each in diagnosis.findings if each.kind is not Kind.SETTLING]
+            diagnosis.findings = others
+            add_settling(two[0], two[1], diagnosis, WHOLE_SKIN, most, PRESSED_LSB, pressed=True)
 
     def measure(self, rest: Rest) -> list[WireShare]:
         """The share of both layers, then that of each row and column; none if none was pressed."""
