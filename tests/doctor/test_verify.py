@@ -217,7 +217,7 @@ def test_a_wrong_use_is_one_line(run: Run, write: Write, tmp_path: Path) -> None
     for text, *words in (
         ("", "1 to 16"),
         ("open,open", "no resistor"),
-        ("1e4,open\n1e4", "different numbers"),
+        ("1e4,open\n1e4", "row 1 has 1 fields, row 0 2"),
         ("10k", "row 0, column 0", "'10k'", "without a unit"),
         ("open,0.01", "row 0, column 1"),
         ("nan", "row 0, column 0"),

@@ -6,6 +6,7 @@ ohms, or nothing or ``open`` where there is no resistor.
 """
 
 import csv
+from contextlib import suppress
 from typing import Final
 
 import numpy as np
@@ -14,7 +15,6 @@ from ohmskin.arrays import Float
 from ohmskin.files import PathName, naming, read_bounded
 from ohmskin.link.protocol import CONSTANTS
 
-OPEN: Final = ("", "open")
 MAX_FILE_BYTES: Final = 100_000  # 16 x 16 numbers are 5 kB.
 # [ohm] Readings differ by less than a code beyond: it is a number in another unit.
 LEAST_OHM: Final = 100.0
@@ -26,32 +26,26 @@ def load_plate(path: PathName) -> Float:
     with naming(path):
         text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
         lines = [fields for fields in csv.reader(text.splitlines()) if fields]
-        sizes = {len(fields) for fields in lines}
-        if not lines or len(lines) > CONSTANTS["rows_max"] or max(sizes) > CONSTANTS["columns_max"]:
+        columns = len(lines[0]) if lines else 0
+        if not (1 <= len(lines) <= CONSTANTS["rows_max"] and columns <= CONSTANTS["columns_max"]):
             raise ValueError("a plate has 1 to 16 lines, of 1 to 16 fields each")
-        if len(sizes) > 1:
-            raise ValueError("its lines have different numbers of fields: write 'open' for none")
-        plate = np.array(
-            [
-                [_siemens(field.strip(), row, column) for column, field in enumerate(fields)]
-                for row, fields in enumerate(lines)
-            ]
-        )
+        plate = np.zeros((len(lines), columns))
+        for row, fields in enumerate(lines):
+            if len(fields) != columns:
+                raise ValueError(f"row {row} has {len(fields)} fields, row 0 {columns}")
+            for column, field in enumerate(fields):
+                with naming(f"row {row}, column {column}"):
+                    plate[row, column] = _siemens(field.strip())
         if not plate.any():
             raise ValueError("it has no resistor")
         return plate
 
 
-def _siemens(field: str, row: int, column: int) -> float:
-    if field.lower() in OPEN:
+def _siemens(field: str) -> float:
+    if field.lower() in ("", "open"):
         return 0.0
-    try:
-        ohm = float(field)
-    except ValueError:
-        ohm = 0.0
-    if not LEAST_OHM <= ohm <= MOST_OHM:
-        raise ValueError(
-            f"row {row}, column {column} is '{field:.20}': write 'open', or ohms from "
-            f"{LEAST_OHM:g} to {MOST_OHM:g}, without a unit"
-        )
-    return 1 / ohm
+    with suppress(ValueError):
+        if LEAST_OHM <= (ohm := float(field)) <= MOST_OHM:
+            return 1 / ohm
+    most = f"ohms from {LEAST_OHM:g} to {MOST_OHM:g}, without a unit"
+    raise ValueError(f"'{field:.20}': write 'open', or {most}")

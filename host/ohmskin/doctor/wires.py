@@ -75,9 +75,7 @@ PRESSED_SIEMENS: Final = 2e-5  # [S] A firm press conducts more: 20 times a cell
 FOURTH_SHARE: Final = 0.5  # [1] No other cell conducts more than this share of the weakest corner.
 HELD_SHARE: Final = 0.5  # [1] Corners with less than this share of the most scans were passed by.
 LEAST_HELD: Final = 5  # [scans] Fewer scans of a look at pressed corners do not count.
-PRESSED_LSB: Final = (
-    4.0  # [LSB] 30 pF a line and 100 pF a node change readings by less (simulated).
-)
+PRESSED_LSB: Final = 4.0  # [LSB] A firm press shows some 400: a change by 1 % of it is no fault.
 MOST_STEPS: Final = 20  # [steps] A fit that converges takes fewer.
 LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
 CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
