@@ -59,6 +59,7 @@ def test_a_sound_plate_passes(run: Run, write: Write, ohm: dict, noise: float) -
     code, told = verified(run, f"emulator://8x8?plate={plate}&noise={noise}", plate)
     assert (code, told["findings"]) == (0, [])
     assert told["measured"]["worst_cell_percent"] < 2
+    assert told["measured"]["resistors_not_told"] == 0
     assert told["measured"]["reference_ohm"] == pytest.approx([30000, 30000], rel=0.004)
     assert sorted(told["exam"]["noise_lsb"]) == ["clock_125khz", "clock_250khz", "clock_500khz"]
     for line in told["exam"]["lines"].values():
@@ -140,6 +141,17 @@ def test_tolerances_are_options(
     # What is no fault any more is no longer left out of the circuit that predicts the readings.
     assert found <= {"linearity", "wrong_resistor", "reference_value"}
     assert code == bool(found)
+
+
+@pytest.mark.usefixtures("benches")
+def test_resistors_that_hide_each_other_are_counted(run: Run, write: Write) -> None:
+    """Large ones among small ones, at every crossing."""
+    plate = write({divmod(n, 8): 1e6 if n % 9 == 0 else 10e3 for n in range(64)})
+    code, told = verified(run, f"emulator://8x8?plate={plate}", plate)
+    assert code == 0
+    deviation = np.array(told["exam"]["std_percent"])
+    assert (deviation.diagonal() > 3).all()
+    assert told["measured"]["resistors_not_told"] == (deviation > 3).sum()
 
 
 @pytest.mark.usefixtures("benches")
@@ -228,6 +240,17 @@ def test_a_wrong_use_is_one_line(run: Run, write: Write, tmp_path: Path) -> None
     plate = write({(0, 0): 1e4}, size=2)
     assert_one_line(run("verify", url, plate, "--wires", "1"), "two numbers")
     assert_one_line(run("verify", f"{url}?plate={plate}", plate), "2x2", "8x8")
+
+
+@pytest.mark.parametrize("vanish", [0.3, 2.5])
+def test_a_board_that_goes_away_is_a_finding(
+    run: Run, write: Write, tmp_path: Path, vanish: float
+) -> None:
+    plate, picture = write(PLATE), tmp_path / "plate.png"
+    url = f"emulator://8x8?plate={plate}&vanish={vanish}"
+    code, told = verified(run, url, plate, "--picture", str(picture))
+    assert (code, told["findings"][0]["id"]) == (1, "lost")
+    assert picture.exists()
 
 
 def test_empty_fields_are_open(tmp_path: Path) -> None:

@@ -189,20 +189,24 @@ def gather(
 
 @contextmanager
 def put_back(device: Device) -> Iterator[None]:
-    """Let the board stand still and then scan as before, however the body ends."""
+    """Let the board stand still and then scan as before, however the body ends.
+
+    A board that is lost cannot be put back, and who reads it next is told.
+    """
     board = device.info
     device.stop()
     try:
         yield
     finally:
-        device.stop()
-        device.configure(
-            rows=board.rows,
-            columns=board.columns,
-            rate_hz=board.rate_asked_mhz / 1000,
-            settle_us=board.settle_asked_us,
-            adc_prescaler=board.adc_prescaler,
-        )
+        with suppress(errors.DeviceLost):
+            device.stop()
+            device.configure(
+                rows=board.rows,
+                columns=board.columns,
+                rate_hz=board.rate_asked_mhz / 1000,
+                settle_us=board.settle_asked_us,
+                adc_prescaler=board.adc_prescaler,
+            )
 
 
 def _scan(

@@ -74,7 +74,8 @@ class Tolerance:
 
 @dataclass(eq=False)
 class PlateExam:
-    """What a board reads of a plate p. `examine`, for `doctor.examine.examine`, sets the rest.
+    """What a board reads of a plate p. `examine`, for `doctor.examine.examine`, sets the rest,
+    which is not known (NaN, empty) until then.
 
     cell_ohm (R, C): 1 / g. std_percent (R, C): its stated deviation. error_percent (R, C): of
     cell_ohm, NaN where no resistor is. wrong (R, C): cells that have a finding. predicted_lsb,
@@ -87,11 +88,20 @@ class PlateExam:
     wire_ohm: WireOhm
     tolerance: Tolerance
 
+    def __post_init__(self) -> None:
+        unknown: Float = np.full(self.plate.shape, np.nan)
+        self.cell_ohm = self.std_percent = self.error_percent = self.settling_lsb = unknown
+        self.wrong = np.isfinite(unknown)
+        self.shown_lsb: Float = np.full((*unknown.shape, 4), np.nan)
+        self.predicted_lsb = self.shown_lsb
+        self.lines: dict[str, dict[str, float]] = {}
+        self.noise_lsb: dict[str, float] = {}
+
     def examine(self, evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
         """Add what the scans show of the plate."""
         settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
         self._examine_signal(evidence, usual, diagnosis)
-        scans, self.settling_lsb = usual, np.full(self.plate.shape, np.nan)
+        scans = usual
         if settled is not None:
             self.settling_lsb = np.abs(usual.mean - settled.mean).max(axis=2)
             if examine_settling(usual, settled, diagnosis, self.tolerance.settling_lsb):
@@ -111,7 +121,6 @@ class PlateExam:
         examine_signal(usual, signal)
         diagnosis.findings += [each for each in signal.findings if each.kind is Kind.HUM]
         diagnosis.measured["hum_lsb"] = signal.measured["hum_lsb"]
-        self.noise_lsb: dict[str, float] = {}
         for scans in (usual, *(RestScans.of(*each) for each in evidence.clocks)):
             if scans is not None:
                 lit = np.abs(scans.mean - FULL / 2) < FULL / 2 - CLIPPED_LSB
@@ -212,6 +221,8 @@ class PlateExam:
                     off_percent=float(self.error_percent[worst]) if there else None,
                     most_percent=most,
                 )
+        hidden = is_there & ~is_open & (self.std_percent > most)  # by others that lie parallel
+        diagnosis.measured["resistors_not_told"] = int(hidden.sum())
         errors = np.abs(self.error_percent[is_there & ~self.wrong])
         if errors.size:
             diagnosis.measured["worst_cell_percent"] = round(float(errors.max()), 2)
@@ -219,7 +230,7 @@ class PlateExam:
 
     def _examine_lines(self, diagnosis: Diagnosis) -> None:
         """Adds readings that are no line of what the circuit predicts."""
-        most, self.lines = self.tolerance, dict[str, dict[str, float]]()
+        most = self.tolerance
         for k, name in enumerate(CONFIGURATIONS):
             lit = self.predicted_lsb[..., k] > CLIPPED_LSB
             x, y = self.predicted_lsb[lit, k], self.shown_lsb[lit, k]

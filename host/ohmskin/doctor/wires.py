@@ -151,7 +151,7 @@ class CornerScans:
 
         A scan of another size is left out: the board was reset meanwhile.
         """
-        if scan.codes.shape[:2] != (self._board.rows, self._board.columns):
+        if not self._fits(scan):
             return
         siemens = self._matrix.estimate(scan.ratio).cell_siemens
         self.pressed = Place.of_cells(siemens > PRESSED_SIEMENS).cells
@@ -164,6 +164,9 @@ class CornerScans:
             self.hold, self.again, self.done = False, True, self.again
             self._first, self.wanted = corners, moved_across(corners)
 
+    def _fits(self, scan: Scan) -> bool:
+        return scan.codes.shape[:2] == (self._board.rows, self._board.columns)
+
     def examine_settling(
         self, looks: Sequence[tuple[Hello, list[Scan]]], diagnosis: Diagnosis
     ) -> None:
@@ -174,7 +177,7 @@ class CornerScans:
         means: defaultdict[Corners, list[list[Float]]] = defaultdict(lambda: [[], []])
         for turn, (_, scans) in enumerate(looks):
             codes = defaultdict(list)
-            for scan in scans:
+            for scan in filter(self._fits, scans):
                 corners = pressed_corners(self._matrix.estimate(scan.ratio).cell_siemens)
                 if corners is not None:
                     codes[corners].append(scan.codes)
