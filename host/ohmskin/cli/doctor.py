@@ -22,7 +22,7 @@ from ohmskin.doctor.wires import CornerScans
 from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.device import Device
-from ohmskin.link.messages import Scan
+from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import latency_timer
 
@@ -167,18 +167,25 @@ def gather(
         tell(f"scanning {'the plate' if clocks else 'the untouched skin'} for {seconds:g} s")
         _scan(device, evidence.scans, seconds, watch)
         evidence.board = device.info
-        tell("scanning with a longer settle time")
-        with suppress(errors.CommandRefused):
-            _scan_settled(device, evidence, watch)
-        if clocks:
-            tell("scanning by other ADC clocks")
-            with suppress(errors.CommandRefused):
-                _scan_clocks(device, evidence, watch)
+        other = comparison(evidence.board)
+        with suppress(errors.CommandRefused), put_back(device):
+            if other is not None:
+                tell("scanning with a longer settle time")
+                evidence.settled = _look(device, SETTLED_S, watch, **other)
+            for clock in ENUMS["adc_prescaler"].values if clocks else ():
+                tell(f"scanning by {clock}")
+                # As fast as it can: a slow clock does not reach the rate of the board.
+                by_clock = _look(device, CLOCK_S, watch, adc_prescaler=clock, rate_hz=0)
+                evidence.clocks.append(by_clock)
         if presses is not None:
             evidence.presses = presses
             _scan_presses(device, presses, tell)
-            with suppress(errors.CommandRefused):
-                _scan_pressed(device, evidence, tell)
+        if presses is not None and presses.done and other is not None:
+            tell("comparing settle times", "keep pressing")
+            usual = {"settle_us": board.settle_asked_us, "rate_hz": board.rate_asked_mhz / 1000}
+            with suppress(errors.CommandRefused), put_back(device):
+                for wanted in TURNS * (usual, other):
+                    evidence.pressed.append(_look(device, TURN_S, watch, **wanted))
     except errors.RecordingEnded:
         pass  # all of the recording was read
     except errors.DeviceLost as exc:
@@ -209,31 +216,20 @@ def put_back(device: Device) -> Iterator[None]:
             )
 
 
-def _scan(
-    device: Device, scans: list[Scan], seconds: float, watch: Watch = lambda scans, seconds: scans
-) -> None:
+def _look(device: Device, seconds: float, watch: Watch, **wanted: Any) -> tuple[Hello, list[Scan]]:
+    """Scans of a board that is configured like this, and what it then says of itself."""
+    device.stop()
+    board, scans = device.configure(**wanted), list[Scan]()
+    _scan(device, scans, seconds, watch)
+    return board, scans
+
+
+def _scan(device: Device, scans: list[Scan], seconds: float, watch: Watch) -> None:
     for scan in watch(device, seconds):
         scans.append(scan)
         elapsed_s = scan.host_time_s - scans[0].host_time_s
         if elapsed_s >= seconds * (1 if len(scans) >= LEAST_SCANS else LONGEST):
             return
-
-
-def _scan_settled(device: Device, evidence: Evidence, watch: Watch) -> None:
-    other = comparison(evidence.board)
-    if other is not None:
-        with put_back(device):
-            evidence.settled = (device.configure(settle_us=other[0], rate_hz=other[1]), [])
-            _scan(device, evidence.settled[1], SETTLED_S, watch)
-
-
-def _scan_clocks(device: Device, evidence: Evidence, watch: Watch) -> None:
-    """As fast as each clock lets: a slow one does not reach the rate of the board."""
-    with put_back(device):
-        for clock in ENUMS["adc_prescaler"].values:
-            device.stop()
-            evidence.clocks.append((device.configure(adc_prescaler=clock, rate_hz=0), []))
-            _scan(device, evidence.clocks[-1][1], CLOCK_S, watch)
 
 
 def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
@@ -245,20 +241,6 @@ def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
         if presses.done or scan.host_time_s - begin_s >= WAIT_S:
             return
         tell(*words.guidance(presses))
-
-
-def _scan_pressed(device: Device, evidence: Evidence, tell: Tell) -> None:
-    """While the last corners are pressed: as usual and with a longer settle time, by turns."""
-    board, other = evidence.board, comparison(evidence.board)
-    if other is None or evidence.presses is None or not evidence.presses.done:
-        return
-    tell("comparing settle times", "keep pressing")
-    usual = (board.settle_asked_us, board.rate_asked_mhz / 1000)
-    with put_back(device):
-        for settle_us, rate_hz in TURNS * (usual, other):
-            device.stop()
-            evidence.pressed.append((device.configure(settle_us=settle_us, rate_hz=rate_hz), []))
-            _scan(device, evidence.pressed[-1][1], TURN_S)
 
 
 # ----------------------------------------------------------------------------------- the page

@@ -30,7 +30,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import (
     CONFIGURATIONS,
     READING_OFFSET,
@@ -158,7 +158,7 @@ class PlateExam:
     def _with_references(self, known: SkinKnowledge, diagnosis: Diagnosis) -> SkinKnowledge:
         """What is known, with the references that the plate shows."""
         found = _estimate(self.shown_lsb, known)
-        bad = self._is_open(found) | self._is_bridged(found)
+        bad = np.logical_or(*self._open_and_bridged(found))
         port_ohm = port_resistance_ohm(
             self._skin(np.where(bad, found.cell_siemens, self.plate), known)
         )
@@ -188,19 +188,17 @@ class PlateExam:
         top, bottom = (np.full(siemens.shape, ohm) for ohm in self.wire_ohm.both or (0.0, 0.0))
         return Skin(siemens, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
 
-    def _is_open(self, found: Estimate) -> NDArray[np.bool_]:
-        return np.asarray(found.cell_siemens < OPEN_SHARE * self.plate)
-
-    def _is_bridged(self, found: Estimate) -> NDArray[np.bool_]:
-        most = BRIDGE_SIEMENS + BRIDGE_STDS * found.cell_siemens_std
-        return np.asarray((self.plate == 0) & (found.cell_siemens > most))
+    def _open_and_bridged(self, found: Estimate) -> tuple[Bool, Bool]:
+        """Cells where a resistor does not conduct, and those where none is that do."""
+        siemens, most = found.cell_siemens, BRIDGE_SIEMENS + BRIDGE_STDS * found.cell_siemens_std
+        return siemens < OPEN_SHARE * self.plate, (self.plate == 0) & (siemens > most)
 
     def _examine_cells(self, found: Estimate, diagnosis: Diagnosis) -> Float:
         """Adds wrong cells. Returns the plate with these as they were measured, (R, C) [S]."""
         siemens, is_there = found.cell_siemens, self.plate > 0
         self.cell_ohm, self.std_percent = 1 / siemens, 100 * found.cell_siemens_std / siemens
         self.error_percent = np.where(is_there, 100 * (self.plate * self.cell_ohm - 1), np.nan)
-        is_open, bridged = self._is_open(found), self._is_bridged(found)
+        is_open, bridged = self._open_and_bridged(found)
         most = self.tolerance.cell_percent
         off = ~is_open & (np.abs(self.error_percent) > most + self.std_percent)
         self.wrong = is_open | bridged | off

@@ -28,7 +28,7 @@ drift.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -312,8 +312,8 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
 # ------------------------------------------------------------------------------------ settling
 
 
-def comparison(board: Hello) -> tuple[int, float] | None:
-    """Settle time [us] and rate [Hz] of a second look; None if it could show nothing new.
+def comparison(board: Hello) -> dict[str, Any] | None:
+    """`settle_us` and `rate_hz` of a second look; None if it could show nothing new.
 
     The settle time is longer, where it can be; the rate is one at which no mains stands still.
     """
@@ -327,7 +327,8 @@ def comparison(board: Hello) -> tuple[int, float] | None:
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
     rates_hz = np.linspace(0.7, 1.0, 31) * fastest_hz
     best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(each, rate_hz) for each in MAINS_HZ))
-    return longer_us, max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
+    rate_hz = max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
+    return {"settle_us": longer_us, "rate_hz": rate_hz}
 
 
 def examine_settling(
