@@ -131,9 +131,8 @@ def decode_rate(codes: Callable[[int], np.ndarray]) -> float:
     kind = protocol.FRAMES["scan"]
     stream = bytearray()
     for number in range(DECODED_SCANS):
-        header = kind.pack(
-            scan=number, time_us=11_111 * number, dropped=0, rx_errors=0, rows=8, columns=8
-        )
+        counters = {"scan": number, "time_us": 11_111 * number, "dropped": 0, "rx_errors": 0}
+        header = kind.pack(**counters, rows=8, columns=8, mode="near")
         tail = protocol.pack_codes(codes(number))
         stream += framing.encode(kind.id, number, header + tail)
     chunks = [bytes(stream[i : i + CHUNK_BYTES]) for i in range(0, len(stream), CHUNK_BYTES)]

@@ -6,7 +6,7 @@
 namespace ohmskin {
 namespace frames {
 
-constexpr uint16_t LAYOUT_CRC = 0x4D00;
+constexpr uint16_t LAYOUT_CRC = 0x2FED;
 constexpr uint8_t DELIMITER = 0x00;
 constexpr uint16_t CRC_POLYNOMIAL = 0x1021;
 constexpr uint16_t CRC_INITIAL = 0xFFFF;
@@ -15,9 +15,11 @@ constexpr uint16_t CRC_INITIAL = 0xFFFF;
 constexpr uint8_t ROWS_MAX = 16;
 // columns a board can scan
 constexpr uint8_t COLUMNS_MAX = 16;
-// readings of a cell in a scan, in the order of the enum `reading`
+// names in the enum `reading`
+constexpr uint8_t READINGS = 8;
+// readings of a cell in a scan: those of its mode, in its order
 constexpr uint8_t READINGS_PER_CELL = 4;
-// readings of a cell that follow each other, with one drive; a scan passes once a drive over all cells
+// readings of a cell that follow each other; a scan passes over all cells for each such group
 constexpr uint8_t READINGS_PER_PASS = 2;
 // bits of one code; codes are packed without gaps, least significant bit first
 constexpr uint8_t ADC_BITS = 10;
@@ -34,12 +36,22 @@ constexpr uint32_t BAUD_FAST = 1000000;
 // a board that hears no valid command this long after set_baud returns to baud_default
 constexpr uint16_t BAUD_CONFIRM_MS = 1000;
 
-// the configurations of a cell, in scan order; V/Vdd of the sense node named
+// V/Vdd of the sense node named; a cell's row is in the top layer, its column in the bottom layer
 enum class Reading : uint8_t {
     A = 0,  // top pin high, bottom pin low: top sense node
     B = 1,  // top pin high, bottom pin low: bottom sense node
     C = 2,  // top pin low, bottom pin high: bottom sense node
     D = 3,  // top pin low, bottom pin high: top sense node
+    E = 4,  // top pin high, bottom pin low: far end of the row
+    F = 5,  // top pin high, bottom pin low: far end of the column
+    G = 6,  // top pin low, bottom pin high: far end of the column
+    H = 7,  // top pin low, bottom pin high: far end of the row
+};
+
+// which readings a scan takes of each cell, in scan order
+enum class Mode : uint8_t {
+    Near = 0,  // both near ends, under both drives
+    Far = 1,  // both ends of row and column, under one drive; needs a second pair of multiplexers at the far ends
 };
 
 // what the firmware was built for
@@ -79,6 +91,7 @@ enum class Result : uint8_t {
     Scanning = 11,  // not while scanning: stop first
     Busy = 12,  // the same command is still being carried out
     EepromFailed = 13,  // the EEPROM does not hold what was written
+    BadMode = 14,  // no such mode
 };
 
 // bits of hello.reset_cause, only those that are known: most boot loaders clear the chip's own record
@@ -90,13 +103,25 @@ enum class ResetCause : uint8_t {
 };
 
 // bits of self_test_report.findings: what no skin can cause
-enum class Finding : uint8_t {
+enum class Finding : uint16_t {
     TopStuckLow = 1,  // top sense node at ground under both drives: short to ground
     TopStuckHigh = 2,  // top sense node at Vdd under both drives: short to Vdd
     TopReferenceMissing = 4,  // top sense node does not follow its drive pin: reference resistor or drive wire open
     BottomStuckLow = 8,  // bottom sense node at ground under both drives: short to ground
     BottomStuckHigh = 16,  // bottom sense node at Vdd under both drives: short to Vdd
     BottomReferenceMissing = 32,  // bottom sense node does not follow its drive pin: reference resistor or drive wire open
+    FarTopStuckLow = 64,  // far sense node of the rows at ground under both drives: short to ground
+    FarTopStuckHigh = 128,  // far sense node of the rows at Vdd under both drives: short to Vdd
+    FarTopOpen = 256,  // far sense node of the rows follows no row: multiplexer, its wire or its connector open
+    FarBottomStuckLow = 512,  // far sense node of the columns at ground under both drives: short to ground
+    FarBottomStuckHigh = 1024,  // far sense node of the columns at Vdd under both drives: short to Vdd
+    FarBottomOpen = 2048,  // far sense node of the columns follows no column: multiplexer, its wire or its connector open
+};
+
+// Readings of each mode, in scan order.
+constexpr Reading MODE_READINGS[][READINGS_PER_CELL] = {
+    {Reading::A, Reading::B, Reading::C, Reading::D},
+    {Reading::A, Reading::E, Reading::B, Reading::F},
 };
 
 enum class Type : uint8_t {
@@ -136,14 +161,15 @@ struct __attribute__((packed)) Hello {
     uint16_t settle_asked_us;  // [us] settle time asked for; 0: as long as the rate allows
     uint16_t settle_us;  // [us] time from a multiplexer change to the hold, at least
     uint8_t adc_prescaler;  // ADC clock divisor
+    uint8_t mode;  // which readings a scan takes
     uint32_t baud;  // [baud] line speed in force
     uint8_t settings;  // where the settings at boot came from
     uint8_t reset_cause;  // why the board last started
     uint8_t scanning;  // 1 while scanning
 };
-static_assert(sizeof(Hello) == 48, "wire size");
+static_assert(sizeof(Hello) == 49, "wire size");
 
-// board to host: all readings of one scan. The codes follow the header: A and B of each cell, cells in column-major order (rows run fastest), then C and D of each cell; adc_bits each, packed least significant bit first; 4 codes of 10 bits fill 5 bytes. The last byte is padded with zero bits.
+// board to host: all readings of one scan. The codes follow the header: the mode's first two readings of each cell, cells in column-major order (rows run fastest), then its other two of each cell; adc_bits each, packed least significant bit first; 4 codes of 10 bits fill 5 bytes. The last byte is padded with zero bits.
 struct __attribute__((packed)) Scan {
     uint32_t scan;  // number of the scan since start, dropped ones counted; wraps
     uint32_t time_us;  // [us] board time at which the scan started; wraps
@@ -151,9 +177,10 @@ struct __attribute__((packed)) Scan {
     uint16_t rx_errors;  // damaged or overlong frames the board has received since boot; wraps
     uint8_t rows;  // rows of this scan
     uint8_t columns;  // columns of this scan
+    uint8_t mode;  // which readings these are
     // followed by codes: rows * columns * readings_per_cell codes
 };
-static_assert(sizeof(Scan) == 14, "wire size");
+static_assert(sizeof(Scan) == 15, "wire size");
 
 // board to host: answer to one command; the only one, sent when the command has been carried out
 struct __attribute__((packed)) Ack {
@@ -166,10 +193,10 @@ static_assert(sizeof(Ack) == 3, "wire size");
 // board to host: what the sense nodes read over all multiplexer inputs; comes before the ack of self_test
 struct __attribute__((packed)) SelfTestReport {
     uint16_t findings;  // what cannot be on a sound board
-    uint16_t code_min[4];  // smallest code of each configuration over all inputs
-    uint16_t code_max[4];  // largest code of each configuration over all inputs
+    uint16_t code_min[8];  // smallest code of each reading over all inputs; above code_max: not taken, as e to h in mode near
+    uint16_t code_max[8];  // largest code of each reading over all inputs
 };
-static_assert(sizeof(SelfTestReport) == 18, "wire size");
+static_assert(sizeof(SelfTestReport) == 34, "wire size");
 
 // host to board: how to scan; all of it or nothing. Refused while scanning
 struct __attribute__((packed)) Configure {
@@ -178,8 +205,9 @@ struct __attribute__((packed)) Configure {
     uint32_t rate_mhz;  // [mHz] scans per 1000 s; 0: as fast as the converter runs
     uint16_t settle_us;  // [us] least settle time, which then also is kept; 0: as long as the rate allows
     uint8_t adc_prescaler;  // ADC clock divisor
+    uint8_t mode;  // which readings a scan takes
 };
-static_assert(sizeof(Configure) == 9, "wire size");
+static_assert(sizeof(Configure) == 10, "wire size");
 
 // host to board: name this skin; `save` makes it last
 struct __attribute__((packed)) SetUnitId {

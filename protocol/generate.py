@@ -15,7 +15,16 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "host"))
 
-from ohmskin.link.protocol import CONSTANTS, DEFINITION, ENUMS, FRAMES, LAYOUT_CRC, Field, Frame  # noqa: E402
+from ohmskin.link.protocol import (  # noqa: E402
+    CONSTANTS,
+    DEFINITION,
+    ENUMS,
+    FRAMES,
+    LAYOUT_CRC,
+    MODES,
+    Field,
+    Frame,
+)
 
 C_TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t"}
 
@@ -59,6 +68,11 @@ def header() -> str:
         out.append(f"enum class {_camel(enum.name)} : {width} {{")
         out += [f"    {_camel(n)} = {v},  // {enum.docs[n]}" for n, v in enum.values.items()]
         out.append("};")
+    out += ["", "// Readings of each mode, in scan order."]
+    out.append("constexpr Reading MODE_READINGS[][READINGS_PER_CELL] = {")
+    for names in MODES.values():
+        out.append("    {" + ", ".join(f"Reading::{_camel(name)}" for name in names) + "},")
+    out.append("};")
     out += ["", "enum class Type : uint8_t {"]
     out += [f"    {_camel(f.name)} = {_hex(f.id)}," for f in FRAMES.values()]
     out.append("};")
@@ -113,7 +127,9 @@ def page() -> str:
     for enum in ENUMS.values():
         out += ["", f"### `{enum.name}`", "", DEFINITION["enums"][enum.name]["doc"] + ".", ""]
         out += ["| value | name | meaning |", "|---|---|---|"]
-        out += [f"| {v} | `{n}` | {enum.docs[n]} |" for n, v in enum.values.items()]
+        for n, v in enum.values.items():
+            readings = " ".join(MODES[n]) + ": " if enum.name == "mode" else ""
+            out.append(f"| {v} | `{n}` | {readings}{enum.docs[n]} |")
     out += ["", "## Constants", "", "| name | value | unit | meaning |", "|---|---|---|---|"]
     for name, entry in DEFINITION["constants"].items():
         out.append(f"| `{name}` | {entry['value']} | {entry.get('unit', '')} | {entry['doc']} |")

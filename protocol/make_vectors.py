@@ -49,8 +49,10 @@ def valid(
     return {**entry, "content": content.hex(), "wire": wire(content).hex()}
 
 
-def scan(name: str, sequence: int, rows: int, columns: int, codes: list[int]) -> dict[str, Any]:
-    header = struct.pack("<IIHHBB", 70000, 777777777, 3, 1, rows, columns)
+def scan(
+    name: str, sequence: int, rows: int, columns: int, codes: list[int], mode: str = "near"
+) -> dict[str, Any]:
+    header = struct.pack("<IIHHBBB", 70000, 777777777, 3, 1, rows, columns, mode == "far")
     fields = {
         "scan": 70000,
         "time_us": 777777777,
@@ -58,15 +60,16 @@ def scan(name: str, sequence: int, rows: int, columns: int, codes: list[int]) ->
         "rx_errors": 1,
         "rows": rows,
         "columns": columns,
+        "mode": mode,
     }
     return valid(name, bytes([0x02, sequence]) + header + pack10(codes), fields, codes)
 
 
 def all_valid() -> list[dict[str, Any]]:
     hello = struct.pack(
-        "<HBBBBIBBBBIIIIHIHHBIBBB",
+        "<HBBBBIBBBBIIIIHIHHBBIBBB",
         *(0x3C72, 0, 1, 0, 1, 0xC0FFEE, 8, 8, 4, 10, 30000, 30000),
-        *(90000, 177762, 689, 16000000, 0, 36, 32, 500000, 1, 2, 0),
+        *(90000, 177762, 689, 16000000, 0, 36, 32, 1, 500000, 1, 2, 0),
     )
     hello_fields = {
         "layout_crc": 0x3C72,
@@ -88,14 +91,15 @@ def all_valid() -> list[dict[str, Any]]:
         "settle_asked_us": 0,
         "settle_us": 36,
         "adc_prescaler": "clock_500khz",
+        "mode": "far",
         "baud": 500000,
         "settings": "defaults_blank",
         "reset_cause": ["external"],
         "scanning": 0,
     }
     ramp = [(37 * i + 5) % 1024 for i in range(8 * 8 * 4)]
-    report = struct.pack("<H8H", 0b100100, 0, 1, 2, 3, 1020, 1021, 1022, 1023)
-    configure = struct.pack("<BBIHB", 8, 12, 90000, 20, 64)
+    report = struct.pack("<H16H", 0b100100100, *range(8), *range(1016, 1024))
+    configure = struct.pack("<BBIHBB", 8, 12, 90000, 20, 64, 1)
     return [
         valid("get_hello", bytes([0x81, 0]), {}),
         valid("start", bytes([0x83, 7]), {}),
@@ -109,6 +113,7 @@ def all_valid() -> list[dict[str, Any]]:
                 "rate_mhz": 90000,
                 "settle_us": 20,
                 "adc_prescaler": "clock_250khz",
+                "mode": "far",
             },
         ),
         valid("set_unit_id", bytes([0x85, 1]) + b"\xff\x00\xff\x00", {"unit_id": 0x00FF00FF}),
@@ -128,18 +133,22 @@ def all_valid() -> list[dict[str, Any]]:
             "self_test_report",
             bytes([0x04, 6]) + report,
             {
-                "findings": ["top_reference_missing", "bottom_reference_missing"],
-                "code_min": [0, 1, 2, 3],
-                "code_max": [1020, 1021, 1022, 1023],
+                "findings": ["top_reference_missing", "bottom_reference_missing", "far_top_open"],
+                "code_min": list(range(8)),
+                "code_max": list(range(1016, 1024)),
             },
         ),
         scan("scan 1x1", 10, 1, 1, [994, 29, 993, 30]),
         scan("scan 2x3, all codes zero", 11, 2, 3, [0] * 24),
         scan("scan 3x1, all codes 1023", 12, 3, 1, [1023] * 12),
-        scan("scan 8x8", 13, 8, 8, ramp),
+        scan("scan 8x8", 13, 8, 8, ramp, "far"),
         # COBS's blocks end after 254 bytes without a zero: once past it, once exactly there.
         scan("scan 16x4, long run without zeros", 14, 16, 4, [1023] * 256),
-        scan("scan 10x5, last run of exactly 254", 15, 10, 5, [1023] * 200),
+        # The eighth byte of the codes is the last zero: 252 bytes and the CRC follow it.
+        scan(
+            *("scan 13x4, last run of 254", 15, 13, 4),
+            [*(5 * [1023]), 63, 1008, *(201 * [1023])],
+        ),
     ]
 
 

@@ -238,7 +238,11 @@ class OneFrameBoard:
     def __init__(self, shape: tuple[int, int], seed: int) -> None:
         self._ratio = np.empty(0)
         self._board = EmulatedBoard(
-            lambda _: self._ratio, *shape, rate_hz=DEFAULT_RATE_HZ, noise_lsb=NOISE_LSB, seed=seed
+            lambda _time_s, _mode: self._ratio,
+            *shape,
+            rate_hz=DEFAULT_RATE_HZ,
+            noise_lsb=NOISE_LSB,
+            seed=seed,
         )
         self._decoder = BoardDecoder()
 

@@ -12,7 +12,9 @@ const REGISTERS_END = 0x100; // avr8js counts what lies above it as SRAM
 const MCUSR = 0x54, TIFR1 = 0x36, OCF1B = 0x04;
 const POWER_ON = 0x01, EXTERNAL = 0x02, WATCHDOG = 0x08; // bits of MCUSR
 const NEVER_CYCLES = 0xffffffff;
-const A_TO_D = 4, EQUAL_DRIVE = 4, UNDRIVEN = 5, OTHER_CHANNEL = 6;
+const A_TO_H = 8, EQUAL_DRIVE = 8, UNDRIVEN = 9, OTHER_CHANNEL = 10;
+// Readings by channel: A0 and A1 are at the near ends of row and column, A2 and A3 at the far ends.
+const TOP_HIGH = "abef", BOTTOM_HIGH = "dchg";
 
 const { timer0Config, timer1Config, usart0Config, eepromConfig, watchdogConfig } = avr8js;
 
@@ -85,7 +87,7 @@ class Board {
         if (!this.chip) throw new Error(`no board '${name}': there are ${names}`);
         this.flash = loadHex(hex, this.chip.flashBytes);
         this.eeprom = new avr8js.EEPROMMemoryBackend(this.chip.eepromBytes);
-        this.table = new Float64Array(16 * 16 * A_TO_D);
+        this.table = new Float64Array(16 * 16 * A_TO_H);
         this.sent = [];
         this.logging = false;
         this.holds = [];
@@ -179,7 +181,7 @@ class Board {
         const row = this.pins(chip.row, 4), column = this.pins(chip.column, 4);
         const top = this.pins(chip.driveTop, 1), bottom = this.pins(chip.driveBottom, 1);
         let configuration, ratio = 0;
-        if (channel > 1) {
+        if (channel >= TOP_HIGH.length) {
             configuration = OTHER_CHANNEL;
         } else if (![row, column, top, bottom].every((pin) => pin.driven)) {
             configuration = UNDRIVEN;
@@ -187,9 +189,9 @@ class Board {
             configuration = EQUAL_DRIVE;
             ratio = top.value;
         } else {
-            // A, B: top pin high, nodes top, bottom. C, D: bottom pin high, nodes bottom, top.
-            configuration = top.value ? channel : 3 - channel;
-            ratio = this.table[(row.value * 16 + column.value) * A_TO_D + configuration];
+            const letter = (top.value ? TOP_HIGH : BOTTOM_HIGH)[channel];
+            configuration = letter.charCodeAt() - "a".charCodeAt();
+            ratio = this.table[(row.value * 16 + column.value) * A_TO_H + configuration];
         }
         const code = Math.min(1023, Math.max(0, Math.floor(ratio * 1024)));
         if (this.logging) {

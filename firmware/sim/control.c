@@ -18,7 +18,8 @@
 
 enum {
     REQUEST_MAX = 4 << 20,
-    ADMITTANCE_BYTES = SKIN_LINES * SKIN_LINES * sizeof(double),
+    ADMITTANCE_BYTES = SKIN_ENDS * SKIN_ENDS * sizeof(double),
+    HAS_FAR = 0x80, /* in the count of rows */
     TABLE_BYTES = SKIN_ROWS * SKIN_COLUMNS * SKIN_CONFIGURATIONS * sizeof(double)
 };
 static const uint64_t RUN_MAX = (uint64_t)CPU_HZ * 3600;
@@ -95,19 +96,21 @@ static bool set_table(void) {
 }
 
 static bool set_admittance(size_t length) {
-    static double siemens[SKIN_LINES * SKIN_LINES];
-    const size_t rows = payload[0];
-    size_t lines = 0;
-    while (1 + lines * lines * sizeof *siemens < length)
-        lines++;
-    if (1 + lines * lines * sizeof *siemens != length || rows > SKIN_ROWS || lines < rows ||
-        lines - rows > SKIN_COLUMNS)
+    static double siemens[SKIN_ENDS * SKIN_ENDS];
+    const size_t rows = payload[0] & ~HAS_FAR;
+    const bool has_far = payload[0] & HAS_FAR;
+    size_t ends = 0;
+    while (1 + ends * ends * sizeof *siemens < length)
+        ends++;
+    const size_t lines = has_far ? ends / 2 : ends;
+    if (1 + ends * ends * sizeof *siemens != length || (has_far && ends % 2) || rows > SKIN_ROWS ||
+        lines < rows || lines - rows > SKIN_COLUMNS)
         return refuse("C: rows, then a square matrix of up to 16 rows and 16 columns");
     memcpy(siemens, payload + 1, length - 1);
-    for (size_t i = 0; i < lines * lines; i++)
+    for (size_t i = 0; i < ends * ends; i++)
         if (!isfinite(siemens[i]))
             return refuse("C: an admittance is not finite");
-    skin_set_admittance(rows, lines, siemens);
+    skin_set_admittance(rows, lines, has_far, siemens);
     return control_reply('C', NULL, 0);
 }
 

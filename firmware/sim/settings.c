@@ -24,6 +24,7 @@ static const struct setting {
     {"line_pf", &settings.line_pf, 0, 1e6, false},
     {"cell_pf", &settings.cell_pf, 0, 1e6, false},
     {"half_code", &settings.half_code, 0, 1, false},
+    {"far_open", &settings.far_open, 0, 1, false},
     {"offset_lsb", settings.offset_lsb, -1024, 1024, true},
     {"gain_lsb", settings.gain_lsb, -1024, 1024, true},
     {"inl_lsb", settings.inl_lsb, -1024, 1024, true},
@@ -57,9 +58,9 @@ static bool is_named(const struct setting *s, const char *name, size_t *first, s
 static const struct {
     const char *name;
     double value;
-} DESK[] = {{"sample_pf", 14}, {"input_ohm", 10e3}, {"node_pf", 100},   {"line_pf", 30},
-            {"cell_pf", 2},    {"half_code", 1},    {"offset_lsb", 2},  {"gain_lsb", 2},
-            {"inl_lsb", 1.5},  {"noise_lsb", 0.5},  {"late_cycles", 16}};
+} DESK[] = {{"sample_pf", 14}, {"input_ohm", 10e3}, {"node_pf", 100},    {"line_pf", 30},
+            {"cell_pf", 2},    {"half_code", 1},    {"offset_lsb", 2},   {"gain_lsb", 2},
+            {"inl_lsb", 1.5},  {"noise_lsb", 0.5},  {"late_cycles", 16}, {"far_open", 1}};
 
 static const char *set_desk(bool on) {
     for (size_t i = 0; i < sizeof DESK / sizeof *DESK; i++) {

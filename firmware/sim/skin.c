@@ -13,9 +13,9 @@
 
 /* The one table of pins. PINx, DDRx and PORTx follow each other in data space. Of all ports: the
  * pins that a board can use, without the sense pins, the crystal's and the reset pin. */
-static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x3C}, {0x2B, 0xFF}, {0, 0}};
+static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x30}, {0x2B, 0xFF}, {0, 0}};
 static const struct port MEGA[] = {{0x22, 0xFF},  {0x25, 0xFF},  {0x28, 0xFF},  {0x2B, 0xFF},
-                                   {0x2E, 0xFF},  {0x31, 0xFC},  {0x34, 0x3F},  {0x102, 0xFF},
+                                   {0x2E, 0xFF},  {0x31, 0xF0},  {0x34, 0x3F},  {0x102, 0xFF},
                                    {0x105, 0xFF}, {0x108, 0xFF}, {0x10B, 0xFF}, {0, 0}};
 static const struct board BOARDS[] = {
     /* rows PORTD4-7, columns PORTB0-3, drive PD2 and PD3 */
@@ -60,8 +60,8 @@ static struct {
 } skin;
 
 /* With any capacitance set, the nodes are part of a circuit, and its voltages are kept here: of
- * the skin's lines (rows first), the two nodes and the sample capacitor. */
-enum { SAMPLE = SKIN_LINES + NODES, STATES };
+ * the lines' near ends (rows first), their far ends, the nodes and the sample capacitor. */
+enum { SAMPLE = SKIN_ENDS + NODES, STATES };
 enum { MATRICES = CONFIG_OTHER };
 #define REF_OHM 30e3
 #define MUX_OHM 1.0
@@ -69,7 +69,8 @@ enum { MATRICES = CONFIG_OTHER };
 #define STRAY_PF 0.01
 
 static struct {
-    double siemens[SKIN_LINES][SKIN_LINES];
+    double siemens[SKIN_ENDS][SKIN_ENDS];
+    bool has_far;        /* else a line's capacitance is all at its near end */
     double volt[STATES]; /* V/Vdd ... */
     instant since;       /* ... then */
     unsigned connected;  /* node at the sample capacitor */
@@ -84,13 +85,12 @@ const struct board *skin_find_board(const char *name) {
 }
 
 static uint8_t configuration(unsigned node) {
+    static const char NAMES[2][NODES + 1] = {"dchg", "abef"}; /* by top_high */
     if (skin.undriven)
         return CONFIG_UNDRIVEN;
     if (skin.top_high == skin.bottom_high)
         return CONFIG_NO_CURRENT;
-    if (skin.top_high)
-        return node == NODE_TOP ? CONFIG_A : CONFIG_B;
-    return node == NODE_BOTTOM ? CONFIG_C : CONFIG_D;
+    return (uint8_t)(NAMES[skin.top_high][node] - 'a');
 }
 
 static double target(unsigned node) {
@@ -107,7 +107,8 @@ static bool is_circuit(void) {
 }
 
 /* Without lines, each node hangs on a source with the table's voltage. Of the reference resistor
- * and the skin behind it, R (1 - R I) is the parallel, and 1 - R I is A, C, 1 - B or 1 - D. */
+ * and the skin behind it, R (1 - R I) is the parallel, and 1 - R I is A, C, 1 - B or 1 - D. What
+ * the wires add to a far end is left out. */
 static double source_ohm(unsigned node) {
     const double ratio = target(node) > 1 ? 1 : target(node) < 0 ? 0 : target(node);
     return REF_OHM * fmax(ratio, 1 - ratio);
@@ -118,7 +119,7 @@ static double source_ohm(unsigned node) {
 static size_t list_states(size_t states[STATES]) {
     size_t n = 0;
     for (size_t i = 0; i < STATES; i++)
-        if (i >= SKIN_LINES || (settings.line_pf > 0 && circuit.siemens[i][i] > 0))
+        if (i >= SKIN_ENDS || (settings.line_pf > 0 && circuit.siemens[i][i] > 0))
             states[n++] = i;
     return n;
 }
@@ -134,30 +135,34 @@ static struct modes *make_modes(size_t n, const size_t states[n]) {
     static double farad[STATES][STATES], siemens[STATES][STATES];
     memset(farad, 0, sizeof farad);
     memset(siemens, 0, sizeof siemens);
-    const size_t of_node[NODES] = {skin.row, SKIN_ROWS + skin.column};
+    const size_t of_node[NODES] = {skin.row, SKIN_ROWS + skin.column, SKIN_LINES + skin.row,
+                                   SKIN_LINES + SKIN_ROWS + skin.column};
     for (unsigned node = 0; node < NODES; node++) {
-        const size_t at = SKIN_LINES + node, line = of_node[node];
+        const size_t at = SKIN_ENDS + node, line = of_node[node];
         farad[at][at] = 1e-12 * fmax(settings.node_pf, STRAY_PF);
         if (settings.line_pf <= 0)
             siemens[at][at] = 1 / source_ohm(node);
-        else if (!skin.undriven)
+        else if (!skin.undriven && node < DRIVEN_NODES)
             siemens[at][at] = 1 / REF_OHM;
-        if (settings.line_pf > 0 && circuit.siemens[line][line] > 0)
+        const bool is_joined = node < DRIVEN_NODES || settings.far_open < 0.5;
+        if (is_joined && settings.line_pf > 0 && circuit.siemens[line][line] > 0)
             join(siemens, at, line, 1 / MUX_OHM);
     }
     farad[SAMPLE][SAMPLE] = 1e-12 * fmax(settings.sample_pf, STRAY_PF);
     if (circuit.connected < NODES && settings.sample_pf > 0)
-        join(siemens, SAMPLE, SKIN_LINES + circuit.connected, 1 / fmax(settings.input_ohm, 1));
+        join(siemens, SAMPLE, SKIN_ENDS + circuit.connected, 1 / fmax(settings.input_ohm, 1));
+    const double at_end = circuit.has_far ? 0.5e-12 : 1e-12;
     double c[n][n], g[n][n];
     for (size_t i = 0; i < n; i++) {
         const size_t line = states[i];
-        if (line >= SKIN_LINES)
+        if (line >= SKIN_ENDS)
             continue;
-        farad[line][line] += 1e-12 * settings.line_pf;
-        for (size_t j = 0; j < i; j++)
-            if (line >= SKIN_ROWS && states[j] < SKIN_ROWS)
-                join(farad, line, states[j], 1e-12 * settings.cell_pf);
-        for (size_t j = 0; j < SKIN_LINES; j++)
+        farad[line][line] += at_end * settings.line_pf;
+        for (size_t j = 0; j < i; j++) /* a row and a column cross, at their ends of one side */
+            if (line % SKIN_LINES >= SKIN_ROWS && states[j] % SKIN_LINES < SKIN_ROWS &&
+                line / SKIN_LINES == states[j] / SKIN_LINES)
+                join(farad, line, states[j], at_end * settings.cell_pf);
+        for (size_t j = 0; j < SKIN_ENDS; j++)
             siemens[line][j] += circuit.siemens[line][j];
     }
     for (size_t i = 0; i < n; i++)
@@ -194,9 +199,10 @@ static void advance(instant when) {
     }
     for (unsigned node = 0; node < NODES; node++) {
         const bool high = node == NODE_TOP ? skin.top_high : skin.bottom_high;
+        const bool driven = node < DRIVEN_NODES && !skin.undriven;
         ampere[n - 1 - NODES + node] = settings.line_pf <= 0 ? target(node) / source_ohm(node)
-                                       : skin.undriven       ? 0
-                                                             : high / REF_OHM;
+                                       : driven              ? high / REF_OHM
+                                                             : 0;
     }
     modes_advance(*modes, ampere, (double)(when - circuit.since) / CPU_HZ, volt);
     for (size_t i = 0; i < n; i++)
@@ -209,14 +215,19 @@ void skin_connect(unsigned node, instant when) {
     circuit.connected = node < NODES ? node : NODES;
 }
 
-void skin_set_admittance(size_t rows, size_t lines, const double *siemens) {
+static size_t end_of(size_t i, size_t rows, size_t lines) {
+    const size_t line = i % lines, far = i / lines;
+    return far * SKIN_LINES + (line < rows ? line : SKIN_ROWS + line - rows);
+}
+
+void skin_set_admittance(size_t rows, size_t lines, bool has_far, const double *siemens) {
+    const size_t ends = has_far ? 2 * lines : lines;
     advance(cpu->cycle);
     memset(circuit.siemens, 0, sizeof circuit.siemens);
-    for (size_t i = 0; i < lines; i++)
-        for (size_t j = 0; j < lines; j++)
-            circuit
-                .siemens[i < rows ? i : SKIN_ROWS + i - rows][j < rows ? j : SKIN_ROWS + j - rows] =
-                siemens[i * lines + j];
+    circuit.has_far = has_far;
+    for (size_t i = 0; i < ends; i++)
+        for (size_t j = 0; j < ends; j++)
+            circuit.siemens[end_of(i, rows, lines)][end_of(j, rows, lines)] = *siemens++;
     forget_modes();
 }
 
@@ -224,7 +235,7 @@ double skin_ratio(unsigned node, instant when) {
     if (is_circuit()) {
         advance(when);
         const bool sampled = settings.sample_pf > 0 && circuit.connected == node;
-        return circuit.volt[sampled ? SAMPLE : SKIN_LINES + node];
+        return circuit.volt[sampled ? SAMPLE : SKIN_ENDS + node];
     }
     const struct node *n = &skin.node[node];
     const double tau_cycles = settings.tau_us * (CPU_HZ / 1e6);
@@ -286,7 +297,8 @@ void skin_start(const struct board *board) {
     skin.undriven = true;
     for (int r = 0; r < SKIN_ROWS; r++)
         for (int c = 0; c < SKIN_COLUMNS; c++) /* nothing connected: no current */
-            memcpy(skin.ratio[r][c], (const double[]){1, 0, 1, 0}, sizeof skin.ratio[r][c]);
+            memcpy(skin.ratio[r][c], (const double[]){1, 0, 1, 0, 1, 0, 1, 0},
+                   sizeof skin.ratio[r][c]);
     const uint16_t ports[] = {board->row_port, board->column_port, board->drive_port};
     for (int i = 0; i < 3; i++) {
         if (i == 2 && (ports[2] == ports[0] || ports[2] == ports[1]))
@@ -312,7 +324,7 @@ void skin_before_setting(void) {
         return;
     circuit.since = cpu->cycle; /* it may become one, and begins with these voltages */
     for (unsigned i = 0; i < NODES; i++)
-        circuit.volt[SKIN_LINES + i] = skin.node[i].start;
+        circuit.volt[SKIN_ENDS + i] = skin.node[i].start;
 }
 
 struct skin_pins skin_pins(unsigned node) {

@@ -78,10 +78,12 @@ void events_reset(void);
 
 /* ---- skin.c: pins and table to node voltages */
 
-enum { SKIN_ROWS = 16, SKIN_COLUMNS = 16, SKIN_CONFIGURATIONS = 4 };
-enum { NODE_TOP, NODE_BOTTOM, NODES };
-/* Configurations A to D as in the table, then what no table entry describes. */
-enum { CONFIG_A, CONFIG_B, CONFIG_C, CONFIG_D, CONFIG_NO_CURRENT, CONFIG_UNDRIVEN, CONFIG_OTHER };
+enum { SKIN_ROWS = 16, SKIN_COLUMNS = 16, SKIN_CONFIGURATIONS = 8 };
+/* Sense nodes, by the converter's channel: those of the near ends, which are driven, and of the far
+ * ends of the selected row and column. */
+enum { NODE_TOP, NODE_BOTTOM, DRIVEN_NODES, NODE_FAR_TOP = DRIVEN_NODES, NODE_FAR_BOTTOM, NODES };
+/* Configurations A to H as in the table, then what no table entry describes. */
+enum { CONFIG_NO_CURRENT = SKIN_CONFIGURATIONS, CONFIG_UNDRIVEN, CONFIG_OTHER };
 
 struct port {
     uint16_t port; /* data-space address of PORTx */
@@ -109,9 +111,10 @@ unsigned skin_floating_pins(void);
 bool skin_tx_pin_is_high(void);
 /* The sample capacitor is joined to this node from now on; NODES: to none. */
 void skin_connect(unsigned node, instant when);
-enum { SKIN_LINES = SKIN_ROWS + SKIN_COLUMNS };
-/* Currents into the electrodes (rows first) per potential of each [S], (lines, lines). */
-void skin_set_admittance(size_t rows, size_t lines, const double *siemens);
+enum { SKIN_LINES = SKIN_ROWS + SKIN_COLUMNS, SKIN_ENDS = 2 * SKIN_LINES };
+/* Currents into the ends of the lines per potential of each [S]: near ends, rows first, and then
+ * the far ends, if has_far; (ends, ends). */
+void skin_set_admittance(size_t rows, size_t lines, bool has_far, const double *siemens);
 struct skin_pins {
     uint8_t row, column, configuration;
 };
@@ -129,7 +132,7 @@ void modes_advance(const struct modes *modes, const double *ampere, double secon
 struct settings {
     double tau_us;
     double sample_pf, input_ohm, node_pf, line_pf, cell_pf;
-    double late_cycles, half_code;
+    double late_cycles, half_code, far_open;
     /* of the converter, by ADPS, which gives the ADC clock */
     double offset_lsb[8], gain_lsb[8], inl_lsb[8], noise_lsb[8];
     double seed;

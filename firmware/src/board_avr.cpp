@@ -15,32 +15,34 @@ namespace ohmskin {
 namespace board {
 
 // ------------------------------------------------------------- wiring: the one table that says it
-// Sense nodes: top on A0, bottom on A1. No other pin floats. The serial line's RX has its pull-up
-// on. Its TX is an output at 1, which holds the line idle while the transmitter is off. Unused pins
-// of the ports that each slot writes as a whole are outputs at 0: connect nothing to them. All
-// other unused pins are inputs with pull-ups.
+// Sense nodes: top on A0, bottom on A1, far end of the row on A2, of the column on A3. A pull-up
+// would draw current through the skin, so they float, as analog inputs. No other pin floats. The
+// serial line's RX has its pull-up on. Its TX is an output at 1, which holds the line idle while
+// the transmitter is off. Unused pins of the ports that each slot writes as a whole are outputs at
+// 0: connect nothing to them. All other unused pins are inputs with pull-ups.
 const uint32_t CLOCK_HZ = F_CPU;
 const uint32_t REF_TOP_OHM = 30000;
 const uint32_t REF_BOTTOM_OHM = 30000;
 
 namespace {
-constexpr uint8_t CHANNEL_TOP = 0;
-constexpr uint8_t CHANNEL_BOTTOM = 1;
+// By Sense.
+constexpr uint8_t CHANNELS[] = {0, 1, 2, 3};
+constexpr uint8_t CHANNEL_PINS = 0x0F;  // of port C (Uno) or F (Mega)
 }  // namespace
 
 #if defined(__AVR_ATmega328P__)
 const frames::Board KIND = frames::Board::Uno;
 namespace {
 // Row address D4-D7 (PD4-7), drive top D2 (PD2), drive bottom D3 (PD3), column address D8-D11
-// (PB0-3). Serial line: RX D0 (PD0), TX D1 (PD1). Outputs at 0: D12, D13 (PB4-5). Pull-ups: A2-A5
-// (PC2-5).
+// (PB0-3). Serial line: RX D0 (PD0), TX D1 (PD1). Outputs at 0: D12, D13 (PB4-5). Pull-ups: A4, A5
+// (PC4-5).
 constexpr uint8_t DRIVE_TOP = _BV(PD2);
 constexpr uint8_t DRIVE_BOTTOM = _BV(PD3);
 constexpr uint8_t LINE_IDLE = _BV(PD0) | _BV(PD1);
 inline void pins_begin() {
     PORTD = LINE_IDLE;
     PORTB = 0;
-    PORTC = 0x3C;
+    PORTC = 0x3F & ~CHANNEL_PINS;
     DDRD = 0xF0 | DRIVE_TOP | DRIVE_BOTTOM | _BV(PD1);
     DDRB = 0x3F;
 }
@@ -66,7 +68,7 @@ inline void pins_begin() {
     PORTD = PORTG = PORTH = PORTJ = PORTK = 0xFF;
     PORTE = 0xFF;
     DDRE = _BV(PE1);
-    PORTF = 0xFC;
+    PORTF = 0xFF & ~CHANNEL_PINS;
 }
 inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
     PORTA = row;
@@ -83,22 +85,24 @@ Scanner scanner;
 
 namespace {
 
-// CONFIGURATIONS as register values.
+// Readings as register values, by Selection::reading.
 struct Registers {
     uint8_t drive;
     uint8_t admux;
 };
 constexpr Registers registers_of(Configuration c) {
-    return Registers{
-        c.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
-        static_cast<uint8_t>(_BV(REFS0) | (c.sense == Sense::Top ? CHANNEL_TOP : CHANNEL_BOTTOM))};
+    return Registers{c.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
+                     static_cast<uint8_t>(_BV(REFS0) | CHANNELS[static_cast<uint8_t>(c.sense)])};
 }
-static_assert(frames::READINGS_PER_CELL == 4, "one entry a configuration below");
+constexpr Registers registers_of(uint8_t order, uint8_t n) {
+    return registers_of(CONFIGURATIONS[static_cast<uint8_t>(reading_of(order, n))]);
+}
+static_assert(frames::READINGS_PER_CELL == 4 && ORDERS == 4, "one entry a reading below");
 constexpr Registers REGISTERS[] = {
-    registers_of(CONFIGURATIONS[0]),
-    registers_of(CONFIGURATIONS[1]),
-    registers_of(CONFIGURATIONS[2]),
-    registers_of(CONFIGURATIONS[3]),
+    registers_of(0, 0), registers_of(0, 1), registers_of(0, 2), registers_of(0, 3),
+    registers_of(1, 0), registers_of(1, 1), registers_of(1, 2), registers_of(1, 3),
+    registers_of(2, 0), registers_of(2, 1), registers_of(2, 2), registers_of(2, 3),
+    registers_of(3, 0), registers_of(3, 1), registers_of(3, 2), registers_of(3, 3),
 };
 
 // Timer 1 counts a slot. Compare B triggers the conversion, whose sample is held 2 ADC clocks and 3
@@ -182,7 +186,7 @@ void clock_begin() {
 }
 
 void converter_begin() {
-    DIDR0 = _BV(CHANNEL_TOP) | _BV(CHANNEL_BOTTOM);
+    DIDR0 = CHANNEL_PINS;
     ADMUX = REGISTERS[0].admux;
     // A conversion nobody reads: the first one after switching on takes 25 ADC clocks.
     ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(32));

@@ -42,7 +42,7 @@ CalibrationLike = Calibration | PathName
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
 # Options of ``emulator://`` that are no faults, and of ``simavr://`` that are no settings.
-_OF_BOARD = ("scene", "plate", "seed", "rate", "noise", "unit", "foreign")
+_OF_BOARD = ("scene", "plate", "seed", "rate", "noise", "unit", "mode", "foreign")
 _NOT_OF_SIMULATOR = ("scene", "plate", "baud")
 
 
@@ -185,6 +185,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
             noise_lsb=float(options.get("noise", _DEFAULT_NOISE_LSB)),
             seed=seed,
             unit_id=int(options.get("unit", 0)),
+            mode=options.get("mode", "near"),
             layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
             sampled=faults.sampled if faults.of_sampling else None,
         )

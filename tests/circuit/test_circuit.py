@@ -9,8 +9,10 @@ import pytest
 
 from ohmskin.circuit.skin import (
     Skin,
+    all_readings,
     current_from_ratio,
     current_std,
+    end_admittance,
     port_resistance_ohm,
     readings,
 )
@@ -33,7 +35,7 @@ def random_skin(rows: int, columns: int, seed: int) -> Skin:
 
 
 def test_all_reference_files_are_there() -> None:
-    assert len(REFERENCE_FILES) == 8
+    assert len(REFERENCE_FILES) == 9
 
 
 @pytest.mark.parametrize("path", REFERENCE_FILES, ids=lambda path: path.stem)
@@ -48,7 +50,9 @@ def test_readings_agree_with_ngspice(path: Path) -> None:
                 float(reference["ref_bottom_ohm"]),
             )
             # Measured: 6e-13, the last digit ngspice printed.
-            np.testing.assert_allclose(readings(skin), expected, rtol=0, atol=2e-12)
+            np.testing.assert_allclose(readings(skin), expected[..., :4], rtol=0, atol=2e-12)
+            found = all_readings(skin, end_admittance(skin))[..., : expected.shape[-1]]
+            np.testing.assert_allclose(found, expected, rtol=0, atol=2e-12)
 
 
 def test_one_cell_is_a_series_circuit() -> None:
@@ -74,6 +78,17 @@ def test_one_column_without_wires_has_no_other_path() -> None:
 def test_one_row_adds_the_segments_up_to_the_cell() -> None:
     skin = Skin(np.array([[1e-3, 1e-3, 1e-3]]), np.array([[10.0, 20, 30]]), np.full((1, 3), 5.0))
     np.testing.assert_allclose(port_resistance_ohm(skin), [[1015, 1035, 1065]], rtol=1e-12)
+
+
+def test_far_ends_show_the_crossing_that_carries_the_current() -> None:
+    """One cell conducts; its row and column carry the current up to it, and nothing beyond."""
+    cell = np.zeros((3, 4))
+    cell[1, 2] = 1 / 40e3
+    skin = Skin(cell, np.full((3, 4), 1e3), np.full((3, 4), 2.5e3), ref_bottom_ohm=20e3)
+    # 30 kOhm, three segments of the row, the cell, two of the column, 20 kOhm: 98 kOhm.
+    a, b, e, f = (np.array([98 - 30, 20, 98 - 33, 25]) / 98).tolist()
+    found = all_readings(skin, end_admittance(skin))[1, 2]
+    np.testing.assert_allclose(found, [a, b, 1 - b, 1 - a, e, f, 1 - f, 1 - e], rtol=1e-9)
 
 
 def test_open_cells_give_inf_ports_and_readings_at_the_rails() -> None:

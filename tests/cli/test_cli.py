@@ -56,7 +56,7 @@ def test_info(run: Run) -> None:
     assert "findings" not in facts
     tested = json.loads(run("info", EMULATED, "--json", "--self-test").out)
     assert tested["findings"] == []
-    assert len(tested["code_min"]) == 4
+    assert len(tested["code_min"]) == 8
 
 
 def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:

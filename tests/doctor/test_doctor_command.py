@@ -123,7 +123,7 @@ def test_drift_of_a_press_is_no_slow_node() -> None:
     scene = Scene("corners", 8, 8)
     pressed = scene.skin(6.0)
 
-    def ratio(time_s: float) -> Float:
+    def ratio(time_s: float, _mode: str) -> Float:
         siemens = scene.skin(min(time_s, 5.0)).cell_siemens
         if time_s > 5.5:
             moved = (4, 4) if time_s < 7.5 else (2, 2)

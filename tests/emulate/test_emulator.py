@@ -21,7 +21,8 @@ from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfT
 from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
 
-DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0, "adc_prescaler": 32}
+DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0}
+DEFAULT |= {"adc_prescaler": 32, "mode": 0}
 
 
 class Emulated(Closing):
@@ -96,7 +97,8 @@ class Host:
 
 def asked_for(hello: Hello) -> dict[str, protocol.Value]:
     prescaler = protocol.ENUMS["adc_prescaler"].values[hello.adc_prescaler]
-    return configuration(hello) | {"adc_prescaler": prescaler}
+    mode = protocol.ENUMS["mode"].values[hello.mode]
+    return configuration(hello) | {"adc_prescaler": prescaler, "mode": mode}
 
 
 # ------------------------------------------------------------------------------ sans-IO board
@@ -123,7 +125,7 @@ def test_noise_is_that_of_the_seed_and_of_its_size() -> None:
     ratio = np.full((8, 8, 4), 0.5)
 
     def codes(seed: int, noise_lsb: float) -> np.ndarray:
-        board = EmulatedBoard(lambda _: ratio, 8, 8, noise_lsb=noise_lsb, seed=seed)
+        board = EmulatedBoard(lambda *_: ratio, 8, 8, noise_lsb=noise_lsb, seed=seed)
         return np.stack([board.codes_at(0.0) for _ in range(40)]).astype(float)
 
     np.testing.assert_array_equal(codes(1, 3.0), codes(1, 3.0))
@@ -233,6 +235,7 @@ ALONE: dict[str, tuple[int, ...]] = {
     "rate_mhz": RATES_MHZ,
     "settle_us": (1, 20, 36, 40, 100, 3000, 3001, 0xFFFF),
     "adc_prescaler": (0, 16, 33, 64, 128, 255),
+    "mode": (1, 2, 255),
 }
 SIZES_AND_RATES = [
     *((1, 1, 90_000), (1, 16, 90_000), (16, 1, 90_000), (3, 5, 90_000), (16, 16, 90_000)),
@@ -253,6 +256,8 @@ CONFIGURATIONS: list[dict[str, int]] = [
     {"adc_prescaler": 64, "rate_mhz": 70_000},
     {"adc_prescaler": 128, "rate_mhz": 30_000},
     {"adc_prescaler": 64, "rate_mhz": 0},
+    {"mode": 1, "rate_mhz": 0},
+    {"mode": 1, "adc_prescaler": 128, "rate_mhz": 0},
     {"adc_prescaler": 128, "rate_mhz": 0, "settle_us": 200},
     # With several faults, the first of the checks decides.
     {"rows": 0, "columns": 0},
@@ -261,6 +266,8 @@ CONFIGURATIONS: list[dict[str, int]] = [
     {"rate_mhz": 1, "settle_us": 9999},
     {"settle_us": 9999, "adc_prescaler": 1},
     {"adc_prescaler": 1, "rate_mhz": 2_000_000},
+    {"mode": 2, "adc_prescaler": 1},
+    {"mode": 2, "rate_mhz": 2_000_000},
 ]
 
 
@@ -329,7 +336,7 @@ def both_in_every_state(real: Host, model: Host) -> None:
         assert found[0].number == 0
         report = [m for m in host.messages if isinstance(m, SelfTestReport)][-1]
         assert report.findings == ()
-        assert len(report.code_min) == len(report.code_max) == 4
+        assert len(report.code_min) == len(report.code_max) == 8
     # The same skin reads the same, but for the instant of the hold: this one does not move.
     np.testing.assert_array_equal(real.scans()[-1].codes, model.scans()[-1].codes)
 
@@ -344,6 +351,7 @@ requests = st.fixed_dictionaries(
         "rate_mhz": st.one_of(st.integers(0, 2_100_000), st.integers(0, 150_000), u32),
         "settle_us": st.one_of(st.integers(0, 3100), st.integers(0, 100), u16),
         "adc_prescaler": st.one_of(st.sampled_from([32, 64, 128]), u8),
+        "mode": st.one_of(st.sampled_from([0, 1]), u8),
     }
 )
 LIMITS = {
@@ -352,6 +360,7 @@ LIMITS = {
     "bad_rate": lambda asked: asked["rate_mhz"] and not 1000 <= asked["rate_mhz"] <= 2_000_000,
     "bad_settle": lambda asked: asked["settle_us"] > 3000,
     "bad_prescaler": lambda asked: asked["adc_prescaler"] not in (32, 64, 128),
+    "bad_mode": lambda asked: asked["mode"] not in (0, 1),
 }
 
 

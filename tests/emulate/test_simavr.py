@@ -287,8 +287,8 @@ def test_undriven_pins_and_equal_drive(simulate: Simulate) -> None:
     holds = hold_log(sim, 3000)
     undriven = sim.stats()["undriven"]
     states = [(int(h["configuration"]), int(h["code"])) for h in holds]
-    assert sorted(set(states)) == [(4, 0), (4, 1023), (5, 0)]
-    assert undriven == states.count((5, 0)) > 5
+    assert sorted(set(states)) == [(8, 0), (8, 1023), (9, 0)]
+    assert undriven == states.count((9, 0)) > 5
 
 
 # Pins: outputs first, drive top high at row 0, then row 1 a little later.
@@ -718,7 +718,13 @@ BAD_REQUESTS = {
     "R": [b"\x01", b"\xff" * 8],
     "T": [bytes(16), b"\xff" * 8192],  # too short; not a number
     "O": [b"tau_us=-1", b"tau_us=nan", b"tau_us=1e10", b"tau_us=", b"tau_us", b"tau=1"],
-    "C": [b"", b"\x01" + bytes(40), b"\x11" + bytes(18 * 18 * 8), b"\x01" + b"\xff" * 32],
+    "C": [
+        b"",
+        b"\x01" + bytes(40),
+        b"\x81" + bytes(3 * 3 * 8),
+        b"\x11" + bytes(18 * 18 * 8),
+        b"\x01" + b"\xff" * 32,
+    ],
     "B": [struct.pack("<I", 7)],
     "L": [b"\x09"],
     "e": [b"\xff\xffx", b"x"],
@@ -733,7 +739,7 @@ def test_bad_requests_are_refused(simulate: Simulate) -> None:
         for payload in payloads:
             with pytest.raises(SimulationError, match=r"^(?!skinsim)"):
                 sim.request(op, payload)
-    for shape in [(17, 1, 4), (1, 17, 4), (2, 2, 3)]:
+    for shape in [(17, 1, 4), (1, 17, 4), (2, 2, 9)]:
         with pytest.raises(ValueError, match="shape"):
             sim.set_table(np.zeros(shape))
     assert sim.stats()["state"] == "running"

@@ -22,7 +22,7 @@ def test_boot_hello(rig: Rig) -> None:
     assert hello["clock_hz"] == CPU_HZ
     assert (hello["rows"], hello["columns"]) == (8, 8)
     assert (hello["rate_asked_mhz"], hello["adc_prescaler"]) == (90_000, "clock_500khz")
-    assert (hello["unit_id"], hello["scanning"]) == (0, 0)
+    assert (hello["unit_id"], hello["scanning"], hello["mode"]) == (0, 0, "near")
     assert rig.damaged == 0
     assert reset(rig)["reset_cause"] == ("external",)
     assert rig.hello() == hello | {"reset_cause": ("external",)}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_helpers import CYCLES_PER_US, assert_whole, go_fast, numbers, reset
-from lockstep import CODES, CPU_HZ, DEFAULT_SCAN, TABLE_SHAPE, Rig, elf_of
+from lockstep import CODES, CPU_HZ, DEFAULT_SCAN, READINGS, TABLE_SHAPE, Rig, elf_of
 from ohmskin.link import protocol
 
 pytestmark = pytest.mark.simavr
@@ -31,6 +31,10 @@ SCANS = [
     {"rate_mhz": 0, "adc_prescaler": "clock_125khz", "settle_us": 200},
     {"rate_mhz": 7_000, "rows": 2, "columns": 2, "settle_us": 3000},
     {"rate_mhz": 1_000, "rows": 16, "columns": 16, "adc_prescaler": "clock_125khz"},
+    {"mode": "far"},
+    {"mode": "far", "rate_mhz": 0},
+    {"mode": "far", "rate_mhz": 400_000, "rows": 3, "columns": 5},
+    {"mode": "far", "rate_mhz": 30_000, "rows": 16, "columns": 16},
 ]
 
 
@@ -199,9 +203,10 @@ def test_no_load_damages_a_frame(rig: Rig, ratio: float | None) -> None:
         assert last["scan"] + 1 == len(rig.scans) + last["dropped"]
 
 
-def test_settle_time_before_each_hold(rig: Rig) -> None:
-    """Pins change before A and C, a slot earlier for B and D, and not in idle slots."""
-    rig.start_scan()
+@pytest.mark.parametrize("mode", ["near", "far"])
+def test_settle_time_before_each_hold(rig: Rig, mode: str) -> None:
+    """Pins change before every other reading, a slot earlier for the rest; not in idle slots."""
+    rig.start_scan(mode=mode)
     slots_per_scan = 258
     slot_cycles = rig.hello()["scan_cycles"] // slots_per_scan
     rig.sim.reset_stats()
@@ -212,7 +217,9 @@ def test_settle_time_before_each_hold(rig: Rig) -> None:
     assert np.ptp(since_change) <= 8  # the longest instruction that an interrupt waits for
     first_cell = (log["row"] == 0) & (log["column"] == 0)
     within = ~first_cell
-    np.testing.assert_array_equal(slots[within], log["configuration"][within] % 2)
+    order = [READINGS.index(name) for name in protocol.MODES[mode]]
+    second = np.isin(log["configuration"], order[1::2])
+    np.testing.assert_array_equal(slots[within], second[within])
     # The idle slots already stand at the first reading of the next scan.
     assert set(slots[first_cell]) == {0, 1, 2, 3}
 

@@ -15,8 +15,8 @@ pytestmark = pytest.mark.simavr
 
 
 def settings_in(hello: dict[str, Any]) -> dict[str, Any]:
-    names = ("rows", "columns", "rate_asked_mhz", "settle_asked_us", "adc_prescaler", "unit_id")
-    return {name: hello[name] for name in names}
+    names = ("rows", "columns", "rate_asked_mhz", "settle_asked_us", "adc_prescaler", "mode")
+    return {name: hello[name] for name in (*names, "unit_id")}
 
 
 @pytest.fixture
@@ -53,15 +53,23 @@ def test_a_record_with_any_one_byte_damaged_yields_the_defaults(
     assert reset(rig)["settings"] == "defaults_blank"
 
 
-@pytest.mark.parametrize(("at", "head"), [(RECORD_AT, b"\x01\x09"), (0, b"\xbe\xef")])
-def test_the_unit_id_outlives_protocol_and_scan(rig: Rig, at: int, head: bytes) -> None:
-    """At 0 is the record of older firmware, which begins with its protocol's layout CRC."""
+@pytest.mark.parametrize(
+    ("at", "head", "mode"),
+    [(RECORD_AT, b"\x02\x09", "far"), (RECORD_AT, b"\x01\x09", ""), (0, b"\xbe\xef", "")],
+)
+def test_the_unit_id_outlives_protocol_and_scan(rig: Rig, at: int, head: bytes, mode: str) -> None:
+    """At 0 is the record of older firmware, which begins with its protocol's layout CRC.
+
+    Records of before there were modes have none: they are near.
+    """
     for rows, source, kept in (200, "defaults_damaged", 8), (5, "stored", 5):
-        scan = protocol.FRAMES["configure"].pack(**(DEFAULT_SCAN | {"rows": rows}))
-        record = head + struct.pack("<I", 5) + scan
+        wanted = DEFAULT_SCAN | {"rows": rows, "mode": mode or "near"}
+        scan = protocol.FRAMES["configure"].pack(**wanted)
+        record = head + struct.pack("<I", 5) + (scan if mode else scan[:-1])
         rig.sim.write_eeprom(record + struct.pack("<H", protocol.crc16(record)), at)
         hello = reset(rig)
         assert (hello["settings"], hello["rows"], hello["unit_id"]) == (source, kept, 5)
+        assert hello["mode"] == (wanted["mode"] if source == "stored" else "near")
 
 
 def test_a_reset_during_save_leaves_the_old_settings_or_the_new(

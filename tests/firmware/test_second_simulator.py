@@ -12,7 +12,7 @@ import test_firmware_settings as settings
 
 from firmware_helpers import BOOT_S, CYCLES_PER_US, assert_whole, go_fast
 from lockstep import BOARDS, TABLE_SHAPE, Rig, elf_of, first_holds
-from ohmskin.circuit.skin import Skin, readings
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance
 from ohmskin.link.codes import quantise
 from second_simulator import SecondSim
 
@@ -27,6 +27,7 @@ test_commands_at_the_highest_rate = scans.test_commands_back_to_back_at_the_high
 test_saved_settings = settings.test_saved_settings_survive_a_reset
 test_save_while_scanning = settings.test_save_while_scanning_loses_no_scan
 test_self_test = self_test.test_self_test_of_a_sound_board
+test_self_test_of_far_nodes = self_test.test_self_test_judges_far_nodes
 test_watchdog = scans.test_watchdog_restarts_a_hung_main_loop
 
 
@@ -46,16 +47,21 @@ def test_a_nano_gets_what_an_uno_gets() -> None:
     assert uno == nano
 
 
-@pytest.mark.parametrize("rate_mhz", [90_000, 120_000, 0])
-def test_codes_times_and_settling(rig: Rig, rng: np.random.Generator, rate_mhz: int) -> None:
+@pytest.mark.parametrize(
+    ("mode", "rate_mhz"), [("near", 90_000), ("near", 120_000), ("near", 0), ("far", 90_000)]
+)
+def test_codes_times_and_settling(
+    rig: Rig, rng: np.random.Generator, mode: str, rate_mhz: int
+) -> None:
     """Circuits that change; their references differ, so no two configurations read alike."""
     go_fast(rig)
-    rig.start_scan(rate_mhz=rate_mhz)
+    rig.start_scan(rate_mhz=rate_mhz, mode=mode)
     hello = rig.hello()
     for _ in range(5):
         cells, wires_ohm = 10 ** rng.uniform(-6, -3, (8, 8)), rng.uniform(0, 300, (2, 8, 8))
         codes = np.zeros(TABLE_SHAPE, np.uint16)
-        codes[:8, :8] = quantise(readings(Skin(cells, *wires_ohm, ref_top_ohm=20e3)))
+        skin = Skin(cells, *wires_ohm, ref_top_ohm=20e3)
+        codes[:8, :8] = quantise(all_readings(skin, end_admittance(skin)))
         rig.set_codes(codes, rng)
         rig.run_cycles(int(rng.integers(300_000, 700_000)))
     rig.must("stop")
@@ -63,6 +69,8 @@ def test_codes_times_and_settling(rig: Rig, rng: np.random.Generator, rate_mhz: 
     check, holds = rig.check(), rig.holds()
     assert check.readings > 2000
     np.testing.assert_array_equal(np.diff(check.start_cycles), hello["scan_cycles"])
-    settled = holds["settle_cycles"][first_holds(holds)[1] : -1]  # `stop` may come before the last
+    settled = holds["settle_cycles"][
+        first_holds(holds, mode)[1] : -1
+    ]  # `stop` may come before the last
     assert settled.min() >= hello["settle_us"] * CYCLES_PER_US
     assert rig.sim.stats()["ignored_triggers"] == 0

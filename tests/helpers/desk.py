@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lockstep import Rig
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, electrode_admittance, readings
+from ohmskin.circuit.skin import Skin, end_admittance, readings
 from ohmskin.link.codes import ratio_from_codes
 from studies.trials import skin_at_rest, touch
 
@@ -57,7 +57,14 @@ def desk_skin(seed: int, frames: int, **settings: float) -> DeskSkin:
 
 def _show(rig: Rig, skin: Skin) -> None:
     rig.sim.set_table(readings(skin))
-    rig.sim.request("C", bytes([skin.shape[0]]) + electrode_admittance(skin).tobytes())
+    rig.sim.request("C", bytes([skin.shape[0]]) + near_admittance(skin).tobytes())
+
+
+def near_admittance(skin: Skin) -> Float:
+    """Of the near ends alone, (R+C, R+C) [S]: no current leaves the skin at the far ends."""
+    ends, lines = end_admittance(skin), sum(skin.shape)
+    beyond = np.linalg.solve(ends[lines:, lines:], ends[lines:, :lines])
+    return np.ascontiguousarray(ends[:lines, :lines] - ends[:lines, lines:] @ beyond)
 
 
 def _scans(rig: Rig, count: int) -> NDArray[Any]:

@@ -22,18 +22,20 @@ from skins import scan_order
 
 CPU_HZ = 16_000_000
 BOARDS = ("uno", "megaatmega2560")
+READINGS = tuple(protocol.ENUMS["reading"].values)
 CODES = 1 << protocol.ADC_BITS
-TABLE_SHAPE = (16, 16, protocol.READINGS_PER_CELL)
+TABLE_SHAPE = (16, 16, len(READINGS))
 DEFAULT_SCAN: dict[str, Any] = {
     "rows": 8,
     "columns": 8,
     "rate_mhz": 90_000,
     "settle_us": 0,
     "adc_prescaler": "clock_500khz",
+    "mode": "near",
 }
 
 # One record of the hold log. cycle: CPU cycles since power-on at the instant of the hold.
-# configuration: 0 to 3 are A to D; 4: no current, 5: undriven, 6: of another channel.
+# configuration: 0 to 7 are A to H; 8: no current, 9: undriven, 10: of another channel.
 # settle_cycles: since row, column or drive pins last changed; 2**32 - 1: never, or longer ago.
 HOLD_DTYPE = np.dtype(
     [
@@ -123,13 +125,15 @@ def elf_of(board: str) -> Path:
     return ROOT / ".pio" / "build" / board / "firmware.elf"
 
 
-def first_holds(holds: NDArray[np.void]) -> NDArray[np.intp]:
+def first_holds(holds: NDArray[np.void], mode: str = "near") -> NDArray[np.intp]:
     """Where in a log of holds each scan begins.
 
-    Reading b of the first cell comes once a scan, right after the scan's first hold; idle slots lie
-    before that.
+    The second reading of the first cell comes once a scan, right after the scan's first hold; idle
+    slots lie before that.
     """
-    second = (holds["row"] == 0) & (holds["column"] == 0) & (holds["configuration"] == 1)
+    second_reading = READINGS.index(protocol.MODES[mode][1])
+    first_cell = (holds["row"] == 0) & (holds["column"] == 0)
+    second = first_cell & (holds["configuration"] == second_reading)
     return np.flatnonzero(second) - 1
 
 
@@ -268,7 +272,7 @@ class Rig(Closing):
 
     # ---- the skin
     def set_codes(self, codes: NDArray[np.uint16], rng: np.random.Generator) -> None:
-        """Make the skin read `codes` (16, 16, 4): a third each at the step's edges and inside."""
+        """Make the skin read `codes` (16, 16, 8): a third each at the step's edges and inside."""
         inside = rng.random(codes.shape)
         upper_edge = np.nextafter((codes + 1.0) / CODES, 0)
         where = rng.integers(3, size=codes.shape)
@@ -298,7 +302,8 @@ class Rig(Closing):
         Which hold belongs to which reading follows from the order of a scan.
         """
         holds = self.holds()
-        first = first_holds(holds)
+        mode = self.scans[0].header["mode"] if self.scans else "near"
+        first = first_holds(holds, mode)
         starts = holds["cycle"][first].astype(np.int64)
         if not self.scans:
             return Check(0, 0, starts)
@@ -309,6 +314,7 @@ class Rig(Closing):
         # The simulator holds first where a hold and a new table fall on the same cycle.
         table = np.searchsorted(np.array(self._table_cycles), cycles, side="left") - 1
         place = tuple(np.transpose(scan_order(rows, columns)))
-        expected = np.stack(self._tables)[(table, *place)]
+        readings = np.array([READINGS.index(name) for name in protocol.MODES[mode]])
+        expected = np.stack(self._tables)[..., readings][(table, *place)]
         received = np.stack([scan.codes[place] for scan in self.scans])
         return Check(received.size, int((received != expected).sum()), starts)

@@ -29,7 +29,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READINGS_PER_CELL, Skin
+from ohmskin.circuit.skin import Skin
 
 
 class Network(NamedTuple):
@@ -97,29 +97,36 @@ def skin_network(skin: Skin) -> Network:
     )
 
 
-def laplacian_readings(skin: Skin, joints: Sequence[tuple[int, int]] = ()) -> Float:
-    """What `circuit.readings` returns, (R, C, 4): sense-node voltages / Vdd, configurations A to D.
+def laplacian_readings(
+    skin: Skin, joints: Sequence[tuple[int, int]] = (), names: Sequence[str] = "abcd"
+) -> Float:
+    """Sense-node voltages / Vdd of the readings named, (R, C, n).
 
     Each cell is two circuits: Vdd - ref_top - row electrode i, column electrode j - ref_bottom -
-    ground gives A and B; with Vdd and ground exchanged C (column electrode) and D (row electrode).
-    joints: pairs of electrodes, rows first, that 0.1 ohm joins.
+    ground gives A, B, E and F; with Vdd and ground exchanged D, C, H and G. A far end is behind 1
+    ohm. joints: pairs of ends that 0.1 ohm joins: near ends, rows first, then far ends.
     """
     rows, columns = skin.shape
-    alone = skin_network(skin)
-    top_end, bottom_end = alone.nodes, alone.nodes + 1
-    one, other = np.array(joints, dtype=np.intp).reshape(-1, 2).T
+    alone, lines = skin_network(skin), rows + columns
+    top, bottom = np.arange(lines, alone.nodes).reshape(2, rows, columns)
+    at_far_end = np.concatenate([top[:, -1], bottom[-1]])
+    ends = np.concatenate([np.arange(lines), alone.nodes + np.arange(lines)])
+    top_end, bottom_end = alone.nodes + lines, alone.nodes + lines + 1
+    one, other = ends[np.array(joints, dtype=np.intp).reshape(-1, 2).T]
     references = [skin.ref_top_ohm, skin.ref_bottom_ohm]
-    ohm = np.concatenate([alone.branch_ohm, [0.1] * len(joints), references])
-    ratio = np.empty((rows, columns, READINGS_PER_CELL))
+    ohm = np.concatenate([alone.branch_ohm, [1.0] * lines, [0.1] * len(joints), references])
+    ratio = np.empty((rows, columns, len(names)))
     for i in range(rows):
         for j in range(columns):
-            sense = [i, rows + j]
             network = Network(
-                alone.nodes + 2,
-                np.concatenate([alone.tail, one, [top_end, bottom_end]]),
-                np.concatenate([alone.head, other, sense]),
+                alone.nodes + lines + 2,
+                np.concatenate([alone.tail, at_far_end, one, [top_end, bottom_end]]),
+                np.concatenate([alone.head, ends[lines:], other, [i, rows + j]]),
                 ohm,
             )
-            ratio[i, j, :2] = network.node_v({top_end: 1.0, bottom_end: 0.0})[sense]
-            ratio[i, j, 2:] = network.node_v({top_end: 0.0, bottom_end: 1.0})[sense[::-1]]
+            sense = ends[[i, rows + j, lines + i, lines + rows + j]]
+            top_high = network.node_v({top_end: 1.0, bottom_end: 0.0})[sense]
+            top_low = network.node_v({top_end: 0.0, bottom_end: 1.0})[sense]
+            found = dict(zip("abefdchg", [*top_high, *top_low], strict=True))
+            ratio[i, j] = [found[name] for name in names]
     return ratio

@@ -65,6 +65,6 @@ class ScriptedSkin(Bench):
         """Every scan, without end."""
         return iter(self.latest, None)
 
-    def _ratio(self, time_s: float) -> Float:
+    def _ratio(self, time_s: float, _mode: str) -> Float:
         rise = self._rise(time_s - self.begin_s) if time_s >= self.begin_s else np.zeros((1, 2))
         return readings(replace(REST, cell_siemens=REST.cell_siemens + rise))

@@ -71,6 +71,11 @@ def assert_reads_the_scene(ratio: np.ndarray, url: str) -> None:
     assert np.abs(error.mean()) < mean_lsb
 
 
+def with_far_ends(url: str) -> str:
+    """The preset `desk` has no far multiplexers unless told."""
+    return f"{url}&far_open=0" if "desk" in url else url
+
+
 # ----------------------------------------------------------------------------- every backend
 
 
@@ -160,6 +165,21 @@ def test_configure_while_scanning(url: str) -> None:
         assert skin.stats.missed == 0
 
 
+def test_scans_say_which_readings_they_hold(url: str) -> None:
+    far = Scene("multi", 8, 8, seed=3).ratio(0.0, "far")
+    assert np.abs(far - EXPECTED).max() > 0.1
+    with ohmskin.open(with_far_ends(url)) as skin:
+        assert (skin.info.mode, skin.latest().reading_names) == ("near", tuple("abcd"))
+        assert skin.configure(mode="far").mode == "far"
+        scan = skin.latest()
+        assert scan.reading_names == ("a", "e", "b", "f")
+        largest_lsb = DESK_LSB[0] if "desk" in url else 0.5 + 6 * NOISE_LSB
+        assert 1024 * np.abs(scan.ratio - far).max() <= largest_lsb
+        assert skin.configure(rows=3).mode == "far"  # what is not told stays
+        skin.configure(mode="near")
+        assert skin.latest().reading_names == tuple("abcd")
+
+
 # One of each; all limits are checked in test_emulator.py.
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"rows": 17}, "bad_rows"),
@@ -175,6 +195,7 @@ IMPOSSIBLE: list[dict[str, Any]] = [
     *({"settle_us": settle_us} for settle_us in (-1, 65536)),
     *({"rate_hz": rate_hz} for rate_hz in (-1.0, 1e7, 0.0001, float("inf"), float("nan"))),
     {"adc_prescaler": "fast"},
+    {"mode": "middle"},
 ]
 
 
@@ -232,15 +253,18 @@ def test_name_and_settings_of_a_board(url: str) -> None:
 
 
 def test_self_test_of_a_sound_board(url: str) -> None:
-    with ohmskin.open(url) as skin:
+    with ohmskin.open(with_far_ends(url)) as skin:
         report = skin.self_test()
         assert report.findings == ()
-        assert len(report.code_min) == len(report.code_max) == 4
-        for low, high in zip(report.code_min, report.code_max, strict=True):
+        assert (report.code_min[4:], report.code_max[4:]) == (4 * (1023,), 4 * (0,))  # not taken
+        skin.configure(mode="far")
+        report = skin.self_test()
+        assert report.findings == ()
+        for low, high in zip(report.code_min[:6], report.code_max, strict=False):
             assert 0 <= low <= high <= 1023
-        # Where little current flows, A and C read near Vdd, B and D near ground.
-        assert min(report.code_max[0], report.code_max[2]) > 700
-        assert max(report.code_min[1], report.code_min[3]) < 300
+        # Where little current flows, A, C and E read near Vdd, B, D and F near ground.
+        assert min(report.code_max[reading] for reading in (0, 2, 4)) > 700
+        assert max(report.code_min[reading] for reading in (1, 3, 5)) < 300
         assert skin.latest().codes.shape == (8, 8, 4)
 
 

@@ -201,7 +201,9 @@ def test_bit_errors_never_deliver_a_damaged_scan() -> None:
     hit = 0
     for number in range(count):
         header = {"scan": number, "time_us": number * 11_111, "dropped": 0, "rx_errors": 0}
-        payload = kind.pack(**header, rows=8, columns=8) + protocol.pack_codes(sent[number])
+        payload = kind.pack(**header, rows=8, columns=8, mode="near") + protocol.pack_codes(
+            sent[number]
+        )
         octets = np.frombuffer(framing.encode(kind.id, number, payload), dtype=np.uint8)
         flips = np.packbits(random.random((octets.size, 8)) < error_rate, axis=1)[:, 0]
         hit += bool(flips.any())

@@ -15,9 +15,8 @@ MINUTE_US = 60_000_000
 
 
 def scan_payload(number: int, time_us: int = 0, dropped: int = 0, rx_errors: int = 0) -> bytes:
-    header = SCAN.pack(
-        scan=number, time_us=time_us, dropped=dropped, rx_errors=rx_errors, rows=1, columns=2
-    )
+    counters = {"scan": number, "time_us": time_us, "dropped": dropped, "rx_errors": rx_errors}
+    header = SCAN.pack(**counters, rows=1, columns=2, mode="far")
     return header + protocol.pack_codes(np.arange(8, dtype=np.uint16).reshape(1, 2, 4))
 
 
@@ -28,7 +27,7 @@ def scan_wire(number: int, **header: int) -> bytes:
 def hello_payload(**changed: Any) -> bytes:
     values: dict[str, Any] = {f.name: 1 for f in protocol.FRAMES["hello"].fields}
     values |= {"layout_crc": protocol.LAYOUT_CRC, "board": "uno", "reset_cause": ("external",)}
-    values |= {"adc_prescaler": "clock_500khz", "settings": "stored", "scanning": 0}
+    values |= {"adc_prescaler": "clock_500khz", "mode": "far", "settings": "stored", "scanning": 0}
     return protocol.FRAMES["hello"].pack(**(values | changed))
 
 
@@ -163,7 +162,7 @@ def test_a_scan_of_no_cells_does_no_harm() -> None:
     decoder = BoardDecoder()
     header = {"scan": 0, "time_us": 0, "dropped": 0, "rx_errors": 0}
     for rows, columns in [(0, 0), (0, 8), (255, 255)]:
-        payload = SCAN.pack(**header, rows=rows, columns=columns)
+        payload = SCAN.pack(**header, rows=rows, columns=columns, mode="near")
         decoder.feed(framing.encode(SCAN.id, 0, payload), 0.0)
     assert scans(decoder, scan_wire(0))[0].codes.shape == (1, 2, 4)
 

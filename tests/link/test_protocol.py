@@ -230,11 +230,11 @@ CHANGES_OF_MEANING = {
     "a field's name": ('name = "settle_asked_us"', 'name = "settle_wanted_us"'),
     "a field's type": ('name = "dropped", type = "u16"', 'name = "dropped", type = "u32"'),
     "a field's count": (
-        'name = "code_min", type = "u16", count = "readings_per_cell"',
+        'name = "code_min", type = "u16", count = "readings"',
         'name = "code_min", type = "u16"',
     ),
     "a field's enum": ('type = "u16", flags = "finding"', 'type = "u16", flags = "reset_cause"'),
-    "an enum's value": ('name = "busy", value = 12', 'name = "busy", value = 14'),
+    "an enum's value": ('name = "busy", value = 12', 'name = "busy", value = 15'),
     "an enum's member": ('name = "brown_out", value = 4', 'name = "brownout", value = 4'),
     "a constant": ("value = 3000\n", "value = 3001\n"),
     "the CRC": ("crc_initial = 0xFFFF", "crc_initial = 0x0000"),

@@ -21,12 +21,12 @@ def test_readings_are_timed_as_the_emulated_board_takes_them(
 ) -> None:
     slots_s = []
 
-    def sampled(ratio: Float, start_s: float, slot_s: float, settle_s: float) -> Float:
+    def sampled(ratio: Float, _start_s: float, slot_s: float, *_: object) -> Float:
         slots_s.append(slot_s)
         return ratio
 
     still = np.full((rows, columns, 4), 0.5)
-    board = EmulatedBoard(lambda _: still, rows, columns, rate_hz=rate_hz, sampled=sampled)
+    board = EmulatedBoard(lambda *_: still, rows, columns, rate_hz=rate_hz, sampled=sampled)
     board.codes_at(0.0)
     (hello,) = BoardDecoder().feed(board.advance(0.0), 0.0)
     assert isinstance(hello, Hello)

@@ -189,14 +189,11 @@ void Device::execute() {
             return answer(Result::LineTooSlow);
         settings_ = DEFAULT_SETTINGS;
         return answer(Result::Ok);
-    case Type::SelfTest: {
-        ScanPlan plan;
-        plan_scan(SelfTest::request(), board::CLOCK_HZ, &plan);
-        self_test_.begin();
-        begin_slots(SelfTest::request(), plan);
+    case Type::SelfTest:
+        self_test_.begin(settings_.request);
+        begin_self_test_scan();
         mode_ = Mode::SelfTesting;
         return defer();
-    }
     case Type::SetBaud:
         return answer(set_baud(reader_.payload()));
     default:
@@ -243,7 +240,7 @@ Result Device::start() {
 
 void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
     groups_left_ = 0;
-    board::scanner.begin(request.rows, request.columns, plan.idle_slots);
+    board::scanner.begin(request.rows, request.columns, request.mode, plan.idle_slots);
     const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
     const uint32_t ahead = uint32_t{plan.slot_cycles} * Scanner::FIRST_SLOT;  // beyond 16 bits
     scan_time_us_ = board::now_us() + ahead / cycles_per_us;
@@ -251,11 +248,21 @@ void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
     board::start_slots(plan, request.adc_prescaler);
 }
 
+void Device::begin_self_test_scan() {
+    ScanRequest request = SelfTest::request();
+    ScanPlan plan;
+    plan_scan(request, board::CLOCK_HZ, &plan);
+    request.mode = self_test_.order();
+    begin_slots(request, plan);
+}
+
 void Device::finish_slots() {
     board::stop_slots();
     if (groups_left_ != 0)
         drop_open_scan();
     if (mode_ == Mode::SelfTesting) {
+        if (self_test_.next())
+            return begin_self_test_scan();
         report_pending_ = true;
         resolve(Type::SelfTest, Result::Ok);
     } else {
@@ -301,6 +308,7 @@ void Device::send_hello() {
         settings_.request.settle_us,
         settle_us(plan_, settings_.request.adc_prescaler, board::CLOCK_HZ),
         settings_.request.adc_prescaler,
+        settings_.request.mode,
         baud_,
         static_cast<uint8_t>(settings_source_),
         board::reset_cause(),

@@ -37,6 +37,7 @@ class Device {
     OHMSKIN_RARE frames::Result set_baud(const uint8_t *payload);
     OHMSKIN_RARE frames::Result start();
     OHMSKIN_RARE void begin_slots(const ScanRequest &request, const ScanPlan &plan);
+    OHMSKIN_RARE void begin_self_test_scan();
     OHMSKIN_RARE void finish_slots();
     OHMSKIN_RARE bool poll_save();
     OHMSKIN_RARE void send_hello();

@@ -55,13 +55,13 @@ void Device::begin_scan() {
     account_for_lost_scans();
     if (hello_pending_ || report_pending_ || ack_count_ != 0)
         send_pending();
-    const uint8_t rows = settings_.request.rows, columns = settings_.request.columns;
+    const ScanRequest &scan = settings_.request;
     if (writer_.used() <= ring_limit_) {
-        const frames::Scan header = {scan_number_,     scan_time_us_, dropped_,
-                                     reader_.errors(), rows,          columns};
+        const frames::Scan header = {scan_number_, scan_time_us_, dropped_, reader_.errors(),
+                                     scan.rows,    scan.columns,  scan.mode};
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
-        groups_left_ = static_cast<uint16_t>(rows * columns);
+        groups_left_ = static_cast<uint16_t>(scan.rows * scan.columns);
     } else {
         dropped_++;
     }

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/scan_plan.h"
 
+#include "core/scan_sequence.h"
+
 namespace ohmskin {
 
 using frames::Result;
@@ -25,6 +27,8 @@ Result check_limits(const ScanRequest &request) {
         return Result::BadSettle;
     if (!known_prescaler(request.adc_prescaler))
         return Result::BadPrescaler;
+    if (request.mode >= MODES)
+        return Result::BadMode;
     return Result::Ok;
 }
 
@@ -76,7 +80,8 @@ Result plan_scan(const ScanRequest &request, uint32_t clock_hz, ScanPlan *plan) 
     uint16_t slot_min = timing::slot_min(prescaler);
     uint16_t least_us = request.settle_us;
     if (request.rate_mhz == 0 && least_us == 0)
-        least_us = timing::SETTLE_US;
+        least_us = request.mode == static_cast<uint8_t>(frames::Mode::Far) ? timing::SETTLE_FAR_US
+                                                                           : timing::SETTLE_US;
     const uint16_t settled =
         static_cast<uint16_t>(least_us * cycles_per_us + timing::held_cycles(prescaler));
     if (least_us != 0 && settled > slot_min)

@@ -32,6 +32,8 @@ constexpr uint16_t held_cycles(uint8_t prescaler) {
 // What a slot leaves for settling where a request names neither rate nor settle time: 14 pF of
 // sample capacitor and 100 pF at a node of 30 kOhm come to half a code.
 constexpr uint16_t SETTLE_US = 20;
+// The same in mode far, where the far node's 100 pF and the line's 30 pF come on top.
+constexpr uint16_t SETTLE_FAR_US = 35;
 constexpr uint16_t SLOT_CYCLES_MAX = 60000;
 }  // namespace timing
 

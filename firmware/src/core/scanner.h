@@ -31,9 +31,9 @@ class Scanner {
     // From begin() to the slot of the first reading.
     static constexpr uint8_t FIRST_SLOT = 2;
 
-    // Before the slots start: geometry, and how many idle slots follow a scan.
-    void begin(uint8_t rows, uint8_t columns, uint16_t idle_slots) {
-        sequence_.begin(rows, columns);
+    // Before the slots start: geometry, order of readings, and how many idle slots follow a scan.
+    void begin(uint8_t rows, uint8_t columns, uint8_t order, uint16_t idle_slots) {
+        sequence_.begin(rows, columns, order);
         idle_slots_ = idle_slots;
         idle_left_ = LEAD_IN;
         idling_ = true;

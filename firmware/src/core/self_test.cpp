@@ -20,6 +20,8 @@ struct Node {
     // A node without its resistor floats wherever the skin does not hold it, so that one impossible
     // reading is enough.
     bool floats() const { return own_min < HALF_LOW || other_max > HALF_HIGH; }
+    // Inputs beyond the skin do so on a sound board, but not all inputs.
+    bool is_open() const { return own_max < HALF_LOW && other_min > HALF_HIGH; }
 };
 
 uint16_t bit_if(bool condition, frames::Finding finding) {
@@ -30,19 +32,35 @@ uint8_t index(frames::Reading reading) { return static_cast<uint8_t>(reading); }
 
 }  // namespace
 
-void SelfTest::begin() {
-    for (uint8_t i = 0; i < frames::READINGS_PER_CELL; i++) {
+void SelfTest::begin(const ScanRequest &skin) {
+    for (uint8_t i = 0; i < frames::READINGS; i++) {
         min_[i] = FULL_SCALE;
         max_[i] = 0;
     }
+    far_ = skin.mode == static_cast<uint8_t>(frames::Mode::Far);
+    // A far node that floats takes a column's inputs, two a group, to forget where it was.
+    forgets_ = skin.columns > 1 ? frames::ROWS_MAX / 2 : 0;
+    order_ = 0;
     groups_ = 0;
 }
 
+bool SelfTest::next() {
+    groups_ = 0;
+    order_ = order_ < MODES ? MODES : order_ + 1;
+    return far_ && order_ < ORDERS;
+}
+
 void SelfTest::take(const uint16_t *codes) {
-    constexpr uint16_t CELLS = frames::ROWS_MAX * frames::COLUMNS_MAX;
-    const uint8_t first = groups_++ < CELLS / 2 ? 0 : frames::READINGS_PER_PASS;
+    constexpr uint16_t PASS = frames::ROWS_MAX * frames::COLUMNS_MAX / 2;
+    const bool second = groups_ >= PASS;
+    const uint16_t at = second ? groups_ - PASS : groups_;
+    groups_++;
+    if (order_ >= MODES && at < forgets_)
+        return;
     for (uint8_t n = 0; n < Scanner::GROUP; n++) {
-        const uint8_t i = first + (n & (frames::READINGS_PER_PASS - 1));
+        const uint8_t of_pass = n & (frames::READINGS_PER_PASS - 1);
+        const uint8_t i =
+            index(reading_of(order_, second ? of_pass + frames::READINGS_PER_PASS : of_pass));
         const uint16_t code = codes[n] & Scanner::CODE;
         if (code < min_[i])
             min_[i] = code;
@@ -54,21 +72,31 @@ void SelfTest::take(const uint16_t *codes) {
 frames::SelfTestReport SelfTest::report() const {
     using frames::Finding;
     using frames::Reading;
-    const uint8_t a = index(Reading::A), b = index(Reading::B);
-    const uint8_t c = index(Reading::C), d = index(Reading::D);
-    const Node top = {min_[a], max_[a], min_[d], max_[d]};
-    const Node bottom = {min_[c], max_[c], min_[b], max_[b]};
+    const auto node = [this](Reading own, Reading other) {
+        return Node{min_[index(own)], max_[index(own)], min_[index(other)], max_[index(other)]};
+    };
+    const Node top = node(Reading::A, Reading::D), bottom = node(Reading::C, Reading::B);
+    const Node far_top = node(Reading::E, Reading::H), far_bottom = node(Reading::G, Reading::F);
     frames::SelfTestReport report;
     report.findings = static_cast<uint16_t>(bit_if(top.stuck_low(), Finding::TopStuckLow) |
                                             bit_if(top.stuck_high(), Finding::TopStuckHigh) |
                                             bit_if(bottom.stuck_low(), Finding::BottomStuckLow) |
                                             bit_if(bottom.stuck_high(), Finding::BottomStuckHigh));
-    // A rail at one node pulls the other across half of Vdd through a pressed cell.
+    // A rail at one node pulls others across half of Vdd: through a pressed cell, or at the far
+    // end.
+    if (report.findings == 0 && far_)
+        report.findings =
+            static_cast<uint16_t>(bit_if(far_top.stuck_low(), Finding::FarTopStuckLow) |
+                                  bit_if(far_top.stuck_high(), Finding::FarTopStuckHigh) |
+                                  bit_if(far_bottom.stuck_low(), Finding::FarBottomStuckLow) |
+                                  bit_if(far_bottom.stuck_high(), Finding::FarBottomStuckHigh));
     if (report.findings == 0)
         report.findings =
             static_cast<uint16_t>(bit_if(top.floats(), Finding::TopReferenceMissing) |
-                                  bit_if(bottom.floats(), Finding::BottomReferenceMissing));
-    for (uint8_t i = 0; i < frames::READINGS_PER_CELL; i++) {
+                                  bit_if(bottom.floats(), Finding::BottomReferenceMissing) |
+                                  bit_if(far_ && far_top.is_open(), Finding::FarTopOpen) |
+                                  bit_if(far_ && far_bottom.is_open(), Finding::FarBottomOpen));
+    for (uint8_t i = 0; i < frames::READINGS; i++) {
         report.code_min[i] = min_[i];
         report.code_max[i] = max_[i];
     }

@@ -22,27 +22,37 @@ constexpr uint8_t BLANK = 0xFF;
 
 uint8_t *bytes_of(Record *record) { return reinterpret_cast<uint8_t *>(record); }
 
-Crc16 crc_of(Record *record) {
+Crc16 crc_of(Record *record, uint8_t size) {
     Crc16 crc;
-    for (uint8_t i = 0; i < sizeof *record - 2; i++)
+    for (uint8_t i = 0; i < size - 2; i++)
         crc.add(bytes_of(record)[i]);
     return crc;
 }
 
-// Reads a record; false where its CRC is wrong.
-bool read(uint8_t at, Record *record) {
-    for (uint8_t i = 0; i < sizeof *record; i++)
-        bytes_of(record)[i] = board::eeprom_read(at + i);
-    const Crc16 crc = crc_of(record);
-    return record->crc_low == crc.low() && record->crc_high == crc.high();
+bool known(uint8_t version) {
+    return version == Record::VERSION || version == Record::VERSION_WITHOUT_MODE;
 }
 
-// Reads the newest sound record of this version; where it is, or NOWHERE.
+// Reads a record; false where its CRC is wrong.
+bool read(uint8_t at, Record *record) {
+    uint8_t *bytes = bytes_of(record);
+    for (uint8_t i = 0; i < sizeof *record; i++)
+        bytes[i] = board::eeprom_read(at + i);
+    const bool has_mode = at != OLD_AT && record->version != Record::VERSION_WITHOUT_MODE;
+    const uint8_t size = has_mode ? sizeof *record : sizeof *record - 1;
+    const Crc16 crc = crc_of(record, size);
+    const bool sound = bytes[size - 2] == crc.low() && bytes[size - 1] == crc.high();
+    if (!has_mode)
+        record->mode = static_cast<uint8_t>(frames::Mode::Near);
+    return sound;
+}
+
+// Reads the newest sound record of a version that is known; where it is, or NOWHERE.
 uint8_t read_newest(Record *newest) {
     uint8_t found = NOWHERE;
     for (uint8_t at = FIRST_AT; at <= SECOND_AT; at += SECOND_AT - FIRST_AT) {
         Record record;
-        if (!read(at, &record) || record.version != Record::VERSION)
+        if (!read(at, &record) || !known(record.version))
             continue;
         if (found != NOWHERE && static_cast<int8_t>(record.sequence - newest->sequence) <= 0)
             continue;
@@ -62,7 +72,7 @@ bool all_blank() {
 // Of another version, as newer firmware may have left it.
 bool foreign(uint8_t at) {
     const uint8_t version = board::eeprom_read(at);
-    return version != Record::VERSION && version != BLANK;
+    return !known(version) && version != BLANK;
 }
 
 }  // namespace
@@ -73,8 +83,8 @@ frames::Settings load_settings(Settings *settings) {
     if (read_newest(&record) == NOWHERE && !read(OLD_AT, &record))
         return all_blank() ? frames::Settings::DefaultsBlank : frames::Settings::DefaultsDamaged;
     settings->unit_id = record.unit_id;
-    const ScanRequest request = {record.rows, record.columns, record.rate_mhz, record.settle_us,
-                                 record.adc_prescaler};
+    const ScanRequest request = {record.rows,      record.columns,       record.rate_mhz,
+                                 record.settle_us, record.adc_prescaler, record.mode};
     ScanPlan plan;
     if (plan_scan(request, board::CLOCK_HZ, &plan) != frames::Result::Ok)
         return frames::Settings::DefaultsDamaged;
@@ -86,8 +96,9 @@ void SettingsWriter::begin(const Settings &settings) {
     Record last = {};
     const uint8_t newest = read_newest(&last);
     const ScanRequest &scan = settings.request;
-    record_ = {Record::VERSION, last.sequence,  settings.unit_id,   scan.rows,    scan.columns,
-               scan.rate_mhz,   scan.settle_us, scan.adc_prescaler, last.crc_low, last.crc_high};
+    record_ = {Record::VERSION, last.sequence, settings.unit_id, scan.rows,
+               scan.columns,    scan.rate_mhz, scan.settle_us,   scan.adc_prescaler,
+               scan.mode,       last.crc_low,  last.crc_high};
     state_ = State::Writing;
     at_ = newest;
     left_ = 0;
@@ -99,7 +110,7 @@ void SettingsWriter::begin(const Settings &settings) {
     at_ = second ? SECOND_AT : FIRST_AT;
     left_ = sizeof record_;
     record_.sequence++;
-    const Crc16 crc = crc_of(&record_);
+    const Crc16 crc = crc_of(&record_, sizeof record_);
     record_.crc_low = crc.low();
     record_.crc_high = crc.high();
 }

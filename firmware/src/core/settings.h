@@ -12,13 +12,15 @@ struct Settings {
     ScanRequest request;
 };
 
-constexpr Settings DEFAULT_SETTINGS = {0, {8, 8, 90000, 0, 32}};
+constexpr Settings DEFAULT_SETTINGS = {0, {8, 8, 90000, 0, 32, 0}};
 
 // Settings as the EEPROM holds them. The fields are the record's own, not the protocol's, so that a
 // change of the protocol forgets nothing. A change of the fields needs a new VERSION; `version` and
 // `sequence` stay the first two bytes.
 struct __attribute__((packed)) SettingsRecord {
-    static constexpr uint8_t VERSION = 1;
+    static constexpr uint8_t VERSION = 2;
+    // A record of before there were modes. It is still read: the mode is near.
+    static constexpr uint8_t VERSION_WITHOUT_MODE = 1;
 
     uint8_t version;
     uint8_t sequence;  // one more than that of the record written before; wraps
@@ -28,9 +30,10 @@ struct __attribute__((packed)) SettingsRecord {
     uint32_t rate_mhz;
     uint16_t settle_us;
     uint8_t adc_prescaler;
+    uint8_t mode;
     uint8_t crc_low, crc_high;  // over all before
 };
-static_assert(sizeof(SettingsRecord) == 17, "no padding; a change needs a new VERSION");
+static_assert(sizeof(SettingsRecord) == 18, "no padding; a change needs a new VERSION");
 
 // Loads settings from EEPROM. Without a sound record of this version it yields the defaults. Where
 // this firmware cannot make the record's scan, the unit id stays and the scan is the default. The

@@ -14,7 +14,7 @@ constexpr uint32_t CLOCK_HZ = 16000000;
 
 ScanRequest request(uint8_t rows, uint8_t columns, uint32_t rate_mhz, uint16_t settle_us = 0,
                     uint8_t prescaler = 32) {
-    return ScanRequest{rows, columns, rate_mhz, settle_us, prescaler};
+    return ScanRequest{rows, columns, rate_mhz, settle_us, prescaler, 0};
 }
 
 // The code a fake skin gives for a selection, unique up to 16x16 within 10 bits of each cell's
@@ -48,7 +48,7 @@ struct Taker {
         for (; scanner.has_group(); scanner.release_group()) {
             if (scanner.starts_scan()) {
                 number = scanner.scan_number();
-                expected.begin(rows, columns);
+                expected.begin(rows, columns, 0);
                 codes = 0;
                 scans++;
             }
@@ -132,21 +132,22 @@ TEST(what_is_out_of_range_is_refused_by_name) {
     CHECK_EQ(Result::TooFast, plan_scan(request(8, 8, 150000), CLOCK_HZ, &plan));
 }
 
-TEST(a_scan_passes_over_all_cells_once_a_drive_and_rows_run_fastest) {
-    ScanSequence sequence;
-    sequence.begin(2, 3);
-    for (uint8_t first = 0; first < 4; first = static_cast<uint8_t>(first + 2))
-        for (uint8_t column = 0; column < 3; column++)
-            for (uint8_t row = 0; row < 2; row++)
-                for (uint8_t reading = first; reading < first + 2; reading++) {
-                    CHECK_EQ(row, sequence.at().row);
-                    CHECK_EQ(column, sequence.at().column);
-                    CHECK_EQ(reading, sequence.at().reading);
-                    const bool last = column == 2 && row == 1 && reading == 3;
-                    CHECK_EQ(last, sequence.next());
-                }
-    CHECK_EQ(0, sequence.at().column);
-    CHECK_EQ(0, sequence.at().reading);
+TEST(a_scan_passes_over_all_cells_twice_and_rows_run_fastest) {
+    for (uint8_t order = 0; order < ORDERS; order++) {
+        ScanSequence sequence;
+        sequence.begin(2, 3, order);
+        for (uint8_t first = 0; first < 4; first = static_cast<uint8_t>(first + 2))
+            for (uint8_t column = 0; column < 3; column++)
+                for (uint8_t row = 0; row < 2; row++)
+                    for (uint8_t n = first; n < first + 2; n++) {
+                        CHECK_EQ(row << 8 | column, sequence.at().row << 8 | sequence.at().column);
+                        CHECK_EQ(order * 4 + n, sequence.at().reading);
+                        const bool last = column == 2 && row == 1 && n == 3;
+                        CHECK_EQ(last, sequence.next());
+                    }
+        CHECK_EQ(0, sequence.at().column);
+        CHECK_EQ(order * 4, sequence.at().reading);
+    }
 }
 
 TEST(every_code_is_of_the_reading_it_is_counted_for) {
@@ -157,7 +158,7 @@ TEST(every_code_is_of_the_reading_it_is_counted_for) {
             Scanner scanner;
             Pipeline pipeline;
             Taker taker(size[0], size[1]);
-            scanner.begin(size[0], size[1], idle);
+            scanner.begin(size[0], size[1], 0, idle);
             const uint16_t readings = readings_in(size[0], size[1]);
             const uint16_t scans = 3;
             uint16_t slots = 0;
@@ -177,7 +178,7 @@ TEST(a_stop_ends_with_a_whole_scan) {
         for (uint16_t stop_at = 0; stop_at < 40; stop_at++) {
             Scanner scanner;
             Pipeline pipeline;
-            scanner.begin(2, 1, idle);
+            scanner.begin(2, 1, 0, idle);
             uint16_t taken = 0;
             for (uint16_t slot = 0; !scanner.parked(); slot++) {
                 if (slot == stop_at)
@@ -201,7 +202,7 @@ TEST(a_late_main_loop_cuts_scans_short_and_never_leaves_holes) {
         Scanner scanner;
         Pipeline pipeline;
         Taker taker(5, 1);
-        scanner.begin(5, 1, 3);
+        scanner.begin(5, 1, 0, 3);
         for (uint16_t slot = 0; slot < 2 + 20 * 23 + 1; slot++) {
             pipeline.slot(scanner);
             if (slot % 230 >= pause)
@@ -220,7 +221,7 @@ TEST(a_late_conversion_costs_its_scan_and_no_other_is_wrong) {
         Scanner scanner;
         Pipeline pipeline;
         Taker taker(3, 1);
-        scanner.begin(3, 1, 2);
+        scanner.begin(3, 1, 0, 2);
         Selection held = pipeline.pins;
         for (uint16_t slot = 0; slot < 2 + 6 * 14 + 1; slot++) {
             const uint16_t code = pipeline.result;

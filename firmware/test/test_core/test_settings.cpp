@@ -13,25 +13,31 @@ using Source = frames::Settings;
 namespace {
 
 // Nearly every byte differs.
-const Settings ONE = {0x11121314, {1, 2, 0x00015F90, 0x0141, 32}};
-const Settings TWO = {0x21222324, {3, 4, 0x00001203, 0x0242, 64}};
-const Settings THREE = {0x31323334, {5, 6, 0x00001504, 0x0303, 128}};
+const Settings ONE = {0x11121314, {1, 2, 0x00015F90, 0x0141, 32, 0}};
+const Settings TWO = {0x21222324, {3, 4, 0x00001203, 0x0242, 64, 1}};
+const Settings THREE = {0x31323334, {5, 6, 0x00001504, 0x0303, 128, 0}};
 
 // Made with Python's struct and a textbook CRC: version, sequence, settings, CRC.
-const uint8_t RECORD[] = {0x01, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
-                          0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x8F, 0x61};
-const uint8_t OF_LATER_VERSION[] = {0x02, 0x09, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
-                                    0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x0A, 0x85};
+const uint8_t RECORD[] = {0x02, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
+                          0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x01, 0xEB, 0x0B};
+const uint8_t OF_LATER_VERSION[] = {0x03, 0x09, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
+                                    0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x01, 0x28, 0x73};
+// Of the version before there were modes, one after the other.
+const uint8_t WITHOUT_MODE[] = {0x01, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
+                                0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x8F, 0x61};
+const uint8_t EARLIER_WITHOUT_MODE[] = {0x01, 0xC7, 0x74, 0x73, 0x72, 0x71, 0x06, 0x05, 0x50,
+                                        0xC3, 0x00, 0x00, 0x1E, 0x00, 0x80, 0x08, 0xE3};
 // With some protocol's layout CRC at its start, and at address 0.
 const uint8_t OLD_RECORD[] = {0xBE, 0xEF, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
                               0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x18, 0x54};
-const Settings RECORDED = {0xABCD1234, {5, 7, 60000, 20, 64}};
+const Settings RECORDED = {0xABCD1234, {5, 7, 60000, 20, 64, 1}};
+const Settings RECORDED_NEAR = {0xABCD1234, {5, 7, 60000, 20, 64, 0}};
 // 16x16 at 90 Hz, which does not fit.
 const uint8_t IMPOSSIBLE[] = {0x01, 0x03, 0x4D, 0x00, 0x00, 0x00, 0x10, 0x10, 0x90,
                               0x5F, 0x01, 0x00, 0x00, 0x00, 0x20, 0xB4, 0xB5};
 
-void put(uint8_t at, const uint8_t *record) {
-    memcpy(fake::state.eeprom + at, record, sizeof(SettingsRecord));
+template <size_t SIZE> void put(uint8_t at, const uint8_t (&record)[SIZE]) {
+    memcpy(fake::state.eeprom + at, record, SIZE);
 }
 
 bool same(const Settings &a, const Settings &b) {
@@ -74,12 +80,17 @@ uint8_t half_erased(uint8_t before, uint8_t) { return before | 0x5A; }
 uint8_t half_written(uint8_t, uint8_t wanted) { return wanted | 0x96; }
 uint8_t written(uint8_t, uint8_t wanted) { return wanted; }
 
-// What was saved before: nothing, by older firmware, and in each of the two places.
+// What was saved before: nothing, by older firmware, in each of the two places, and by firmware
+// without modes in one place and in both.
 void start_from(uint8_t start) {
     fake::reset();
     if (start == 1)
         put(0, OLD_RECORD);
-    for (uint8_t saves = 1; saves < start; saves++)
+    if (start > 4)
+        put(64, WITHOUT_MODE);
+    if (start > 5)
+        put(32, EARLIER_WITHOUT_MODE);
+    for (uint8_t saves = 1; saves < start && start < 5; saves++)
         CHECK_EQ(State::Done, save(saves & 1 ? ONE : TWO));
 }
 
@@ -88,7 +99,7 @@ void start_from(uint8_t start) {
 TEST(a_save_cut_at_any_byte_leaves_the_old_settings_or_the_new) {
     uint8_t (*const torn[])(uint8_t, uint8_t) = {erased, not_begun, half_erased, half_written,
                                                  written};
-    for (uint8_t start = 0; start < 5; start++)
+    for (uint8_t start = 0; start < 7; start++)
         for (const auto each : torn) {
             uint8_t cuts = 0;
             for (;; cuts++) {
@@ -108,7 +119,7 @@ TEST(a_save_cut_at_any_byte_leaves_the_old_settings_or_the_new) {
                 static uint8_t left[sizeof fake::state.eeprom];
                 memcpy(left, fake::state.eeprom, sizeof left);
                 const Settings &next = start & 1 ? ONE : TWO;
-                for (uint8_t again = 1; again < 18; again++) {
+                for (uint8_t again = 1; again < 19; again++) {
                     memcpy(fake::state.eeprom, left, sizeof left);
                     const bool next_done = save_cut(next, again);
                     const Settings last = loaded();
@@ -128,11 +139,28 @@ TEST(a_record_is_read_whatever_the_protocol_has_become) {
     CHECK_EQ(Source::Stored, source);
 }
 
+TEST(a_record_without_mode_is_of_mode_near_until_another_is_saved) {
+    const uint8_t places[] = {32, 64};
+    for (uint8_t at : places) {
+        fake::reset();
+        put(at, WITHOUT_MODE);
+        fake::state.eeprom[at + sizeof WITHOUT_MODE] = 0x01;  // behind it, where a mode ends
+        Source source;
+        CHECK(same(RECORDED_NEAR, loaded(&source)));
+        CHECK_EQ(Source::Stored, source);
+        CHECK_EQ(State::Done, save(RECORDED));
+        CHECK(same(RECORDED, loaded()));
+        CHECK_BYTES(WITHOUT_MODE, fake::state.eeprom + at, sizeof WITHOUT_MODE);
+        CHECK_EQ(State::Done, save(RECORDED_NEAR));
+        CHECK(same(RECORDED_NEAR, loaded()));
+    }
+}
+
 TEST(the_one_record_of_older_firmware_is_read_until_another_is_saved) {
     fake::reset();
     put(0, OLD_RECORD);
     Source source;
-    CHECK(same(RECORDED, loaded(&source)));
+    CHECK(same(RECORDED_NEAR, loaded(&source)));
     CHECK_EQ(Source::Stored, source);
     CHECK_EQ(State::Done, save(ONE));
     CHECK(same(ONE, loaded()));

@@ -38,12 +38,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.small import cholesky, one_blas_thread, solve, solve_lower
-from ohmskin.link.protocol import ENUMS
+from ohmskin.link.protocol import MODES
 
 Wire = float | Float  # segments of a layer: one number for all of them, or (R, C)
 
-CONFIGURATIONS: Final = tuple(name.upper() for name in ENUMS["reading"].values)
-READINGS_PER_CELL: Final = len(CONFIGURATIONS)
+NEAR: Final = MODES["near"]
+CONFIGURATIONS: Final = tuple(name.upper() for name in NEAR)
+READINGS_PER_CELL: Final = len(NEAR)
 # Every configuration reads y = offset + sign * R * I, R the reference resistor of the sensed layer.
 READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
 READING_SIGN: Final[Float] = np.array([-1.0, 1.0, -1.0, 1.0])
@@ -149,21 +150,15 @@ def admittance_of(half: Float) -> Float:
 
 
 @one_blas_thread
-def electrode_admittance(skin: Skin) -> Float:
-    """Y [S], shape (R+C, R+C): currents into the electrodes (rows first) per potential of each."""
-    root = np.sqrt(skin.cell_siemens)
-    return admittance_of(factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1])
-
-
-@one_blas_thread
 def port_resistance_ohm(skin: Skin) -> Float:
     """rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] [ohm], shape (R, C), all other electrodes floating.
 
     A port that no chain of cells connects (all of them open) is inf.
     """
-    rows = skin.shape[0]
+    rows, root = skin.shape[0], np.sqrt(skin.cell_siemens)
+    half = factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1]
     part = _connected_parts(skin.cell_siemens)
-    _, resistance = impedance_of(electrode_admittance(skin), rows, part)
+    _, resistance = impedance_of(admittance_of(half), rows, part)
     connected = part[:rows, None] == part[None, rows:]
     return np.where(connected, np.maximum(resistance, 0.0), np.inf)
 
@@ -186,6 +181,29 @@ def impedance_of(
     diagonal = impedance.diagonal()
     port_ohm = diagonal[:rows, None] + diagonal[None, rows:] - 2 * impedance[:rows, rows:]
     return np.asarray(impedance), np.asarray(port_ohm)
+
+
+@one_blas_thread
+def end_admittance(skin: Skin) -> Float:
+    """Y [S] of both ends of all lines, (2(R+C), 2(R+C)): near ends, rows first, then far ends.
+
+    A far end is behind 1 ohm, a multiplexer's, at T[i, C-1] or B[R-1, j]: one more cell of its
+    line, which shares wires with the others.
+    """
+    rows, columns = skin.shape
+    cells, lines = rows * columns, rows + columns
+    along_row, along_column = np.cumsum(skin.top_wire_ohm, 1), np.cumsum(skin.bottom_wire_ohm, 0)
+    to_cell = np.zeros((rows, columns, lines))
+    np.einsum("iji->ij", to_cell[..., :rows])[:] = along_row
+    np.einsum("ijj->ij", to_cell[..., rows:])[:] = along_column
+    shared = to_cell.reshape(cells, lines)
+    whole = np.diag(np.concatenate([along_row[:, -1], along_column[-1]]))
+    coupling = wire_coupling_ohm(skin.top_wire_ohm, skin.bottom_wire_ohm, skin.shape)
+    sign = np.diag(np.repeat([1.0, -1.0], (rows, columns)))
+    ends = np.block([[_incidence(rows, columns), np.zeros((cells, lines))], [sign, -sign]])
+    root = np.sqrt(np.concatenate([skin.cell_siemens.ravel(), np.ones(lines)]))[:, None]
+    system = np.eye(len(root)) + root * np.block([[coupling, shared], [shared.T, whole]]) * root.T
+    return admittance_of(solve_lower(cholesky(system), ends * root))
 
 
 def port_difference(lines: Float, rows: int) -> Float:
@@ -273,12 +291,11 @@ def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:
     joined = cell_siemens > 0
     if joined.all():
         return np.zeros(rows + columns, dtype=np.intp)
-    reach = np.eye(rows + columns, dtype=bool)
-    reach[:rows, rows:] = joined
-    reach[rows:, :rows] = joined.T
-    for _ in range(int(rows + columns).bit_length()):
-        reach = reach @ reach
-    return np.asarray(reach.argmax(axis=1), dtype=np.intp)
+    from scipy.sparse.csgraph import connected_components  # loaded when needed
+
+    graph = np.zeros((rows + columns, rows + columns))
+    graph[:rows, rows:] = joined
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
 
 def reference_ohm(ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
@@ -320,3 +337,27 @@ def readings(skin: Skin) -> Float:
     """Sense-node voltages / Vdd, shape (R, C, 4): y = offset + sign R_ref / (rho + Rt + Rb)."""
     current = 1.0 / (port_resistance_ohm(skin) + skin.ref_top_ohm + skin.ref_bottom_ohm)
     return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)
+
+
+@one_blas_thread
+def all_readings(skin: Skin, admittance: Float) -> Float:
+    """Readings a to h, shape (R, C, 8). admittance: of the ends, as `end_admittance`; overwritten.
+
+    v_k = Z[k, i] - Z[k, j] is the potential of end k per current of the port of row i and column j.
+    A far end's differs from its near end's by the wire between them, as far as it carries current.
+    Both supplies exchanged turn each reading y into 1 - y.
+    """
+    rows, lines = skin.shape[0], sum(skin.shape)
+    part = _connected_parts(skin.cell_siemens)
+    impedance, _ = impedance_of(admittance, rows, np.tile(part, 2))
+    row, column = np.arange(rows)[:, None], np.arange(rows, lines)
+    near_row, near_column, far_row, far_column = (
+        impedance[end, row] - impedance[end, column]
+        for end in (row, column, lines + row, lines + column)
+    )
+    port_ohm = np.maximum(near_row - near_column, 0.0)
+    port_ohm[part[row] != part[column]] = np.inf
+    current = 1.0 / (port_ohm + skin.ref_top_ohm + skin.ref_bottom_ohm)
+    a, b = 1.0 - skin.ref_top_ohm * current, skin.ref_bottom_ohm * current
+    e, f = a - current * (near_row - far_row), b + current * (far_column - near_column)
+    return np.stack([a, b, 1.0 - b, 1.0 - a, e, f, 1.0 - f, 1.0 - e], axis=-1)

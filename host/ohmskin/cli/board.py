@@ -19,7 +19,7 @@ import ohmskin
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.base import NO_WIRES, WireOhm
 from ohmskin.link.messages import Hello
-from ohmskin.link.protocol import ENUMS
+from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.link.serial_port import SerialPort, serial_ports
 
 # avrdude's options, and the boot loaders: PlatformIO's name, speed [baud]. An attempt takes 5 s.
@@ -114,6 +114,7 @@ def configure(
     adc_prescaler: Annotated[
         str | None, typer.Option("--adc", help=" | ".join(ENUMS["adc_prescaler"].values))
     ] = None,
+    mode: Annotated[str | None, typer.Option(help=" | ".join(MODES))] = None,
     unit_id: Annotated[int | None, typer.Option(help="name this skin")] = None,
     defaults: Annotated[bool, typer.Option(help="return to the defaults first")] = False,
     save: Annotated[bool, typer.Option(help="keep it in the board's EEPROM")] = False,
@@ -128,13 +129,15 @@ def configure(
             rate_hz=rate_hz,
             settle_us=settle_us,
             adc_prescaler=adc_prescaler,
+            mode=mode,
         )
         if unit_id is not None:
             skin.set_unit_id(unit_id)
         if save:
             skin.save()
     _out.print(
-        f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, settle time {now.settle_us} us or more"
+        f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, mode {now.mode}, settle time "
+        f"{now.settle_us} us or more"
         f"{', saved' if save else ', until its next reset'}"
     )
 

@@ -9,7 +9,8 @@ Not modelled:
 
 - the speed of the line: a scan's bytes come all at once at the scan's end, and none is dropped;
 - EEPROM beyond the life of the object;
-- findings of the self-test: the board itself is sound (`SkinFaults` are faults of the skin).
+- findings of the self-test, and its readings g and h: the board itself is sound (`SkinFaults` are
+  faults of the skin).
 
 ``simavr://`` has all these, for it runs the firmware itself.
 """
@@ -27,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM, READING_OFFSET
+from ohmskin.circuit.skin import DEFAULT_REF_OHM
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
@@ -35,8 +36,8 @@ from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.serial_port import READ_TIMEOUT_S
 
-RatioAt = Callable[[float], Float]
-Sampled = Callable[[Float, float, float, float], Float]
+RatioAt = Callable[[float, str], Float]
+Sampled = Callable[[Float, float, float, float, str], Float]
 
 VERSION = {"version_major": 0, "version_minor": 1, "version_patch": 0}
 CLOCK_HZ = 16_000_000
@@ -44,12 +45,11 @@ DEFAULT_RATE_HZ = 90.0
 _CONSTANTS = protocol.CONSTANTS
 _PRESCALERS = protocol.ENUMS["adc_prescaler"].values
 _REASONS = protocol.ENUMS["result"].docs
-_DEFAULT_PRESCALER = "clock_500khz"
-# Longest time from the hold of a reading to the change of pins [cycles]; the longest slot, and what
-# it leaves for settling where nothing else is asked [us] (firmware/src/core/scan_plan.h).
-_SELECT_CYCLES = 120
+# Longest time from the hold of a reading to the change of pins [s]; the longest slot [cycles], and
+# what it leaves for settling unless asked [us], by mode (firmware/src/core/scan_plan.h).
+_SELECT_S = 120 / CLOCK_HZ
 _SLOT_CYCLES_MAX = 60_000
-_SETTLE_US = 20
+_SETTLE_US = {"near": 20, "far": 35}
 # At a pseudo-terminal: without scans, faults that are due are looked for as often as this [s].
 _IDLE_S = 0.2
 # The largest number of bytes that is taken there from the host at once.
@@ -57,12 +57,12 @@ _READ_SIZE = 4096
 
 
 class EmulatedBoard:
-    """A board whose skin reads `ratio_at(seconds)`, shape (rows, columns, 4).
+    """A board whose skin reads `ratio_at(seconds, mode)`, shape (rows, columns, 4).
 
     rate_hz: the scan rate at boot; None: 90, or as fast as the converter runs if that is less.
     noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed: of the noise.
-    sampled(readings, start_s, slot_s, settle_s): what the converter reads, (rows, columns, 4), in a
-    scan that starts at a time, with one reading a slot, each so long after the change of pins.
+    sampled(readings, start_s, slot_s, settle_s, mode): what the converter reads, (rows, columns,
+    4), in a scan that starts at a time, one reading a slot, each so long after the change of pins.
 
     :raises ValueError: a board cannot do that.
     """
@@ -77,6 +77,7 @@ class EmulatedBoard:
         noise_lsb: float = 0.0,
         seed: int = 0,
         unit_id: int = 0,
+        mode: str = "near",
         layout_crc: int = protocol.LAYOUT_CRC,
         sampled: Sampled | None = None,
     ) -> None:
@@ -88,25 +89,22 @@ class EmulatedBoard:
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
         self._random = np.random.default_rng(seed)
         self._layout_crc = layout_crc
-        self._defaults = {
-            "unit_id": unit_id,
-            "rows": rows,
-            "columns": columns,
-            "rate_mhz": protocol.rate_mhz(DEFAULT_RATE_HZ if rate_hz is None else rate_hz),
-            "settle_us": 0,
-            "adc_prescaler": _DEFAULT_PRESCALER,
-        }
+        rate_mhz = protocol.rate_mhz(DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
+        skin = {"unit_id": unit_id, "rows": rows, "columns": columns, "mode": mode}
+        pace = {"rate_mhz": rate_mhz, "settle_us": 0, "adc_prescaler": "clock_500khz"}
+        self._defaults: dict[str, Any] = {**skin, **pace}
         try:
             _scan_plan(self._defaults)
         except _Refused as refusal:
-            if rate_hz is not None:
+            if rate_hz is not None or str(refusal) != "too_fast":
                 raise ValueError(f"{refusal}: {_REASONS[str(refusal)]}") from None
             self._defaults["rate_mhz"] = 0
         self._stored: dict[str, Any] | None = None
         self.now_s = 0.0
-        self._boot("power_on")
+        self.reset("power_on")
 
-    def _boot(self, cause: str) -> None:
+    def reset(self, cause: str = "external") -> None:
+        """Do what the reset button does: scanning stops, unsaved settings are lost."""
         self._decoder = framing.Decoder()
         self._settings = dict(self._stored or self._defaults)
         self._settings_source = "stored" if self._stored else "defaults_blank"
@@ -119,10 +117,6 @@ class EmulatedBoard:
         self._started_s: float | None = None
         self._out = bytearray()
         self._send_hello()
-
-    def reset(self) -> None:
-        """Do what the reset button does: scanning stops, unsaved settings are lost."""
-        self._boot("external")
 
     @property
     def next_scan_s(self) -> float | None:
@@ -150,15 +144,16 @@ class EmulatedBoard:
             self.reset()
         return faults.apply(self.advance(now_s), now_s)
 
-    def codes_at(self, time_s: float) -> NDArray[np.uint16]:
+    def codes_at(self, time_s: float, mode: str = "") -> NDArray[np.uint16]:
         """Codes of a scan, shape (rows, columns, 4); lines beyond the skin are open."""
         rows, columns = self._settings["rows"], self._settings["columns"]
-        ratio = np.tile(READING_OFFSET, (rows, columns, 1))  # no current flows
+        mode = mode or self._settings["mode"]
+        ratio = np.tile([float(n in "aceg") for n in protocol.MODES[mode]], (rows, columns, 1))
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
-        ratio[: have[0], : have[1]] = self._ratio_at(time_s)[: have[0], : have[1]]
+        ratio[: have[0], : have[1]] = self._ratio_at(time_s, mode)[: have[0], : have[1]]
         if self._sampled is not None:
             slot_s = self._plan["slot_cycles"] / CLOCK_HZ
-            ratio = self._sampled(ratio, time_s, slot_s, slot_s - _SELECT_CYCLES / CLOCK_HZ)
+            ratio = self._sampled(ratio, time_s, slot_s, slot_s - _SELECT_S, mode)
         if self._noise_ratio:
             ratio += self._noise_ratio * self._random.standard_normal(ratio.shape)
         return quantise(ratio, protocol.ADC_BITS)
@@ -200,8 +195,13 @@ class EmulatedBoard:
                 self._settings = dict(self._defaults)
                 self._plan = _scan_plan(self._settings)
             case "self_test":
-                cells = self.codes_at(self.now_s).reshape(-1, protocol.READINGS_PER_CELL)
-                least, most = (tuple(codes.tolist()) for codes in (cells.min(0), cells.max(0)))
+                none = (1 << protocol.ADC_BITS) - 1, 0
+                bounds = dict.fromkeys(protocol.ENUMS["reading"].values, none)
+                for mode in ("near", self._settings["mode"]):
+                    codes = self.codes_at(self.now_s, mode).reshape(-1, protocol.READINGS_PER_CELL)
+                    each = zip(codes.min(0).tolist(), codes.max(0).tolist(), strict=True)
+                    bounds.update(zip(protocol.MODES[mode], each, strict=True))
+                least, most = zip(*bounds.values(), strict=True)
                 self._send("self_test_report", findings=(), code_min=least, code_max=most)
             case "set_baud":
                 if values["baud"] not in (_CONSTANTS["baud_default"], _CONSTANTS["baud_fast"]):
@@ -225,6 +225,7 @@ class EmulatedBoard:
             rx_errors=self._decoder.stats.damaged % (1 << 16),
             rows=codes.shape[0],
             columns=codes.shape[1],
+            mode=self._settings["mode"],
         )
         self._scan += 1
 
@@ -232,7 +233,8 @@ class EmulatedBoard:
         self._send(
             "hello",
             layout_crc=self._layout_crc,
-            **{name: self._settings[name] for name in ("unit_id", "rows", "columns")},
+            **{name: self._settings[name] for name in ("unit_id", "rows", "columns", "mode")},
+            adc_prescaler=self._settings["adc_prescaler"],
             **self._plan,
             **VERSION,
             board="emulated",
@@ -243,7 +245,6 @@ class EmulatedBoard:
             rate_asked_mhz=self._settings["rate_mhz"],
             clock_hz=CLOCK_HZ,
             settle_asked_us=self._settings["settle_us"],
-            adc_prescaler=self._settings["adc_prescaler"],
             baud=self._baud,
             settings=self._settings_source,
             reset_cause=(self._reset_cause,),
@@ -267,6 +268,7 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
         "bad_rate": not rate or _CONSTANTS["rate_mhz_min"] <= rate <= _CONSTANTS["rate_mhz_max"],
         "bad_settle": settle <= _CONSTANTS["settle_us_max"],
         "bad_prescaler": wanted["adc_prescaler"] in _PRESCALERS,
+        "bad_mode": wanted["mode"] in protocol.MODES,
     }
     for result, kept in limits.items():
         if not kept:
@@ -276,7 +278,7 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
     # From the hold to the end of the conversion the sample capacitor is off.
     slot, held = 15 * prescaler, 11 * prescaler + prescaler // 2
     if settle or not rate:
-        slot = max(slot, (settle or _SETTLE_US) * CLOCK_HZ // 1_000_000 + held)
+        slot = max(slot, (settle or _SETTLE_US[wanted["mode"]]) * CLOCK_HZ // 1_000_000 + held)
     if not rate:
         shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
         period = slot * max(readings, math.ceil(shortest / slot))

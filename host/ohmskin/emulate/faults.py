@@ -2,7 +2,7 @@
 """What can be wrong with an emulated board's line and skin, to see that a host finds it.
 
 `LineFaults` change the bytes that the board sends. `SkinFaults` change resistances (`damaged`),
-join electrodes (`readings`), or change each reading at its own instant (`sampled`).
+join ends of lines (`readings`), or change each reading at its own instant (`sampled`).
 
 A fault has the name of an option of ``emulator://``. Beside its type stand the kind of its values
 and what ``ohmskin emulate --help`` says of it.
@@ -15,18 +15,11 @@ from itertools import accumulate
 from typing import Annotated, Any, Final, TypeVar, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    DEFAULT_REF_OHM,
-    READING_SENSES_TOP,
-    Skin,
-    electrode_admittance,
-    impedance_of,
-    ratio_from_current,
-    readings,
-)
-from ohmskin.link.protocol import ADC_BITS, from_scan_order, in_scan_order
+from ohmskin.circuit.skin import DEFAULT_REF_OHM, Skin, all_readings, end_admittance, readings
+from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, from_scan_order, in_scan_order
 
 # Resistance of a wire that is open [ohm], a million times that of a cell at rest.
 OPEN_OHM: Final = 1e12
@@ -34,6 +27,8 @@ OPEN_OHM: Final = 1e12
 SHORT_SIEMENS: Final = 10.0
 # Conductance of an open cell [S] where a network must be connected: 10 TOhm.
 _LEAST_SIEMENS: Final = 1e-13
+# Readings of each sense node: with the top pin high, and with the bottom pin high.
+_NODES: Final = ("ad", "bc", "eh", "fg")
 # A stall begins so long after the board's start [s].
 _STALL_AFTER_S: Final = 2.0
 
@@ -143,6 +138,12 @@ class SkinFaults:
     open_column: Annotated[Line, "number of a column that is not connected to the board"] = None
     short_rows: Annotated[Lines, "two rows, as 2,3, that touch each other"] = None
     short_columns: Annotated[Lines, "two columns, as 2,3, that touch each other"] = None
+    open_far_row: Annotated[Line, "number of a row whose far end is not connected"] = None
+    open_far_column: Annotated[Line, "the same of a column"] = None
+    short_far_rows: Annotated[Lines, "two rows, as 2,3, whose far ends touch each other"] = None
+    short_far_columns: Annotated[Lines, "the same of columns"] = None
+    swap_far_rows: Annotated[Lines, "two rows, as 2,3, whose far ends are exchanged"] = None
+    swap_far_columns: Annotated[Lines, "the same of columns"] = None
     dead: Annotated[Cell, "row and column, as 1,2, of a cell that never conducts"] = None
     saturated: Annotated[Cell, "row and column, as 1,2, of a cell whose layers are shorted"] = None
     ref_top: Annotated[Positive, "true ohms of the rows' reference resistor"] = DEFAULT_REF_OHM
@@ -159,12 +160,13 @@ class SkinFaults:
 
     def check(self, rows: int, columns: int) -> None:
         """Raise ValueError for a line or a cell that a rows x columns skin does not have."""
-        cells = [cell for cell in (self.dead, self.saturated) if cell is not None]
-        named_rows = [self.open_row, *(self.short_rows or ()), *(row for row, _ in cells)]
-        named_columns = [self.open_column, *(self.short_columns or ()), *(c for _, c in cells)]
-        for what, named, count in (("row", named_rows, rows), ("column", named_columns, columns)):
+        for axis, (what, count) in enumerate((("row", rows), ("column", columns))):
+            named = [cell[axis] for cell in (self.dead, self.saturated) if cell is not None]
+            for name, value in vars(self).items():
+                if what in name and value is not None:
+                    named += value if isinstance(value, tuple) else (value,)
             for line in named:
-                if line is not None and not 0 <= line < count:
+                if not 0 <= line < count:
                     raise ValueError(f"no {what} {line}: the skin has {what}s 0 to {count - 1}")
 
     def damaged(self, skin: Skin) -> Skin:
@@ -181,15 +183,32 @@ class SkinFaults:
             bottom_ohm[0, self.open_column] = OPEN_OHM
         return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom)
 
-    def readings(self, damaged: Skin) -> Float:
-        """Exact readings (R, C, 4) of a skin that `damaged` has made, with its lines shorted."""
-        rows = damaged.shape[0]
-        joints = [] if self.short_rows is None else [self.short_rows]
-        if self.short_columns is not None:
-            joints.append((rows + self.short_columns[0], rows + self.short_columns[1]))
-        return joined_readings(damaged, joints) if joints else readings(damaged)
+    def readings(self, damaged: Skin, mode: str = "near") -> Float:
+        """Exact readings (R, C, 4) of a skin that `damaged` has made, with all faults of its ends.
 
-    def sampled(self, ratio: Float, start_s: float, slot_s: float, settle_s: float) -> Float:
+        An open far end reads what its node had before: the far end of the cell scanned before.
+        """
+        rows, far = len(damaged.cell_siemens), sum(damaged.shape)
+        firsts = {"rows": 0, "columns": rows, "far_rows": far, "far_columns": far + rows}
+        shorts = [(n, getattr(self, f"short_{what}")) for what, n in firsts.items()]
+        joints = [(n + pair[0], n + pair[1]) for n, pair in shorts if pair]
+        if mode == "near" and not joints:
+            return readings(damaged)
+        ends = np.arange(2 * far)
+        for n, pair in ((far, self.swap_far_rows), (far + rows, self.swap_far_columns)):
+            if pair:
+                ends[[n + pair[0], n + pair[1]]] = n + pair[1], n + pair[0]
+        found = joined_readings(damaged, joints, ends)
+        if (row := self.open_far_row) is not None:
+            before = found[row - 1] if row else np.roll(found[-1], 1, axis=0)
+            found[row, :, 4::3] = before[:, 4::3]  # e and h
+        if (column := self.open_far_column) is not None:
+            found[:, column, 5:7] = found[-1, column - 1, 5:7]  # f and g
+        return np.asarray(found[..., [ENUMS["reading"].values[name] for name in MODES[mode]]])
+
+    def sampled(
+        self, ratio: Float, start_s: float, slot_s: float, settle_s: float, mode: str
+    ) -> Float:
         """What the converter reads of a scan with settled readings `ratio` (R, C, 4), same shape.
 
         The scan starts at start_s, with one reading a slot. A node that would settle to x[n] has
@@ -199,14 +218,14 @@ class SkinFaults:
         read = in_scan_order(ratio)
         if self.tau_us:
             kept = float(np.exp(-settle_s / (1e-6 * self.tau_us)))
-            # A pair of readings with the same drive sets both nodes, whichever of them is read.
-            top, bottom = (
-                _settled(in_scan_order(ratio[..., pairs]), kept)
-                for pairs in ([0, 0, 3, 3], [1, 1, 2, 2])
-            )
-            read = np.where(
-                in_scan_order(np.broadcast_to(READING_SENSES_TOP, ratio.shape)), top, bottom
-            )
+            names = MODES[mode]
+            which = in_scan_order(np.broadcast_to(np.arange(len(names)), ratio.shape))
+            for k, name in enumerate(names):
+                node = next(node for node in _NODES if name in node)
+                # The drive of each slot sets the node, whichever node is read in it.
+                goals = [names.index(node[other in "cdgh"]) for other in names]
+                settled = _settled(in_scan_order(ratio[..., goals]), kept)
+                read = np.where(which == k, settled, read)
         if self.hum:
             time_s = start_s + slot_s * np.arange(len(read))
             read = read + self.hum_lsb / 2**ADC_BITS * np.sin(2 * np.pi * self.hum * time_s)
@@ -224,18 +243,16 @@ def _settled(voltage: Float, kept: float) -> Float:
     return np.array(settled)
 
 
-def joined_readings(skin: Skin, joints: Iterable[Pair]) -> Float:
-    """As `circuit.skin.readings`, with pairs of electrodes (rows first) joined by 0.1 ohm each.
+def joined_readings(skin: Skin, joints: Iterable[Pair], ends: NDArray[np.intp]) -> Float:
+    """Readings a to h, (R, C, 8), with pairs of ends joined by 0.1 ohm each.
 
-    A joint adds its conductance to the skin's Y. Open cells are taken for 10 TOhm.
+    Ends are numbered as in `circuit.skin.end_admittance`; ends: where the multiplexers find each. A
+    joint adds its conductance to Y. Open cells are taken for 10 TOhm.
     """
-    rows = skin.shape[0]
-    conducting = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, _LEAST_SIEMENS))
-    admittance = electrode_admittance(conducting)
+    skin = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, _LEAST_SIEMENS))
+    admittance = end_admittance(skin)
     for joint in joints:
-        ends = np.array(joint)
-        admittance[ends, ends] += SHORT_SIEMENS
-        admittance[ends, ends[::-1]] -= SHORT_SIEMENS
-    _, port_ohm = impedance_of(admittance, rows)
-    current = 1.0 / (np.maximum(port_ohm, 0.0) + skin.ref_top_ohm + skin.ref_bottom_ohm)
-    return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)
+        pair = np.array(joint)
+        admittance[pair, pair] += SHORT_SIEMENS
+        admittance[pair, pair[::-1]] -= SHORT_SIEMENS
+    return all_readings(skin, admittance[np.ix_(ends, ends)])

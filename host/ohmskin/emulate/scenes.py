@@ -88,7 +88,7 @@ class Scene:
                 raise ValueError(f"the plate has {size} cells, the skin {rows}x{columns}")
             self._rest = Skin(plate, np.zeros_like(plate), np.zeros_like(plate))
         self._touches = self._place(random)
-        self._still_ratio = lru_cache(maxsize=1)(lambda: self.faults.readings(self.skin(0.0)))
+        self._still_ratio = lru_cache(lambda mode: self.faults.readings(self.skin(0.0), mode))
 
     @property
     def rest_ratio(self) -> Float:
@@ -109,9 +109,10 @@ class Scene:
         rest_siemens = self.faults.damaged(self._rest).cell_siemens
         return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= _TOUCHED_SIEMENS)
 
-    def ratio(self, time_s: float) -> Float:
-        """Exact readings at a time, shape (rows, columns, 4)."""
-        return self.faults.readings(self.skin(time_s)) if self.moves else self._still_ratio()
+    def ratio(self, time_s: float, mode: str = "near") -> Float:
+        """Exact readings of a mode at a time, shape (rows, columns, 4)."""
+        still = not self.moves
+        return self._still_ratio(mode) if still else self.faults.readings(self.skin(time_s), mode)
 
     def _place(self, random: np.random.Generator) -> Float:
         touches = np.zeros((self.rows, self.columns))

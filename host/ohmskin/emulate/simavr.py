@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READING_OFFSET, electrode_admittance
+from ohmskin.circuit.skin import all_readings, end_admittance
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
@@ -84,13 +84,14 @@ class SkinSim(Closing):
         self._stderr.close()
 
     def set_table(self, ratio: Float) -> None:
-        """Set sense voltage / Vdd, shape (rows, columns, 4), up to 16 rows and columns.
+        """Set readings a to h, or a to d alone, (rows, columns, n), of up to 16 rows and columns.
 
         Cells beyond the array carry no current: 1, 0, 1, 0. An ideal conversion gives the code
         min(1023, floor(1024 ratio)). Raises SimulationError for a ratio that is not finite.
         """
-        table = np.tile(READING_OFFSET, (16, 16, 1))
-        table[: ratio.shape[0], : ratio.shape[1]] = ratio
+        rows, columns, readings = ratio.shape
+        table = np.tile([1.0, 0.0], (16, 16, 4))
+        table[:rows, :columns, :readings] = ratio
         self.request("T", table.tobytes())
 
     def set(self, **settings: float | str) -> None:
@@ -183,9 +184,11 @@ class SimavrLink(SerialLink):
         return super().read()
 
     def _show(self, time_s: float) -> None:
-        self.sim.set_table(self._scene.ratio(time_s))
-        siemens = electrode_admittance(self._scene.skin(time_s))
-        self.sim.request("C", bytes([self._scene.rows]) + siemens.tobytes())
+        skin = self._scene.skin(time_s)
+        admittance = end_admittance(skin)
+        # 128: far ends are in it, too.
+        self.sim.request("C", bytes([128 + self._scene.rows]) + admittance.tobytes())
+        self.sim.set_table(all_readings(skin, admittance))
 
     def close(self) -> None:
         """See `Link.close`."""

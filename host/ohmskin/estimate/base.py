@@ -7,6 +7,7 @@ which cells are touched happen here, so that all methods do them alike.
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple, Self
 
@@ -15,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
-    CONFIGURATIONS,
     DEFAULT_REF_OHM,
-    READINGS_PER_CELL,
+    NEAR,
     check_references,
     current_std,
     ratio_from_current,
@@ -26,6 +26,7 @@ from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
+from ohmskin.link.protocol import MODES
 
 # No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
 MIN_CELL_SIEMENS: Final = 1e-9
@@ -68,7 +69,7 @@ class SkinKnowledge:
 
     rows, columns: its size. ref_top_ohm, ref_bottom_ohm [ohm]. adc_bits: resolution of the
     readings, None when they are exact. rest_ratio: readings (R, C, 4) of the untouched skin.
-    nominal_wire_ohm: one wire segment of each layer [ohm], as far as it is known.
+    nominal_wire_ohm: a wire segment of each layer [ohm], where known. reading_names: of each cell.
     Raises ValueError for a value that cannot be.
     """
 
@@ -79,6 +80,7 @@ class SkinKnowledge:
     adc_bits: int | None = None
     rest_ratio: Float | None = None
     nominal_wire_ohm: WireOhm = NO_WIRES
+    reading_names: tuple[str, ...] = NEAR
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -87,7 +89,8 @@ class SkinKnowledge:
         if self.adc_bits is not None:
             check_adc_bits(self.adc_bits)
         if self.rest_ratio is not None:
-            rest = check_ratio(self.rest_ratio, self.rows, self.columns, name="rest_ratio").copy()
+            cells = self.rows, self.columns
+            rest = check_ratio(self.rest_ratio, *cells, "rest_ratio", self.reading_names).copy()
             rest.setflags(write=False)
             object.__setattr__(self, "rest_ratio", rest)
         self.nominal_wire_ohm.check()
@@ -98,7 +101,8 @@ class SkinKnowledge:
     ) -> Self:
         """What is known of the skin at this board."""
         size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
-        return cls(*size, *references, board.adc_bits, rest_ratio, nominal_wire_ohm)
+        told = rest_ratio, nominal_wire_ohm
+        return cls(*size, *references, board.adc_bits, *told, MODES[board.mode])
 
     @property
     def ratio_std(self) -> float:
@@ -169,11 +173,16 @@ class Solution:
 
 
 class Estimator(ABC):
-    """One method for one skin, fed frame after frame."""
+    """One method for one skin, frame after frame. Raises ValueError for readings it cannot take."""
 
     name: ClassVar[str]
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
+        if knowledge.reading_names != NEAR:
+            raise ValueError(
+                f"'{self.name}' takes the readings {' '.join(NEAR)}, not "
+                f"{' '.join(knowledge.reading_names)}: 'ohmskin configure PORT --mode near'"
+            )
         self.knowledge = knowledge
         self._reader = PortReader(knowledge)
         self._rest: Solution | None = None
@@ -265,10 +274,12 @@ class Estimator(ABC):
         return float(residual @ residual) / residual.size
 
 
-def check_ratio(ratio: ArrayLike, rows: int, columns: int, name: str = "ratio") -> Float:
-    """Readings as float64 (R, C, 4), or ValueError naming the first offending cell."""
+def check_ratio(
+    ratio: ArrayLike, rows: int, columns: int, name: str = "ratio", of: Sequence[str] = NEAR
+) -> Float:
+    """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell."""
     readings = np.asarray(ratio, dtype=np.float64)
-    expected = (rows, columns, READINGS_PER_CELL)
+    expected = (rows, columns, len(of))
     if readings.shape != expected:
         raise ValueError(f"{name} has shape {readings.shape}, this skin {expected}")
     # Written so that NaN fails too.
@@ -276,7 +287,7 @@ def check_ratio(ratio: ArrayLike, rows: int, columns: int, name: str = "ratio") 
     if not good.all():
         row, column, k = (int(index) for index in np.argwhere(~good)[0])
         raise ValueError(
-            f"{name} of cell ({row}, {column}), reading {CONFIGURATIONS[k]}, is "
+            f"{name} of cell ({row}, {column}), reading {of[k].upper()}, is "
             f"{readings[row, column, k]:g}, not in 0..1"
         )
     return readings

@@ -95,8 +95,9 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
         return 1 / board.rate_hz - scan_s(board)
     kind = protocol.FRAMES["scan"]
     # With numbers of any scan, because zeros among them end blocks that are early anyway.
-    fields = {"scan": 1, "time_us": 1, "dropped": 0, "rx_errors": 0}
-    header = bytes([kind.id, 1]) + kind.pack(**fields, rows=scan.rows, columns=scan.columns)
+    counters = {"scan": 1, "time_us": 1, "dropped": 0, "rx_errors": 0}
+    payload = kind.pack(**counters, rows=scan.rows, columns=scan.columns, mode=scan.mode)
+    header = bytes([kind.id, 1]) + payload
     codes = protocol.pack_codes(scan.codes)
     wire = cobs_encode(header + codes + _UNKNOWN_CRC)
     byte_s = _BITS_PER_BYTE / board.baud

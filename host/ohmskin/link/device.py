@@ -159,12 +159,13 @@ class Device(Closing):
         rate_hz: float | None = None,
         settle_us: int | None = None,
         adc_prescaler: str | None = None,
+        mode: str | None = None,
     ) -> Hello:
         """Change how the board scans; what is not given stays. Returns what the board now keeps.
 
         rate_hz: scans per second; 0: as fast as readings settle. settle_us: least time from a
         multiplexer change to the sample; 0: as long as the rate allows. adc_prescaler: a name of
-        the enum `adc_prescaler`.
+        the enum `adc_prescaler`. mode: which readings a scan takes, a name of the enum `mode`.
 
         :raises ValueError: a value that no board could be sent.
         :raises CommandRefused: a value out of range, or too much for the rate; nothing changes.
@@ -173,8 +174,9 @@ class Device(Closing):
         given = {
             "rows": rows,
             "columns": columns,
-            "rate_mhz": None if rate_hz is None else protocol.rate_mhz(rate_hz),
             "settle_us": settle_us,
+            "mode": mode,
+            "rate_mhz": None if rate_hz is None else protocol.rate_mhz(rate_hz),
             "adc_prescaler": adc_prescaler,
         }
         with self._paused():
@@ -295,10 +297,6 @@ class Device(Closing):
 
 def configuration(board: Hello) -> dict[str, protocol.Value]:
     """What `configure` would have to say for a board to scan as this one does."""
-    return {
-        "rows": board.rows,
-        "columns": board.columns,
-        "rate_mhz": board.rate_asked_mhz,
-        "settle_us": board.settle_asked_us,
-        "adc_prescaler": board.adc_prescaler,
-    }
+    named: dict[str, protocol.Value] = {"rate_mhz": board.rate_asked_mhz}
+    same = ("rows", "columns", "adc_prescaler", "mode")
+    return named | {"settle_us": board.settle_asked_us, **{n: getattr(board, n) for n in same}}

@@ -47,6 +47,7 @@ class Hello:
     settle_asked_us: int
     settle_us: int
     adc_prescaler: str
+    mode: str
     baud: int
     settings: str
     reset_cause: tuple[str, ...]
@@ -102,7 +103,7 @@ class SelfTestReport:
     """What the sense nodes read over all multiplexer inputs.
 
     findings: names of the members of the enum `finding`; empty on a sound board. code_min,
-    code_max: smallest and largest code of the configurations A to D.
+    code_max: smallest and largest code of the readings a to h; 1023 and 0 for those not taken.
     """
 
     findings: tuple[str, ...]
@@ -114,10 +115,11 @@ class SelfTestReport:
 class Scan:
     """All readings of a skin at one time.
 
-    codes: shape (rows, columns, 4), ADC codes of the configurations A to D. number: of the scan
-    since the board was started. time_us: board time at the scan's start [us], without wraps, from
+    codes: shape (rows, columns, 4), ADC codes of `reading_names`. number: of the scan since the
+    board was started. time_us: board time at the scan's start [us], without wraps, from
     the board's start. host_time_s: `time.monotonic()` when its last byte was read [s]. missed:
-    scans made since the one before this that never came, dropped there or damaged on the way.
+    scans made since the one before this that never came, dropped there or damaged on the way. mode:
+    which readings these are, a name of the enum `mode`.
     rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
     """
 
@@ -126,12 +128,18 @@ class Scan:
     time_us: int
     host_time_s: float
     missed: int
+    mode: str = field(default="near", kw_only=True)
     rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
 
     @property
     def ratio(self) -> NDArray[np.float64]:
         """Sense-node voltages over Vdd, (code + 0.5) / 2^bits, shape (rows, columns, 4)."""
         return ratio_from_codes(self.codes, protocol.ADC_BITS)
+
+    @property
+    def reading_names(self) -> tuple[str, ...]:
+        """What the readings of each cell are, of the names a to h: see the enum `reading`."""
+        return protocol.MODES[self.mode]
 
     @property
     def rows(self) -> int:
@@ -234,7 +242,7 @@ class BoardDecoder:
         stats.board_rx_errors = values["rx_errors"]
         self._number, self._dropped = number, dropped
         self._host_time_s = host_time_s
-        return Scan(codes, number, self._time_us, host_time_s, missed)
+        return Scan(codes, number, self._time_us, host_time_s, missed, mode=values["mode"])
 
     def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
         """Board time of the first scan since a start [us].

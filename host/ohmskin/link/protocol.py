@@ -143,6 +143,8 @@ ENUMS: dict[str, Enum] = {
     )
     for name, e in DEFINITION["enums"].items()
 }
+# The names of each mode's readings, in the order of a cell.
+MODES = {m["name"]: tuple(m["readings"]) for m in DEFINITION["enums"]["mode"]["members"]}
 FRAMES: dict[str, Frame] = {e["name"]: Frame(e) for e in DEFINITION["frames"]}
 FRAMES_BY_ID: dict[int, Frame] = {f.id: f for f in FRAMES.values()}
 # The definition as far as it decides what bytes mean.
