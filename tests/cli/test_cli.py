@@ -64,15 +64,20 @@ def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:
     done = well(
         run(
             *("configure", path, "--rows", "3", "--columns", "5", "--rate", "50", "--settle", "60"),
-            *("--adc", "clock_250khz", "--unit-id", "12", "--save"),
+            *("--adc", "clock_250khz", "--mode", "far", "--unit-id", "12", "--save"),
         )
     )
-    assert "3x5 at 50.00 Hz" in done.out
+    assert "3x5 at 50.00 Hz, mode far" in done.out
     assert "saved" in done.out
     facts = json.loads(run("info", path, "--json").out)
     assert (facts["rows"], facts["columns"], facts["unit_id"]) == (3, 5, 12)
     assert (facts["settle_asked_us"], facts["adc_prescaler"]) == (60, "clock_250khz")
-    assert "8x8 at 90.00 Hz" in run("configure", path, "--defaults").out
+    assert facts["mode"] == "far"
+    (line,) = run("stream", path, "--method", "none", "--json", "--scans", "1").out.splitlines()
+    assert json.loads(line)["reading_names"] == ["a", "e", "b", "f"]
+    for refused in (run("stream", path, "--scans", "1"), run("doctor", path)):
+        assert_one_line(refused, "takes the readings a b c d, not a e b f", "--mode near")
+    assert "8x8 at 90.00 Hz, mode near" in run("configure", path, "--defaults").out
     assert json.loads(run("info", path, "--json").out)["unit_id"] == 0
 
 
@@ -84,7 +89,7 @@ def test_stream_json_is_one_object_a_scan(run: Run) -> None:
     scans = [json.loads(line) for line in done.out.splitlines()]
     assert [scan["scan"] for scan in scans] == list(range(scans[0]["scan"], scans[0]["scan"] + 7))
     expected = Scene("ghost", 4, 6, seed=2).ratio(0.0)
-    bare = {"scan", "time_us", "host_time_s", "missed", "ratio"}
+    bare = {"scan", "time_us", "host_time_s", "missed", "reading_names", "ratio"}
     estimate = {"method", "cell_siemens", "cell_siemens_std", "converged", "message"}
     for scan in scans:
         assert set(scan) == bare | estimate

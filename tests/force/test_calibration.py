@@ -150,6 +150,7 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
         (put("date", "yesterday"), "date is 'yesterday', not ISO 8601"),
         (put("date", 20250301), "date holds int, not str"),
         (put("method", "magic"), "method is 'magic', not one of ohm, matrix, "),
+        (put("mode", "middle"), "mode is 'middle', not one of near, far"),
         (put("rows", 2.0), "rows holds float, not int"),
         (put("rows", 0), "kind has not the shape (0, 3)"),
         (put("columns", 10**18), "kind has not the shape (2, 1000000000000000000)"),

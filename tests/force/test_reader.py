@@ -75,6 +75,23 @@ def test_another_unit_is_refused_unless_forced() -> None:
             ohmskin.open("emulator://4x16", calibration=of_scene("rest"), force=force)
 
 
+@pytest.mark.parametrize(("of", "board"), [("near", "far"), ("far", "near")])
+def test_a_calibration_of_another_mode_is_refused_even_if_forced(of: str, board: str) -> None:
+    told = replace(of_scene("ghost"), mode=of)
+    for force in (False, True):
+        with pytest.raises(ValueError, match=f"of mode {of}, the board scans in mode {board}: "):
+            ohmskin.open(f"{GHOST}&mode={board}", calibration=told, force=force)
+
+
+def test_scans_of_another_mode_are_refused() -> None:
+    bench = Bench(GHOST)
+    reader = SkinReader(bench.info)
+    scans = iter(bench)
+    reader.read(next(scans))
+    with pytest.raises(ValueError, match="scanned in mode near, now in far"):
+        reader.read(replace(next(scans), mode="far"))
+
+
 def test_tare_is_refused_while_something_touches_the_skin() -> None:
     before = of_scene("ghost")
     with ohmskin.open(GHOST, calibration=before) as board:

@@ -39,6 +39,21 @@ def test_a_reference_file_is_read_whole() -> None:
     assert not readings.one_skin_per_frame
 
 
+def test_readings_at_far_ends_have_names(tmp_path: Path) -> None:
+    """The file of the reference has all of them: eight a cell."""
+    readings = load_readings(DATA / "far_harsh_8x8.npz")
+    assert readings.reading_names == tuple("abcdefgh")
+    assert readings.ratio.shape[-1] == 8
+    far = Readings(readings.ratio[..., [0, 4, 1, 5]], reading_names=tuple("aebf"))
+    assert far.knowledge(0).reading_names == tuple("aebf")
+    for names, ratio in (("abef", np.ones((1, 2, 2, 8))), ("aaef", np.ones((1, 2, 2, 4)))):
+        path = write(tmp_path / "wrong.npz", ratio=ratio, reading_names=list(names))
+        with pytest.raises(ValueError, match=r"wrong\.npz: (ratio has shape|reading_names are)"):
+            load_readings(path)
+    with pytest.raises(ValueError, match="reading E, is 2, not in 0"):
+        Readings(2 * np.eye(4)[1] * np.ones((1, 1, 1, 4)), reading_names=tuple("aebf"))
+
+
 def test_a_sweep_has_rest_and_wires_of_its_own_per_frame() -> None:
     readings = load_readings(DATA / "wire_sweep_3x3.npz")
     assert readings.one_skin_per_frame
@@ -198,7 +213,7 @@ def test_frames_that_are_right_are_not_checked_one_by_one(monkeypatch: pytest.Mo
     ratio = np.full((500, 1, 1, 4), 0.5)
     ratio[321, 0, 0, 2] = np.nan
     Readings(ratio)
-    assert checked == [{"name": "ratio, frame 321,"}]
+    assert checked == [{"name": "ratio, frame 321,", "of": tuple("abcd")}]
 
 
 def test_a_header_that_promises_more_than_the_file_holds_is_refused(tmp_path: Path) -> None:

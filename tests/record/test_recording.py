@@ -105,6 +105,28 @@ def test_everything_is_read_again(path: Path, hello: Hello) -> None:
     assert [*found.marks, *found.forces] == others
 
 
+def test_scans_keep_their_mode(tmp_path: Path, path: Path, hello: Hello) -> None:
+    """Two scans of each mode: read, replayed, exported, and read by methods that know but one."""
+    modes = ["near", "near", "far", "far"]
+    scans = [replace(scan(n), mode=mode) for n, mode in enumerate(modes)]
+    far = replace(hello, mode="far")
+    write_recording(path, hello, [*scans[:2], far, *scans[2:]])
+    assert [each.mode for each in load_recording(path).hellos] == ["near", "far"]
+    for found in (load_recording(path).scans, replayed(path)):
+        assert [each.mode for each in found] == modes
+    with pytest.raises(RecordingError, match=r"\(near\) become 3x4 \(far\) after 0\.005 s"):
+        export(load_recording(path), tmp_path / "both.npz")
+    for out in (tmp_path / "far.npz", tmp_path / "far.csv"):
+        export(load_recording(path), out, begin_s=0.004)
+    readings = load_readings(tmp_path / "far.npz")
+    assert readings.reading_names == ("a", "e", "b", "f")
+    np.testing.assert_array_equal(readings.ratio, [each.ratio for each in scans[2:]])
+    with pytest.raises(ValueError, match="'joint' takes the readings a b c d, not a e b f"):
+        estimate_file(readings, "joint")
+    header = (tmp_path / "far.csv").read_text().splitlines()[0].split(",")
+    assert header[4:8] == ["r0c0a", "r0c0e", "r0c0b", "r0c0f"]
+
+
 def test_other_programs_read_it(path: Path, hello: Hello) -> None:
     """The library's seeking reader, with the index; each message fits its schema's properties."""
     before_ns = time.time_ns()
@@ -302,7 +324,7 @@ def foreign(path: Path, topic: str, content: object) -> None:
 
 def test_an_old_recording_does_not_say_how_long_a_slot_is(path: Path, hello: Hello) -> None:
     content = {**asdict(hello), "host_time_s": 1.0}
-    del content["slot_cycles"]
+    del content["slot_cycles"], content["mode"]
     readings = hello.rows * hello.columns * 4
     for scan_cycles, slot_cycles in ((177_762, 177_762 // readings), (10**7, 60_000)):
         foreign(path, "/skin/hello", {**content, "scan_cycles": scan_cycles})
@@ -337,6 +359,11 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
         ("/skin/force", {"host_time_s": 1, "force_n": -(10**400), "source": ""}, "too large"),
         ("/skin/tare", {**head, "rows": 1, "columns": 1, "rest_ratio": [10**400] * 4}, "too large"),
         ("/skin/mark", {"host_time_s": 1, "text": "x" * 1_100_000}, "a message mark of 110"),
+        (
+            "/skin/scan",
+            {**head, "rows": 1, "columns": 1, "codes": [1] * 4, "mode": "x"},
+            "no mode 'x': there are near, far",
+        ),
     ):
         foreign(path, topic, content)
         assert reason in outcome(path)
@@ -575,7 +602,7 @@ def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) 
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
         assert_same(list(skin), scans, host_time=False)
         assert skin.info.rows == 2
-    with pytest.raises(RecordingError, match=r"3x4 cells become 2x4"):
+    with pytest.raises(RecordingError, match=r"3x4 cells \(near\) become 2x4"):
         export(load_recording(path), tmp_path / "a.npz")
 
 

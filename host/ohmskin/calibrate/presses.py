@@ -256,5 +256,6 @@ class Calibrator:
             model=found.model_,
             indenter_area_m2=self.indenter_area_m2,
             nominal_wire_ohm=self.estimator.wires(),
+            mode=self.board.mode,
         )
         return calibration, found.message_

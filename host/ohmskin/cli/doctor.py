@@ -82,7 +82,7 @@ def doctor(
         else:
             with device:
                 if told is not None:
-                    told.check(device.info.unit_id, device.info.rows, device.info.columns)
+                    told.check(device.info)
                 evidence = gather(device, tell, wire_ohm, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)

@@ -70,7 +70,7 @@ def stream(
     with ohmskin.open(port) as skin:
         board = skin.info
         if told is not None:
-            told.check(board.unit_id, board.rows, board.columns, force=force)
+            told.check(board, force=force)
         reader = None if method == "none" else SkinReader(board, told, method=method)
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
@@ -102,6 +102,7 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
             "time_us": scan.time_us,
             "host_time_s": round(scan.host_time_s, 6),
             "missed": scan.missed,
+            "reading_names": scan.reading_names,
             "ratio": scan.ratio.tolist(),
         }
         if reader is not None:
@@ -148,7 +149,8 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     )
     if reader is None:
         title = f"{skin.name}: reading B in thousandths of Vdd"
-        return Group(Text(title), conductances(1e-3 * scan.ratio[:, :, 1]), Text(caption))
+        level = 1e-3 * scan.ratio[:, :, scan.reading_names.index("b")]
+        return Group(Text(title), conductances(level), Text(caption))
     found = reader.read(scan)
     if not found.estimate.converged:
         caption += f"  not converged: {found.estimate.message}"

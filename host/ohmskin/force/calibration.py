@@ -9,6 +9,7 @@ unit_id                                    the board's, 0 to 2^32 - 1
 date                                       ISO 8601
 method                                     the estimator that told the cells, or "voltage"
 rows, columns                              R, C
+mode                                       which readings its scans hold, "near" if absent
 nominal_top_wire_ohm                       one wire segment of each layer [ohm], null: not told
 nominal_bottom_wire_ohm
 wire_log_std                               deviation of the log of both, null: not measured
@@ -40,6 +41,8 @@ from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
+from ohmskin.link.messages import Hello
+from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import MAX_CELLS
 
 FORMAT: Final = "ohmskin calibration"
@@ -53,7 +56,7 @@ MAX_NUMBER: Final = 1e60
 _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 _RESTS: Final = ("rest", "tare")
 _WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
-_PLAIN: Final = {"unit_id": int, "date": str, "method": str, "indenter_area_m2": float}
+_OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str, "indenter_area_m2": float}
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
 
 
@@ -100,6 +103,7 @@ class Calibration:
     indenter_area_m2: float
     nominal_wire_ohm: WireOhm = NO_WIRES
     tare: Rest | None = None
+    mode: str = "near"
 
     def __post_init__(self) -> None:
         if not 0 <= self.unit_id <= MAX_UNIT_ID:
@@ -108,6 +112,8 @@ class Calibration:
         if self.method not in LEVEL_METHODS:
             methods = ", ".join(LEVEL_METHODS)
             raise ValueError(f"method is {self.method[:40]!r}, not one of {methods}")
+        if self.mode not in MODES:
+            raise ValueError(f"mode is {self.mode[:40]!r}, not one of {', '.join(MODES)}")
         shape = self.model.kind.shape
         for name, rest in (("rest", self.rest), ("tare", self.tare)):
             if rest is not None and rest.level.shape != shape:
@@ -133,26 +139,28 @@ class Calibration:
         """The rest in force: the tare, if there is one."""
         return self.rest if self.tare is None else self.tare
 
-    def check(self, unit_id: int, rows: int, columns: int, *, force: bool = False) -> None:
-        """Raise ValueError unless this calibration is of this board's skin.
-
-        force: the unit may be another one.
-        """
-        if (rows, columns) != (self.rows, self.columns):
+    def check(self, board: Hello, *, force: bool = False) -> None:
+        """Raise ValueError unless this calibration is of this board's skin. force: of any unit."""
+        if (board.rows, board.columns) != (self.rows, self.columns):
             raise ValueError(
                 f"this calibration is of a {self.rows}x{self.columns} skin, the board scans "
-                f"{rows}x{columns}: calibrate this skin"
+                f"{board.rows}x{board.columns}: calibrate this skin"
             )
-        if unit_id != self.unit_id and not force:
+        if board.mode != self.mode:
             raise ValueError(
-                f"this calibration is of unit {self.unit_id}, the board is unit {unit_id}: "
+                f"this calibration is of mode {self.mode}, the board scans in mode {board.mode}: "
+                f"'ohmskin configure PORT --mode {self.mode}', or calibrate this skin anew"
+            )
+        if board.unit_id != self.unit_id and not force:
+            raise ValueError(
+                f"this calibration is of unit {self.unit_id}, the board is unit {board.unit_id}: "
                 "calibrate this skin, or force it if the same skin has a new board"
             )
 
     def save(self, path: PathName) -> None:
         """Write the file whole or not at all. Raises ValueError if it cannot be written."""
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
-        for name in ("unit_id", "date", "method", "rows", "columns", "indenter_area_m2"):
+        for name in (*_OWN, "rows", "columns"):
             content[name] = getattr(self, name)
         content |= dict(zip(_WIRES, self.nominal_wire_ohm, strict=True))
         for name in _RESTS:
@@ -205,8 +213,8 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
     if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
-    content.setdefault("wire_log_std", None)  # files of before have none
-    known = {"format", "schema", "rows", "columns", *_PLAIN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
+    content = {"wire_log_std": None, "mode": "near", **content}  # files of before have none
+    known = {"format", "schema", "rows", "columns", *_OWN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
     of_before = {"intercept", "intercept_std"} & content.keys()
     _require_fields(content, known | of_before)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
@@ -218,7 +226,7 @@ def _from_content(content: Any) -> Calibration:
         None if content[name] is None else _value(name, content[name], float) for name in _WIRES
     )
     return Calibration(
-        **{name: _value(name, content[name], wanted) for name, wanted in _PLAIN.items()},
+        **{name: _value(name, content[name], wanted) for name, wanted in _OWN.items()},
         rest=_rest("rest", content["rest"], shape),
         tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
         model=model,

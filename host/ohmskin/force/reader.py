@@ -73,7 +73,7 @@ class SkinReader:
     Of recorded tares (`Scan.rest_ratio`) and those taken by `tare`, the latest is the rest. Scans
     are read by one thread; all else may be called from any thread.
 
-    :raises ValueError: no such method, or the board scans other cells than were calibrated.
+    :raises ValueError: no such method, or other cells or another mode than were calibrated.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class SkinReader:
         self._replayed: list[Float] = []
         self._lock = threading.Lock()
         if calibration is not None:
-            calibration.check(calibration.unit_id, board.rows, board.columns)
+            calibration.check(board, force=True)
             self._wanted = method or calibration.method
             known = (calibration.rest, calibration.tare)
             self._rests = [each for each in known if each is not None]
@@ -185,7 +185,9 @@ class SkinReader:
         return np.asarray(found.level - at_rest)
 
     def read(self, scan: Scan) -> ForceScan:
-        """What a scan shows. Raises ValueError if it is of other cells."""
+        """What a scan shows. Raises ValueError if it is of other cells, or of another mode."""
+        if scan.mode != self.board.mode:
+            raise ValueError(f"the board scanned in mode {self.board.mode}, now in {scan.mode}")
         if scan.rest_ratio is not None and scan.rest_ratio.shape == scan.codes.shape:
             self._replay(scan.rest_ratio)
         if self._made != (self._wanted, self.rest):
@@ -242,8 +244,8 @@ class CalibratedSkin(Closing):
         self.name = device.name
         """See `Device.name`."""
         board = device.info
-        calibration.check(board.unit_id, board.rows, board.columns, force=force)
-        self._reader = SkinReader(board, calibration)  # even forced, it must have the same cells
+        calibration.check(board, force=force)
+        self._reader = SkinReader(board, calibration)
         self._lock = threading.Lock()
 
     @property

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The readings file (.npz): frames of readings in, one estimate per frame out.
 
-In (F frames of R x C cells, 4 readings a cell; other arrays are ignored):
+In (F frames of R x C cells, 4 readings a cell unless named; other arrays are ignored):
 
 ======================= ============================ =========================================
 array                   shape                        meaning
 ======================= ============================ =========================================
-ratio                   F, R, C, 4                   sense voltage / Vdd, order A, B, C, D
+ratio                   F, R, C, 4                   sense voltage / Vdd
 rest_ratio              R, C, 4 or F, R, C, 4        the same untouched (optional)
 ref_top_ohm             scalar                       reference resistors, 30 kOhm if absent
 ref_bottom_ohm          scalar
 nominal_top_wire_ohm    scalar or F                  one wire segment, per layer (optional)
 nominal_bottom_wire_ohm scalar or F
 adc_bits                scalar                       absent: the readings are exact
+reading_names           4, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
 
 Out: cell_ohm, cell_siemens, cell_siemens_std, top_wire_ohm, bottom_wire_ohm (F, R, C; NaN where the
@@ -30,14 +31,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM, READINGS_PER_CELL
+from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR
 from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import PathName, naming, whole_file
+from ohmskin.link.protocol import ENUMS
 
 MAX_ARRAY_BYTES: Final = 200_000_000
 # The estimators' matrices grow with the square: 4096 cells make 134 MB.
 MAX_CELLS: Final = 4096
+_NAMES: Final = tuple(ENUMS["reading"].values)
 # What is told of each frame, in this order.
 _OUT: Final = (
     *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched", "top_wire_ohm", "bottom_wire_ohm"),
@@ -56,10 +59,14 @@ class Readings:
     nominal_top_wire_ohm: Float | None = None
     nominal_bottom_wire_ohm: Float | None = None
     adc_bits: int | None = None
+    reading_names: tuple[str, ...] = NEAR
 
     def __post_init__(self) -> None:
-        if self.ratio.ndim != 4 or self.ratio.shape[-1] != READINGS_PER_CELL:
-            raise ValueError(f"ratio has shape {self.ratio.shape}, not (frames, rows, columns, 4)")
+        names, n = self.reading_names, len(self.reading_names)
+        if len({*names} & {*_NAMES}) != n:
+            raise ValueError(f"reading_names are {' '.join(names):.80}, not some of {_NAMES}")
+        if self.ratio.ndim != 4 or self.ratio.shape[-1] != n:
+            raise ValueError(f"ratio has shape {self.ratio.shape}, not (F, rows, columns, {n})")
         frames, rows, columns, _ = self.ratio.shape
         if frames < 1 or not 1 <= rows * columns <= MAX_CELLS:
             raise ValueError(
@@ -68,7 +75,7 @@ class Readings:
             )
         good = ((self.ratio >= 0) & (self.ratio <= 1)).all(axis=(1, 2, 3))
         for frame in np.flatnonzero(~good).tolist():
-            check_ratio(self.ratio[frame], rows, columns, name=f"ratio, frame {frame},")
+            check_ratio(self.ratio[frame], rows, columns, name=f"ratio, frame {frame},", of=names)
         rest = self.rest_ratio
         if rest is not None and rest.ndim == 4 and len(rest) != frames:
             raise ValueError(f"rest_ratio has {len(rest)} frames, ratio {frames}")
@@ -97,6 +104,7 @@ class Readings:
             adc_bits=self.adc_bits,
             rest_ratio=_of_frame(self.rest_ratio, frame, 3),
             nominal_wire_ohm=WireOhm(*(_of_frame(wire_ohm, frame, 0) for wire_ohm in wires)),
+            reading_names=self.reading_names,
         )
 
 
@@ -130,15 +138,19 @@ def load_readings(path: PathName) -> Readings:
         for name in ("ref_top_ohm", "ref_bottom_ohm", "adc_bits"):
             if name in arrays:
                 arrays[name] = _scalar(name, arrays[name])
+        if "reading_names" in arrays:
+            arrays["reading_names"] = tuple(arrays["reading_names"].ravel().tolist())
         return Readings(**arrays)
 
 
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Float:
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     # zipfile never yields more than the size it declares, so this bounds what is unpacked.
     if info.file_size > MAX_ARRAY_BYTES:
         raise ValueError(f"{info.file_size} bytes, more than {MAX_ARRAY_BYTES}")
     with archive.open(info) as member:
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
+    if info.filename == "reading_names.npy" and array.dtype.kind == "U":
+        return array
     if array.dtype.kind not in "fiu":
         raise ValueError(f"it holds {array.dtype}, not real numbers")
     if 8 * array.size > MAX_ARRAY_BYTES:

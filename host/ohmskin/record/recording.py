@@ -47,6 +47,7 @@ from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, save_table
 from ohmskin.link.codes import check_adc_bits, ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
 # A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
@@ -112,7 +113,7 @@ _OF_TYPE: Final[dict[object, dict[str, Any]]] = {
 }
 _HOST_TIME: Final = _is("number", "host's monotonic clock [s]")
 _SIZE: Final = {key: {"type": "integer", "minimum": 1} for key in ("rows", "columns")}
-_ORDER: Final = "row by row, in it column by column, A B C D of each cell"
+_ORDER: Final = "row by row, in it column by column, all readings of each cell"
 # By what follows `TOPIC`: the properties of its messages, in the words of JSON Schema.
 SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     "hello": {"host_time_s": _HOST_TIME, **{f.name: _OF_TYPE[f.type] for f in fields(Hello)}},
@@ -121,6 +122,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
         "time_us": _is("integer", "board time at the scan's start [us]"),
         "host_time_s": _HOST_TIME,
         "missed": _is("integer", "scans before this one that never came"),
+        "mode": _is("string", f"readings of each cell, by mode: {MODES}"),
         **_SIZE,
         "codes": _is("array", f"ADC codes: {_ORDER}", items={"type": "integer"}),
     },
@@ -263,7 +265,10 @@ def _message(name: str, octets: bytes) -> Recorded:
         raise ValueError(f"a message {name} is no JSON object")
     if name == "hello":
         content = {"slot_cycles": 0, **content}  # older boards did not say it
+    content.setdefault("mode", "near")  # older recordings know no other
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
+    if values.get("mode", "near") not in MODES:
+        raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
     if name == "hello":
         return _hello(values)
     for array in {"codes", "rest_ratio"} & values.keys():
@@ -343,13 +348,14 @@ def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
     scans = [scan for scan in scans if first_s + begin_s <= scan.host_time_s <= last_s]
     if not scans:
         raise RecordingError("no scans: neither in the recording nor in this part of it")
-    size = scans[0].codes.shape
+    first = scans[0]
     for scan in scans:
-        if scan.codes.shape != size:
+        if (scan.codes.shape, scan.mode) != (first.codes.shape, first.mode):
             at_s = scan.host_time_s - first_s
             raise RecordingError(
-                f"{size[0]}x{size[1]} cells become {scan.rows}x{scan.columns} after {at_s:.3f} s: "
-                "export each part by itself, --begin and --end"
+                f"{first.rows}x{first.columns} cells ({first.mode}) become {scan.rows}x"
+                f"{scan.columns} ({scan.mode}) after {at_s:.3f} s: export each part by itself, "
+                "--begin and --end"
             )
     return scans
 
@@ -369,6 +375,7 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
         )
     arrays: dict[str, Any] = {
         "ratio": ratio,
+        "reading_names": scans[0].reading_names,
         "ref_top_ohm": float(board.ref_top_ohm),
         "ref_bottom_ohm": float(board.ref_bottom_ohm),
         "adc_bits": board.adc_bits,
@@ -383,7 +390,7 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
 def _save_csv(scans: list[Scan], out: Path) -> None:
     """A row a scan: its times, then the codes of each cell, named by row, column and reading."""
     cells = np.ndindex(*scans[0].codes.shape)
-    names = [f"r{row}c{column}{'abcd'[reading]}" for row, column, reading in cells]
+    names = [f"r{row}c{column}{scans[0].reading_names[k]}" for row, column, k in cells]
     times = attrgetter(*_OF_SCAN)
     rows = ([*times(scan), *scan.codes.reshape(-1).tolist()] for scan in scans)
     save_table(out, [*_OF_SCAN, *names], rows)

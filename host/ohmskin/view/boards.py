@@ -47,7 +47,7 @@ _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
 # What makes boards the same skin: methods, rest and tare of one are good for the other.
 _skin_of: Final = attrgetter(
-    *("unit_id", "rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+    *("unit_id", "rows", "columns", "mode", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
 )
 
 
@@ -328,7 +328,7 @@ class ViewedBoard(Closing):
         self._note = note = ""
         for calibration in self._calibrations:
             try:
-                calibration.check(board.unit_id, board.rows, board.columns, force=self._force)
+                calibration.check(board, force=self._force)
                 return SkinReader(board, calibration)
             except ValueError as exc:
                 note = f"no forces: {exc}"
