@@ -65,7 +65,7 @@ def test_every_scan_prints_consecutive_scans() -> None:
 def test_estimate_prints_the_moving_finger() -> None:
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import estimate; "
-        "estimate.main('emulator://8x8?scene=moving', seconds=1.0)"
+        "estimate.main('emulator://8x8?scene=moving', seconds=4.5)"
     )
     text = output_of("-c", code, str(EXAMPLES))
     touches = re.findall(r"\((\d), (\d)\): ([\d.]+) \+- ([\d.]+) microsiemens", text)

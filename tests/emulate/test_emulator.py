@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import ohmskin
 from lockstep import LockstepSim, elf_of
 from ohmskin.emulate.board import EmulatedBoard
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import MOVING_BEGIN_S, Scene
 from ohmskin.errors import PortError
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
@@ -106,7 +106,11 @@ def asked_for(hello: Hello) -> dict[str, protocol.Value]:
 
 def test_scans_come_at_their_time_and_read_the_skin() -> None:
     scene = Scene("moving", 5, 3, seed=4)
-    board = EmulatedBoard(scene.ratio, 5, 3, rate_hz=100)
+
+    def ratio(time_s: float) -> np.ndarray:
+        return scene.ratio(MOVING_BEGIN_S + time_s)
+
+    board = EmulatedBoard(ratio, 5, 3, rate_hz=100)
     host = BoardDecoder()
     host.feed(board.advance(0.0), 0.0)
     start = protocol.FRAMES["start"]
@@ -118,7 +122,16 @@ def test_scans_come_at_their_time_and_read_the_skin() -> None:
     assert [s.number for s in found] == list(range(20))
     assert [s.time_us for s in found] == [10_000 * n for n in range(20)]
     for scan in found:
-        np.testing.assert_array_equal(scan.codes, quantise(scene.ratio(scan.time_us * 1e-6)))
+        np.testing.assert_array_equal(scan.codes, quantise(ratio(scan.time_us * 1e-6)))
+
+
+@pytest.mark.parametrize("name", ["moving", "corners"])
+def test_a_scene_that_moves_begins_untouched(name: str) -> None:
+    """Whoever tares first tares the skin at rest: 2 s, as the pages say, and the time to open."""
+    scene = Scene(name, 8, 8, seed=1)
+    for time_s in np.arange(0, 2.9, 0.1):
+        np.testing.assert_array_equal(scene.ratio(time_s), scene.rest_ratio)
+    assert any(scene.touched(time_s).any() for time_s in np.arange(3.0, 8.0, 0.1))
 
 
 def test_noise_is_that_of_the_seed_and_of_its_size() -> None:

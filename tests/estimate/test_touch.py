@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ohmskin.circuit.skin import port_resistance_ohm
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import MOVING_BEGIN_S, Scene
 from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
@@ -128,16 +128,17 @@ def test_a_skin_that_bends_is_followed(method: str) -> None:
 def test_a_finger_over_several_cells_is_followed(method: str, seed: int, known: bool) -> None:
     """Two seconds of a fingertip with soft edges, once around half the skin. known: the wires."""
     scene = Scene("moving", 8, 8, seed=seed)
+    times_s = MOVING_BEGIN_S + np.arange(180) / 90
     rest = scene.skin(0.0).top_wire_ohm, scene.skin(0.0).bottom_wire_ohm
     estimator = make_estimator(method, told(scene.rest_ratio, wires=known))
     errors, away, converged, shares = [], [], [], []
-    for frame in range(180):
-        found = estimator.estimate(ten_bits(scene.ratio(frame / 90)))
-        error = np.abs(found.cell_siemens - scene.skin(frame / 90).cell_siemens)
-        errors.append((error / scene.skin(frame / 90).cell_siemens)[scene.touched(frame / 90)])
+    for time_s in times_s:
+        found = estimator.estimate(ten_bits(scene.ratio(time_s)))
+        error = np.abs(found.cell_siemens - scene.skin(time_s).cell_siemens)
+        errors.append((error / scene.skin(time_s).cell_siemens)[scene.touched(time_s)])
         away.append(error / found.cell_siemens_std)
         converged.append(found.converged)
-        shares.append(found.cell_siemens.sum() / scene.skin(frame / 90).cell_siemens.sum())
+        shares.append(found.cell_siemens.sum() / scene.skin(time_s).cell_siemens.sum())
     assert np.median(np.concatenate(errors)) < (0.03 if known else 0.06)
     assert np.mean(np.array(away) < 4) > 0.99
     assert np.mean(converged) > 0.97

@@ -342,7 +342,7 @@ def test_the_faster_line(board: str, pty_board: Serve) -> None:
 @pytest.mark.simavr
 def test_a_moving_scene_moves_in_the_simulator_too() -> None:
     with ohmskin.open("simavr://uno?scene=moving") as skin:
-        codes = [scan.codes for scan in take(iter(skin), 60)]
+        codes = [scan.codes for scan in take(iter(skin), 360)]  # touched after 3 s
     assert (codes[0] != codes[-1]).any()
 
 

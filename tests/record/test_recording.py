@@ -156,7 +156,9 @@ def test_size_on_disk(path: Path, hello: Hello) -> None:
     board, _, _ = emulated("emulator://8x8?scene=moving&noise=1")
     with Recorder(path, hello) as recorder:
         for number in range(450):
-            recorder.add(Scan(board.codes_at(number / 90), number, 11_111 * number, number / 90, 0))
+            recorder.add(
+                Scan(board.codes_at(3 + number / 90), number, 11_111 * number, number / 90, 0)
+            )
             if number % 45 == 44:
                 recorder._flush()
     assert path.stat().st_size < 5 * 40_000

@@ -27,13 +27,16 @@ _TOUCHED_SIEMENS: Final = 1e-6
 
 SCENES: Final = {
     "rest": "nothing touches the skin",
-    "single": "one touch in the middle",
-    "ghost": "three corners of a rectangle: without an estimator the fourth seems touched too",
-    "multi": "five touches at places drawn from the seed",
+    "single": "one touch in the middle, from the start",
+    "ghost": "three corners of a rectangle, from the start: without an estimator the fourth seems "
+    "touched too",
+    "multi": "five touches, from the start, at places drawn from the seed",
     "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
-    "moving": "one fingertip on a closed curve over the whole skin, once in 4 s",
+    "moving": "after 3 s, one fingertip on a closed curve over the whole skin, once in 4 s",
 }
-# The scene "moving": its period, the radius of the fingertip's pressure and its peak.
+# The scene "moving": its time before the touch, which a tare takes for rest, its period, the radius
+# of the fingertip's pressure and its peak.
+MOVING_BEGIN_S: Final = 3.0
 _MOVING_PERIOD_S: Final = 4.0
 _FINGER_CELLS: Final = 0.7
 _FINGER_SIEMENS: Final = 2e-4
@@ -142,7 +145,9 @@ class Scene:
         return touches
 
     def _finger(self, time_s: float) -> Float:
-        angle = 2 * np.pi * time_s / _MOVING_PERIOD_S
+        if time_s < MOVING_BEGIN_S:
+            return np.zeros((self.rows, self.columns))
+        angle = 2 * np.pi * (time_s - MOVING_BEGIN_S) / _MOVING_PERIOD_S
         row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
         away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
