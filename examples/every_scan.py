@@ -5,6 +5,8 @@ import sys
 
 import ohmskin
 
+if len(sys.argv) < 2:
+    sys.exit(__doc__)
 port, scans = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 0
 with ohmskin.open(port) as skin:
     for count, scan in enumerate(skin, start=1):

@@ -14,6 +14,8 @@ import sys
 
 import ohmskin
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 with ohmskin.open(sys.argv[1], calibration=sys.argv[2]) as skin:
     for scan in skin:
         for each in scan.contacts:

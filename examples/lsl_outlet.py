@@ -44,4 +44,6 @@ def main(port: str, calibration: str, seconds: float = float("inf")) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     main(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))

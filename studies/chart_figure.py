@@ -62,7 +62,7 @@ def require_matplotlib() -> None:
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError as exc:
-        raise OhmskinError("pictures need matplotlib: pip install 'ohmskin[plot]'") from exc
+        raise OhmskinError("pictures need matplotlib: pip install '.[plot]'") from exc
 
 
 def picture(rows: Sequence[Row], machine: str) -> bytes:

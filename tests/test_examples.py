@@ -93,7 +93,11 @@ def test_forces_says_where_a_force_is_uncertain(tmp_path: Path) -> None:
 def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> None:
     path, table = tmp_path / "skin.json", str(EXAMPLES / "presses.csv")
     arguments = ("emulator://8x8", table, str(path), "--indenter-mm2", "80")
-    assert run("calibrate", "table", *arguments).code == 0
+    said = well(run("calibrate", "table", *arguments)).out
+    assert re.search(
+        "64 of 64 cells take .* of all presses; its held-out error is 0.3[0-9] N", said
+    )
+    assert len(said.splitlines()) == 3  # no table of cells that have nothing of their own
     calibration = ohmskin.load_calibration(path)
     assert (calibration.rows, calibration.columns, calibration.unit_id) == (8, 8, 0)
 
@@ -265,6 +269,14 @@ def test_foxglove_forces_writes_a_grid(recorded: Path, skin_json: str, tmp_path:
     with ohmskin.open(f"replay://{recorded}?speed=0", calibration=skin_json) as skin:
         *_, last = skin
     assert cells[-1][-1]["force_n_std"] == pytest.approx(last.force_n_std.flatten(), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["every_scan", "estimate", "forces", "foxglove_forces"])
+def test_an_example_without_arguments_says_how_to_call_it(name: str) -> None:
+    done = python(str(EXAMPLES / f"{name}.py"))
+    assert (done.code, done.out) == (1, "")
+    assert f"python {name}.py " in done.err
+    assert "Traceback" not in done.err
 
 
 def test_every_example_is_run_here() -> None:

@@ -147,7 +147,8 @@ def test_a_gap_in_the_log_costs_its_presses_alone(
         return t[kept], f[kept]
 
     edited(presses[1], with_gap)
-    well(calibrate(run, presses, *BY_OHM))
+    done = well(calibrate(run, presses, *BY_OHM))
+    assert "held-out error [N], of so many presses, of cells' own curves" in done.out
     assert load_calibration(presses[2]).model.pooled.sum() <= 1
 
 

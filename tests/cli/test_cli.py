@@ -4,6 +4,7 @@
 import errno
 import json
 import os
+import re
 import select
 import signal
 import time
@@ -14,14 +15,15 @@ import pytest
 import serial
 
 import ohmskin
-from command_line import Command, Done, Run, assert_one_line, finish, well
+from calibrations import of_scene
+from command_line import Command, Done, Run, assert_one_line, finish, python, well
 from ohmskin.cli.main import app
-from ohmskin.emulate.faults import SKIN_FAULTS
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
+from ohmskin.emulate.scenes import SCENES, Scene
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link import session
 from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.link.protocol import LAYOUT_CRC
+from ohmskin.link.protocol import ENUMS, LAYOUT_CRC
 from ohmskin.record.readings import estimate_file, load_readings
 from places import DATA
 from ports import Attach, Serve
@@ -57,6 +59,29 @@ def test_info(run: Run) -> None:
     tested = json.loads(run("info", EMULATED, "--json", "--self-test").out)
     assert tested["findings"] == []
     assert len(tested["code_min"]) == 8
+
+
+def test_info_is_in_peoples_units(run: Run) -> None:
+    said = dict(re.findall(r"^ ([a-z ]+?)  +(.*?) *$", well(run("info", EMULATED)).out, re.M))
+    assert said["cells"] == "4 rows, 6 columns"
+    assert said["rate"] == "90.00 Hz (asked: 90.00 Hz)"
+    assert said["references"] == "30000 Ohm top, 30000 Ohm bottom"
+    assert said["settings"] == ENUMS["settings"].docs["defaults_blank"]
+    assert not [name for name in said if "_" in name]
+
+
+def test_the_environment_names_port_and_calibration(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "skin.json"
+    of_scene("ghost").save(path)
+    monkeypatch.setenv("OHMSKIN_PORT", "emulator://8x8?scene=ghost&seed=1")
+    monkeypatch.setenv("OHMSKIN_CALIBRATION", str(path))
+    assert "8 rows, 8 columns" in well(run("info")).out
+    assert "4 rows, 6 columns" in well(run("info", EMULATED)).out
+    assert "force by 'touch'" in well(run("stream", "--scans", "1")).out
+    assert "by 'ohm'" in well(run("stream", "--scans", "1", "--method", "ohm")).out
+    assert "tared" in well(run("tare", "--force", "--seconds", "0.1")).out
 
 
 def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:
@@ -168,6 +193,14 @@ def test_estimate_does_not_leave_half_a_file(run: Run, tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_a_stream_into_a_pipe_is_printed_as_it_goes(command: Command) -> None:
+    process = command("stream", EMULATED, "--seconds", "8")
+    for _ in range(2):  # two pictures, and it goes on
+        while "missed 0" not in (line := process.stdout.readline()):
+            assert line
+    assert process.poll() is None
+
+
 # ------------------------------------------------------------------------------ without a board
 
 
@@ -235,6 +268,7 @@ def test_demo_shows_a_ghost_and_how_it_goes(run: Run, tmp_path: Path) -> None:
     picture = tmp_path / "demo.png"
     done = run("demo", "--seconds", "0.5", "--picture", str(picture))
     assert done.code == 0
+    assert done.out.startswith("scanning emulator://8x8?scene=ghost&seed=1 for 0.5 s\n")
     for word in ("truth", "ohm", "joint", "0 missed", "0 damaged"):
         assert word in done.out
     verdicts = {
@@ -311,8 +345,8 @@ def test_an_error_is_one_line(what: str, run: Run, attach: Attach) -> None:
     attach()
     arguments, words = WRONG[what]
     done = run(*arguments)
-    if what == "unplugged":
-        done = Done(done.code, "", done.err)  # it was shown until then
+    if what in ("unplugged", "demo of a real port"):
+        done = Done(done.code, "", done.err)  # what was shown until then
     assert_one_line(done, *words)
 
 
@@ -377,6 +411,28 @@ def test_help_of_a_command(run: Run, name: str) -> None:
     for option in OPTIONS[name]:
         assert option.lower() in done.out.lower()
     assert run(name, "-h").out == done.out
+
+
+def test_help_of_emulate_has_a_line_for_each_scene_and_fault(run: Run) -> None:
+    lines = [line.strip() for line in run("emulate", "--help").out.splitlines()]
+    known = {**SCENES, **LINE_FAULTS, **SKIN_FAULTS}
+    assert [line for line in lines if line.startswith("- ")] == [
+        f"- {name}: {text}" for name, text in known.items()
+    ]
+
+
+def test_version(run: Run) -> None:
+    assert well(run("--version")).out == f"ohmskin {ohmskin.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "wanted"), [("ohmskin str", "stream"), ("ohmskin stream --tar", "--tare")]
+)
+def test_shells_complete_commands_and_options(typed: str, wanted: str) -> None:
+    environment = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    program = "from ohmskin.cli.main import main; main()"
+    done = python("-c", program, _OHMSKIN_COMPLETE="complete_bash", **environment)
+    assert done.out.split() == [wanted]
 
 
 def test_help_names_every_command(run: Run) -> None:

@@ -107,6 +107,17 @@ def test_a_reset_board_says_its_name_anew() -> None:
         assert skin.info.unit_id == 3
 
 
+def test_restarts_and_missed_scans_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "ohmskin")
+    with ohmskin.open("emulator://2x2?reset=0.5&drop=0.3") as skin:
+        for scan in skin:
+            if skin.stats.restarts and scan.missed:
+                break
+    said = {(each.levelname, each.message.split(" ", 1)[1]) for each in caplog.records}
+    assert ("WARNING", "was reset (external)") in said
+    assert ("INFO", f"missed {scan.missed} scans before scan {scan.number}") in said
+
+
 class ResetAfterConfigure(EmulatorLink):
     """Resets the board right after its first answer to `configure`."""
 

@@ -128,7 +128,7 @@ def test_without_matplotlib_nothing_is_measured(
     monkeypatch.setattr(module, "measure", lambda *_, **__: pytest.fail("measured in vain"))
     code, out, err = study(*command.split(), "--quick", "--out", str(tmp_path))
     assert (code, out) == (2, "")
-    assert err == "studies: pictures need matplotlib: pip install 'ohmskin[plot]'\n"
+    assert err == "studies: pictures need matplotlib: pip install '.[plot]'\n"
 
 
 @pytest.mark.parametrize(

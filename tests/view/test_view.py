@@ -624,7 +624,7 @@ def test_a_port_that_is_taken(run: Run) -> None:
 
 def test_without_the_extra_it_says_what_to_install() -> None:
     program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__"
-    assert_one_line(python("-c", program, "view"), "pip install 'ohmskin[view]'")
+    assert_one_line(python("-c", program, "view"), "pip install '.[view]'")
 
 
 def gone_socket(error: Exception) -> AsyncMock:

@@ -36,7 +36,10 @@ _RETRY_S: Final = 0.2
 
 _out = Console(soft_wrap=True)
 
-Port = Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")]
+Port = Annotated[
+    str,
+    typer.Argument(envvar="OHMSKIN_PORT", help="serial port or URL; 'ohmskin ports' lists them"),
+]
 Wires = Annotated[str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
 
 
@@ -75,29 +78,46 @@ def info(
 ) -> None:
     """Say what board is at PORT and how it scans."""
     with ohmskin.open(port, start=False) as skin:
-        facts: dict[str, Any] = {**asdict(skin.info), "rate_hz": round(skin.info.rate_hz, 4)}
-        if self_test:
-            facts.update(asdict(skin.self_test()))
+        board = skin.info
+        tested = skin.self_test() if self_test else None
     if as_json:
-        print(json.dumps(facts))  # noqa: T201
+        facts: dict[str, Any] = {**asdict(board), "rate_hz": round(board.rate_hz, 4)}
+        print(json.dumps(facts | (asdict(tested) if tested else {})))  # noqa: T201
         return
+    findings = tested.findings if tested else ()
     table = Table(box=None, show_header=False)
-    for name, value in facts.items():
-        table.add_row(name, _text(name, value))
+    for name, text in _said_of(board).items():
+        table.add_row(name, text)
+    if tested is not None:
+        ranges = zip("ABCD", tested.code_min, tested.code_max, strict=True)
+        table.add_row("codes", ", ".join(f"{name} {low} to {high}" for name, low, high in ranges))
+        table.add_row("findings", ", ".join(findings) or "none")
     _out.print(table)
-    findings = facts.get("findings", ())
     for finding in findings:
         _out.print(f"[red]{finding}[/]: {ENUMS['finding'].docs[finding]}")
     if findings:
         raise SystemExit(1)
 
 
-def _text(name: str, value: object) -> str:
-    if name == "layout_crc":
-        return f"0x{value:04X}"
-    if isinstance(value, tuple):
-        return ", ".join(map(str, value)) or "none"
-    return str(value)
+def _said_of(board: Hello) -> dict[str, str]:
+    """What a board says of itself, in people's units."""
+    rate = f"{1e-3 * board.rate_asked_mhz:.2f} Hz" if board.rate_asked_mhz else "the fastest"
+    settle = (
+        f"{board.settle_asked_us} us" if board.settle_asked_us else "as long as the rate allows"
+    )
+    return {
+        "board": f"{board.board}, firmware {board.version}, layout 0x{board.layout_crc:04X}",
+        "unit id": str(board.unit_id),
+        "cells": f"{board.rows} rows, {board.columns} columns",
+        "rate": f"{board.rate_hz:.2f} Hz (asked: {rate})",
+        "settle time": f"{board.settle_us} us or more (asked: {settle})",
+        "converter": f"{board.adc_bits} bits, {board.adc_prescaler}",
+        "references": f"{board.ref_top_ohm} Ohm top, {board.ref_bottom_ohm} Ohm bottom",
+        "line": f"{board.baud} baud",
+        "settings": ENUMS["settings"].docs.get(board.settings, board.settings),
+        "last reset": ", ".join(board.reset_cause) or "of no known cause",
+        "scans now": "yes" if board.scanning else "no",
+    }
 
 
 def configure(

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
 
 import ohmskin
 from ohmskin.arrays import Float
@@ -24,6 +25,7 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
+from ohmskin.cli.board import Port as SkinPort
 from ohmskin.cli.board import Wires, wires_of
 from ohmskin.cli.record import progress, until_stopped
 from ohmskin.cli.stream import cell_table
@@ -176,8 +178,13 @@ def table(
 
 
 def tare(
-    port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
-    calibration: Annotated[Path, typer.Argument(help="calibration file (.json), to be changed")],
+    port: SkinPort,
+    calibration: Annotated[
+        Path,
+        typer.Argument(
+            envvar="OHMSKIN_CALIBRATION", help="calibration file (.json), to be changed"
+        ),
+    ],
     seconds: Annotated[
         float, typer.Option(help="so long nothing touches the skin, in seconds")
     ] = TARE_S,
@@ -253,12 +260,13 @@ def _finish(
         calibration, message = calibrator.calibration(presses)
     calibration.save(out)
     model = calibration.model
-    every_cell = zip(model.held_out_rmse.flat, presses.counts.flat, model.pooled.flat, strict=True)
-    texts = [
-        f"{rmse_n:.2f} ({count}){'*' if of_all else ''}" for rmse_n, count, of_all in every_cell
-    ]
-    title = "held-out error [N], of so many presses; *: no curve of its own"
-    table = cell_table(np.reshape(texts, model.pooled.shape).tolist(), title)
+    table: Table | str = ""
+    if not model.pooled.all():
+        errors = np.char.mod("%.2f", model.held_out_rmse), np.char.mod(" (%d)", presses.counts)
+        texts = np.where(model.pooled, "-", np.char.add(*errors)).tolist()
+        table = cell_table(texts, "held-out error [N], of so many presses, of cells' own curves")
+    if message:
+        message += f"; its held-out error is {model.held_out_rmse[model.pooled].max():.2f} N"
     for each in filter(None, (note, table, message)):
         _out.print(each)
     top, bottom, log_std = calibration.nominal_wire_ohm

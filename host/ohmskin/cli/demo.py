@@ -1,127 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Without a board: ``ohmskin demo``, the main job compared with the truth, and ``emulate``."""
+"""``ohmskin demo``: the main job without a board. Says a word before it loads what it needs."""
 
-import signal
-import time
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated, Final
 
-import numpy as np
 import typer
-from rich.columns import Columns
-from rich.console import Console
 
-import ohmskin
-from ohmskin.arrays import Bool, Float
-from ohmskin.cli.stream import FULL_SCALE_US, conductances
-from ohmskin.emulate.board import PtyServer
-from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
-from ohmskin.emulate.scenes import SCENES
-from ohmskin.estimate.base import SkinKnowledge
-from ohmskin.estimate.methods import make_estimator
-from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.opening import emulated
-
-_URL: Final = "emulator://8x8?scene=ghost&seed=1"
-_METHODS: Final = ("ohm", "joint")
-_out = Console()
-
-EPILOGS: Final = {
-    "emulate": f"Scenes: {'; '.join(f'{k}: {v}' for k, v in SCENES.items())}. "
-    f"Faults of the line: {'; '.join(f'{k}: {v}' for k, v in LINE_FAULTS.items())}. "
-    f"Faults of the skin: {'; '.join(f'{k}: {v}' for k, v in SKIN_FAULTS.items())}."
-}
+URL: Final = "emulator://8x8?scene=ghost&seed=1"
 
 
 def demo(
     seconds: Annotated[float, typer.Option(help="how long to scan")] = 3.0,
-    port: Annotated[str, typer.Option(help="an emulator:// URL")] = _URL,
+    port: Annotated[str, typer.Option(help="an emulator:// URL")] = URL,
     picture: Annotated[Path, typer.Option(help="PNG to write")] = Path("ohmskin-demo.png"),
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
-    _, scene, _ = emulated(port)
-    with ohmskin.open(port) as skin:
-        board = skin.info
-        rest_ratio = ratio_from_codes(quantise(scene.rest_ratio))
-        knowledge = SkinKnowledge.of(board, rest_ratio)
-        estimators = [make_estimator(method, knowledge) for method in _METHODS]
-        end_s, found = time.monotonic() + seconds, []
-        for scan in skin:
-            found.append([estimator.estimate(scan.ratio) for estimator in estimators])
-            if time.monotonic() >= end_s:
-                break
-        stats = skin.stats
-    now_s = 1e-6 * scan.time_us
-    truth = scene.touched(now_s)
-    views = [("truth", scene.skin(now_s).cell_siemens, truth)]
-    views += [
-        (method, estimate.cell_siemens, estimate.touched)
-        for method, estimate in zip(_METHODS, found[-1], strict=True)
-    ]
-    title = f"scene '{scene.name}', simulated {board.rows}x{board.columns} skin"
-    out = _out if _out.is_terminal else Console(width=160)  # three tables side by side
-    out.print(f"{title}: cell conductance in microsiemens")
-    out.print(Columns([conductances(cell_siemens, name) for name, cell_siemens, _ in views]))
-    for (name, _, touched), estimates in zip(views[1:], zip(*found, strict=True), strict=True):
-        ghosts = int((touched & ~truth).sum())
-        said = f"{ghosts or 'no'} ghost{'s' if ghosts > 1 else ''}"
-        took_ms = 1e3 * float(np.median([estimate.seconds for estimate in estimates]))
-        out.print(f"{name:>8}: {said}, {took_ms:.2f} ms a scan")
-    out.print(
-        f"{stats.scans} scans at {board.rate_hz:.2f} Hz, {stats.missed} missed, "
-        f"{stats.line.damaged} damaged"
-    )
-    try:
-        _save_picture(picture, views, title)
-    except ImportError:
-        hint = "no picture: pictures need matplotlib: pip install 'ohmskin[plot]'"
-        out.print(hint, markup=False)
-    else:
-        out.print(f"picture: {picture}")
+    print(f"scanning {port} for {seconds:g} s", flush=True)  # noqa: T201
+    from ohmskin.cli.ghosts import compare  # loads for a second
 
-
-def _save_picture(path: Path, views: Sequence[tuple[str, Float, Bool]], title: str) -> None:
-    """A PNG of views side by side: name, conductances [S] and touched cells, each (R, C).
-
-    :raises ImportError: matplotlib is not installed.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(3.4 * len(views) + 0.8, 3.9), layout="constrained")
-    figure.suptitle(title)
-    all_axes = figure.subplots(1, len(views), squeeze=False)[0]
-    for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
-        seen_us = np.maximum(1e6 * cell_siemens, 0.1)
-        axes.imshow(seen_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
-        for row, column in np.argwhere(touched):
-            text = f"{seen_us[row, column]:.0f}"
-            colour = "white" if seen_us[row, column] < 50 else "black"
-            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
-        rows, columns = map(range, cell_siemens.shape)
-        axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
-    figure.colorbar(all_axes[0].images[0], ax=all_axes, label="cell conductance [µS]", shrink=0.9)
-    figure.savefig(path, dpi=120)
-
-
-def emulate(
-    url: Annotated[str, typer.Argument(help="an emulator:// URL")] = _URL,
-    link: Annotated[
-        Path | None, typer.Option(help="also make this symbolic link to the pseudo-terminal")
-    ] = None,
-    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
-) -> None:
-    """Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C ends it."""
-    board, _, faults = emulated(url)
-    with ExitStack() as stack:
-        server = stack.enter_context(PtyServer(board, faults))
-        if link is not None:
-            if link.is_symlink():
-                link.unlink()
-            link.symlink_to(server.path)
-            stack.callback(link.unlink, missing_ok=True)
-        print(server.path, flush=True)  # noqa: T201
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # the link goes then, too
-        with suppress(KeyboardInterrupt):
-            server.serve(seconds or float("inf"))
+    compare(port, seconds, picture)

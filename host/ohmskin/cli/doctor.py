@@ -14,7 +14,7 @@ from rich.console import Console
 import ohmskin
 from ohmskin import errors
 from ohmskin.cli import doctor_words as words
-from ohmskin.cli.board import Wires, wires_of
+from ohmskin.cli.board import Port, Wires, wires_of
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
@@ -46,7 +46,7 @@ Watch = Callable[[Iterable[Scan], float], Iterable[Scan]]
 
 
 def doctor(
-    port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
+    port: Port,
     calibration: Annotated[
         Path | None,
         typer.Option(

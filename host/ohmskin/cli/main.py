@@ -8,11 +8,12 @@ import sys
 from collections import namedtuple
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+import ohmskin
 from ohmskin.errors import OhmskinError
 
 # Where each command is, and what the list of commands says of it: the first paragraph of its help.
@@ -35,7 +36,7 @@ _COMMANDS: Final = {
     "mark.",
     "record.export": "Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as "
     "a table (.csv).",
-    "demo.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
+    "emulate.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
     "ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
     "calibrate.calibrate": "Learn each cell's force from presses of single cells: a calibration "
@@ -67,15 +68,34 @@ class _Command(TyperCommand):
         return self.load().make_context(info_name, args, parent, **extra)
 
 
-app = TyperGroup(
-    name="ohmskin",
-    commands=[_Command(*each) for each in _COMMANDS.items()],
+_typer = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Reads resistive tactile skins: boards, scans, and the conductance of every cell.",
     epilog="PORT is a serial port (/dev/ttyACM0, COM3) or a URL: emulator://8x8?scene=ghost, "
-    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1.",
+    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1. Where it may be left out, the "
+    "environment's OHMSKIN_PORT is taken.",
 )
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        print(f"ohmskin {ohmskin.__version__}")  # noqa: T201
+        raise typer.Exit
+
+
+@_typer.callback()
+def _ohmskin(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_say_version, is_eager=True, help="say the version"),
+    ] = False,
+) -> None:
+    """Reads resistive tactile skins: boards, scans, and the conductance of every cell."""
+
+
+app = typer.main.get_command(_typer)
+assert isinstance(app, TyperGroup)
+app.commands = {place.partition(".")[2]: _Command(place, said) for place, said in _COMMANDS.items()}
 
 
 def main() -> None:

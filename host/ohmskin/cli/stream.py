@@ -2,10 +2,12 @@
 """``ohmskin stream``: the skin at a port, live in a terminal or as JSON."""
 
 import json
+import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -20,6 +22,7 @@ from rich.text import Text
 
 import ohmskin
 from ohmskin.arrays import Float
+from ohmskin.cli.board import Port
 from ohmskin.errors import ctrl_c_kept
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
@@ -35,12 +38,13 @@ FULL_SCALE_N: Final = 10.0
 # An untouched cell's force counts as known up to this deviation [N], as on the page.
 KNOWN_N: Final = 0.1
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
-# Time between two pictures in a terminal [s]; every scan is counted all the same.
+# Time between two pictures in a terminal, and in a file or pipe [s]; every scan is counted.
 DISPLAY_EVERY_S: Final = 0.1
+_PRINT_EVERY_S: Final = 1.0
 
 
 def stream(
-    port: Annotated[str, typer.Argument(help="serial port or URL; 'ohmskin ports' lists them")],
+    port: Port,
     method: Annotated[
         str,
         typer.Option(
@@ -49,7 +53,8 @@ def stream(
         ),
     ] = "",
     calibration: Annotated[
-        Path | None, typer.Option(help="calibration file (.json): show forces")
+        Path | None,
+        typer.Option(envvar="OHMSKIN_CALIBRATION", help="calibration file (.json): show forces"),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     tare_s: Annotated[
@@ -62,6 +67,8 @@ def stream(
     """Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it."""
     if method not in ("", "none", *METHODS):
         raise ValueError(f"no method '{method}': there are none, {', '.join(METHODS)}")
+    if method and str(calibration) == os.environ.get("OHMSKIN_CALIBRATION"):
+        calibration = None  # what is said goes before what the environment says
     if method and calibration is not None:
         raise ValueError(
             "say either --method or --calibration: forces are by the calibration's method"
@@ -133,12 +140,16 @@ def _numbers(values: ArrayLike) -> Any:
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
-    shown_s = 0.0
-    with Live(console=_out, auto_refresh=False) as live:
+    shown_s, every_s = 0.0, DISPLAY_EVERY_S if _out.is_terminal else _PRINT_EVERY_S
+    with ExitStack() as stack:
+        show: Callable[[Group], None] = _out.print
+        if _out.is_terminal:
+            live = stack.enter_context(Live(console=_out, auto_refresh=False))
+            show = partial(live.update, refresh=True)
         for scan in scans:
-            if scan.host_time_s - shown_s >= DISPLAY_EVERY_S:
+            if scan.host_time_s - shown_s >= every_s:
                 shown_s = scan.host_time_s
-                live.update(_picture(skin, reader, scan), refresh=True)
+                show(_picture(skin, reader, scan))
 
 
 def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:

@@ -123,7 +123,7 @@ def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
         from matplotlib.figure import Figure
         from matplotlib.patches import Rectangle
     except ImportError as exc:
-        raise ValueError("no picture: it needs matplotlib: pip install 'ohmskin[plot]'") from exc
+        raise ValueError("no picture: it needs matplotlib: pip install '.[plot]'") from exc
     size = 8 if max(exam.plate.shape) <= 8 else 5  # of letters
     most, crossings = exam.tolerance, range(max(exam.plate.shape))
     figure = Figure(figsize=(11, 9), layout="constrained")

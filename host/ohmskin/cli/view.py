@@ -20,11 +20,16 @@ HTTP_PORT = 8765
 def view(
     ports: Annotated[
         list[str] | None,
-        typer.Argument(metavar="PORT", help="serial ports or URLs; none: the page asks"),
+        typer.Argument(
+            metavar="PORT", envvar="OHMSKIN_PORT", help="serial ports or URLs; none: the page asks"
+        ),
     ] = None,
     calibration: Annotated[
         list[Path] | None,
-        typer.Option(help="calibration file (.json): show forces; may be given for each unit"),
+        typer.Option(
+            envvar="OHMSKIN_CALIBRATION",
+            help="calibration file (.json): show forces; may be given for each unit",
+        ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     host: Annotated[
@@ -46,7 +51,8 @@ def view(
         from ohmskin.view import server
     except ImportError as exc:
         raise OhmskinError(
-            f"the page needs more ({exc.name}): pip install 'ohmskin[view]'"
+            f"the page needs more ({exc.name}): run pip install '.[view]' in the checkout, or "
+            "'FILE.whl[view]' of a release's wheel"
         ) from exc
     from ohmskin.view.boards import ViewedBoards
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What gives scans, as programs see it: a board, or a recording that is played."""
 
+import logging
 import threading
 from abc import abstractmethod
 from collections import deque
@@ -17,6 +18,9 @@ from ohmskin.files import Closing
 from ohmskin.link import protocol
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
+# What a program may want in its log: restarts and boards that go are warnings, missed scans infos.
+LOG = logging.getLogger("ohmskin")
+LOG.addHandler(logging.NullHandler())
 # A device that should scan and is silent for so long counts as lost [s].
 SILENCE_TIMEOUT_S = 5.0
 # Scans that are kept for an iterator that is slower than the board: 11 s at 90 Hz.
@@ -259,6 +263,8 @@ class Device(Closing):
 
     def _publish(self, scan: Scan) -> None:
         """Give a scan to all who read; what a slow iterator loses is missed before its next."""
+        if scan.missed:
+            LOG.info("%s: missed %d scans before scan %d", self.name, scan.missed, scan.number)
         with self._changed:
             self._newest = scan
             for queue in self._queues.values():

@@ -16,7 +16,7 @@ from ohmskin.errors import (
     ProtocolMismatch,
 )
 from ohmskin.link import framing, protocol
-from ohmskin.link.device import COMMAND_TRIES, Device, configuration
+from ohmskin.link.device import COMMAND_TRIES, LOG, Device, configuration
 from ohmskin.link.messages import (
     Ack,
     BoardDecoder,
@@ -181,6 +181,7 @@ class Session(Device):
             case Hello() if self._want_scans and not message.scanning:
                 # It was reset: bring it back to where it was.
                 self._stats.restarts += 1
+                LOG.warning("%s: was reset (%s)", self.name, ", ".join(message.reset_cause))
                 before = self.info
                 self._send("configure", **configuration(before))
                 self._hello = replace(

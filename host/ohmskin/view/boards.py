@@ -27,7 +27,7 @@ from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import MEMORY_US
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
-from ohmskin.link.device import Device
+from ohmskin.link.device import LOG, Device
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
 
@@ -286,6 +286,8 @@ class ViewedBoard(Closing):
             self.closing.wait(AGAIN_S)
 
     def _say(self, status: str, text: str = "") -> None:
+        if status != self._status:
+            LOG.warning("%s: %s %s", self.port, status, text)
         self._status, self._text = status, text
         self._changed()
 
