@@ -42,10 +42,10 @@ setup: $(STAMP) $(PIO_STAMP) ## install what development needs (apt packages, .v
 
 setup-host: $(HOST_STAMP) ## install what the host alone needs (.venv)
 
-$(HOST_STAMP): pyproject.toml tools/setup.sh
+$(HOST_STAMP): pyproject.toml tools/setup.sh tools/constraints.txt
 	tools/setup.sh host
 
-$(STAMP): pyproject.toml tools/setup.sh firmware/second_sim/package-lock.json
+$(STAMP): pyproject.toml tools/setup.sh tools/constraints.txt firmware/second_sim/package-lock.json
 	tools/setup.sh all
 
 check: setup ## formatting, lint, types, generated files, docs

@@ -42,7 +42,7 @@ from places import ROOT
 from ports import Attach, Serve
 from recordings import HOST_BEGIN_S, record_presses, sensor_log, write_log, write_recording
 
-PROGRAMS = "ohmskin|make|python|pip|pio|npm|sudo|apt-get|export"
+PROGRAMS = "ohmskin|make|uv|build/lowest/bin/python|python|pip|pio|npm|sudo|apt-get|export"
 SPAN = re.compile(r"`(ohmskin\s[^`]*(?:PORT|/dev/tty|emulator://|first\.mcap)[^`]*)`")
 COMMAND = re.compile(rf"(?:\.venv/bin/)?(?:{PROGRAMS}) |\. ")
 BLOCK = re.compile(r"(?:^    .*\n|^\n(?=    ))+", re.MULTILINE)
@@ -58,6 +58,9 @@ NOT_RUN = {
     "make setup-host": "installs packages",
     "make test": "runs these tests",
     "make check": "CI runs it before these tests",
+    "uv venv build/lowest": "makes an environment",
+    "uv pip install --python build/lowest --resolution lowest-direct -e .[dev]": "installs them",
+    "build/lowest/bin/python -m pytest": "runs these tests",
     "make docs": "a part of make check",
     "make fuzz": "takes minutes; the tests have a short run of it",
     "make format": "changes sources",

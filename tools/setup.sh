@@ -6,7 +6,8 @@
 # host: .venv with the ohmskin package.
 # all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second
 # simulator, for tests) from npm, and the development tools.
-# Installs only what is missing, and says what.
+# Installs only what is missing, and says what. Python packages are of the versions that were tested:
+# tools/constraints.txt.
 set -euo pipefail
 
 APT_PACKAGES=(gcc-avr binutils-avr avr-libc arduino-core-avr avrdude cppcheck
@@ -75,7 +76,8 @@ make_venv() {
 
 pip_install() { # requirement
     echo "setup: installing $1 and its dependencies into .venv"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable "$1"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check \
+        --constraint tools/constraints.txt --editable "$1"
 }
 
 npm_install() { # folder
