@@ -236,6 +236,77 @@ def test_a_force_below_its_deviation_is_a_word(page: Any) -> None:
     has_text(panel, ".value", r"\d ± [\d.]+ µS")
 
 
+def test_no_value_below_its_deviation_is_written(page: Any) -> None:
+    def said(value: float, std: float, touched: int) -> str:
+        return page.evaluate(
+            """async ([value, std, touched]) => {
+                const { scaleOf, withStd } = await import(new URL("scale.js", location));
+                return withStd(scaleOf("siemens"), value, std, touched);
+            }""",
+            [value, std, touched],
+        )
+
+    assert said(20e-6, 19e-6, 1) == "20.0 ± 19.0 µS"
+    assert said(20e-6, 21e-6, 1) == said(20e-6, 21e-6, 0) == "uncertain"
+    assert said(0.3e-6, 0.4e-6, 0) == "0.30 ± 0.40 µS"  # known well enough: it is next to nothing
+    assert said(20e-6, float("nan"), 1) == "uncertain"
+
+
+def test_what_is_off_the_scale_is_marked(page: Any) -> None:
+    panel = open_board(page, "emulator://8x8?scene=single&seed=1")
+    has_text(panel, ".estimate .count", "1 cell touched")
+    scale = panel.get_by_label("Scale")
+    edge = """canvas => {
+        const ratio = canvas.width / canvas.clientWidth;
+        const at = [canvas.width - 14 * ratio, 8 * ratio, 1, 1];
+        return [...canvas.getContext("2d").getImageData(...at).data].join();
+    }"""
+    red = ",".join(map(str, (0xA8, 0x20, 0x1A, 255)))
+    inks = {}
+    for top_n, off in (("50", False), ("5", True)):
+        scale.select_option(top_n)
+        has_text(panel, ".value", "N, off the scale$" if off else "N$")
+        page.wait_for_timeout(300)
+        assert (panel.locator(".plot").evaluate(edge) == red) == off
+        inks[off] = ink(panel, 4, 4)
+    assert inks[True] > inks[False]
+
+
+def test_many_columns_have_their_numbers_on_hover(page: Any) -> None:
+    panel = open_board(page, "emulator://13x13?scene=ghost&seed=1")
+    cells, hover = panel.locator(".estimate .cells"), panel.locator(".estimate .hover")
+    assert hover.is_hidden()
+    box = cells.bounding_box()
+    side = (box["height"] - 20) / 13
+    cells.hover(position={"x": 20 + 3.5 * side, "y": 20 + 9.5 * side})
+    has_text(panel, ".estimate .hover", r"^\(9, 3\): \d\d\.\d ± \d\.\d+ µS$")
+    page.mouse.move(1, 1)
+    assert hover.is_hidden()
+    digits = """(canvas, at) => {
+        const ratio = canvas.width / canvas.clientWidth;
+        const data = canvas.getContext("2d").getImageData(at * ratio, at * ratio, 99, 99).data;
+        return data.some((each) => each > 0);
+    }"""
+    assert not panel.locator(".estimate .digits").evaluate(digits, 22)
+    assert panel.locator(".estimate .digits").evaluate(digits, 0)  # numbers of rows and columns
+
+
+def test_the_empty_page_offers_an_emulated_skin_and_the_doctor(page: Any) -> None:
+    start = page.locator("#start")
+    assert "ohmskin doctor" in start.inner_text()
+    start.get_by_role("button", name="Open an emulated skin").click()
+    panel = page.get_by_role("region", name="emulator://8x8?scene=moving", exact=True)
+    has_text(panel, ".status", "scanning")
+    assert start.is_hidden()
+    other = open_board(page, "emulator://4x4")
+    chips = [each.locator(".chip") for each in (panel, other)]
+    assert len({chip.inner_text() for chip in chips}) == 2
+    shade = "chip => getComputedStyle(chip).backgroundColor"
+    assert len({chip.evaluate(shade) for chip in chips}) == 2
+    page.mouse.wheel(0, 500)
+    assert panel.locator("h2").is_visible()
+
+
 def test_every_control_has_a_name(page: Any) -> None:
     panel = open_board(page, GHOST)
     for control in page.locator("button, select, input, canvas[tabindex]").all():

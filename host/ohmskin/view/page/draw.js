@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The heat map, its bar and the curve, on canvases that keep to the screen's own pixels.
 
-import { colourAt, inkAt, isHatched, isUncertain, written } from "./scale.js";
+import { colourAt, inkAt, isAbove, isHatched, isUncertain, written } from "./scale.js";
 
 const EDGE = 20; // px, for the numbers of rows and columns
 const TALLEST = 480;
+const MOST_COLUMNS = 12; // of more, numbers would touch: they are there on hover
 const FONT = "system-ui, 'DejaVu Sans', sans-serif";
 
 // The context of a canvas of so many CSS pixels, cleared.
@@ -65,6 +66,7 @@ export class HeatMap {
       if (!known || (std && isHatched(scale, values[cell], std[cell], touched[cell]))) {
         this.hatch(context, x, y, inkAt(position));
       }
+      if (isAbove(scale, values[cell])) this.corner(context, x, y, inkAt(position));
       if (touched[cell]) {
         context.strokeStyle = inkAt(position);
         context.lineWidth = 1.5;
@@ -75,6 +77,17 @@ export class HeatMap {
     context.strokeStyle = styleOf("--accent");
     context.lineWidth = 3;
     context.strokeRect(x - 1, y - 1, size + 1, size + 1);
+  }
+
+  // Of a value above the scale, whose colour ends there.
+  corner(context, x, y, ink) {
+    const [right, side] = [x + this.size - 1, Math.max(3, this.size / 4)];
+    context.fillStyle = ink;
+    context.beginPath();
+    context.moveTo(right - side, y);
+    context.lineTo(right, y);
+    context.lineTo(right, y + side);
+    context.fill();
   }
 
   hatch(context, x, y, ink) {
@@ -110,7 +123,7 @@ export class HeatMap {
     for (let column = 0; column < this.columns; column += every) {
       context.fillText(column, EDGE + (column + 0.5) * size, EDGE / 2);
     }
-    if (size < 28) return;
+    if (size < 28 || this.columns > MOST_COLUMNS) return;
     for (let cell = 0; cell < values.length; cell++) {
       const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
       const middle = x + (size - 1) / 2;
@@ -213,5 +226,17 @@ export class History {
     context.strokeStyle = styleOf("--accent");
     context.lineWidth = 1.5;
     context.stroke();
+    for (const [edge, off, word] of [[top, (at) => at > 1, "above"], [bottom, (at) => at < 0, "below"]]) {
+      const beyond = known.filter((scan) => off(scale.position(scan[scale.plane][cell])));
+      if (!beyond.length) continue;
+      // Where the curve is off the scale: a thick edge, and the furthest value in words.
+      context.fillStyle = styleOf("--bad");
+      for (const scan of beyond) context.fillRect(x(scan) - 2, edge - 2, 4, 4);
+      const values = beyond.map((scan) => scan[scale.plane][cell]);
+      const furthest = word === "above" ? Math.max(...values) : Math.min(...values);
+      context.textAlign = "left";
+      const text = `${word} the scale: ${written(scale.show(furthest))} ${scale.unit}`;
+      context.fillText(text, left + 4, word === "above" ? edge + 10 : edge - 10);
+    }
   }
 }

@@ -70,6 +70,7 @@ find("open").addEventListener("submit", (event) => {
   open(event.target.elements.port.value);
 });
 find("look").addEventListener("click", look);
+find("emulator").addEventListener("click", () => open("emulator://8x8?scene=moving"));
 onTheme(() => panels.forEach((panel) => panel.state && panel.rescale()));
 
 function frame(nowMs) {

@@ -72,6 +72,8 @@ export class Panel {
   }
 
   label(port, number) {
+    this.element.style.setProperty("--hue", (210 + 137 * number) % 360); // no two alike side by side
+    this.find(".chip").textContent = number + 1;
     const title = this.find("h2");
     title.textContent = port;
     title.id = `panel-${number}`;
@@ -123,7 +125,28 @@ export class Panel {
         if (cell !== null) this.choose(cell);
       });
       map.cells.addEventListener("keydown", (event) => this.move(event));
+      map.cells.addEventListener("pointermove", (event) => this.hover(map, event));
+      map.cells.addEventListener("pointerleave", () => this.hover(map, null));
     }
+  }
+
+  // The value under the pointer: numbers of many columns have no room.
+  hover(map, event) {
+    const text = map.cells.parentNode.querySelector(".hover");
+    const cell = event && this.scan && map.cellAt(event.offsetX, event.offsetY);
+    text.hidden = cell === null || cell === undefined;
+    map.hovered = text.hidden ? null : cell;
+    if (text.hidden) return;
+    text.style.left = `${Math.min(event.offsetX + 12, map.width - 90)}px`;
+    text.style.top = `${event.offsetY + 14}px`;
+    this.sayHovered(map);
+  }
+
+  sayHovered(map) {
+    if (map.hovered === null || map.hovered === undefined) return;
+    const value = map === this.estimate ? this.value(map.hovered)
+      : `${written(this.rawScale.show(this.scan.raw[map.hovered]))} ${this.rawScale.unit}`;
+    say(map.cells.parentNode.querySelector(".hover"), `${this.place(map.hovered)}: ${value}`);
   }
 
   command(message) {
@@ -215,8 +238,8 @@ export class Panel {
 
   // -------------------------------------------------------------------------------- drawing
 
-  place() {
-    return `(${Math.floor(this.chosen / this.scan.columns)}, ${this.chosen % this.scan.columns})`;
+  place(cell = this.chosen) {
+    return `(${Math.floor(cell / this.scan.columns)}, ${cell % this.scan.columns})`;
   }
 
   shownScale() {
@@ -310,10 +333,11 @@ export class Panel {
     const rows = scan.contacts.map(([identity, row, column, amount, std]) => {
       const [value, spread] = force ? [amount, std] : [1e6 * amount, 1e6 * std];
       return [identity, `${row.toFixed(1)}, ${column.toFixed(1)}`,
-        force && std > amount ? "uncertain" : `${written(value)} ± ${written(spread)}`];
+        !(std <= amount) ? "uncertain" : `${written(value)} ± ${written(spread)}`];
     });
     fill(this.find(".contacts tbody"), rows.length ? rows : [["–", "no contact", ""]]);
     this.sayFile();
+    for (const map of [this.raw, this.estimate]) this.sayHovered(map);
   }
 
   table(scan, scale) {

@@ -65,15 +65,18 @@ export function scaleOf(quantity, topN) {
   return quantity === "newtons" ? newtons(topN) : quantity === "ohms" ? ohms : siemens;
 }
 
-// A force that may be none: its deviation is larger. It has a word in place of a number. Cells that
-// nothing touches have none anyway, and it is known well enough below the floor.
+// A value that may be none: its deviation is larger. It has a word in place of a number. Cells that
+// nothing touches have no force anyway, and values are known well enough below the floor.
 export const isUncertain = (scale, value, std, touched) =>
-  scale.plane === "force" && std > (touched ? value : Math.max(value, scale.floor));
+  !(std <= (touched ? value : Math.max(value, scale.floor)));
 
 export const isHatched = (scale, value, std, touched) =>
   !(std <= Math.max(scale.floor, value / 4)) || isUncertain(scale, value, std, touched);
 
+export const isAbove = (scale, value) => scale.position(value) > 1;
+
 export function withStd(scale, value, std, touched) {
   if (isUncertain(scale, value, std, touched)) return "uncertain";
-  return `${written(scale.show(value))} ± ${written(scale.std(value, std))} ${scale.unit}`;
+  const above = isAbove(scale, value) ? ", off the scale" : "";
+  return `${written(scale.show(value))} ± ${written(scale.std(value, std))} ${scale.unit}${above}`;
 }
