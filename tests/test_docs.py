@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages say is there: commands and their options, code, files, names, printed numbers."""
 
+import os
 import pkgutil
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from runpy import run_path
@@ -212,6 +216,41 @@ def test_tables_and_sessions_in_docstrings_stay_as_they_are() -> None:
     assert "\n    >>> f()\n    1\n" in shown
     assert "\nx[i] \\[ohm]\n" in shown
     assert shown.endswith("\nend")
+
+
+@pytest.mark.browser
+def test_the_site_is_searched_from_the_disk_and_follows_the_scheme(tmp_path: Path) -> None:
+    from playwright.sync_api import sync_playwright
+
+    build = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "-q",
+        "-f",
+        ROOT / "mkdocs.yml",
+        "-d",
+        tmp_path,
+    ]
+    quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    subprocess.run(build, env=quiet, check=True, capture_output=True)
+    foreign: list[str] = []
+    with sync_playwright() as playwright:
+        arguments = [] if os.geteuid() else ["--no-sandbox"]
+        chromium = shutil.which("chromium")
+        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        for scheme, name in (("light", "default"), ("dark", "slate")):
+            page = browser.new_context(color_scheme=scheme).new_page()
+            page.on("request", lambda request: foreign.append(request.url))
+            page.goto((tmp_path / "examples/foxglove.html").as_uri())
+            assert page.locator("body").get_attribute("data-md-color-scheme") == name
+        page.locator(".md-search__input").click()
+        page.keyboard.type("brown-out", delay=30)
+        found = page.locator(".md-search-result__item h1", has_text="Troubleshooting")
+        found.wait_for(timeout=20_000)
+        browser.close()
+    assert [url for url in foreign if not url.startswith("file:")] == []
 
 
 @pytest.fixture(scope="module")
