@@ -36,10 +36,7 @@ _RETRY_S: Final = 0.2
 
 _out = Console(soft_wrap=True)
 
-Port = Annotated[
-    str,
-    typer.Argument(envvar="OHMSKIN_PORT", help="serial port or URL; 'ohmskin ports' lists them"),
-]
+Port = Annotated[str, typer.Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
 Wires = Annotated[str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
 
 
@@ -55,7 +52,7 @@ def wires_of(text: str) -> WireOhm:
 
 
 def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")] = False) -> None:
-    """List the serial ports of this machine, and the kinds of ports that need no board."""
+    """List serial ports, and the kinds of ports that need no board."""
     found = serial_ports()
     if as_json:
         print(json.dumps([asdict(port) for port in found]))  # noqa: T201
@@ -102,9 +99,8 @@ def info(
 def _said_of(board: Hello) -> dict[str, str]:
     """What a board says of itself, in people's units."""
     rate = f"{1e-3 * board.rate_asked_mhz:.2f} Hz" if board.rate_asked_mhz else "the fastest"
-    settle = (
-        f"{board.settle_asked_us} us" if board.settle_asked_us else "as long as the rate allows"
-    )
+    us = board.settle_asked_us
+    settle = f"{us} us" if us else "as long as the rate allows"
     return {
         "board": f"{board.board}, firmware {board.version}, layout 0x{board.layout_crc:04X}",
         "unit id": str(board.unit_id),
@@ -116,7 +112,6 @@ def _said_of(board: Hello) -> dict[str, str]:
         "line": f"{board.baud} baud",
         "settings": ENUMS["settings"].docs.get(board.settings, board.settings),
         "last reset": ", ".join(board.reset_cause) or "of no known cause",
-        "scans now": "yes" if board.scanning else "no",
     }
 
 
@@ -139,7 +134,7 @@ def configure(
     defaults: Annotated[bool, typer.Option(help="return to the defaults first")] = False,
     save: Annotated[bool, typer.Option(help="keep it in the board's EEPROM")] = False,
 ) -> None:
-    """Change how the board scans; what is not given stays. Lasts until its reset, or --save."""
+    """Change how the board scans, until its reset or for good (--save)."""
     with ohmskin.open(port, start=False) as skin:
         if defaults:
             skin.load_defaults()

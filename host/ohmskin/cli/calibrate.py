@@ -10,7 +10,6 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
 
 import ohmskin
 from ohmskin.arrays import Float
@@ -25,8 +24,7 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli.board import Port as SkinPort
-from ohmskin.cli.board import Wires, wires_of
+from ohmskin.cli.board import Port, Wires, wires_of
 from ohmskin.cli.record import progress, until_stopped
 from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
@@ -40,10 +38,7 @@ from ohmskin.record.recording import Recording, load_recording
 
 # Standard gravity [m/s^2].
 GRAVITY: Final = 9.80665
-# What a shell says of a command that Ctrl-C ended.
-_INTERRUPTED: Final = 130
 
-Port = Annotated[str, typer.Argument(help="serial port or URL; nothing may touch the skin")]
 Out = Annotated[Path, typer.Argument(help="calibration file to write (.json)")]
 Method = Annotated[str, typer.Option(help=" | ".join(LEVEL_METHODS))]
 Indenter = Annotated[
@@ -51,7 +46,7 @@ Indenter = Annotated[
 ]
 calibrate = typer.Typer(
     no_args_is_help=True,
-    help="Learn each cell's force from presses of single cells: a calibration file (.json).",
+    help="Learn forces from presses of single cells: a calibration file (.json).",
 )
 _out = Console(soft_wrap=True)
 
@@ -108,7 +103,7 @@ def weights(
         command = "the same command without --redo" if again else "the same command"
         done = f"{len(wanted) - left} of {len(wanted)} presses are in {kept.path}"
         _out.print(f"{done}: {command} goes on", markup=False)
-        raise typer.Exit(_INTERRUPTED)
+        raise typer.Exit(130)  # what a shell says of Ctrl-C
     _from_table(calibrator, kept.table, kept.path, out)
 
 
@@ -178,12 +173,9 @@ def table(
 
 
 def tare(
-    port: SkinPort,
+    port: Port,
     calibration: Annotated[
-        Path,
-        typer.Argument(
-            envvar="OHMSKIN_CALIBRATION", help="calibration file (.json), to be changed"
-        ),
+        Path, typer.Argument(envvar="OHMSKIN_CALIBRATION", help="file (.json) to be changed")
     ],
     seconds: Annotated[
         float, typer.Option(help="so long nothing touches the skin, in seconds")
@@ -195,7 +187,7 @@ def tare(
         bool, typer.Option("--force", help="even if cells seem touched: rest has drifted")
     ] = False,
 ) -> None:
-    """Take what the skin at PORT reads now for no force, from now on: nothing may touch it.
+    """Take what the skin at PORT reads now for no force: nothing may touch it.
 
     Is refused while something does. The rest that was calibrated is kept, for --undo.
     """
@@ -260,15 +252,16 @@ def _finish(
         calibration, message = calibrator.calibration(presses)
     calibration.save(out)
     model = calibration.model
-    table: Table | str = ""
+    if note:
+        _out.print(note)
     if not model.pooled.all():
         errors = np.char.mod("%.2f", model.held_out_rmse), np.char.mod(" (%d)", presses.counts)
         texts = np.where(model.pooled, "-", np.char.add(*errors)).tolist()
-        table = cell_table(texts, "held-out error [N], of so many presses, of cells' own curves")
+        title = "held-out error [N], of so many presses, of cells' own curves"
+        _out.print(cell_table(texts, title))
     if message:
-        message += f"; its held-out error is {model.held_out_rmse[model.pooled].max():.2f} N"
-    for each in filter(None, (note, table, message)):
-        _out.print(each)
+        error_n = model.held_out_rmse[model.pooled].max()  # of one cell alone none is known
+        _out.print(message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else ""))
     top, bottom, log_std = calibration.nominal_wire_ohm
     if log_std is not None:
         _out.print(f"wires, as presses tell: {top:.0f}, {bottom:.0f} Ohm, +- {100 * log_std:.0f} %")

@@ -62,7 +62,7 @@ def doctor(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Say what is wrong with the skin board at PORT, and what to do. Touch nothing meanwhile.
+    """Say what is wrong with the board at PORT, and what to do. Touch nothing.
 
     Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
     it says when and where to press. Any rectangle will do: its lines are measured. Exit code 0:

@@ -18,29 +18,21 @@ from ohmskin.errors import OhmskinError
 
 # Where each command is, and what the list of commands says of it: the first paragraph of its help.
 _COMMANDS: Final = {
-    "board.ports": "List the serial ports of this machine, and the kinds of ports that need no "
-    "board.",
+    "board.ports": "List serial ports, and the kinds of ports that need no board.",
     "board.info": "Say what board is at PORT and how it scans.",
-    "board.configure": "Change how the board scans; what is not given stays. Lasts until its "
-    "reset, or --save.",
+    "board.configure": "Change how the board scans, until its reset or for good (--save).",
     "board.flash": "Write the firmware to a board, and check that it answers.",
     "stream.stream": "Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it.",
     "view.view": "Show skins live on a page in the browser: heat map, contacts, tare, recording.",
-    "calibrate.tare": "Take what the skin at PORT reads now for no force, from now on: nothing may "
-    "touch it.",
-    "doctor.doctor": "Say what is wrong with the skin board at PORT, and what to do. Touch "
-    "nothing meanwhile.",
+    "calibrate.tare": "Take what the skin at PORT reads now for no force: nothing may touch it.",
+    "doctor.doctor": "Say what is wrong with the board at PORT, and what to do. Touch nothing.",
     "verify.verify": "Compare the board at PORT with a plate of known resistors.",
     "record.estimate": "Estimate every cell of every frame of a readings file.",
-    "record.record": "Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a "
-    "mark.",
-    "record.export": "Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as "
-    "a table (.csv).",
-    "emulate.emulate": "Serve an emulated board at a pseudo-terminal, for any program. Ctrl-C "
-    "ends it.",
+    "record.record": "Record every scan at PORT. Ctrl-C ends it; a line typed becomes a mark.",
+    "record.export": "Write a recording's scans as readings (.npz) or as a table (.csv).",
+    "emulate.emulate": "Serve an emulated board at a pseudo-terminal. Ctrl-C ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
-    "calibrate.calibrate": "Learn each cell's force from presses of single cells: a calibration "
-    "file (.json).",
+    "calibrate.calibrate": "Learn forces from presses of single cells: a calibration file (.json).",
 }
 
 
@@ -72,25 +64,16 @@ _typer = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="PORT is a serial port (/dev/ttyACM0, COM3) or a URL: emulator://8x8?scene=ghost, "
-    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1. Where it may be left out, the "
-    "environment's OHMSKIN_PORT is taken.",
+    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1. OHMSKIN_PORT may name it, too.",
 )
 
 
-def _say_version(wanted: bool) -> None:
-    if wanted:
+@_typer.callback(invoke_without_command=True)
+def _top(version: Annotated[bool, typer.Option("--version", help="the version")] = False) -> None:
+    """Reads resistive tactile skins: boards, scans, and the conductance of every cell."""
+    if version:
         print(f"ohmskin {ohmskin.__version__}")  # noqa: T201
         raise typer.Exit
-
-
-@_typer.callback()
-def _ohmskin(
-    version: Annotated[
-        bool,
-        typer.Option("--version", callback=_say_version, is_eager=True, help="say the version"),
-    ] = False,
-) -> None:
-    """Reads resistive tactile skins: boards, scans, and the conductance of every cell."""
 
 
 app = typer.main.get_command(_typer)

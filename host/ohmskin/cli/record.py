@@ -22,6 +22,7 @@ from rich.text import Text
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
+from ohmskin.cli.board import Port
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.methods import METHODS
@@ -38,14 +39,13 @@ from ohmskin.record.recording import export as export_recording
 FORCE_TARE_S: Final = 2.0
 # So many different messages of estimates are printed for a file.
 _MESSAGES: Final = 8
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 _out = Console(soft_wrap=True)
 _T = TypeVar("_T")
 
 
 def record(
-    port: Annotated[str, typer.Argument(help="serial port or URL")],
+    port: Port,
     file: Annotated[Path, typer.Argument(help="file to write (.mcap), a new one")],
     scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
     seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
@@ -66,7 +66,7 @@ def record(
         float, typer.Option(help="newtons for one unit of its numbers; of grams: 0.00980665")
     ] = 1.0,
 ) -> None:
-    """Record every scan at PORT. Ctrl-C ends it; a line typed meanwhile becomes a mark.
+    """Record every scan at PORT. Ctrl-C ends it; a line typed becomes a mark.
 
     With a force sensor: press cell after cell, and 'ohmskin calibrate recording' learns from that.
     """
@@ -129,7 +129,7 @@ def until_stopped(scans: Iterable[_T]) -> Iterator[_T]:
         if waits:
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, handle) for number in _SIGNALS}
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with suppress(KeyboardInterrupt):
             source = iter(scans)
@@ -210,7 +210,7 @@ def export(
         float, typer.Option("--end", help="until then, in seconds; 0: to the last")
     ] = 0.0,
 ) -> None:
-    """Write a recording's scans as readings (.npz, for 'ohmskin estimate') or as a table (.csv)."""
+    """Write a recording's scans as readings (.npz) or as a table (.csv)."""
     given = load_recording(recording)
     try:
         scans = export_recording(given, out, begin_s, end_s)

@@ -5,9 +5,8 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
-from functools import partial
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -82,7 +81,7 @@ def stream(
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
         with suppress(KeyboardInterrupt), ctrl_c_kept():
-            given = _limited(iter(skin), scans, seconds)
+            given = limited(iter(skin), scans, seconds)
             if as_json:
                 _print_scans(reader, given)
             else:
@@ -94,7 +93,8 @@ def stream(
         print(text, file=sys.stderr)  # noqa: T201
 
 
-def _limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
+def limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
+    """So many scans, or those of so long; 0: no limit."""
     end_s = time.monotonic() + seconds if seconds else float("inf")
     for number, scan in enumerate(scans, start=1):
         yield scan
@@ -140,16 +140,17 @@ def _numbers(values: ArrayLike) -> Any:
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
-    shown_s, every_s = 0.0, DISPLAY_EVERY_S if _out.is_terminal else _PRINT_EVERY_S
-    with ExitStack() as stack:
-        show: Callable[[Group], None] = _out.print
-        if _out.is_terminal:
-            live = stack.enter_context(Live(console=_out, auto_refresh=False))
-            show = partial(live.update, refresh=True)
+    shown_s = 0.0
+    live = Live(console=_out, auto_refresh=False) if _out.is_terminal else None
+    with live or nullcontext():
         for scan in scans:
-            if scan.host_time_s - shown_s >= every_s:
+            if scan.host_time_s - shown_s >= (DISPLAY_EVERY_S if live else _PRINT_EVERY_S):
                 shown_s = scan.host_time_s
-                show(_picture(skin, reader, scan))
+                picture = _picture(skin, reader, scan)
+                if live:
+                    live.update(picture, refresh=True)
+                else:
+                    _out.print(picture)
 
 
 def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
@@ -160,8 +161,8 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     )
     if reader is None:
         title = f"{skin.name}: reading B in thousandths of Vdd"
-        level = 1e-3 * scan.ratio[:, :, scan.reading_names.index("b")]
-        return Group(Text(title), conductances(level), Text(caption))
+        level = 1e3 * scan.ratio[:, :, scan.reading_names.index("b")]
+        return Group(Text(title), coloured(level, FULL_SCALE_US), Text(caption))
     found = reader.read(scan)
     if not found.estimate.converged:
         caption += f"  not converged: {found.estimate.message}"
@@ -169,7 +170,7 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
         title = f"{skin.name}: force by '{reader.method}' [N], ?: uncertain"
         least_n = np.where(found.estimate.touched, 0.0, KNOWN_N)
         uncertain = found.force_n_std > np.maximum(found.force_n, least_n)
-        table = _coloured(np.where(uncertain, np.nan, found.force_n), FULL_SCALE_N)
+        table = coloured(np.where(uncertain, np.nan, found.force_n), FULL_SCALE_N)
         contacts = (
             f"contact {each.identity}: {each.force_text} at ({each.row:.1f}, {each.column:.1f})"
             for each in found.contacts
@@ -177,16 +178,12 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
         caption = f"{'   '.join(contacts) or 'no contact'}\n{caption}"
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
-        table = conductances(found.estimate.cell_siemens)
+        table = coloured(1e6 * found.estimate.cell_siemens, FULL_SCALE_US)
     return Group(Text(title), table, Text(caption))
 
 
-def conductances(cell_siemens: Float, title: str = "") -> Table:
-    """Conductances [S], shape (rows, columns), as a table in microsiemens, coloured by value."""
-    return _coloured(1e6 * cell_siemens, FULL_SCALE_US, title)
-
-
-def _coloured(values: Float, full_scale: float, title: str = "") -> Table:
+def coloured(values: Float, full_scale: float, title: str = "") -> Table:
+    """Values, shape (rows, columns), as a table, coloured on a scale that ends at `full_scale`."""
     texts = [[Text(_short(value), _colour(value / full_scale)) for value in row] for row in values]
     return cell_table(texts, title)
 

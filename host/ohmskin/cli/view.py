@@ -15,21 +15,17 @@ from ohmskin.errors import OhmskinError
 from ohmskin.force.calibration import load_calibration
 
 HTTP_PORT = 8765
+_DISPLAYS = {"DISPLAY", "WAYLAND_DISPLAY"}
 
 
 def view(
     ports: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="PORT", envvar="OHMSKIN_PORT", help="serial ports or URLs; none: the page asks"
-        ),
+        typer.Argument(metavar="PORT", envvar="OHMSKIN_PORT", help="or URLs; none: the page asks"),
     ] = None,
     calibration: Annotated[
         list[Path] | None,
-        typer.Option(
-            envvar="OHMSKIN_CALIBRATION",
-            help="calibration file (.json): show forces; may be given for each unit",
-        ),
+        typer.Option(envvar="OHMSKIN_CALIBRATION", help="file (.json): forces; one for each unit"),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
     host: Annotated[
@@ -60,7 +56,8 @@ def view(
 
     def started(url: str) -> None:
         print(url, flush=True)  # noqa: T201
-        if not no_browser and _has_display():
+        has_display = sys.platform in ("win32", "darwin") or _DISPLAYS & {*os.environ}
+        if has_display and not no_browser:
             # Some browsers return only when they are closed.
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
@@ -68,9 +65,3 @@ def view(
         server.serve(
             ViewedBoards(ports or (), calibrations, Path(), force=force), host, http_port, started
         )
-
-
-def _has_display() -> bool:
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -28,14 +28,12 @@ _TOUCHED_SIEMENS: Final = 1e-6
 SCENES: Final = {
     "rest": "nothing touches the skin",
     "single": "one touch in the middle, from the start",
-    "ghost": "three corners of a rectangle, from the start: without an estimator the fourth seems "
-    "touched too",
+    "ghost": "three corners of a rectangle, from the start: raw readings show a fourth",
     "multi": "five touches, from the start, at places drawn from the seed",
     "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
     "moving": "after 3 s, one fingertip on a closed curve over the whole skin, once in 4 s",
 }
-# The scene "moving": its time before the touch, which a tare takes for rest, its period, the radius
-# of the fingertip's pressure and its peak.
+# The scene "moving": when it begins, its period, the radius and the peak of the finger's pressure.
 MOVING_BEGIN_S: Final = 3.0
 _MOVING_PERIOD_S: Final = 4.0
 _FINGER_CELLS: Final = 0.7
