@@ -120,7 +120,8 @@ def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> N
     # Creep has not quite ended, and wires of 300 ohm are not told apart from a cell of 700.
     np.testing.assert_allclose(kept["conductance"], truth, rtol=0.12)
     assert (kept["conductance_std"] > 0).all()
-    assert (kept["conductance_std"] < 0.02 * kept["conductance"]).all()
+    # At 700 ohm, noise of 0.3 LSB makes 5 % a scan, and a mean has a few scans.
+    assert (kept["conductance_std"] < 0.03 * kept["conductance"]).all()
     calibration = load_calibration(out)
     assert (calibration.unit_id, calibration.method) == (7, "joint")
     assert calibration.indenter_area_m2 == pytest.approx(1e-4)
