@@ -160,6 +160,24 @@ def test_errors_of_currents_are_as_large_as_stated(rest: Skin, codes: float, off
     assert 0.7 < np.std(away) < 1.05
 
 
+def test_what_stays_from_frame_to_frame_is_no_noise(rest: Skin) -> None:
+    """Lines that have not settled err alike in every frame; noise does not, and is not halved."""
+    random = np.random.default_rng(6)
+    stays = readings(rest) + 10 / 1024 * random.standard_normal((8, 8, 4))
+    reader = reader_of(None)
+    first, *_, last = (
+        reader.read(ten_bits(stays + 3e-4 * random.standard_normal(stays.shape)), in_order=True)
+        for _ in range(3)
+    )
+    assert last.current_std.mean() < 0.3 * first.current_std.mean()
+    for _ in range(10):
+        noisy = readings(rest) + 10 / 1024 * random.standard_normal(stays.shape)
+        found = reader.read(ten_bits(noisy), in_order=True)
+        assert found.current_std.mean() > 0.7 * first.current_std.mean()
+        again = reader.read(ten_bits(noisy))  # one scan at rest, not a mean of many
+        np.testing.assert_array_equal(again.current_std, found.current_std)
+
+
 def test_without_rest_readings_nothing_is_said_of_a_change(rest: Skin) -> None:
     dark = replace(rest, cell_siemens=np.full((8, 8), 1e-9))
     assert not reader_of(None).read(ten_bits(readings(dark))).fault

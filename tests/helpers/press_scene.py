@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, readings
+from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
 from studies.press import LEAVE_S, PressModel, robot_presses
@@ -43,8 +43,8 @@ class PressScene(Scene):
         rest = super().skin(time_s)
         return replace(rest, cell_siemens=rest.cell_siemens + self._pressed(time_s)[0])
 
-    def ratio(self, time_s: float) -> Float:
-        return readings(self.skin(time_s))
+    def ratio(self, time_s: float, mode: str = "near") -> Float:
+        return self.faults.readings(self.skin(time_s), mode)
 
     def force_n(self, time_s: float) -> Float:
         """Force on every cell [N], shape (rows, columns)."""

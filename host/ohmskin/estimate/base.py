@@ -231,7 +231,7 @@ class Estimator(ABC):
         self.rest()
         started = time.perf_counter()
         with one_blas_thread:
-            ports = self._reader.read(readings)
+            ports = self._reader.read(readings, in_order=True)
             found = self._solve(ports)
         message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)

@@ -125,8 +125,12 @@ class PortReader:
         self._residual: Float | None = None
         self._alike_frames = [np.asarray(ALIKE_FRAMES), np.asarray(ALIKE_FRAMES)]
 
-    def read(self, ratio: Float) -> PortReadings:
-        """Currents of checked readings (R, C, 4), and what is wrong with them."""
+    def read(self, ratio: Float, *, in_order: bool = False) -> PortReadings:
+        """Currents of checked readings (R, C, 4), and what is wrong with them.
+
+        in_order: they are of the frame after the last such, and what has changed is noise. Others
+        are of rest: where they lie between codes, they are a mean of many scans, with little noise.
+        """
         current = current_from_ratio(ratio, *self._ref_ohm)
         residual = ratio - ratio_from_current(current, *self._ref_ohm)
         # Currents do not show a node's offset: its two readings, A and D, B and C, have it alike.
@@ -144,7 +148,9 @@ class PortReader:
         most = _MOST_USUAL * max(rounding, typical / _DEGREES)
         usual = float(own[own <= most].mean())
         noise, variance = usual, np.maximum(own, usual)
-        if (changing := max(self._noise(residual), 2.0 * rounding)) < SLOW * usual:
+        changing = self._noise(residual) if in_order else self._noise_at_rest(ratio)
+        changing = max(changing, 2.0 * rounding)
+        if changing < SLOW * usual:
             noise, variance = changing, changing + SLOW_SHARE**2 * np.maximum(own - changing, 0.0)
         alike = max(0.0, 1.0 - noise / (2.0 * rounding)) * self._current_std**2
         std = np.sqrt(variance / self._ref_square + alike)
@@ -161,6 +167,11 @@ class PortReader:
             return np.inf
         change = ((residual - before) ** 2).sum(axis=2)
         return float(np.median(change)) / (2.0 * _MEDIAN_CHI2)
+
+    def _noise_at_rest(self, ratio: Float) -> float:
+        """The same of readings at rest: little in a mean of many scans, else not known."""
+        code = ratio / (self._ratio_std * 12**0.5) - 0.5
+        return 0.0 if np.abs(code - np.rint(code)).max() > 0.01 else np.inf
 
     def _disagreement(
         self, current: Float, std: Float, ratio: Float, square: Float, typical: float
