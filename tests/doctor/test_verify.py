@@ -6,6 +6,7 @@ The plate that is told and the one at the board are two files. The emulator know
 
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from bench_board import Bench
 from command_line import Run, assert_one_line
 from ohmskin.circuit.plate import load_plate
 from ohmskin.cli import doctor as doctor_command
+from ohmskin.doctor.plate import Tolerance
 
 # One resistor a line, as docs/hardware.md says; and a chain, two a line.
 ONE_A_LINE = dict(enumerate((10e3, 15e3, 22e3, 33e3, 47e3, 68e3, 100e3, 220e3)))
@@ -124,7 +126,6 @@ def test_every_fault_is_named(run: Run, write: Write, fault: str) -> None:
     [
         ("5 % more", "--cell-percent", 7),
         ("references", "--reference-percent", 4),
-        ("noise", "--noise-lsb", 3),
         ("slow", "--settling-lsb", 40),
         ("lost", "--loss", 0.2),
     ],
@@ -155,9 +156,13 @@ def test_resistors_that_hide_each_other_are_counted(run: Run, write: Write) -> N
 
 
 @pytest.mark.usefixtures("benches")
-def test_readings_that_are_not_linear_are_named(run: Run, write: Write) -> None:
+def test_readings_that_are_not_linear_are_named(
+    run: Run, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plate = write(PLATE)
-    code, told = verified(run, f"emulator://8x8?plate={plate}", plate, "--residual-lsb", "0.001")
+    sound = partial(Tolerance, residual_lsb=0.001)
+    monkeypatch.setattr("ohmskin.cli.verify.Tolerance", sound)
+    code, told = verified(run, f"emulator://8x8?plate={plate}", plate)
     assert (code, [each["id"] for each in told["findings"]]) == (1, ["linearity"])
     assert told["findings"][0]["where"] == "readings A, B, C, D"
 

@@ -2,7 +2,7 @@
 """``ohmskin doctor``: one page of findings about the skin board at a port."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -42,7 +42,6 @@ _UNANSWERED: Final = {
 _out = Console(soft_wrap=True, markup=False, highlight=False)
 # Says what is being done, and before it what a person is asked to press, if anything.
 Tell = Callable[..., None]
-Watch = Callable[[Iterable[Scan], float], Iterable[Scan]]
 
 
 def doctor(
@@ -74,7 +73,7 @@ def doctor(
     wire_ohm = nominal.both or (None if told is None else told.nominal_wire_ohm.both)
     if into is not None and not (press and wire_ohm):
         raise ValueError("--into takes what --press measures, and it needs nominal --wires")
-    with _terminal() as tell:
+    with terminal() as tell:
         try:
             device = ohmskin.open(port, start=False)
         except errors.OhmskinError as exc:
@@ -117,7 +116,7 @@ def _unanswered(port: str, error: errors.OhmskinError) -> Finding:
 
 
 @contextmanager
-def _terminal() -> Iterator[Tell]:
+def terminal() -> Iterator[Tell]:
     """On a terminal, one line changes. Elsewhere each request is printed once, and no progress."""
     console, said = Console(stderr=True, markup=False, highlight=False), {""}
 
@@ -142,14 +141,12 @@ def gather(
     wire_ohm: tuple[float, float] | None = None,
     *,
     press: bool = False,
-    seconds: float | None = None,
+    seconds: float = REST_S,
     clocks: bool = False,
-    watch: Watch = lambda scans, seconds: scans,
 ) -> Evidence:
     """What `examine` goes by, as far as the board lets. Leaves the board as it was.
 
-    seconds: how long the first look takes; None: `REST_S`. clocks: whether to scan by each ADC
-    clock, too. watch: passes on the scans of so many seconds.
+    seconds: how long the first look takes. clocks: whether to scan by each ADC clock, too.
 
     :raises ValueError: somebody would be asked to press a skin of one row or column.
     """
@@ -163,19 +160,18 @@ def gather(
         tell("self-test")
         with suppress(errors.CommandRefused):  # a recording has none
             evidence.report = device.self_test()
-        seconds = REST_S if seconds is None else seconds
         tell(f"scanning {'the plate' if clocks else 'the untouched skin'} for {seconds:g} s")
-        _scan(device, evidence.scans, seconds, watch)
+        _scan(device, evidence.scans, seconds)
         evidence.board = device.info
         other = comparison(evidence.board)
         with suppress(errors.CommandRefused), put_back(device):
             if other is not None:
                 tell("scanning with a longer settle time")
-                evidence.settled = _look(device, SETTLED_S, watch, **other)
+                evidence.settled = _look(device, SETTLED_S, **other)
             for clock in ENUMS["adc_prescaler"].values if clocks else ():
                 tell(f"scanning by {clock}")
                 # As fast as it can: a slow clock does not reach the rate of the board.
-                by_clock = _look(device, CLOCK_S, watch, adc_prescaler=clock, rate_hz=0)
+                by_clock = _look(device, CLOCK_S, adc_prescaler=clock, rate_hz=0)
                 evidence.clocks.append(by_clock)
         if presses is not None:
             evidence.presses = presses
@@ -185,7 +181,7 @@ def gather(
             usual = {"settle_us": board.settle_asked_us, "rate_hz": board.rate_asked_mhz / 1000}
             with suppress(errors.CommandRefused), put_back(device):
                 for wanted in TURNS * (usual, other):
-                    evidence.pressed.append(_look(device, TURN_S, watch, **wanted))
+                    evidence.pressed.append(_look(device, TURN_S, **wanted))
     except errors.RecordingEnded:
         pass  # all of the recording was read
     except errors.DeviceLost as exc:
@@ -216,16 +212,16 @@ def put_back(device: Device) -> Iterator[None]:
             )
 
 
-def _look(device: Device, seconds: float, watch: Watch, **wanted: Any) -> tuple[Hello, list[Scan]]:
+def _look(device: Device, seconds: float, **wanted: Any) -> tuple[Hello, list[Scan]]:
     """Scans of a board that is configured like this, and what it then says of itself."""
     device.stop()
     board, scans = device.configure(**wanted), list[Scan]()
-    _scan(device, scans, seconds, watch)
+    _scan(device, scans, seconds)
     return board, scans
 
 
-def _scan(device: Device, scans: list[Scan], seconds: float, watch: Watch) -> None:
-    for scan in watch(device, seconds):
+def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
+    for scan in device:
         scans.append(scan)
         elapsed_s = scan.host_time_s - scans[0].host_time_s
         if elapsed_s >= seconds * (1 if len(scans) >= LEAST_SCANS else LONGEST):

@@ -115,16 +115,16 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
         if reader is not None:
             found = reader.read(scan)
             line["method"] = reader.method
-            line["cell_siemens"] = _numbers(found.estimate.cell_siemens)
-            line["cell_siemens_std"] = _numbers(found.estimate.cell_siemens_std)
+            line["cell_siemens"] = numbers(found.estimate.cell_siemens)
+            line["cell_siemens_std"] = numbers(found.estimate.cell_siemens_std)
             line["converged"] = found.estimate.converged
             line["message"] = found.estimate.message
             if reader.has_forces:
-                line["force_n"] = _numbers(found.force_n)
-                line["force_n_std"] = _numbers(found.force_n_std)
+                line["force_n"] = numbers(found.force_n)
+                line["force_n_std"] = numbers(found.force_n_std)
                 of_contact = ("identity", "row", "column", "force_n", "force_n_std")
                 line["contacts"] = [
-                    {name: _numbers(getattr(each, name)) for name in of_contact}
+                    {name: numbers(getattr(each, name)) for name in of_contact}
                     for each in found.contacts
                 ]
         try:
@@ -134,9 +134,9 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
             return
 
 
-def _numbers(values: ArrayLike) -> Any:
-    """As JSON has them, which knows no NaN: null."""
-    return np.where(np.isnan(values), np.array(None), values).tolist()
+def numbers(values: ArrayLike) -> Any:
+    """As JSON has them, with null in place of what is not finite."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:

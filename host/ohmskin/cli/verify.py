@@ -2,7 +2,6 @@
 """``ohmskin verify``: a board against a reference plate, known resistors at its crossings."""
 
 import json
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -10,18 +9,17 @@ from typing import Annotated, Any, Final
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import track
 
 import ohmskin
 from ohmskin.circuit.plate import load_plate
 from ohmskin.circuit.skin import CONFIGURATIONS
 from ohmskin.cli.board import Port, Wires, wires_of
-from ohmskin.cli.doctor import as_object, gather, print_page, put_back
+from ohmskin.cli.doctor import as_object, gather, print_page, put_back, terminal
 from ohmskin.cli.doctor_words import line_in_words
+from ohmskin.cli.stream import numbers
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.plate import PlateExam, Tolerance
 from ohmskin.files import whole_file
-from ohmskin.link.messages import Scan
 
 _MOST: Final = Tolerance()
 _out = Console(soft_wrap=True, markup=False, highlight=False)
@@ -48,22 +46,10 @@ def verify(
     reference_percent: Annotated[
         float, _most("error of a reference: 1 % of itself, the rest of the converter")
     ] = _MOST.reference_percent,
-    slope: Annotated[
-        float, _most("error of a reading's slope: a gain error of 2 LSB, a bow of 1.5")
-    ] = _MOST.slope,
-    offset_lsb: Annotated[
-        float, _most("offset: 2 LSB, and 2 of gain, by the data sheet; half a code; noise")
-    ] = _MOST.offset_lsb,
-    residual_lsb: Annotated[
-        float, _most("distance of a reading from its line: a bow of 1.5 LSB, rounding")
-    ] = _MOST.residual_lsb,
     settling_lsb: Annotated[
         float, _most("change with more time: 30 pF a line and 100 pF a node make 3")
     ] = _MOST.settling_lsb,
-    noise_lsb: Annotated[
-        float, _most("noise of a reading: twice that of a sound converter")
-    ] = _MOST.noise_lsb,
-    loss: Annotated[float, _most("share of lost scans: a sound line loses none")] = _MOST.loss,
+    loss: Annotated[float, _most("share of lost scans: a sound line loses none")] = 0.0,
 ) -> None:
     """Compare the board at PORT with a plate of known resistors.
 
@@ -71,32 +57,29 @@ def verify(
     settled, noise by ADC clock, and lost scans. Leaves the board as it was. Exit code 0: all is
     within the tolerances; 1: something is not.
     """
-    limits = (slope, offset_lsb, residual_lsb, settling_lsb, noise_lsb, loss)
-    tolerance = Tolerance(cell_percent, reference_percent, *limits)
+    tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
-    with ohmskin.open(port, start=False) as device, put_back(device):
+    with terminal() as tell, ohmskin.open(port, start=False) as device, put_back(device):
         rows, columns = exam.plate.shape
         rate_hz = device.info.rate_asked_mhz / 1000
         device.configure(rows=rows, columns=columns, rate_hz=rate_hz)
-        bar = Console(stderr=True)
-
-        def watch(scans: Iterable[Scan], seconds: float) -> Iterable[Scan]:
-            total, hidden = seconds * device.info.rate_hz, not bar.is_terminal
-            return track(scans, "scanning", total, console=bar, transient=True, disable=hidden)
-
-        evidence = gather(device, seconds=seconds, clocks=True, watch=watch)
+        evidence = gather(device, tell, seconds=seconds, clocks=True)
     evidence.loss = loss
     diagnosis = examine(evidence, exam.examine)
     page = as_object(port, diagnosis)
-    everything = page | {"hello": evidence.board, "exam": exam.as_object()}
+    figures = {
+        name: numbers(value) if isinstance(value, np.ndarray) else value
+        for name, value in vars(exam).items()
+    }
+    everything = json.dumps(page | {"hello": evidence.board, "exam": figures}, default=asdict)
     if json_file == "-":
-        print(json.dumps(everything, default=asdict))  # noqa: T201
+        print(everything)  # noqa: T201
     else:
         print_page(page)
         _print_exam(exam)
     if json_file not in ("", "-"):
         with whole_file(json_file) as file:
-            file.write(json.dumps(everything, default=asdict).encode())
+            file.write(everything.encode())
     if picture is not None:
         _save_picture(picture, exam, f"{port}: {page['verdict']}")
     if diagnosis.worse:

@@ -25,7 +25,7 @@ A factor common to all resistances changes no reading and cannot be known.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,16 +60,15 @@ LEAST_SPAN_LSB: Final = 50.0  # [LSB] Readings that span less tell no line.
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The most that a sound board has; ``ohmskin verify --help`` says where each number is from."""
+    """The most that a sound board has; ``ohmskin verify --help`` says where options are from."""
 
     cell_percent: float = 3.0
     reference_percent: float = 1.5
-    slope: float = 0.01
-    offset_lsb: float = 5.0
-    residual_lsb: float = 2.0
     settling_lsb: float = 4.0
+    slope: float = 0.01  # a gain error of 2 LSB, a bow of 1.5
+    offset_lsb: float = 5.0  # 2 LSB, and 2 of gain; half a code; noise
+    residual_lsb: float = 2.0  # a bow of 1.5 LSB, rounding
     noise_lsb: float = NOISY_LSB
-    loss: float = 0.0
 
 
 @dataclass(eq=False)
@@ -138,19 +137,12 @@ class PlateExam:
         siemens = (_estimate(shown, known).cell_siemens, self.plate)
         found, plate = (each / (each + 1 / known.ref_ohm) for each in siemens)
         for _ in range(2):
-            orders = (_order(found, plate), _order(found.T, plate.T))
-            if all(order is None for order in orders):
-                break
-            left = [
-                np.inf
-                if order is None
-                else float(np.abs(np.take(found, order, axis) - plate).sum())
-                for axis, order in enumerate(orders)
-            ]
-            axis = int(np.argmin(left))
-            order = orders[axis]
-            assert order is not None
+            rows, columns = _order(found, plate), _order(found.T, plate.T)
+            axis = int(columns[1] < rows[1])
+            order, off = (rows, columns)[axis]
             moved = lines_of(order != np.arange(len(order)))
+            if not moved or off >= SWAPPED_SHARE * np.abs(found - plate).sum():
+                break
             diagnosis.add(Kind.SWAPPED_LINES, Place(columns=moved) if axis else Place(moved))
             shown, found = np.take(shown, order, axis), np.take(found, order, axis)
         return shown
@@ -246,16 +238,6 @@ class PlateExam:
         if bad:
             diagnosis.add(Kind.LINEARITY, readings=bad, lines=self.lines, most=most)
 
-    def as_object(self) -> dict[str, Any]:
-        """All figures; arrays as lists, with None in place of what is not known."""
-        told = dict(vars(self))
-        for name, value in told.items():
-            if isinstance(value, np.ndarray):
-                plain = value.astype(object)
-                plain[~np.isfinite(value)] = None
-                told[name] = plain.tolist()
-        return told
-
 
 def _estimate(shown_lsb: Float, knowledge: SkinKnowledge) -> Estimate:
     """What `joint` makes of s."""
@@ -263,11 +245,10 @@ def _estimate(shown_lsb: Float, knowledge: SkinKnowledge) -> Estimate:
     return make_estimator("joint", knowledge).estimate(ratio)
 
 
-def _order(found: Float, plate: Float) -> NDArray[np.intp] | None:
-    """Which line of `found` (lines, n) is each of `plate`. None: they are not clearly swapped."""
+def _order(found: Float, plate: Float) -> tuple[NDArray[np.intp], float]:
+    """Which line of `found` (lines, n) each of `plate` is, and how far off these are in all."""
     from scipy.optimize import linear_sum_assignment
 
     cost = np.abs(plate[:, None] - found[None]).sum(axis=2)
     lines, order = linear_sum_assignment(cost)
-    better = cost[lines, order].sum() < SWAPPED_SHARE * cost.trace()
-    return np.asarray(order) if better and np.any(order != lines) else None
+    return np.asarray(order), float(cost[lines, order].sum())
