@@ -59,6 +59,10 @@ def test_info(run: Run) -> None:
     tested = json.loads(run("info", EMULATED, "--json", "--self-test").out)
     assert tested["findings"] == []
     assert len(tested["code_min"]) == 8
+    for mode, names in (("near", "ABCD"), ("far", "ABCDEF")):
+        page = well(run("info", f"{EMULATED}&mode={mode}", "--self-test")).out
+        codes = page[page.index("codes") : page.index("findings")]
+        assert re.findall("[A-H]", codes) == list(names)
 
 
 def test_info_is_in_peoples_units(run: Run) -> None:

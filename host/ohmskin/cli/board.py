@@ -86,8 +86,9 @@ def info(
     for name, text in _said_of(board).items():
         table.add_row(name, text)
     if tested is not None:
-        ranges = zip("ABCD", tested.code_min, tested.code_max, strict=True)
-        table.add_row("codes", ", ".join(f"{name} {low} to {high}" for name, low, high in ranges))
+        ranges = zip("ABCDEFGH", tested.code_min, tested.code_max, strict=True)
+        taken = [f"{name} {low} to {high}" for name, low, high in ranges if low <= high]
+        table.add_row("codes", ", ".join(taken))
         table.add_row("findings", ", ".join(findings) or "none")
     _out.print(table)
     for finding in findings:
