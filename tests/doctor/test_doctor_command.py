@@ -245,7 +245,7 @@ def test_the_end_of_a_recording_is_no_loss(run: Run, tmp_path: Path, speed: int)
     for more in ((), ("--press",)):
         answer = json.loads(run("doctor", f"replay://{path}?speed={speed}", "--json", *more).out)
         assert answer["verdict"].startswith("sound: ")
-        assert {each["id"] for each in answer["findings"]} <= {"slow_host"}
+        assert answer["findings"] == []
         assert answer["measured"]["scans"] == 60
 
 
@@ -269,4 +269,4 @@ def test_the_firmware_is_sound(run: Run) -> None:
     assert answer["sound"], answer["findings"]
     assert done.code == 0
     assert answer["measured"]["settling_lsb"] < 1
-    assert {each["id"] for each in answer["findings"]} <= {"slow_host"}
+    assert answer["findings"] == []

@@ -40,8 +40,9 @@ def _words(finding: Finding) -> dict[str, Any]:
         case Kind.PORT_UNUSABLE:
             return {"unknown": not values["remedy"]}
         case Kind.SELF_TEST:
-            side, _, fault = values["name"].partition("_")
+            side, _, fault = values["name"].removeprefix("far_").partition("_")
             doc = ENUMS["finding"].docs.get(values["name"], "a finding of a newer firmware")
+            side = f"far {side}" if values["name"].startswith("far_") else side
             return {"side": side, "fault": fault, "doc": doc}
         case Kind.NOTHING_CONDUCTS:
             return {"one_cell": values["cell_count"] == 1}
@@ -53,8 +54,7 @@ def _words(finding: Finding) -> dict[str, Any]:
         case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS:
             return {"table": "short", "line": line, "joined": " and ".join(map(str, lines))}
         case Kind.REFERENCE_RATIO:
-            nominal, off = values["ref_top_ohm"] / values["ref_bottom_ohm"], values["off_percent"]
-            return {"nominal_ratio": nominal, "percent": abs(off), "low": off < 0}
+            return {"nominal_ratio": values["ref_top_ohm"] / values["ref_bottom_ohm"]}
         case Kind.OPEN_JOINT | Kind.BRIDGE | Kind.WRONG_RESISTOR:
             plate_ohm, told = values["plate_ohm"], kilohm(values["cell_ohm"])
             return {"cell": told, "plate": plate_ohm and kilohm(plate_ohm)}

@@ -22,8 +22,6 @@ from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
-SLOW_HOST: Final = 0.1  # [1] Clocks differ by far less, so a host that is off by this is slow.
-LEAST_SPAN_S: Final = 1.0  # [s] Scans come in bursts, which hide the rate in less time.
 LEAST_TIMER_MS: Final = 1  # [ms] The timer of a USB bridge cannot be set to less.
 BAD_RESETS: Final = ("brown_out", "watchdog")  # A sound board is not reset by these.
 
@@ -89,7 +87,7 @@ def examine(
     """All findings, and the figures behind them. of_scans: adds what the scans show."""
     board, stats = evidence.board, evidence.stats
     usual = RestScans.of(board, evidence.scans)
-    rates_hz = None if usual is None else _rates_hz(evidence.scans)
+    rate_hz = None if usual is None else _rate_hz(evidence.scans)
     diagnosis = Diagnosis()
     diagnosis.measured = {
         "board": board.board,
@@ -101,10 +99,10 @@ def examine(
         "dropped_by_board": stats.dropped_by_board,
         "damaged": stats.line.damaged,
         "restarts": stats.restarts,
-        "rate_hz": None if rates_hz is None else round(rates_hz[0], 3),
+        "rate_hz": None if rate_hz is None else round(rate_hz, 3),
     }
     _examine_board(evidence, diagnosis)
-    _examine_line(evidence, rates_hz, diagnosis)
+    _examine_line(evidence, rate_hz, diagnosis)
     if usual is not None:
         with one_blas_thread:
             of_scans(evidence, usual, diagnosis)
@@ -130,15 +128,13 @@ def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
         add(Kind.USB_LATENCY, timer_ms=evidence.latency[0], file=evidence.latency[1])
 
 
-def _examine_line(
-    evidence: Evidence, rates_hz: tuple[float, float] | None, diagnosis: Diagnosis
-) -> None:
-    """Adds what the connection has counted, and scan rates by the board's and the host's clock."""
+def _examine_line(evidence: Evidence, rate_hz: float | None, diagnosis: Diagnosis) -> None:
+    """Adds what the connection has counted, and a scan rate that is not what was asked for."""
     board, stats, add = evidence.board, evidence.stats, diagnosis.add
     if stats.restarts:
         add(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
     made = stats.scans + stats.missed
-    if stats.missed > evidence.loss * made or (rates_hz is None and not stats.restarts):
+    if stats.missed > evidence.loss * made or (rate_hz is None and not stats.restarts):
         add(
             Kind.LOSS,
             received=len(evidence.scans),
@@ -147,28 +143,17 @@ def _examine_line(
             dropped_by_board=stats.dropped_by_board,
             rate_hz=board.rate_hz,
         )
-    if stats.line.damaged:
-        add(Kind.DAMAGED, damaged=stats.line.damaged, crc_errors=stats.line.crc_errors)
-    if stats.board_rx_errors:
-        add(Kind.RECEIVE_ERRORS, commands=stats.board_rx_errors)
-    if rates_hz is None:
-        return
-    rate_hz, host_rate_hz = rates_hz
+    line, commands = stats.line, stats.board_rx_errors
+    if line.damaged or commands:
+        add(Kind.DAMAGED, damaged=line.damaged, crc_errors=line.crc_errors, commands=commands)
     asked_hz = board.rate_asked_mhz / 1000 or board.rate_hz
-    if abs(rate_hz / asked_hz - 1) > RATE_TOLERANCE:
+    if rate_hz is not None and abs(rate_hz / asked_hz - 1) > RATE_TOLERANCE:
         add(Kind.RATE, rate_hz=rate_hz, asked_hz=asked_hz)
-    if abs(host_rate_hz / rate_hz - 1) > SLOW_HOST and not stats.missed and not stats.restarts:
-        add(Kind.SLOW_HOST, host_rate_hz=host_rate_hz, rate_hz=rate_hz)
 
 
-def _rates_hz(scans: list[Scan]) -> tuple[float, float]:
-    """Scan rate by the board's clock, and by the host's if that is to be trusted [Hz]."""
-    number = np.array([scan.number for scan in scans], dtype=np.float64)
-    board_s = np.array([1e-6 * scan.time_us for scan in scans])
-    step, took_s = np.diff(number), np.diff(board_s)
+def _rate_hz(scans: list[Scan]) -> float:
+    """Scan rate by the board's clock [Hz]."""
+    step = np.diff([float(scan.number) for scan in scans])
+    took_s = np.diff([1e-6 * scan.time_us for scan in scans])
     forward = (step > 0) & (took_s > 0)  # but for restarts
-    rate_hz = float(step[forward].sum() / took_s[forward].sum()) if forward.any() else 0.0
-    span_s = scans[-1].host_time_s - scans[0].host_time_s
-    if span_s < LEAST_SPAN_S:
-        return rate_hz, rate_hz
-    return rate_hz, float(number[-1] - number[0]) / span_s
+    return float(step[forward].sum() / took_s[forward].sum()) if forward.any() else 0.0

@@ -57,8 +57,7 @@ class Kind(Enum):
     RESET_CAUSE = "reset_cause", _WARNING, "cause"
     RESTARTED = "restarted", _WARNING, "restarts causes"
     LOSS = "loss", _WARNING, "received missed made dropped_by_board rate_hz"
-    DAMAGED = "damaged", _WARNING, "damaged crc_errors"
-    RECEIVE_ERRORS = "receive_errors", _WARNING, "commands"
+    DAMAGED = "damaged", _WARNING, "damaged crc_errors commands"
     RATE = "rate", _WARNING, "rate_hz asked_hz"
     HUM = "hum", _WARNING, "mains_hz amplitude_lsb most_lsb rate_hz seen_hz"
     NOISE = "noise", _WARNING, "noise_lsb sound_lsb adc_lsb"
@@ -67,7 +66,6 @@ class Kind(Enum):
     TOUCHED = "touched", _NOTE, "moves"
     VERSION = "version", _NOTE, "firmware host"
     USB_LATENCY = "usb_latency", _NOTE, "timer_ms file"
-    SLOW_HOST = "slow_host", _NOTE, "host_rate_hz rate_hz"
 
     def __init__(self, id: str, severity: Severity, names: str) -> None:
         self.id = id

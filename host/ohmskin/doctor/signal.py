@@ -54,8 +54,7 @@ HUM_LSB: Final = 0.5  # [LSB] Hum of a smaller amplitude changes a code by one, 
 HUM_OVER_NOISE: Final = 10.0
 HUM_OVER_BESIDE: Final = 3.0  # [1] P of drift and of other tones is as high beside.
 BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)  # [1 / duration] A Hann window's main lobe ends at 2.
-ALIKE_POWER: Final = 2.0  # [1] If two mains differ less in P, they may be one that is seen twice.
-IN_PHASE: Final = 1.5  # [1] The right one of these has phases that agree better by this factor.
+IN_PHASE: Final = 1.5  # [1] If two mains differ less in phase, they may be one that is seen twice.
 OVERLAP: Final = 0.5  # [1] From this |m|^2 on, a sine and its mirror image cannot be told apart.
 STILL_HZ: Final = 0.5  # [Hz] Mains that are seen below this plus 4 / duration look like drift.
 
@@ -198,7 +197,6 @@ def examine_signal(
         _examine_noise(np.sqrt(variance.mean(axis=2)), diagnosis)
     diagnosis.measured |= {
         "noise_lsb": round(noise_lsb, 3),
-        "noise_of_adc_lsb": round(SOUND_NOISE_LSB, 3),
         "hum_lsb": 0.0 if hum is None else round(hum.lsb, 2),
         "hum_not_visible": list(hidden_hz),
     }
@@ -221,7 +219,7 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 def find_hum(scans: RestScans) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen.
 
-    Of two mains that are found, the stronger one, or else the one with one phase, or both.
+    Of two mains that are found, the one with one phase, or both.
     """
     if not np.ptp(scans.codes, axis=0).any():
         return None
@@ -231,19 +229,14 @@ def find_hum(scans: RestScans) -> Hum | None:
         return hums[0] if hums else None
     offsets_s = reading_offsets_s(scans.board)
 
-    def power(hum: Hum) -> float:
-        return scans.power(hum.frequency_hz)
-
-    def agreement(hum: Hum) -> float:
-        """1 if all readings have one phase, less if they have not."""
+    def in_phase_lsb(hum: Hum) -> float:
+        """Its amplitude if all readings have one phase, less if they have not."""
         turn = np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
-        at_reading = scans.amplitude(hum.frequency_hz) * turn
-        return float(np.abs(at_reading.mean()) / np.abs(at_reading).mean())
+        return float(np.abs(np.mean(scans.amplitude(hum.frequency_hz) * turn)))
 
-    for measure, clear in ((power, ALIKE_POWER), (agreement, IN_PHASE)):
-        less, more = sorted(hums, key=measure)
-        if measure(more) > clear * measure(less):
-            return more
+    less, more = sorted(hums, key=in_phase_lsb)
+    if in_phase_lsb(more) > IN_PHASE * in_phase_lsb(less):
+        return more
     return replace(hums[0], mains_hz=MAINS_HZ)
 
 

@@ -144,28 +144,27 @@ class CornerScans:
         self._board = board
         self._matrix = make_estimator("matrix", SkinKnowledge.of(board))
         self._codes: defaultdict[Corners, list[Float]] = defaultdict(list)
-        self._first: Corners | None = None
+        self._last: Corners | None = None
 
     def take(self, scan: Scan) -> None:
-        """Keep a scan if three corners are pressed in it, and nothing else is.
-
-        A scan of another size is left out: the board was reset meanwhile.
-        """
-        if not self._fits(scan):
-            return
-        siemens = self._matrix.estimate(scan.ratio).cell_siemens
+        """Keep a scan if three corners are pressed in it, and nothing else is."""
+        siemens = self._siemens(scan)
         self.pressed = Place.of_cells(siemens > PRESSED_SIEMENS).cells
         corners = pressed_corners(siemens)
-        self.hold = corners is not None and corners != self._first
+        self.hold = corners is not None and corners != self._last
         if corners is None:
             return
         self._codes[corners].append(scan.codes.astype(np.float64))
         if self.hold and len(self._codes[corners]) >= PRESS_S * self._board.rate_hz:
             self.hold, self.again, self.done = False, True, self.again
-            self._first, self.wanted = corners, moved_across(corners)
+            self._last, self.wanted = corners, moved_across(corners)
 
-    def _fits(self, scan: Scan) -> bool:
-        return scan.codes.shape[:2] == (self._board.rows, self._board.columns)
+    def _siemens(self, scan: Scan) -> Float:
+        """Conductances (R, C) [S]; zeros for another size: the board was reset meanwhile."""
+        shape = self._board.rows, self._board.columns
+        if scan.codes.shape[:2] != shape:
+            return np.zeros(shape)
+        return self._matrix.estimate(scan.ratio).cell_siemens
 
     def examine_settling(
         self, looks: Sequence[tuple[Hello, list[Scan]]], diagnosis: Diagnosis
@@ -177,29 +176,28 @@ class CornerScans:
         means: defaultdict[Corners, list[list[Float]]] = defaultdict(lambda: [[], []])
         for turn, (_, scans) in enumerate(looks):
             codes = defaultdict(list)
-            for scan in filter(self._fits, scans):
-                corners = pressed_corners(self._matrix.estimate(scan.ratio).cell_siemens)
-                if corners is not None:
+            for scan in scans:
+                if corners := pressed_corners(self._siemens(scan)):
                     codes[corners].append(scan.codes)
             for corners, held in codes.items():
                 if len(held) >= LEAST_HELD:
                     means[corners][turn % 2].append(np.mean(held, axis=0))
         both = [each for each in means.values() if min(map(len, each)) >= 2]
-        two = [RestScans.of(*look) for look in looks[:2]]
-        if not both or two[0] is None or two[1] is None:
+        first = [RestScans.of(*look) for look in looks[:2]]
+        if not both or first[0] is None or first[1] is None:
             return
         changes = []
-        for usual, longer in both:
-            scatter = np.var(usual, axis=0, ddof=1) / len(usual)
-            scatter += np.var(longer, axis=0, ddof=1) / len(longer)
-            change = np.abs(np.mean(usual, axis=0) - np.mean(longer, axis=0)).max()
+        for each in both:
+            before, after = (np.mean(held, axis=0) for held in each)
+            scatter = np.sum([np.var(held, axis=0, ddof=1) / len(held) for held in each], axis=0)
+            change = np.abs(after - before).max()
             changes.append((change - CLEAR_STDS * scatter.max() ** 0.5, change))
         clear, most = map(float, max(changes))
         diagnosis.measured["settling_pressed_lsb"] = round(max(clear, 0.0), 2)
         if clear > PRESSED_LSB:
             others = [each for each in diagnosis.findings if each.kind is not Kind.SETTLING]
             diagnosis.findings = others
-            add_settling(two[0], two[1], diagnosis, WHOLE_SKIN, most, PRESSED_LSB, pressed=True)
+            add_settling(first[0], first[1], diagnosis, WHOLE_SKIN, most, PRESSED_LSB, pressed=True)
 
     def measure(self, rest: Rest) -> list[WireShare]:
         """The share of both layers, then that of each row and column; none if none was pressed."""
