@@ -144,22 +144,22 @@ def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> N
 
 
 def test_a_full_table_is_fitted_at_once(weigh: Run, tmp_path: Path) -> None:
-    table, out = tmp_path / "mine.csv", tmp_path / "skin.json"
+    table, out = tmp_path / "skin.presses.csv", tmp_path / "skin.json"
     lines = ["row,column,force_n,conductance"]
     for cell, mass_g in ASKED:
         siemens = REST.cell_siemens[cell] + rise(newtons(mass_g))
         lines.append(f"{cell[0]},{cell[1]},{newtons(mass_g)},{siemens}")
     table.write_text("\n".join(lines) + "\n")
     of_table = table.read_text()
-    done = well(weigh([], *OPTIONS, "--table", str(table)))
+    done = well(weigh([], *OPTIONS))
     assert "put" not in done.out
     assert load_calibration(out).columns == 2
     assert table.read_text() == of_table
     # What cannot be fitted leaves the calibration as it was, and the table.
     was = out.read_bytes()
     table.write_text(of_table.replace(f"{newtons(1000)},", f"{newtons(1000)},-"))
-    done = weigh([], *OPTIONS, "--table", str(table))
-    assert_one_line(done, "mine.csv: row 4: conductance is -")
+    done = weigh([], *OPTIONS)
+    assert_one_line(done, "skin.presses.csv: row 4: conductance is -")
     assert out.read_bytes() == was
 
 

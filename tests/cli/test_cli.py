@@ -208,38 +208,24 @@ def test_a_stream_into_a_pipe_is_printed_as_it_goes(command: Command) -> None:
 # ------------------------------------------------------------------------------ without a board
 
 
-def test_emulate_serves_other_processes(run: Run, command: Command, tmp_path: Path) -> None:
-    link = tmp_path / "skin"
-    process = command("emulate", "emulator://3x3?scene=single&noise=0", "--link", str(link))
+def test_emulate_serves_other_processes(run: Run, command: Command) -> None:
+    process = command("emulate", "emulator://3x3?scene=single&noise=0")
     path = process.stdout.readline().strip()
-    assert os.readlink(link) == path
-    with ohmskin.open(str(link)) as skin:
+    with ohmskin.open(path) as skin:
         scan = skin.latest()
         np.testing.assert_array_equal(
             scan.ratio, ratio_from_codes(quantise(Scene("single", 3, 3).ratio(0.0)))
         )
         assert skin.info.board == "emulated"
-    assert json.loads(run("info", str(link), "--json").out)["rows"] == 3
+    assert json.loads(run("info", path, "--json").out)["rows"] == 3
     process.send_signal(signal.SIGINT)
     done = finish(process)
     assert (done.code, done.out, done.err) == (0, "", "")
-    assert not link.is_symlink()
 
 
-def test_emulate_ends_by_itself(command: Command, tmp_path: Path) -> None:
-    link = tmp_path / "skin"
-    link.symlink_to("/dev/null")  # of a process that was killed
-    done = well(finish(command("emulate", "--seconds", "0.2", "--link", str(link))))
+def test_emulate_ends_by_itself(command: Command) -> None:
+    done = well(finish(command("emulate", "--seconds", "0.2")))
     assert done.out.startswith("/dev/")
-    assert not link.is_symlink()
-
-
-def test_emulate_does_not_overwrite_a_file(run: Run, tmp_path: Path) -> None:
-    link = tmp_path / "skin"
-    link.write_text("precious")
-    done = run("emulate", "--seconds", "0.1", "--link", str(link))
-    assert_one_line(done, str(link))
-    assert link.read_text() == "precious"
 
 
 def test_ctrl_c_while_opening(command: Command, silent_port: tuple[int, str]) -> None:
@@ -404,7 +390,7 @@ OPTIONS = {
     "estimate": ["--method", "--out", "--cold", *METHODS],
     "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],
     "export": ["--begin", "--end", ".npz", ".csv"],
-    "emulate": ["--link", "--seconds", "ghost", "bitflip", *SKIN_FAULTS],
+    "emulate": ["--seconds", "ghost", "bitflip", *SKIN_FAULTS],
     "demo": ["--seconds", "--port", "--picture"],
 }
 

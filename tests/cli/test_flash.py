@@ -7,7 +7,6 @@ PlatformIO and avrdude are scripts that note their arguments; the board is at a 
 import os
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from command_line import Run, assert_one_line, well
 from ohmskin.cli import board as flash_command
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.link import session
-from ohmskin.link.serial_port import SerialPort
 from ohmskin.opening import emulated
 from places import ROOT
 from ports import Attach, Serve
@@ -139,22 +137,6 @@ def test_the_port_may_be_gone_for_a_while(
     back.start()
     assert run("flash").code == 0
     back.join()
-
-
-def test_the_port_may_come_back_by_another_name(
-    run: Run, attach: Attach, pty_board: Serve, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port = pty_board(board()).path
-    begin_s = time.monotonic()
-
-    def ports() -> list[SerialPort]:
-        renamed = time.monotonic() - begin_s > 0.5
-        return [SerialPort(port if renamed else "/dev/ttyACM77", "", "uno")]
-
-    monkeypatch.setattr(flash_command, "serial_ports", ports)
-    done = run("flash")
-    assert done.code == 0
-    assert f"{port}: uno" in done.out
 
 
 UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {

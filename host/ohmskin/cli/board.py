@@ -11,9 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import typer
 from rich.console import Console
 from rich.table import Table
+from typer import Argument, Option
 
 import ohmskin
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
@@ -36,8 +36,8 @@ _RETRY_S: Final = 0.2
 
 _out = Console(soft_wrap=True)
 
-Port = Annotated[str, typer.Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
-Wires = Annotated[str, typer.Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
+Port = Annotated[str, Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
+Wires = Annotated[str, Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
 
 
 def wires_of(text: str) -> WireOhm:
@@ -51,7 +51,7 @@ def wires_of(text: str) -> WireOhm:
     return WireOhm(top, bottom).check()
 
 
-def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")] = False) -> None:
+def ports(as_json: Annotated[bool, Option("--json", help="one JSON array")] = False) -> None:
     """List serial ports, and the kinds of ports that need no board."""
     found = serial_ports()
     if as_json:
@@ -68,10 +68,8 @@ def ports(as_json: Annotated[bool, typer.Option("--json", help="one JSON array")
 
 def info(
     port: Port,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
-    self_test: Annotated[
-        bool, typer.Option("--self-test", help="also test sense nodes and reference resistors")
-    ] = False,
+    as_json: Annotated[bool, Option("--json", help="one JSON object")] = False,
+    self_test: Annotated[bool, Option("--self-test", help="also test the board itself")] = False,
 ) -> None:
     """Say what board is at PORT and how it scans."""
     with ohmskin.open(port, start=False) as skin:
@@ -118,22 +116,19 @@ def _said_of(board: Hello) -> dict[str, str]:
 
 def configure(
     port: Port,
-    rows: Annotated[int | None, typer.Option(help="rows to scan, 1 to 16")] = None,
-    columns: Annotated[int | None, typer.Option(help="columns to scan, 1 to 16")] = None,
-    rate_hz: Annotated[
-        float | None, typer.Option("--rate", help="scans a second; 0: as fast as possible")
-    ] = None,
+    rows: Annotated[int | None, Option(help="rows to scan, 1 to 16")] = None,
+    columns: Annotated[int | None, Option(help="columns to scan, 1 to 16")] = None,
+    rate_hz: Annotated[float | None, Option("--rate", help="scans a second; 0: the most")] = None,
     settle_us: Annotated[
-        int | None,
-        typer.Option("--settle", help="least settle time in us; 0: as long as the rate allows"),
+        int | None, Option("--settle", help="least settle time in us; 0: as long as the rate lets")
     ] = None,
     adc_prescaler: Annotated[
-        str | None, typer.Option("--adc", help=" | ".join(ENUMS["adc_prescaler"].values))
+        str | None, Option("--adc", help=" | ".join(ENUMS["adc_prescaler"].values))
     ] = None,
-    mode: Annotated[str | None, typer.Option(help=" | ".join(MODES))] = None,
-    unit_id: Annotated[int | None, typer.Option(help="name this skin")] = None,
-    defaults: Annotated[bool, typer.Option(help="return to the defaults first")] = False,
-    save: Annotated[bool, typer.Option(help="keep it in the board's EEPROM")] = False,
+    mode: Annotated[str | None, Option(help=" | ".join(MODES))] = None,
+    unit_id: Annotated[int | None, Option(help="name this skin")] = None,
+    defaults: Annotated[bool, Option(help="return to the defaults first")] = False,
+    save: Annotated[bool, Option(help="keep it in the board's EEPROM")] = False,
 ) -> None:
     """Change how the board scans, until its reset or for good (--save)."""
     with ohmskin.open(port, start=False) as skin:
@@ -159,8 +154,8 @@ def configure(
 
 
 def flash(
-    board: Annotated[str, typer.Argument(help=" | ".join(_BOARDS))] = "",
-    port: Annotated[str, typer.Option(help="serial port of the board")] = "",
+    board: Annotated[str, Argument(help=" | ".join(_BOARDS))] = "",
+    port: Annotated[str, Option(help="serial port of the board")] = "",
 ) -> None:
     """Write the firmware to a board, and check that it answers.
 
@@ -170,17 +165,16 @@ def flash(
     board, port = _chosen(board, port, serial_ports())
     packages = _ROOT / ".pio" / "core"  # where `make setup` puts them
     environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
-    before = {each.path for each in serial_ports()}
     for baud, command in _uploads(board, port).items():
         _out.print(f"flashing {board} at {port}, {baud} baud", markup=False)
         if not subprocess.run(command, env=environment | os.environ).returncode:
             break
     else:
         raise OhmskinError(f"flashing {board} at {port} failed: the lines above say why")
-    found, hello = _answer(board, port, before)
+    hello = _answer(port)
     if hello.board != ("uno" if board == "nano" else board):  # the same chip, and the same wiring
-        raise OhmskinError(f"{found} answers as '{hello.board}', not as {board}: flash that one")
-    _out.print(f"{found}: {board}, firmware {hello.version}, answers", markup=False)
+        raise OhmskinError(f"{port} answers as '{hello.board}', not as {board}: flash that one")
+    _out.print(f"{port}: {board}, firmware {hello.version}, answers", markup=False)
 
 
 def _uploads(board: str, port: str) -> dict[int, list[str]]:
@@ -230,16 +224,13 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
     )
 
 
-def _answer(board: str, port: str, before: set[str]) -> tuple[str, Hello]:
-    """Where the flashed board is now, which may be a new port, and what it says of itself."""
+def _answer(port: str) -> Hello:
+    """What the flashed board says of itself."""
     deadline_s = time.monotonic() + REBOOT_S
     while True:
-        now = {each.path: each.board for each in serial_ports()}
-        new = [path for path, name in now.items() if name == board and path not in before]
-        at = new[0] if port in before - now.keys() and len(new) == 1 else port
         try:
-            with ohmskin.open(at, start=False) as skin:
-                return at, skin.info
+            with ohmskin.open(port, start=False) as skin:
+                return skin.info
         except (PortError, DeviceLost):
             if time.monotonic() > deadline_s:
                 raise

@@ -10,6 +10,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from typer import Argument, Option
 
 import ohmskin
 from ohmskin.arrays import Float
@@ -39,10 +40,10 @@ from ohmskin.record.recording import Recording, load_recording
 # Standard gravity [m/s^2].
 GRAVITY: Final = 9.80665
 
-Out = Annotated[Path, typer.Argument(help="calibration file to write (.json)")]
-Method = Annotated[str, typer.Option(help=" | ".join(LEVEL_METHODS))]
+Out = Annotated[Path, Argument(help="calibration file to write (.json)")]
+Method = Annotated[str, Option(help=" | ".join(LEVEL_METHODS))]
 Indenter = Annotated[
-    float, typer.Option("--indenter-mm2", help="area that the skin is pressed with, in mm2")
+    float, Option("--indenter-mm2", help="area that the skin is pressed with, in mm2")
 ]
 calibrate = typer.Typer(
     no_args_is_help=True,
@@ -58,26 +59,21 @@ _out = Console(soft_wrap=True)
 def weights(
     port: Port,
     out: Out,
-    grams: Annotated[str, typer.Option(help="the weights you have, in gram, such as 50,100")],
+    grams: Annotated[str, Option(help="the weights you have, in gram, such as 50,100")],
     indenter_mm2: Indenter,
-    repeats: Annotated[int, typer.Option(min=1, help="times each weight is put on each cell")] = 2,
-    cells: Annotated[str, typer.Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
-    redo: Annotated[
-        list[str] | None, typer.Option(help="row,column: drop this cell's presses first")
-    ] = None,
-    table: Annotated[
-        Path | None, typer.Option(help="presses so far (.csv); default: OUT with .presses.csv")
-    ] = None,
+    repeats: Annotated[int, Option(min=1, help="times each weight is put on each cell")] = 2,
+    cells: Annotated[str, Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
+    redo: Annotated[list[str] | None, Option(help="row,column: drop its presses first")] = None,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
 ) -> None:
     """With weights: says which to put on which cell of the skin at PORT, and when it has read it.
 
-    Every press is kept at once: after Ctrl-C the same command goes on.
+    Every press is kept at once, in OUT with .presses.csv: after Ctrl-C the same command goes on.
     """
     calibrator_of = _options(out, method, indenter_mm2, wires, table=True)
     forces_n = [1e-3 * mass_g * GRAVITY for mass_g in _grams(grams)]
-    kept = _KeptPresses(table or out.with_suffix(".presses.csv"))
+    kept = _KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         shape = skin.info.rows, skin.info.columns
         only, again = (_cells(text, shape) for text in (cells, " ".join(redo or ())))
@@ -109,16 +105,15 @@ def weights(
 
 @calibrate.command()
 def recording(
-    recording: Annotated[Path, typer.Argument(help="recording (.mcap) of presses of single cells")],
+    recording: Annotated[Path, Argument(help="recording (.mcap) of presses of single cells")],
     out: Out,
     indenter_mm2: Indenter,
     forces: Annotated[
         Path | None,
-        typer.Option(help="force sensor's log (.csv: time_s, force_n); default: the recording's"),
+        Option(help="force sensor's log (.csv: time_s, force_n); default: the forces in it"),
     ] = None,
     rest_s: Annotated[
-        float,
-        typer.Option("--rest", help="so long nothing touched the skin at first, in s; 0: its tare"),
+        float, Option("--rest", help="so long nothing touched the skin at first, in s; 0: its tare")
     ] = 0.0,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
@@ -155,11 +150,11 @@ def recording(
 @calibrate.command()
 def table(
     port: Port,
-    table: Annotated[Path, typer.Argument(help="row,column,force_n,conductance (.csv)")],
+    table: Annotated[Path, Argument(help="row,column,force_n,conductance (.csv)")],
     out: Out,
     indenter_mm2: Indenter,
     rest_s: Annotated[
-        float, typer.Option("--rest", help="so long the untouched skin is measured, in s")
+        float, Option("--rest", help="so long the untouched skin is measured, in s")
     ] = TARE_S,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
@@ -175,17 +170,11 @@ def table(
 def tare(
     port: Port,
     calibration: Annotated[
-        Path, typer.Argument(envvar="OHMSKIN_CALIBRATION", help="file (.json) to be changed")
+        Path, Argument(envvar="OHMSKIN_CALIBRATION", help="file (.json) to be changed")
     ],
-    seconds: Annotated[
-        float, typer.Option(help="so long nothing touches the skin, in seconds")
-    ] = TARE_S,
-    undo: Annotated[
-        bool, typer.Option("--undo", help="return to the rest of the calibration")
-    ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="even if cells seem touched: rest has drifted")
-    ] = False,
+    seconds: Annotated[float, Option(help="so long nothing touches the skin, in s")] = TARE_S,
+    undo: Annotated[bool, Option("--undo", help="return to the rest of the calibration")] = False,
+    force: Annotated[bool, Option("--force", help="even if cells seem to be touched")] = False,
 ) -> None:
     """Take what the skin at PORT reads now for no force: nothing may touch it.
 

@@ -4,15 +4,15 @@
 from pathlib import Path
 from typing import Annotated, Final
 
-import typer
+from typer import Option
 
 URL: Final = "emulator://8x8?scene=ghost&seed=1"
 
 
 def demo(
-    seconds: Annotated[float, typer.Option(help="how long to scan")] = 3.0,
-    port: Annotated[str, typer.Option(help="an emulator:// URL")] = URL,
-    picture: Annotated[Path, typer.Option(help="PNG to write")] = Path("ohmskin-demo.png"),
+    seconds: Annotated[float, Option(help="how long to scan")] = 3.0,
+    port: Annotated[str, Option(help="an emulator:// URL")] = URL,
+    picture: Annotated[Path, Option(help="PNG to write")] = Path("ohmskin-demo.png"),
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
     print(f"scanning {port} for {seconds:g} s", flush=True)  # noqa: T201

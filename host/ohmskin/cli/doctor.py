@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import typer
 from rich.console import Console
+from typer import Option
 
 import ohmskin
 from ohmskin import errors
@@ -47,19 +47,12 @@ Tell = Callable[..., None]
 def doctor(
     port: Port,
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="calibration file (.json) of this board: --press compares with its wires"
-        ),
+        Path | None, Option(help="file (.json) of this board: --press compares with its wires")
     ] = None,
     wires: Wires = "",
-    press: Annotated[
-        bool, typer.Option(help="afterwards ask for touches, which show the wires")
-    ] = False,
-    into: Annotated[
-        Path | None, typer.Option(help="calibration file (.json) that takes the wires of --press")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+    press: Annotated[bool, Option(help="then ask for touches, which show the wires")] = False,
+    into: Annotated[Path | None, Option(help="calibration that takes these wires (.json)")] = None,
+    as_json: Annotated[bool, Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what is wrong with the board at PORT, and what to do. Touch nothing.
 

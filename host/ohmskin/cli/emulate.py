@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Without a board: ``ohmskin emulate``, and the comparison with the truth of ``ohmskin demo``."""
 
-import signal
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-import typer
 from rich.columns import Columns
 from rich.console import Console
+from typer import Argument, Option
 
 import ohmskin
 from ohmskin.arrays import Bool, Float
@@ -42,25 +41,14 @@ EPILOGS: Final = {
 
 
 def emulate(
-    url: Annotated[str, typer.Argument(help="an emulator:// URL")] = URL,
-    link: Annotated[
-        Path | None, typer.Option(help="also make this symbolic link to the pseudo-terminal")
-    ] = None,
-    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+    url: Annotated[str, Argument(help="an emulator:// URL")] = URL,
+    seconds: Annotated[float, Option(help="stop after so long; 0: never")] = 0.0,
 ) -> None:
     """Serve an emulated board at a pseudo-terminal. Ctrl-C ends it."""
     board, _, faults = emulated(url)
-    with ExitStack() as stack:
-        server = stack.enter_context(PtyServer(board, faults))
-        if link is not None:
-            if link.is_symlink():
-                link.unlink()
-            link.symlink_to(server.path)
-            stack.callback(link.unlink, missing_ok=True)
+    with PtyServer(board, faults) as server, suppress(KeyboardInterrupt):
         print(server.path, flush=True)  # noqa: T201
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # the link goes then, too
-        with suppress(KeyboardInterrupt):
-            server.serve(seconds or float("inf"))
+        server.serve(seconds or float("inf"))
 
 
 def compare(port: str, seconds: float, picture: Path) -> None:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
-import typer
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import track
 from rich.text import Text
+from typer import Argument, Option
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
@@ -46,29 +46,21 @@ _T = TypeVar("_T")
 
 def record(
     port: Port,
-    file: Annotated[Path, typer.Argument(help="file to write (.mcap), a new one")],
-    scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
-    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+    file: Annotated[Path, Argument(help="file to write (.mcap), a new one")],
+    scans: Annotated[int, Option(help="stop after so many; 0: never")] = 0,
+    seconds: Annotated[float, Option(help="stop after so long; 0: never")] = 0.0,
     tare_s: Annotated[
-        float | None,
-        typer.Option(
-            "--tare",
-            help="so long nothing touches the skin at first, in seconds: its tare "
-            "[default: 0; with a force sensor 2]",
-        ),
+        float | None, Option("--tare", help="so long nothing touches the skin at first, in s")
     ] = None,
-    mark: Annotated[list[str] | None, typer.Option(help="a mark at the beginning")] = None,
-    force_port: Annotated[
-        str, typer.Option(help="also record a force sensor at this serial port: a number a line")
-    ] = "",
-    force_baud: Annotated[int, typer.Option(help="speed of that port")] = DEFAULT_BAUD,
-    force_scale: Annotated[
-        float, typer.Option(help="newtons for one unit of its numbers; of grams: 0.00980665")
-    ] = 1.0,
+    mark: Annotated[list[str] | None, Option(help="a mark at the beginning")] = None,
+    force_port: Annotated[str, Option(help="a force sensor's serial port: a number a line")] = "",
+    force_baud: Annotated[int, Option(help="speed of that port")] = DEFAULT_BAUD,
+    force_scale: Annotated[float, Option(help="newtons a unit; of grams: 0.00980665")] = 1.0,
 ) -> None:
     """Record every scan at PORT. Ctrl-C ends it; a line typed becomes a mark.
 
-    With a force sensor: press cell after cell, and 'ohmskin calibrate recording' learns from that.
+    With a force sensor: press cell after cell, and 'ohmskin calibrate recording' learns from that;
+    --tare is 2 then, unless told.
     """
     if tare_s is None:
         tare_s = FORCE_TARE_S if force_port else 0.0
@@ -201,14 +193,12 @@ def _take_marks(recorder: Recorder) -> None:
 
 
 def export(
-    recording: Annotated[Path, typer.Argument(help="recording (.mcap)")],
-    out: Annotated[Path, typer.Argument(help=f"file to write: {' or '.join(FORMATS)}")],
+    recording: Annotated[Path, Argument(help="recording (.mcap)")],
+    out: Annotated[Path, Argument(help=f"file to write: {' or '.join(FORMATS)}")],
     begin_s: Annotated[
-        float, typer.Option("--begin", help="from so long after the first scan, in seconds")
+        float, Option("--begin", help="from so long after the first scan, in s")
     ] = 0.0,
-    end_s: Annotated[
-        float, typer.Option("--end", help="until then, in seconds; 0: to the last")
-    ] = 0.0,
+    end_s: Annotated[float, Option("--end", help="until then, in s; 0: to the last")] = 0.0,
 ) -> None:
     """Write a recording's scans as readings (.npz) or as a table (.csv)."""
     given = load_recording(recording)
@@ -222,10 +212,10 @@ def export(
 
 
 def estimate(
-    readings: Annotated[Path, typer.Argument(help="readings file (.npz)")],
-    method: Annotated[str, typer.Option(help=" | ".join(METHODS))],
-    out: Annotated[Path, typer.Option(help="file to write (.npz)")],
-    cold: Annotated[bool, typer.Option(help="start every frame afresh")] = False,
+    readings: Annotated[Path, Argument(help="readings file (.npz)")],
+    method: Annotated[str, Option(help=" | ".join(METHODS))],
+    out: Annotated[Path, Option(help="file to write (.npz)")],
+    cold: Annotated[bool, Option(help="start every frame afresh")] = False,
 ) -> None:
     """Estimate every cell of every frame of a readings file."""
     answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-import typer
 from numpy.typing import ArrayLike
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
+from typer import Option
 
 import ohmskin
 from ohmskin.arrays import Float
@@ -45,23 +45,16 @@ _PRINT_EVERY_S: Final = 1.0
 def stream(
     port: Port,
     method: Annotated[
-        str,
-        typer.Option(
-            help=f"estimator: {' | '.join(METHODS)}; none: readings alone. Default: joint, or the "
-            "calibration's"
-        ),
+        str, Option(help=f"none | {' | '.join(METHODS)}; default: joint, or the calibration's")
     ] = "",
     calibration: Annotated[
-        Path | None,
-        typer.Option(envvar="OHMSKIN_CALIBRATION", help="calibration file (.json): show forces"),
+        Path | None, Option(envvar="OHMSKIN_CALIBRATION", help="file (.json): show forces")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
-    tare_s: Annotated[
-        float, typer.Option("--tare", help="so long nothing touches the skin, in seconds: its rest")
-    ] = 0.0,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object a scan")] = False,
-    scans: Annotated[int, typer.Option(help="stop after so many; 0: never")] = 0,
-    seconds: Annotated[float, typer.Option(help="stop after so long; 0: never")] = 0.0,
+    force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
+    tare_s: Annotated[float, Option("--tare", help="so long nothing touches the skin, in s")] = 0.0,
+    as_json: Annotated[bool, Option("--json", help="one JSON object a scan")] = False,
+    scans: Annotated[int, Option(help="stop after so many; 0: never")] = 0,
+    seconds: Annotated[float, Option(help="stop after so long; 0: never")] = 0.0,
 ) -> None:
     """Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it."""
     if method not in ("", "none", *METHODS):

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-import typer
 from rich.console import Console
+from typer import Argument, Option
 
 import ohmskin
 from ohmskin.circuit.plate import load_plate
@@ -26,20 +26,16 @@ _out = Console(soft_wrap=True, markup=False, highlight=False)
 
 
 def _most(what: str) -> Any:
-    return typer.Option(min=0.0, help=f"most {what}", rich_help_panel="Tolerances")
+    return Option(min=0.0, help=f"most {what}", rich_help_panel="Tolerances")
 
 
 def verify(
     port: Port,
-    plate: Annotated[
-        Path, typer.Argument(help="ohms at each crossing (.csv), 'open' where no resistor is")
-    ],
+    plate: Annotated[Path, Argument(help="ohms at each crossing (.csv), 'open' for none")],
     wires: Wires = "0,0",
-    seconds: Annotated[float, typer.Option(min=0.5, help="so long losses are counted")] = 60.0,
-    picture: Annotated[Path | None, typer.Option(help="PNG to write")] = None,
-    json_file: Annotated[
-        str, typer.Option("--json", help="file for all figures, to attach to a bug report; -: here")
-    ] = "",
+    seconds: Annotated[float, Option(min=0.5, help="so long losses are counted")] = 60.0,
+    picture: Annotated[Path | None, Option(help="PNG to write")] = None,
+    json_file: Annotated[str, Option("--json", help="file for all figures; -: here")] = "",
     cell_percent: Annotated[
         float, _most("error of a cell: 1 % of a resistor, 2 % of multiplexers and converter")
     ] = _MOST.cell_percent,

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from ohmskin.errors import OhmskinError
 from ohmskin.force.calibration import load_calibration
@@ -21,22 +21,15 @@ _DISPLAYS = {"DISPLAY", "WAYLAND_DISPLAY"}
 def view(
     ports: Annotated[
         list[str] | None,
-        typer.Argument(metavar="PORT", envvar="OHMSKIN_PORT", help="or URLs; none: the page asks"),
+        Argument(metavar="PORT", envvar="OHMSKIN_PORT", help="or URLs; none: the page asks"),
     ] = None,
     calibration: Annotated[
-        list[Path] | None,
-        typer.Option(envvar="OHMSKIN_CALIBRATION", help="file (.json): forces; one for each unit"),
+        list[Path] | None, Option(envvar="OHMSKIN_CALIBRATION", help="forces; one for each unit")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="take that of another unit")] = False,
-    host: Annotated[
-        str, typer.Option(help="address to listen at; by default, this machine alone reaches it")
-    ] = "127.0.0.1",
-    http_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")
-    ] = HTTP_PORT,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="only print the page's address")
-    ] = False,
+    force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
+    host: Annotated[str, Option(help="address at which the page listens")] = "127.0.0.1",
+    http_port: Annotated[int, Option(min=0, max=65535, help="its port; 0: any free")] = HTTP_PORT,
+    no_browser: Annotated[bool, Option("--no-browser", help="only print its address")] = False,
 ) -> None:
     """Show skins live on a page in the browser: heat map, contacts, tare, recording.
 
