@@ -104,7 +104,8 @@ def _unanswered(port: str, error: errors.OhmskinError) -> Finding:
     wrong_url = kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None)
     if kind is None or wrong_url:
         raise error
-    told = {"port": port, "problem": error.problem, "remedy": error.remedy}
+    remedy = error.remedy or "check the port's name and its cable"
+    told = {"port": port, "problem": error.problem, "remedy": remedy}
     return Finding(kind, WHOLE_SKIN, {name: told[name] for name in kind.names})
 
 

@@ -37,15 +37,11 @@ def _words(finding: Finding) -> dict[str, Any]:
     if not lines:
         line, lines = "column", finding.place.columns
     match finding.kind:
-        case Kind.PORT_UNUSABLE:
-            return {"unknown": not values["remedy"]}
         case Kind.SELF_TEST:
             side, _, fault = values["name"].removeprefix("far_").partition("_")
             doc = ENUMS["finding"].docs.get(values["name"], "a finding of a newer firmware")
             side = f"far {side}" if values["name"].startswith("far_") else side
             return {"side": side, "fault": fault, "doc": doc}
-        case Kind.NOTHING_CONDUCTS:
-            return {"one_cell": values["cell_count"] == 1}
         case Kind.OPEN_ROW | Kind.OPEN_COLUMN:
             # Lines beyond the skin look open, too.
             beyond = lines == tuple(range(lines[0], values["line_count"]))

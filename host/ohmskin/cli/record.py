@@ -6,7 +6,6 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -37,8 +36,6 @@ from ohmskin.record.recording import export as export_recording
 
 # With a force sensor the first scans are a tare of so many seconds, unless told.
 FORCE_TARE_S: Final = 2.0
-# So many different messages of estimates are printed for a file.
-_MESSAGES: Final = 8
 
 _out = Console(soft_wrap=True)
 _T = TypeVar("_T")
@@ -166,20 +163,13 @@ class PressDisplay:
 
     def picture(self) -> Group:
         """All of it, for a terminal."""
-        force, on = self._recorder.force, self._on.cells
-        now = "touch nothing yet"
-        if self._reader is not None:
-            now = f"pressed: {', '.join(map(str, on)) or 'none'}"
+        force, pressed = self._recorder.force, ", ".join(map(str, self._on.cells))
+        now = "touch nothing yet" if self._reader is None else f"pressed: {pressed or 'none'}"
         force_n = float("nan") if force is None else force.force_n
         head = f"{self._recorder.scans} scans   force {force_n:.2f} N   {now}"
-        styled = [
-            [
-                Text(str(count), "reverse" * ((row, column) in on))
-                for column, count in enumerate(counts)
-            ]
-            for row, counts in enumerate(self.counts)
-        ]
-        return Group(Text(head), cell_table(styled, "presses of each cell"))
+        return Group(
+            Text(head), cell_table(self.counts.astype(str).tolist(), "presses of each cell")
+        )
 
 
 def _take_marks(recorder: Recorder) -> None:
@@ -225,6 +215,3 @@ def estimate(
         f"{out}: {frames} frames, {int(answers['converged'].sum())} converged, "
         f"median {1e3 * float(np.median(answers['seconds'])):.2f} ms a frame"
     )
-    for message, count in Counter(answers["message"].tolist()).most_common(_MESSAGES):
-        if message:
-            _out.print(f"  {count} of {frames}: {message}")

@@ -100,14 +100,13 @@ def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
     """
     try:
         from matplotlib.figure import Figure
-        from matplotlib.patches import Rectangle
     except ImportError as exc:
         raise ValueError("no picture: it needs matplotlib: pip install '.[plot]'") from exc
     size = 8 if max(exam.plate.shape) <= 8 else 5  # of letters
     most, crossings = exam.tolerance, range(max(exam.plate.shape))
-    figure = Figure(figsize=(11, 9), layout="constrained")
+    figure = Figure(figsize=(15, 5), layout="constrained")
     figure.suptitle(title, wrap=True)
-    (of_cells, of_lines), (of_settling, of_noise) = figure.subplots(2, 2)
+    of_cells, of_settling, of_lines = figure.subplots(1, 3)
     for axes, values, limit, name, colours in (
         (of_cells, exam.error_percent, most.cell_percent, "error of each resistor [%]", "RdBu_r"),
         (of_settling, exam.settling_lsb, most.settling_lsb, "change if settled [LSB]", "Oranges"),
@@ -120,18 +119,12 @@ def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 1.4 * limit else "black"
             text = "" if np.isnan(value) else f"{value:.1f}" if abs(value) < 99.5 else "open"
-            is_wrong = axes is of_cells and bool(exam.wrong[row, column])
-            text = text or "bridge" * is_wrong
-            edge = {"edgecolor": "black", "zorder": 2} if is_wrong else {"edgecolor": "0.9"}
-            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, **edge))
+            if axes is of_cells and exam.wrong[row, column]:
+                text = f"[{text or 'bridge'}]"
             axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=size)
     for k, name in enumerate(CONFIGURATIONS):
         x, y = exam.predicted_lsb[..., k].ravel(), exam.shown_lsb[..., k].ravel()
         of_lines.plot(x, y - x, "o+x."[k], label=name, markersize=6, fillstyle="none")
     of_lines.set(title="reading less prediction [LSB]", xlabel="current by the circuit [LSB]")
     of_lines.legend(title="reading")
-    clocks = [clock.removeprefix("clock_") for clock in exam.noise_lsb]
-    of_noise.bar(clocks, list(exam.noise_lsb.values()), width=0.5)
-    of_noise.axhline(most.noise_lsb, color="0.6", linestyle="--", linewidth=1)
-    of_noise.set(title="noise of a reading [LSB]", xlabel="ADC clock")
     figure.savefig(path, dpi=110)

@@ -87,7 +87,7 @@ def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> tuple[Bool, Bool]:
     dark = current < least
     shorted = np.zeros(current.shape, dtype=np.bool_)
     if dark.all():
-        diagnosis.add(Kind.NOTHING_CONDUCTS, cell_count=dark.size)
+        diagnosis.add(Kind.NOTHING_CONDUCTS, one_cell=dark.size == 1)
         diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
         return shorted, dark
     no_row, no_column = dark.all(axis=1), dark.all(axis=0)

@@ -21,7 +21,6 @@ from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_sig
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
-RATE_TOLERANCE: Final = 0.005  # [1] A board's resonator is off by up to this.
 LEAST_TIMER_MS: Final = 1  # [ms] The timer of a USB bridge cannot be set to less.
 BAD_RESETS: Final = ("brown_out", "watchdog")  # A sound board is not reset by these.
 
@@ -87,7 +86,6 @@ def examine(
     """All findings, and the figures behind them. of_scans: adds what the scans show."""
     board, stats = evidence.board, evidence.stats
     usual = RestScans.of(board, evidence.scans)
-    rate_hz = None if usual is None else _rate_hz(evidence.scans)
     diagnosis = Diagnosis()
     diagnosis.measured = {
         "board": board.board,
@@ -99,10 +97,10 @@ def examine(
         "dropped_by_board": stats.dropped_by_board,
         "damaged": stats.line.damaged,
         "restarts": stats.restarts,
-        "rate_hz": None if rate_hz is None else round(rate_hz, 3),
+        "rate_hz": None if usual is None else _rate_hz(evidence.scans),
     }
     _examine_board(evidence, diagnosis)
-    _examine_line(evidence, rate_hz, diagnosis)
+    _examine_line(evidence, diagnosis)
     if usual is not None:
         with one_blas_thread:
             of_scans(evidence, usual, diagnosis)
@@ -128,13 +126,14 @@ def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
         add(Kind.USB_LATENCY, timer_ms=evidence.latency[0], file=evidence.latency[1])
 
 
-def _examine_line(evidence: Evidence, rate_hz: float | None, diagnosis: Diagnosis) -> None:
-    """Adds what the connection has counted, and a scan rate that is not what was asked for."""
+def _examine_line(evidence: Evidence, diagnosis: Diagnosis) -> None:
+    """Adds what the connection has counted."""
     board, stats, add = evidence.board, evidence.stats, diagnosis.add
+    line, commands = stats.line, stats.board_rx_errors
     if stats.restarts:
         add(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
     made = stats.scans + stats.missed
-    if stats.missed > evidence.loss * made or (rate_hz is None and not stats.restarts):
+    if stats.missed > evidence.loss * made or (len(evidence.scans) < 2 and not stats.restarts):
         add(
             Kind.LOSS,
             received=len(evidence.scans),
@@ -143,12 +142,8 @@ def _examine_line(evidence: Evidence, rate_hz: float | None, diagnosis: Diagnosi
             dropped_by_board=stats.dropped_by_board,
             rate_hz=board.rate_hz,
         )
-    line, commands = stats.line, stats.board_rx_errors
     if line.damaged or commands:
         add(Kind.DAMAGED, damaged=line.damaged, crc_errors=line.crc_errors, commands=commands)
-    asked_hz = board.rate_asked_mhz / 1000 or board.rate_hz
-    if rate_hz is not None and abs(rate_hz / asked_hz - 1) > RATE_TOLERANCE:
-        add(Kind.RATE, rate_hz=rate_hz, asked_hz=asked_hz)
 
 
 def _rate_hz(scans: list[Scan]) -> float:
@@ -156,4 +151,4 @@ def _rate_hz(scans: list[Scan]) -> float:
     step = np.diff([float(scan.number) for scan in scans])
     took_s = np.diff([1e-6 * scan.time_us for scan in scans])
     forward = (step > 0) & (took_s > 0)  # but for restarts
-    return float(step[forward].sum() / took_s[forward].sum()) if forward.any() else 0.0
+    return round(float(step[forward].sum() / took_s[forward].sum()), 3) if forward.any() else 0.0

@@ -39,7 +39,7 @@ class Kind(Enum):
     PROTOCOL_MISMATCH = "protocol_mismatch", _FAULT, "port problem remedy"
     LOST = "lost", _FAULT, "problem"
     SELF_TEST = "self_test", _FAULT, "name code_min code_max"
-    NOTHING_CONDUCTS = "nothing_conducts", _FAULT, "cell_count"
+    NOTHING_CONDUCTS = "nothing_conducts", _FAULT, "one_cell"
     OPEN_ROW = "open_row", _FAULT, "line_count cells_per_line"
     OPEN_COLUMN = "open_column", _FAULT, "line_count cells_per_line"
     SHORT_ROWS = "short_rows", _FAULT, ""
@@ -58,9 +58,8 @@ class Kind(Enum):
     RESTARTED = "restarted", _WARNING, "restarts causes"
     LOSS = "loss", _WARNING, "received missed made dropped_by_board rate_hz"
     DAMAGED = "damaged", _WARNING, "damaged crc_errors commands"
-    RATE = "rate", _WARNING, "rate_hz asked_hz"
     HUM = "hum", _WARNING, "mains_hz amplitude_lsb most_lsb rate_hz seen_hz"
-    NOISE = "noise", _WARNING, "noise_lsb sound_lsb adc_lsb"
+    NOISE = "noise", _WARNING, "noise_lsb sound_lsb"
     ADC_NOISE = "adc_noise", _WARNING, "clocks most_lsb"
     WIRES = "wires", _WARNING, "share nominal_ohm"
     TOUCHED = "touched", _NOTE, "moves"
@@ -113,8 +112,7 @@ class WireShare:
     """Wire resistance over the nominal one, and its deviation.
 
     place: lines, or the whole layers. known: the deviation is small enough to tell the share.
-    differs: the wires are clearly not nominal, and no other share tells it already. layers: those
-    whose wires are seen together.
+    differs: the wires are clearly not nominal, and no other share tells it already.
     """
 
     place: Place
@@ -122,7 +120,6 @@ class WireShare:
     std: float
     known: bool
     differs: bool
-    layers: tuple[str, str] = ("top", "bottom")
 
 
 @dataclass

@@ -298,8 +298,7 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
     elif (cell_lsb > limit).any():
         place, lsb = Place.of_cells(cell_lsb > limit), float(cell_lsb.max())
     if place != WHOLE_SKIN or usual > NOISY_LSB:
-        sound = {"sound_lsb": SOUND_NOISE_LSB, "adc_lsb": ADC_NOISE_LSB}
-        diagnosis.add(Kind.NOISE, place, noise_lsb=lsb, **sound)
+        diagnosis.add(Kind.NOISE, place, noise_lsb=lsb, sound_lsb=SOUND_NOISE_LSB)
 
 
 # ------------------------------------------------------------------------------------ settling
