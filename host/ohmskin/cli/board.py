@@ -146,11 +146,9 @@ def configure(
             skin.set_unit_id(unit_id)
         if save:
             skin.save()
-    _out.print(
-        f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, mode {now.mode}, settle time "
-        f"{now.settle_us} us or more"
-        f"{', saved' if save else ', until its next reset'}"
-    )
+    done = f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, mode {now.mode}, settle time "
+    kept = "saved" if save else "until its next reset"
+    _out.print(f"{done}{now.settle_us} us or more, {kept}")
 
 
 def flash(

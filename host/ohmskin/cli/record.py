@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -215,3 +216,6 @@ def estimate(
         f"{out}: {frames} frames, {int(answers['converged'].sum())} converged, "
         f"median {1e3 * float(np.median(answers['seconds'])):.2f} ms a frame"
     )
+    for message, count in Counter(answers["message"].tolist()).most_common(8):
+        if message:
+            _out.print(f"  {count} of {frames}: {message}")

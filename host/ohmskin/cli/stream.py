@@ -62,9 +62,7 @@ def stream(
     if method and str(calibration) == os.environ.get("OHMSKIN_CALIBRATION"):
         calibration = None  # what is said goes before what the environment says
     if method and calibration is not None:
-        raise ValueError(
-            "say either --method or --calibration: forces are by the calibration's method"
-        )
+        raise ValueError("say either --method or --calibration: a calibration has its own method")
     told = None if calibration is None else load_calibration(calibration)
     with ohmskin.open(port) as skin:
         board = skin.info

@@ -194,11 +194,6 @@ def _reference_ratio(lit: Float, rest: Rest, diagnosis: Diagnosis) -> float:
     top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
     if abs(off) >= RATIO_TOLERANCE + RATIO_STDS * ratio_std:
-        diagnosis.add(
-            Kind.REFERENCE_RATIO,
-            ratio=ratio,
-            off_percent=100 * off,
-            ref_top_ohm=top,
-            ref_bottom_ohm=bottom,
-        )
+        nominal = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
+        diagnosis.add(Kind.REFERENCE_RATIO, ratio=ratio, off_percent=100 * off, **nominal)
     return ratio

@@ -136,7 +136,7 @@ class Diagnosis:
     nominal_ohm: tuple[float, float] | None = None
     pressed: list[WireShare] | None = None
 
-    def add(self, kind: Kind, place: Place = WHOLE_SKIN, **values: Any) -> None:
+    def add(self, kind: Kind, place: Place = WHOLE_SKIN, /, **values: Any) -> None:
         """Add a finding with these values."""
         self.findings.append(Finding(kind, place, values))
 

@@ -167,13 +167,8 @@ class PlateExam:
         diagnosis.measured["reference_ohm"] = [round(each) for each in ohm]
         most = self.tolerance.reference_percent
         if max(map(abs, off)) > most:
-            diagnosis.add(
-                Kind.REFERENCE_VALUE,
-                ohm=ohm,
-                nominal_ohm=nominal_ohm,
-                off_percent=off,
-                most_percent=most,
-            )
+            values = {"ohm": ohm, "nominal_ohm": nominal_ohm, "off_percent": off}
+            diagnosis.add(Kind.REFERENCE_VALUE, most_percent=most, **values)
         return replace(known, ref_top_ohm=ohm[0], ref_bottom_ohm=ohm[1])
 
     def _skin(self, siemens: Float, known: SkinKnowledge) -> Skin:

@@ -342,33 +342,21 @@ def examine_settling(
     cells = (clear > most_lsb).any(axis=2)
     if cells.any():
         place = WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells)
-        add_settling(usual, settled, diagnosis, place, float(change.max()), most_lsb)
+        values = settling(usual, settled, float(change.max()))
+        diagnosis.add(Kind.SETTLING, place, most_lsb=most_lsb, pressed=False, **values)
     return bool(cells.any())
 
 
-def add_settling(
-    usual: RestScans,
-    settled: RestScans,
-    diagnosis: Diagnosis,
-    place: Place,
-    change_lsb: float,
-    most_lsb: float,
-    pressed: bool = False,
-) -> None:
-    """Add that readings change with a longer settle time, and the one that is long enough."""
+def settling(usual: RestScans, settled: RestScans, change_lsb: float) -> dict[str, float]:
+    """A change with a longer settle time, both times, and the one that is long enough [us]."""
     # A node that is left with e of its swing S after a slot t settles with tau = t / ln(S / e).
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(change_lsb, 0.9 * swing)
     slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
-    settle_us = usual.board.settle_us
-    needed_us = settle_us + 1e6 * slot_s(usual.board) * (slots - 1)
-    diagnosis.add(
-        Kind.SETTLING,
-        place,
-        change_lsb=change_lsb,
-        most_lsb=most_lsb,
-        settle_us=settle_us,
-        longer_us=settled.board.settle_us,
-        needed_us=int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
-        pressed=pressed,
-    )
+    needed_us = usual.board.settle_us + 1e6 * slot_s(usual.board) * (slots - 1)
+    return {
+        "change_lsb": change_lsb,
+        "settle_us": usual.board.settle_us,
+        "longer_us": settled.board.settle_us,
+        "needed_us": int(np.ceil(min(needed_us, CONSTANTS["settle_us_max"]))),
+    }

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wires of a skin against nominal ones, from three corners of a rectangle that are pressed.
 
-Port resistances are compared with those of a model; what the wires have to be for both to agree is
-found by least squares. A figure carries its deviation, which says whether it is worth anything.
-
 Symbols. Index 0 is the untouched skin, index 1 the pressed one.
 
 ====== ============ =====================================================================
@@ -17,11 +14,9 @@ y      ()           log of the wires over nominal
 u      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
 ====== ============ =====================================================================
 
-An untouched skin hides its wires: cells of 1 MOhm scatter by far more than wires of 100 ohm. A
-pressed cell hides the wires behind it, too, because its own resistance is in the same reading.
-Three corners of a rectangle do not: with (a, b) the one between the other two, (a, b') and (a', b),
-the current of the fourth goes through all three in series, so that four ports see three unknown
-cells. But for the untouched cells,
+With three corners of a rectangle pressed, (a, b) the one between the other two, (a, b') and
+(a', b), the current of the fourth goes through all three in series, so that four ports see three
+unknown cells and the wires. But for the untouched cells,
 
     rho[a,b] + rho[a,b'] + rho[a',b] - rho[a',b'] = 2 (top + bottom)
 
@@ -50,7 +45,7 @@ import numpy as np
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit, current_from_ratio, current_std
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
-from ohmskin.doctor.signal import Rest, RestScans, add_settling, rounding_std_lsb
+from ohmskin.doctor.signal import Rest, RestScans, rounding_std_lsb, settling
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
@@ -197,7 +192,8 @@ class CornerScans:
         if clear > PRESSED_LSB:
             others = [each for each in diagnosis.findings if each.kind is not Kind.SETTLING]
             diagnosis.findings = others
-            add_settling(first[0], first[1], diagnosis, WHOLE_SKIN, most, PRESSED_LSB, pressed=True)
+            values = settling(first[0], first[1], most)
+            diagnosis.add(Kind.SETTLING, most_lsb=PRESSED_LSB, pressed=True, **values)
 
     def measure(self, rest: Rest) -> list[WireShare]:
         """The share of both layers, then that of each row and column; none if none was pressed."""
