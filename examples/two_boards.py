@@ -16,6 +16,6 @@ import ohmskin
 
 with ohmskin.open_all(sys.argv[1:] or None) as skins:
     print(f"units {', '.join(map(str, skins))}", flush=True)
-    for unit_id, scan, time_s, jitter_s in skins.scans():
+    for unit_id, scan, time_s in skins.scans():
         text = f"{time_s:.4f} s: unit {unit_id}, scan {scan.number}, missed {scan.missed}, "
-        print(f"{text}{scan.ratio[0, 0, 1]:.3f}, jitter {1e3 * jitter_s:.1f} ms", flush=True)
+        print(f"{text}{scan.ratio[0, 0, 1]:.3f}", flush=True)

@@ -187,7 +187,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
             unit_id=int(options.get("unit", 0)),
             mode=options.get("mode", "near"),
             layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
-            sampled=faults.sampled if faults.of_sampling else None,
+            sampled=faults.sampled,
         )
         return board, scene, faults_of(LineFaults, options, seed=seed)
 
@@ -216,14 +216,12 @@ class BoardScan(NamedTuple):
     """A scan of one of several boards.
 
     scan: a `Scan`; a `ForceScan` if the boards were opened with calibrations. time_s: when its
-    middle was, on `time.monotonic()` [s]; late by what USB delays all scans alike. jitter_s:
-    `BoardClock.jitter_s`.
+    middle was, on `time.monotonic()` [s]; late by what USB delays all scans alike.
     """
 
     unit_id: int
     scan: Any
     time_s: float
-    jitter_s: float
 
 
 class Boards(Closing, dict[int, Any]):
@@ -235,15 +233,13 @@ class Boards(Closing, dict[int, Any]):
     """
 
     def __init__(self, devices: Sequence[Device | CalibratedSkin]) -> None:
-        taken = {device.info.unit_id for device in devices}
         for device in devices:
             unit_id = device.info.unit_id
             first = self.setdefault(unit_id, device)
             if first is not device:
-                free = next(number for number in range(1, len(taken) + 2) if number not in taken)
                 raise PortError(
                     f"{first.name} and {device.name} are both unit {unit_id}: rename one: "
-                    f"ohmskin configure {device.name} --unit-id {free} --save"
+                    f"ohmskin configure {device.name} --unit-id NUMBER --save"
                 )
 
     def scans(self) -> Iterator[BoardScan]:
@@ -272,8 +268,7 @@ def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[B
         board = device.info
         took_us = 1e6 * scan_s(board)
         clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
-        time_s = clock.host_s(scan.time_us + took_us / 2)
-        yield BoardScan(unit_id, scan, time_s, clock.jitter_s)
+        yield BoardScan(unit_id, scan, clock.host_s(scan.time_us + took_us / 2))
 
 
 def open_all(
@@ -301,10 +296,7 @@ def open_all(
     searched = urls is None
     named = [port.path for port in serial_ports() if port.board] if urls is None else list(urls)
     if not named:
-        raise PortError(
-            "no skin board found: 'ohmskin ports' lists the ports there are; name those of boards "
-            "that it does not know"
-        )
+        raise PortError("no skin board found: name ports out of those that 'ohmskin ports' lists")
     by_unit = None if calibrations is None else _by_unit(calibrations)
     with ExitStack() as opened:
 
@@ -332,13 +324,9 @@ def open_all(
 
 def _calibrated(device: Device, by_unit: dict[int, Calibration]) -> CalibratedSkin:
     unit_id = device.info.unit_id
-    if unit_id not in by_unit:
-        known = ", ".join(map(str, sorted(by_unit))) or "none"
-        raise ValueError(
-            f"{device.name} is unit {unit_id}, of which there is no calibration (there are of "
-            f"units: {known}): calibrate this skin"
-        )
     with naming(device.name):
+        if unit_id not in by_unit:
+            raise ValueError(f"no calibration is of its unit, {unit_id}: calibrate this skin")
         return CalibratedSkin(device, by_unit[unit_id])
 
 

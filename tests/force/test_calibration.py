@@ -87,14 +87,6 @@ def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
     assert not forces(loaded, saved.rest.level).any()
 
 
-def test_a_file_of_before_with_intercepts_of_zero_is_read(tmp_path: Path) -> None:
-    path, saved = tmp_path / "skin.json", calibration()
-    saved.save(path)
-    content = json.loads(path.read_bytes())
-    path.write_text(json.dumps(content | {"intercept": cells(0.0), "intercept_std": cells(0)}))
-    assert_same(saved, load_calibration(path))
-
-
 def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
     before = calibration()
     tared = replace(before, tare=rest(3, "2025-03-02T08:00:00+00:00"))
@@ -141,7 +133,6 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
     [
         (lambda content: content.pop("slope"), "no field 'slope'"),
         (put("colour", "red"), "unknown field 'colour'"),
-        (put("intercept", cells(0.5)), "intercept is not 0: curves go through rest"),
         (put("format", "other"), "no calibration: field 'format' is not 'ohmskin calibration'"),
         (put("schema", 2), "field 'schema' is not 1: written by another version of ohmskin"),
         (put("schema", True), "field 'schema' is not 1: written by another version of ohmskin"),
@@ -205,7 +196,6 @@ def test_edited_files_are_refused_by_field(
         (b"", "no JSON of ours: "),
         (b"\x89PNG\r\n\x1a\n", "no JSON of ours: "),
         (b"[" * 100_000, "no JSON of ours: "),
-        (b'{"a": 1, "a": 2}', "no JSON of ours: field 'a' stands twice"),
         (b'{"a": ' + b"9" * 5000 + b"}", "no JSON of ours: "),
         (b"[]", "no calibration: field 'format' is not 'ohmskin calibration'"),
         (b"{}", "no calibration: field 'format' is not 'ohmskin calibration'"),

@@ -79,7 +79,7 @@ def test_another_unit_is_refused_unless_forced() -> None:
 def test_a_calibration_of_another_mode_is_refused_even_if_forced(of: str, board: str) -> None:
     told = replace(of_scene("ghost"), mode=of)
     for force in (False, True):
-        with pytest.raises(ValueError, match=f"of mode {of}, the board scans in mode {board}: "):
+        with pytest.raises(ValueError, match=f"of mode {of}, not {board}: "):
             ohmskin.open(f"{GHOST}&mode={board}", calibration=told, force=force)
 
 

@@ -50,7 +50,7 @@ def test_delays_and_drift_leave_less_than_a_millisecond(delays, rate_error) -> N
     board_s = np.arange(60 * HZ) / HZ
     true_s = START_S + (1 + rate_error) * board_s
     arrival_s = in_order(delays(random, true_s))
-    found_s, clock = mapped(board_s, arrival_s)
+    found_s, _ = mapped(board_s, arrival_s)
     settled = board_s > 5
     error_s = (found_s - true_s)[settled]
     late_s = (arrival_s - true_s)[settled]
@@ -63,8 +63,6 @@ def test_delays_and_drift_leave_less_than_a_millisecond(delays, rate_error) -> N
     assert np.abs(error_s).max() < 2e-3
     assert np.diff(found_s).min() > 0
     assert np.abs(np.diff(found_s) - 1 / HZ).max() < 1e-3
-    expected_s = np.percentile(late_s[-2048:], 95)
-    assert clock.jitter_s == pytest.approx(expected_s, rel=0.1, abs=1e-3)
 
 
 def test_a_resonator_that_warms_is_followed() -> None:

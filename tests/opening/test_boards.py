@@ -113,7 +113,6 @@ def test_times_are_of_the_middle_of_scans_on_one_clock() -> None:
         middles_s = [begin_s + 1e-6 * each.scan.time_us + period_s / 2 for each in found]
         assert times_s == pytest.approx(np.array(middles_s), abs=2e-3)
         assert np.diff(times_s) == pytest.approx(period_s, abs=1e-3)
-        assert 0 <= found[-1].jitter_s < 0.02
 
 
 def test_a_slow_board_has_the_time_of_its_readings() -> None:
@@ -184,7 +183,7 @@ def test_a_skin_that_cannot_be_used_is_an_error_of_a_search(
 @pytest.mark.parametrize("urls", [None, []])
 def test_no_board_is_an_error(urls: list[str] | None, attach: Attach) -> None:
     attach(("/dev/ttyS0", ""))
-    with pytest.raises(PortError, match="no skin board found: 'ohmskin ports'"):
+    with pytest.raises(PortError, match=r"no skin board found: .* 'ohmskin ports' lists"):
         ohmskin.open_all(urls)
 
 
@@ -202,7 +201,7 @@ def test_two_of_one_unit_are_refused() -> None:
         ohmskin.open_all(urls)
     assert str(error.value) == (
         f"{urls[1]} and {urls[2]} are both unit 2: rename one: "
-        f"ohmskin configure {urls[2]} --unit-id 3 --save"
+        f"ohmskin configure {urls[2]} --unit-id NUMBER --save"
     )
 
 
@@ -226,7 +225,7 @@ def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("urls", "calibrated", "words"),
     [
-        (units(1, 2), (1, 3), r"unit=2 is unit 2, of which .* units: 1, 3"),
+        (units(1, 2), (1, 3), r"unit=2: no calibration is of its unit, 2: calibrate"),
         (units(1), (1, 1), "two calibrations are of unit 1"),
         (["emulator://4x4?unit=1"], (1,), r"emulator://4x4\?unit=1: .* 8x8 skin"),
     ],

@@ -114,7 +114,7 @@ def test_scans_keep_their_mode(tmp_path: Path, path: Path, hello: Hello) -> None
     assert [each.mode for each in load_recording(path).hellos] == ["near", "far"]
     for found in (load_recording(path).scans, replayed(path)):
         assert [each.mode for each in found] == modes
-    with pytest.raises(RecordingError, match=r"\(near\) become 3x4 \(far\) after 0\.005 s"):
+    with pytest.raises(RecordingError, match=r"cells or mode change after 0\.005 s"):
         export(load_recording(path), tmp_path / "both.npz")
     for out in (tmp_path / "far.npz", tmp_path / "far.csv"):
         export(load_recording(path), out, begin_s=0.004)
@@ -324,16 +324,6 @@ def foreign(path: Path, topic: str, content: object) -> None:
         writer.finish()
 
 
-def test_an_old_recording_does_not_say_how_long_a_slot_is(path: Path, hello: Hello) -> None:
-    content = {**asdict(hello), "host_time_s": 1.0}
-    del content["slot_cycles"], content["mode"]
-    readings = hello.rows * hello.columns * 4
-    for scan_cycles, slot_cycles in ((177_762, 177_762 // readings), (10**7, 60_000)):
-        foreign(path, "/skin/hello", {**content, "scan_cycles": scan_cycles})
-        (found,) = load_recording(path).hellos
-        assert found == replace(hello, scan_cycles=scan_cycles, slot_cycles=slot_cycles)
-
-
 def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_bytes(b"")
     assert "cut off" in outcome(path)
@@ -348,11 +338,11 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
         ("/skin/mark", {"host_time_s": 1.0, "text": ""}, "no board says hello"),
         ("/skin/hello", {"host_time_s": 1}, "layout_crc"),
         ("/skin/hello", [1], "no JSON object"),
-        ("/skin/hello", {**known, "columns": 0}, "hello: columns is 0"),
-        ("/skin/hello", {**known, "adc_bits": 80}, "adc bits must be an integer from 1 to 16"),
-        ("/skin/hello", {**known, "scan_cycles": 0}, "hello: scan_cycles is 0"),
-        ("/skin/hello", {**known, "ref_top_ohm": 0}, "hello: ref_top_ohm is 0"),
-        ("/skin/hello", {**known, "rows": 10**9}, "hello: no 1000000000x4 cells"),
+        ("/skin/hello", {**known, "columns": 0}, "hello says columns 0"),
+        ("/skin/hello", {**known, "adc_bits": 80}, "hello says adc_bits 80"),
+        ("/skin/hello", {**known, "scan_cycles": 0}, "hello says scan_cycles 0"),
+        ("/skin/hello", {**known, "ref_top_ohm": 0}, "hello says ref_top_ohm 0"),
+        ("/skin/hello", {**known, "rows": 10**9}, "hello says rows 1000000000"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [1] * 5}, "5 codes"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [-1] * 4}, "range"),
         ("/skin/scan", {**head, "rows": 10**9, "columns": 9, "codes": []}, "no 10000"),
@@ -604,7 +594,7 @@ def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) 
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
         assert_same(list(skin), scans, host_time=False)
         assert skin.info.rows == 2
-    with pytest.raises(RecordingError, match=r"3x4 cells \(near\) become 2x4"):
+    with pytest.raises(RecordingError, match="cells or mode change after "):
         export(load_recording(path), tmp_path / "a.npz")
 
 
@@ -619,7 +609,7 @@ def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
     beyond = scan(1)
     beyond.codes[0, 0, 0] = 1024
     write_recording(path, hello, [scan(0), beyond])
-    with pytest.raises(RecordingError, match="scan 1 has a code beyond the converter"):
+    with pytest.raises(RecordingError, match="a code is out of range"):
         replayed(path)
 
 

@@ -84,18 +84,14 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     shorter_s = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * STEP_S
     enough = shared * STEP_S >= max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s)
     if not enough.any():
-        raise ValueError(
-            f"scans and force log overlap at no offset for {MIN_OVERLAP_S:g} s, and for half of "
-            "the shorter one, gaps left out"
-        )
+        needed = f"{MIN_OVERLAP_S:g} s, and for half of the shorter one, gaps left out"
+        raise ValueError(f"scans and force log overlap at no offset for {needed}")
     likeness = np.where(enough, r, 0.0).clip(0.0, 1 - 1e-12)
     score = -0.5 * shared * np.log1p(-(likeness**2))
     best = int(np.argmax(score))
     if likeness[best] < MIN_CORRELATION:
-        raise ValueError(
-            "scans and force log fit at no offset: their best correlation is "
-            f"{likeness[best]:.2f}, less than {MIN_CORRELATION:g}: are they of the same session?"
-        )
+        found = f"their best correlation is {likeness[best]:.2f}, less than {MIN_CORRELATION:g}"
+        raise ValueError(f"scans and force log fit at no offset: {found}: are they of one session?")
     _check_unique(r, score, best)
     lag = best + _vertex(score, best) - (y.size - 1)
     return Alignment(
@@ -168,10 +164,8 @@ def _check_unique(r: Float, score: Float, best: int) -> None:
     second = int(np.argmax(others))
     if others[second] > MAX_SECOND * score[best]:
         raise ValueError(
-            f"an offset {abs(second - best) * STEP_S:.2f} s away fits nearly as well, with "
-            f"correlation {r[second]:.2f} for {r[best]:.2f}: the presses are too even or too few: "
-            "press at irregular intervals, and begin and end both recordings with the skin "
-            "untouched"
+            f"an offset {abs(second - best) * STEP_S:.2f} s away fits nearly as well: the presses "
+            "are too even or too few: press at irregular intervals, and begin and end untouched"
         )
 
 

@@ -170,10 +170,8 @@ def _valleys(rise: Float) -> list[int]:
 def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]:
     """The cell. Raises ValueError if it is not on a skin of this shape."""
     if row >= shape[0] or column >= shape[1]:
-        raise ValueError(
-            f"cell ({row}, {column}) is not on this {shape[0]}x{shape[1]} skin, whose first is "
-            "(0, 0)"
-        )
+        skin = f"{shape[0]}x{shape[1]} skin, whose first is (0, 0)"
+        raise ValueError(f"cell ({row}, {column}) is not on this {skin}")
     return row, column
 
 
@@ -243,10 +241,8 @@ class Calibrator:
         )
         pressed = np.argwhere(presses.counts).tolist()
         if len(pressed) == 1 and presses.counts.size > 1:
-            raise ValueError(
-                f"all presses are on cell {tuple(pressed[0])}: press at least one more, which "
-                "tells how much cells differ"
-            )
+            remedy = "press at least one more, which tells how much cells differ"
+            raise ValueError(f"all presses are on cell {tuple(pressed[0])}: {remedy}")
         date = now()
         calibration = Calibration(
             unit_id=self.board.unit_id,

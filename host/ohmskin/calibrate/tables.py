@@ -177,9 +177,9 @@ def _read(
     rows = array("q")
     for row, cells in lines:
         if len(cells) != len(header):
+            remedy = "give each column one field, and write a point, no comma, in numbers"
             raise ValueError(
-                f"row {row} has {len(cells)} fields, the header {len(header)}: give each column "
-                "one field, and write a point, no comma, in numbers"
+                f"row {row} has {len(cells)} fields, the header {len(header)}: {remedy}"
             )
         rows.append(row)
         for name, place in places.items():
@@ -209,10 +209,8 @@ def _places(
         if name not in names:
             shown = ",".join(header)[:_SHOWN]
             hint = ": separate columns by commas" if re.search("[;\t]", shown) else ""
-            raise ValueError(
-                f"no column {name}{_UNITS.get(name, '')}: row 1 must be the header "
-                f"{','.join(needed)}, it is {shown!r}{hint}"
-            )
+            must = f"row 1 must be the header {','.join(needed)}, it is {shown!r}{hint}"
+            raise ValueError(f"no column {name}{_UNITS.get(name, '')}: {must}")
     for title, name in zip(header, names, strict=True):
         if name not in ours and optional is not None:
             known = ", ".join(ours)

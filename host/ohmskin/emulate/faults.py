@@ -153,11 +153,6 @@ class SkinFaults:
     hum_lsb: Annotated[Amount, "amplitude of the hum in LSB, 3 unless told"] = 3.0
     tau_us: Annotated[Amount, "microseconds of the sense nodes' time constant of settling"] = 0.0
 
-    @property
-    def of_sampling(self) -> bool:
-        """Whether readings depend on the instant at which they are taken."""
-        return self.tau_us > 0 or (self.hum > 0 and self.hum_lsb > 0)
-
     def check(self, rows: int, columns: int) -> None:
         """Raise ValueError for a line or a cell that a rows x columns skin does not have."""
         for axis, (what, count) in enumerate((("row", rows), ("column", columns))):

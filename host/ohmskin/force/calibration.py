@@ -142,20 +142,15 @@ class Calibration:
     def check(self, board: Hello, *, force: bool = False) -> None:
         """Raise ValueError unless this calibration is of this board's skin. force: of any unit."""
         if (board.rows, board.columns) != (self.rows, self.columns):
-            raise ValueError(
-                f"this calibration is of a {self.rows}x{self.columns} skin, the board scans "
-                f"{board.rows}x{board.columns}: calibrate this skin"
-            )
+            sizes = f"{self.rows}x{self.columns} skin, the board scans {board.rows}x{board.columns}"
+            raise ValueError(f"this calibration is of a {sizes}: calibrate this skin")
         if board.mode != self.mode:
-            raise ValueError(
-                f"this calibration is of mode {self.mode}, the board scans in mode {board.mode}: "
-                f"'ohmskin configure PORT --mode {self.mode}', or calibrate this skin anew"
-            )
+            remedy = f"'ohmskin configure PORT --mode {self.mode}', or calibrate this skin anew"
+            raise ValueError(f"this calibration is of mode {self.mode}, not {board.mode}: {remedy}")
         if board.unit_id != self.unit_id and not force:
-            raise ValueError(
-                f"this calibration is of unit {self.unit_id}, the board is unit {board.unit_id}: "
-                "calibrate this skin, or force it if the same skin has a new board"
-            )
+            units = f"unit {self.unit_id}, the board is unit {board.unit_id}"
+            remedy = "calibrate this skin, or force it if the same skin has a new board"
+            raise ValueError(f"this calibration is of {units}: {remedy}")
 
     def save(self, path: PathName) -> None:
         """Write the file whole or not at all. Raises ValueError if it cannot be written."""
@@ -193,19 +188,10 @@ def load_calibration(path: PathName) -> Calibration:
     with naming(path):
         octets = read_bounded(path, MAX_FILE_BYTES)
         try:
-            content = json.loads(octets, object_pairs_hook=_no_repeats)
+            content = json.loads(octets)
         except (ValueError, RecursionError) as error:
             raise ValueError(f"no JSON of ours: {error}") from error
         return _from_content(content)
-
-
-def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in content:
-            raise ValueError(f"field {name[:40]!r} stands twice")
-        content[name] = value
-    return content
 
 
 def _from_content(content: Any) -> Calibration:
@@ -215,12 +201,8 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
     content = {"wire_log_std": None, "mode": "near", **content}  # files of before have none
     known = {"format", "schema", "rows", "columns", *_OWN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
-    of_before = {"intercept", "intercept_std"} & content.keys()
-    _require_fields(content, known | of_before)
+    _require_fields(content, known)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
-    for name in of_before:
-        if np.any(_array(name, content[name], shape)):
-            raise ValueError(f"{name} is not 0: curves go through rest: calibrate this skin")
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
     wires = (
         None if content[name] is None else _value(name, content[name], float) for name in _WIRES

@@ -158,10 +158,8 @@ class SkinReader:
         """
         touched = self.another().estimate(rest_ratio).touched
         if touched.any() and not force:
-            raise TareRefused(
-                f"{touched_cells(touched)}: take everything off the skin, or force the tare if "
-                "nothing is on it"
-            )
+            remedy = "take everything off the skin, or force the tare if nothing is on it"
+            raise TareRefused(touched_cells(touched), remedy)
         self._rests.append(Untouched(rest_ratio, now()))
         return _recorded(rest_ratio)
 

@@ -52,13 +52,8 @@ STEP_S: Final = 0.05
 _BLOCK_S: Final = 0.25
 # A better line takes effect within this time [s], so that times never jump or go back.
 _SLEW_S: Final = 1.0
-# The jitter is this percentile of the delays of so many scans.
-_JITTER_PERCENT: Final = 95
-_JITTER_SCANS: Final = 2048
 # A byte takes ten bits on a line of 8N1: a start bit, eight data bits and a stop bit.
 _BITS_PER_BYTE: Final = 10
-# The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
-_UNKNOWN_CRC: Final = b"\x01\x01"
 # The last conversion and the pass of the main loop that packs its cell [s]: 0.1 ms fits the built
 # firmware in the simulator (tests/link/test_timing.py).
 _FIRMWARE_S: Final = 0.1e-3
@@ -99,7 +94,8 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     payload = kind.pack(**counters, rows=scan.rows, columns=scan.columns, mode=scan.mode)
     header = bytes([kind.id, 1]) + payload
     codes = protocol.pack_codes(scan.codes)
-    wire = cobs_encode(header + codes + _UNKNOWN_CRC)
+    # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
+    wire = cobs_encode(header + codes + b"\x01\x01")
     byte_s = _BITS_PER_BYTE / board.baud
     known_byte_s = scan_s(board) / len(codes)
     delay_s, at, unknown = 0.0, 0, len(header) + len(codes)
@@ -156,9 +152,6 @@ class BoardClock:
         self._points: deque[_Point] = deque()  # the earliest of each block
         self._block_u_s = self._last_u_s = 0.0  # begin of the last block; the last time
         self._slew_s, self._slew_from_s = 0.0, 0.0
-        self._lates_s: deque[float] = deque(maxlen=_JITTER_SCANS)
-        self.jitter_s = math.nan
-        """95 % of the last 2048 scans came at most this much after h [s]; at first NaN."""
 
     def add(self, time_us: float, host_time_s: float) -> None:
         """Learn that something at `time_us` of the board's clock was known here at `host_time_s`.
@@ -171,7 +164,6 @@ class BoardClock:
             self._restart(u_s, t_s)
             return
         self._last_u_s = u_s
-        self._lates_s.append(max(late_s, 0.0))
         ends_block = u_s - self._block_u_s >= _BLOCK_S
         if ends_block:
             while self._points and u_s - self._points[0][0] > WINDOW_S:
@@ -182,8 +174,6 @@ class BoardClock:
             self._points[-1] = (u_s, t_s)
         if ends_block or late_s < 0:
             self._learn(u_s)
-        if ends_block:
-            self.jitter_s = float(np.percentile(self._lates_s, _JITTER_PERCENT))
 
     def host_s(self, time_us: float) -> float:
         """Host time at which the board's clock showed `time_us`, on `time.monotonic()` [s].

@@ -183,9 +183,9 @@ class Device(Closing):
             "rate_mhz": None if rate_hz is None else protocol.rate_mhz(rate_hz),
             "adc_prescaler": adc_prescaler,
         }
+        changes = {name: value for name, value in given.items() if value is not None}
         with self._paused():
-            wanted = configuration(self.info)
-            wanted.update({name: value for name, value in given.items() if value is not None})
+            wanted = configuration(self.info) | changes
             self._command("configure", **wanted)
             self._wanted = wanted
             self._refresh()
@@ -303,6 +303,6 @@ class Device(Closing):
 
 def configuration(board: Hello) -> dict[str, protocol.Value]:
     """What `configure` would have to say for a board to scan as this one does."""
-    named: dict[str, protocol.Value] = {"rate_mhz": board.rate_asked_mhz}
+    asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
     same = ("rows", "columns", "adc_prescaler", "mode")
-    return named | {"settle_us": board.settle_asked_us, **{n: getattr(board, n) for n in same}}
+    return asked | {name: getattr(board, name) for name in same}

@@ -96,11 +96,9 @@ class Session(Device):
                 if self._wait(lambda: self._hello is not None, listen_s):
                     return
         speaks = self._decoder.stats.line.octets > 0
-        raise DeviceSilent(
-            f"{self.name} {'sends bytes that are no frames' if speaks else 'is silent'}: is it the "
-            "skin board's port? Flash the board with 'ohmskin flash'"
-            f"{'' if speaks else ', and check its USB cable'}"
-        )
+        said = "sends bytes that are no frames" if speaks else "is silent"
+        remedy = "is it the skin board's port? Check its cable, and flash it with 'ohmskin flash'"
+        raise DeviceSilent(f"{self.name} {said}", remedy)
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
@@ -167,11 +165,10 @@ class Session(Device):
     def _keep(self, message: Message) -> None:
         match message:
             case Hello() if odd := message.impossible():
-                said = f"hello says {odd}, which cannot be"
-                raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
+                raise ProtocolError(f"{self.name}: hello says {odd}, which cannot be", _BROKEN)
             case Scan() if self._want_scans and _size(message) != _size(self.info):
-                said = f"hello says {_size(self.info)} cells, its scans have {_size(message)}"
-                raise ProtocolError(f"{self.name}: the board's {said}", _BROKEN)
+                said = f"{_size(self.info)} cells, its scans have {_size(message)}"
+                raise ProtocolError(f"{self.name}: hello says {said}", _BROKEN)
             case Scan():
                 self._publish(message)
             case Ack():
@@ -195,8 +192,6 @@ class Session(Device):
             case Hello():
                 self._hello = message
             case ForeignHello():
-                raise ProtocolMismatch(
-                    f"{self.name}: board speaks layout 0x{message.layout_crc:04X}, this host "
-                    f"0x{protocol.LAYOUT_CRC:04X}",
-                    "flash it with 'ohmskin flash'",
-                )
+                layouts = f"0x{message.layout_crc:04X}, this host 0x{protocol.LAYOUT_CRC:04X}"
+                problem = f"{self.name}: board speaks layout {layouts}"
+                raise ProtocolMismatch(problem, "flash it with 'ohmskin flash'")

@@ -119,14 +119,11 @@ class ForceSensor(Closing):
             raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_S:
             return
-        trouble = (
-            f"prints no numbers ({self.damaged} damaged lines): it must print one number a line "
-            f"and nothing else; does its sketch print at {self._baud} baud?"
-        )
-        if not self._octets:
-            asked = "is it the force sensor's port, and does its sketch print?"
-            trouble = f"has said nothing for {SILENCE_S:g} s: {asked}"
-        raise DeviceLost(f"{self.path} {trouble}")
+        trouble = f"has said nothing for {SILENCE_S:g} s"
+        if self._octets:
+            trouble = f"prints no numbers ({self.damaged} damaged lines)"
+        remedy = f"the force sensor must print one number a line, and that at {self._baud} baud"
+        raise DeviceLost(f"{self.path} {trouble}", remedy)
 
     def _read(self) -> None:
         try:

@@ -69,10 +69,8 @@ class Readings:
             raise ValueError(f"ratio has shape {self.ratio.shape}, not (F, rows, columns, {n})")
         frames, rows, columns, _ = self.ratio.shape
         if frames < 1 or not 1 <= rows * columns <= MAX_CELLS:
-            raise ValueError(
-                f"ratio has {frames} frames of {rows}x{columns} cells: at least 1 frame and "
-                f"1 to {MAX_CELLS} cells"
-            )
+            given = f"{frames} frames of {rows}x{columns} cells"
+            raise ValueError(f"ratio has {given}: at least 1 frame and 1 to {MAX_CELLS} cells")
         good = ((self.ratio >= 0) & (self.ratio <= 1)).all(axis=(1, 2, 3))
         for frame in np.flatnonzero(~good).tolist():
             check_ratio(self.ratio[frame], rows, columns, name=f"ratio, frame {frame},", of=names)

@@ -45,9 +45,9 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, save_table
-from ohmskin.link.codes import check_adc_bits, ratio_from_codes
+from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import MODES
+from ohmskin.link.protocol import ADC_BITS, MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
 # A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
@@ -58,7 +58,7 @@ _LARGEST_MESSAGE: Final = 1_000_000
 # Codes without noise pack best, 115 times.
 _MOST_UNPACKED: Final = 200
 _SMALL: Final = 1_000_000
-_LARGEST_CODE: Final = 0xFFFF
+_LARGEST_CODE: Final = (1 << ADC_BITS) - 1
 _LARGEST_COUNTER: Final = (1 << 63) - 1
 # What `export` writes.
 FORMATS: Final = (".npz", ".csv")
@@ -190,10 +190,8 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
                         yield message
                     case Footer():
                         ended = True
-        if not known and not ended:
-            raise ValueError("cut off before the first message: nothing in it can be read")
         if not known:
-            raise ValueError("no recording of a skin: no board says hello in it")
+            raise ValueError("no recording of a skin, or cut off before a board says hello in it")
         if ended:
             yield None
     except OSError as exc:
@@ -263,8 +261,6 @@ def _message(name: str, octets: bytes) -> Recorded:
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
-    if name == "hello":
-        content = {"slot_cycles": 0, **content}  # older boards did not say it
     content.setdefault("mode", "near")  # older recordings know no other
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
@@ -281,17 +277,9 @@ def _hello(values: dict[str, Any]) -> Hello:
     del values["host_time_s"]
     values["reset_cause"] = tuple(map(str, values["reset_cause"]))
     hello = Hello(**values)
-    check_adc_bits(hello.adc_bits)
-    for name in ("rows", "columns", "ref_top_ohm", "ref_bottom_ohm", "clock_hz", "scan_cycles"):
-        if not getattr(hello, name):
-            raise ValueError(f"hello: {name} is 0")
-    if hello.rows * hello.columns > MAX_CELLS:
-        raise ValueError(f"hello: no {hello.rows}x{hello.columns} cells")
-    if hello.slot_cycles:
-        return hello
-    # Where no settle time was asked for, readings fill a scan, in slots of at most 60,000 cycles.
-    readings = max(hello.rows * hello.columns * hello.readings_per_cell, 1)
-    return replace(hello, slot_cycles=min(hello.scan_cycles // readings, 60_000))
+    if odd := hello.impossible():
+        raise ValueError(f"hello says {odd}, which cannot be")
+    return hello
 
 
 def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
@@ -351,12 +339,8 @@ def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
     first = scans[0]
     for scan in scans:
         if (scan.codes.shape, scan.mode) != (first.codes.shape, first.mode):
-            at_s = scan.host_time_s - first_s
-            raise RecordingError(
-                f"{first.rows}x{first.columns} cells ({first.mode}) become {scan.rows}x"
-                f"{scan.columns} ({scan.mode}) after {at_s:.3f} s: export each part by itself, "
-                "--begin and --end"
-            )
+            change = f"cells or mode change after {scan.host_time_s - first_s:.3f} s"
+            raise RecordingError(f"{change}: export each part by itself, --begin and --end")
     return scans
 
 
@@ -369,10 +353,8 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
     codes = np.array([scan.codes for scan in scans])
     ratio = ratio_from_codes(codes, board.adc_bits).astype(np.float32)
     if ratio.nbytes > MAX_ARRAY_BYTES:
-        raise RecordingError(
-            f"{len(scans)} scans are more than a readings file holds: export a part of them, "
-            "--begin and --end"
-        )
+        many = f"{len(scans)} scans are more than a readings file holds"
+        raise RecordingError(f"{many}: export a part of them, --begin and --end")
     arrays: dict[str, Any] = {
         "ratio": ratio,
         "reading_names": scans[0].reading_names,

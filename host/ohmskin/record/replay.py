@@ -19,7 +19,7 @@ import time
 from dataclasses import replace
 from typing import Final
 
-from ohmskin.errors import CommandRefused, PortError, RecordingEnded, RecordingError
+from ohmskin.errors import CommandRefused, RecordingEnded
 from ohmskin.link import protocol
 from ohmskin.link.device import QUEUE_SCANS, Device
 from ohmskin.link.messages import BoardStats, Hello, Scan
@@ -37,7 +37,6 @@ class Replay(Device):
     name: as it was opened. info: what the board had said when the last scan came.
 
     :raises RecordingError: it cannot be read.
-    :raises PortError: it was made with another converter than this protocol knows.
     :raises ValueError: a negative speed.
     """
 
@@ -49,13 +48,6 @@ class Replay(Device):
         self._messages = messages(path)
         hello = next(self._messages)
         assert isinstance(hello, Hello)
-        made = (hello.adc_bits, hello.readings_per_cell)
-        if made != (protocol.ADC_BITS, protocol.READINGS_PER_CELL):
-            self._messages.close()
-            raise PortError(
-                f"{path}: {made[0]} bits and {made[1]} readings a cell cannot be replayed: "
-                "'ohmskin export' reads it"
-            )
         self._hello = hello
         self._running = self._closing = False
         self._last: tuple[float, float] | None = None  # when a scan was due, and was recorded [s]
@@ -103,8 +95,6 @@ class Replay(Device):
         raise RecordingEnded(f"{self.name} has been played to {end}")
 
     def _play_scan(self, scan: Scan) -> None:
-        if int(scan.codes.max()) >> protocol.ADC_BITS:
-            raise RecordingError(f"{self.name}: scan {scan.number} has a code beyond the converter")
         with self._changed:
             self._stats.scans += 1
             self._stats.missed += scan.missed

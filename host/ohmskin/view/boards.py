@@ -264,12 +264,7 @@ class ViewedBoard(Closing):
         return recording is not None
 
     def _new_file(self, unit_id: int) -> Path:
-        stem = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
-        path, number = self._folder / f"{stem}.mcap", 1
-        while path.exists():
-            number += 1
-            path = self._folder / f"{stem}-{number}.mcap"
-        return path
+        return self._folder / f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}.mcap"
 
     def _work(self) -> None:
         while not self.closing.is_set():

@@ -133,10 +133,9 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
         try:
             listening = socket.create_server((host, port), family=family)
         except OSError as exc:
-            raise OhmskinError(
-                f"{host} port {port} cannot be had: {exc.strerror or exc}: say another with "
-                "--http-port; 0 is any that is free"
-            ) from exc
+            problem = f"{host} port {port} cannot be had: {exc.strerror or exc}"
+            remedy = "say another with --http-port; 0 is any that is free"
+            raise OhmskinError(problem, remedy) from exc
         with listening:
             token = secrets.token_urlsafe(16)
             name = socket.gethostname() if host in ("0.0.0.0", "::") else host
