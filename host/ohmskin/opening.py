@@ -57,11 +57,7 @@ def open(
 
 
 def open(
-    url: str,
-    *,
-    start: bool = True,
-    calibration: CalibrationLike | None = None,
-    force: bool = False,
+    url: str, *, start: bool = True, calibration: CalibrationLike | None = None, force: bool = False
 ) -> Device | CalibratedSkin:
     """Connect to a board, and start scanning unless told otherwise.
 
@@ -119,10 +115,8 @@ def _device(url: str) -> Device:
         options = _options(url, query, "speed")
         with _wrong(url):
             return Replay(place, float(options.get("speed", "1")), url)
-    raise PortError(
-        f"no kind of port '{scheme}://': there are serial ports by name, emulator://, simavr:// "
-        "and replay://"
-    )
+    known = "serial ports by name, emulator://, simavr:// and replay://"
+    raise PortError(f"no kind of port '{scheme}://': there are {known}")
 
 
 def _parts(url: str) -> tuple[str | None, str, str]:
@@ -197,12 +191,10 @@ def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None)
     from ohmskin.emulate.scenes import Scene
 
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", size)
-    if match is None:
-        raise ValueError(f"the size '{size}' is not of the form 8x8")
-    rows, columns = int(match[1]), int(match[2])
+    rows, columns = map(int, match.groups()) if match else (0, 0)
     most = (protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
     if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
-        raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not {size}")
+        raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not '{size}'")
     seed = int(options.get("seed", 0))
     plate = load_plate(options["plate"]) if "plate" in options else None
     name = options.get("scene", "rest")

@@ -107,8 +107,8 @@ def asked_for(hello: Hello) -> dict[str, protocol.Value]:
 def test_scans_come_at_their_time_and_read_the_skin() -> None:
     scene = Scene("moving", 5, 3, seed=4)
 
-    def ratio(time_s: float) -> np.ndarray:
-        return scene.ratio(MOVING_BEGIN_S + time_s)
+    def ratio(time_s: float, mode: str) -> np.ndarray:
+        return scene.ratio(MOVING_BEGIN_S + time_s, mode)
 
     board = EmulatedBoard(ratio, 5, 3, rate_hz=100)
     host = BoardDecoder()

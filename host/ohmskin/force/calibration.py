@@ -165,12 +165,9 @@ class Calibration:
             array = getattr(self.model, name)
             null = np.isnan(array) if name in _NULL_FIELDS else np.False_
             content[name] = np.where(null, None, array)
-        text = ",\n".join(
-            f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False, default=np.ndarray.tolist)}"
-            for name, value in content.items()
-        )
+        text = json.dumps(content, allow_nan=False, default=np.ndarray.tolist)
         with whole_file(path) as file:
-            file.write(f"{{\n{text}\n}}\n".encode())
+            file.write(text.encode())
 
 
 def _check_date(date: str) -> None:

@@ -148,11 +148,7 @@ def require(name: str, good: Bool, what: str) -> None:
 
 
 def require_rows(
-    name: str,
-    values: NDArray[Any],
-    good: Bool,
-    must: str,
-    rows: NDArray[np.int64] | None = None,
+    name: str, values: NDArray[Any], good: Bool, must: str, rows: NDArray[np.int64] | None = None
 ) -> None:
     """Raise ValueError, naming the first row where it is not so, by its number in `rows`, if told.
 

@@ -25,22 +25,19 @@ _BOARDS: Final = {0x0001: "uno", 0x0043: "uno", 0x0010: "megaatmega2560", 0x0042
 
 
 class Link(Protocol):
-    """What a `Device` needs of its port. `read` is called by one thread, `write` by any."""
+    """What a `Device` needs of its port. `read` is called by one thread, `write` by any.
+
+    Both raise DeviceLost when the port has gone.
+    """
 
     name: str
     resets_board: bool  # whether opening it resets the board
 
     def read(self) -> bytes:
-        """What has arrived. It is ``b""`` when nothing arrives for about `READ_TIMEOUT_S`.
-
-        :raises DeviceLost: the port has gone.
-        """
+        """What has arrived. It is ``b""`` when nothing arrives for about `READ_TIMEOUT_S`."""
 
     def write(self, octets: bytes) -> None:
-        """Send.
-
-        :raises DeviceLost: the port has gone.
-        """
+        """Send."""
 
     def set_baud(self, baud: int) -> None:
         """Change the speed of the line, if it has one."""
@@ -124,15 +121,14 @@ class SerialPort:
 
 def serial_ports() -> list[SerialPort]:
     """The serial ports of this machine, by path."""
-    found = [
+    return [
         SerialPort(
             port.device,
             "" if port.description in (None, "n/a") else port.description,
             _BOARDS.get(port.pid or 0, "") if port.vid in _ARDUINO else "",
         )
-        for port in list_ports.comports()
+        for port in sorted(list_ports.comports(), key=lambda port: port.device)
     ]
-    return sorted(found, key=lambda port: port.path)
 
 
 def latency_timer(port: str) -> tuple[int, str] | None:

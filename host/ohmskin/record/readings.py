@@ -135,7 +135,9 @@ def load_readings(path: PathName) -> Readings:
             raise ValueError("no array 'ratio'")
         for name in ("ref_top_ohm", "ref_bottom_ohm", "adc_bits"):
             if name in arrays:
-                arrays[name] = _scalar(name, arrays[name])
+                if arrays[name].size != 1:
+                    raise ValueError(f"{name} has shape {arrays[name].shape}, not one number")
+                arrays[name] = arrays[name].item()
         if "reading_names" in arrays:
             arrays["reading_names"] = tuple(arrays["reading_names"].ravel().tolist())
         return Readings(**arrays)
@@ -154,13 +156,6 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]
     if 8 * array.size > MAX_ARRAY_BYTES:
         raise ValueError(f"{8 * array.size} bytes as float64, more than {MAX_ARRAY_BYTES}")
     return array.astype(np.float64, copy=False)
-
-
-def _scalar(name: str, array: Float) -> float | int:
-    if array.size != 1:
-        raise ValueError(f"{name} has shape {array.shape}, it must be one number")
-    number = float(array.item())
-    return int(number) if number.is_integer() and name == "adc_bits" else number
 
 
 def estimate_file(

@@ -79,7 +79,7 @@ class Replay(Device):
         super().close()
 
     def _play(self) -> None:
-        rest_ratio, end = None, "where it was cut off"
+        rest_ratio = None
         for message in self._messages:
             if isinstance(message, Hello | Scan) and not self._wait_for(message):
                 return
@@ -90,9 +90,7 @@ class Replay(Device):
                     self._hello = message
                 case Tare():
                     rest_ratio = message.rest_ratio
-                case None:
-                    end = "its end"
-        raise RecordingEnded(f"{self.name} has been played to {end}")
+        raise RecordingEnded(f"{self.name} has been played to its end")
 
     def _play_scan(self, scan: Scan) -> None:
         with self._changed:
