@@ -107,7 +107,7 @@ def asked_for(hello: Hello) -> dict[str, protocol.Value]:
 def test_scans_come_at_their_time_and_read_the_skin() -> None:
     scene = Scene("moving", 5, 3, seed=4)
 
-    def ratio(time_s: float, mode: str) -> np.ndarray:
+    def ratio(time_s: float, mode: str = "near") -> np.ndarray:
         return scene.ratio(MOVING_BEGIN_S + time_s, mode)
 
     board = EmulatedBoard(ratio, 5, 3, rate_hz=100)
@@ -215,7 +215,7 @@ def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
         ("emulator://1x1?scene=ghost", "2x2"),
         ("emulator://0x4", "1x1 to 16x16"),
         ("emulator://17x4", "1x1 to 16x16"),
-        ("emulator://", "of the form"),
+        ("emulator://", "a board scans 1x1 to"),
     ],
 )
 def test_wrong_urls(url: str, reason: str) -> None:

@@ -418,7 +418,7 @@ def test_there_is_a_limit_of_boards(tmp_path: Path) -> None:
     ("port", "words"),
     [
         ("/dev/ttyACM99", "no port /dev/ttyACM99"),
-        ("emulator://big", "8x8"),
+        ("emulator://big", "1x1 to 16x16"),
         ("emulator://4x4?foreign=1", "ohmskin flash"),
         ("replay:///no/such.mcap", "/no/such.mcap"),
     ],

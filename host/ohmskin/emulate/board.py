@@ -50,6 +50,8 @@ _REASONS = protocol.ENUMS["result"].docs
 _SELECT_S = 120 / CLOCK_HZ
 _SLOT_CYCLES_MAX = 60_000
 _SETTLE_US = {"near": 20, "far": 35}
+# Settings that hello says by the same name.
+_OF_HELLO = ("unit_id", "rows", "columns", "mode", "adc_prescaler")
 # At a pseudo-terminal: without scans, faults that are due are looked for as often as this [s].
 _IDLE_S = 0.2
 # The largest number of bytes that is taken there from the host at once.
@@ -233,8 +235,7 @@ class EmulatedBoard:
         self._send(
             "hello",
             layout_crc=self._layout_crc,
-            **{name: self._settings[name] for name in ("unit_id", "rows", "columns", "mode")},
-            adc_prescaler=self._settings["adc_prescaler"],
+            **{name: self._settings[name] for name in _OF_HELLO},
             **self._plan,
             **VERSION,
             board="emulated",
@@ -321,12 +322,10 @@ class EmulatorLink(_Running):
         """See `Link.read`."""
         with self._wake:
             deadline = self._now_s() + READ_TIMEOUT_S
-            while True:
-                now = self._listen()
-                if self._waiting or now >= deadline:
-                    octets, self._waiting = bytes(self._waiting), bytearray()
-                    return octets
+            while (now := self._listen()) < deadline and not self._waiting:
                 self._wake.wait(min(deadline, self._board.next_scan_s or deadline) - now)
+            octets, self._waiting = bytes(self._waiting), bytearray()
+            return octets
 
     def write(self, octets: bytes) -> None:
         """See `Link.write`."""

@@ -179,15 +179,9 @@ class Session(Device):
                 # It was reset: bring it back to where it was.
                 self._stats.restarts += 1
                 LOG.warning("%s: was reset (%s)", self.name, ", ".join(message.reset_cause))
-                before = self.info
-                self._send("configure", **configuration(before))
-                self._hello = replace(
-                    before,
-                    unit_id=message.unit_id,
-                    baud=message.baud,
-                    settings=message.settings,
-                    reset_cause=message.reset_cause,
-                )
+                self._send("configure", **configuration(self.info))
+                news = ("unit_id", "baud", "settings", "reset_cause")
+                self._hello = replace(self.info, **{n: getattr(message, n) for n in news})
                 self._send("start")
             case Hello():
                 self._hello = message

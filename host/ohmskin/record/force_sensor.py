@@ -81,7 +81,6 @@ class ForceSensor(Closing):
         self._baud = baud
         self._link = SerialLink(path, baud)
         self._decoder = ForceLineDecoder(newtons_per_unit)
-        self._octets = 0  # since the last force
         self._changed = threading.Condition()
         self._waiting: deque[ForceSample] = deque(maxlen=QUEUE_SAMPLES)
         self._last_s = time.monotonic()
@@ -119,11 +118,9 @@ class ForceSensor(Closing):
             raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_S:
             return
-        trouble = f"has said nothing for {SILENCE_S:g} s"
-        if self._octets:
-            trouble = f"prints no numbers ({self.damaged} damaged lines)"
+        trouble = f"no number from {self.path} for {SILENCE_S:g} s ({self.damaged} damaged lines)"
         remedy = f"the force sensor must print one number a line, and that at {self._baud} baud"
-        raise DeviceLost(f"{self.path} {trouble}", remedy)
+        raise DeviceLost(trouble, remedy)
 
     def _read(self) -> None:
         try:
@@ -136,11 +133,9 @@ class ForceSensor(Closing):
 
     def _keep(self, octets: bytes, now_s: float) -> None:
         with self._changed:
-            self._octets += len(octets)
             forces_n = self._decoder.feed(octets)
             if not forces_n:
                 return
-            self._octets = 0
             self.dropped += max(len(self._waiting) + len(forces_n) - QUEUE_SAMPLES, 0)
             step_s = min((now_s - self._last_s) / len(forces_n), _LONGEST_STEP_S)
             for later, force_n in zip(reversed(range(len(forces_n))), forces_n, strict=True):

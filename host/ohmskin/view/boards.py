@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
 from datetime import datetime
 from itertools import count, takewhile
 from operator import attrgetter
@@ -25,7 +24,6 @@ from ohmskin.estimate.base import Estimate, SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.contacts import MEMORY_US
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import LOG, Device
 from ohmskin.record.recorder import Recorder, record
@@ -291,20 +289,14 @@ class ViewedBoard(Closing):
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
             raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
-            seen_us = newest_us = 0
             try:
                 while not self.closing.is_set():
                     scan, running = skin.latest(), self._running()
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
                     if self.watchers:
-                        # Contacts that nobody looked at meanwhile have not gone.
-                        step_us = max(scan.time_us - newest_us, 0)
-                        seen_us += min(step_us, MEMORY_US // 2)
-                        newest_us = scan.time_us
-                        found = reader.read(replace(scan, time_us=seen_us))
                         self.shown = _shown(
-                            *(found, raw.estimate(scan.ratio), reader.has_forces),
+                            *(reader.read(scan), raw.estimate(scan.ratio), reader.has_forces),
                             method=reader.method,
                             missed=skin.stats.missed,
                             rate_hz=skin.info.rate_hz,

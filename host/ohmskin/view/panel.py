@@ -35,7 +35,6 @@ class Panel:
         self._news = asyncio.Event()
         self._sent: Shown | None = None
         self._awaited: int | None = None  # number of the scan that is not yet acknowledged
-        self._is_busy = False  # with a command
 
     async def serve(self) -> None:
         """Returns when it is over."""
@@ -76,9 +75,6 @@ class Panel:
     async def _say(self, kind: str, **content: Any) -> None:
         await self._socket.send_text(json.dumps({"kind": kind, **content}))
 
-    async def _refuse(self, text: str) -> None:
-        await self._say("notice", text=text, good=False, refused="")
-
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
             received = await self._socket.receive()
@@ -96,14 +92,11 @@ class Panel:
                 case {"do": "clock", "page_ms": int() | float() as at_ms} if abs(at_ms) < _MOST_MS:
                     await self._say("clock", page_ms=at_ms, host_s=time.monotonic())
                 case _:
-                    command = self._asked(message)
-                    if command is None:
-                        await self._refuse("the page has asked for what this program does not know")
-                    elif self._is_busy:
-                        await self._refuse("one thing at a time: the last one is not done yet")
-                    else:
-                        self._is_busy = True
+                    if (command := self._asked(message)) is not None:
                         tasks.start_soon(self._run, *command)
+                        continue
+                    text = "the page has asked for what this program does not know"
+                    await self._say("notice", text=text, good=False, refused="")
 
     def _asked(self, message: object) -> tuple[str, _Command] | None:
         board = self._board
@@ -128,5 +121,4 @@ class Panel:
         except (OhmskinError, ValueError, OSError) as exc:
             refused = name if isinstance(exc, TareRefused) else ""
             answer = {"text": str(exc), "good": False, "refused": refused}
-        self._is_busy = False
         await self._say("notice", **answer)
