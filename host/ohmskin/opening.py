@@ -194,7 +194,7 @@ def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None)
     rows, columns = map(int, match.groups()) if match else (0, 0)
     most = (protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
     if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
-        raise ValueError(f"a board scans 1x1 to {most[0]}x{most[1]} cells, not '{size}'")
+        raise ValueError(f"a size is as 8x8, from 1x1 to {most[0]}x{most[1]}, not '{size}'")
     seed = int(options.get("seed", 0))
     plate = load_plate(options["plate"]) if "plate" in options else None
     name = options.get("scene", "rest")

@@ -215,7 +215,7 @@ def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
         ("emulator://1x1?scene=ghost", "2x2"),
         ("emulator://0x4", "1x1 to 16x16"),
         ("emulator://17x4", "1x1 to 16x16"),
-        ("emulator://", "a board scans 1x1 to"),
+        ("emulator://", "a size is as 8x8, from 1x1 to"),
     ],
 )
 def test_wrong_urls(url: str, reason: str) -> None:
