@@ -106,6 +106,7 @@ class PortReader:
         shape = (known.rows, known.columns)
         self._ref_ohm = (known.ref_top_ohm, known.ref_bottom_ohm)
         self._ratio_std, self._current_std = known.ratio_std, known.current_std
+        self._drawn = _DRAWN / reference_ohm(*self._ref_ohm) / READINGS_PER_CELL
         self._ref_square = float(np.sum(reference_ohm(*self._ref_ohm) ** 2))
         self._highest_current: Float = np.full(shape, np.inf)
         if known.nominal_wire_ohm.both is not None:
@@ -137,10 +138,6 @@ class PortReader:
         both = 0.5 * (residual[..., :2] + residual[..., :1:-1]).reshape(-1, 2)
         offset = np.partition(both, len(both) // 2, axis=0)[len(both) // 2, [0, 1, 1, 0]]
         residual -= np.minimum(np.maximum(offset, -MOST_OFFSET), MOST_OFFSET)
-        drawn = (residual * _DRAWN / reference_ohm(*self._ref_ohm)).mean(axis=2)
-        by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
-        more = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
-        current -= drawn * np.minimum(np.maximum(more, -1.0), 1.0)
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
@@ -148,10 +145,15 @@ class PortReader:
         most = _MOST_USUAL * max(rounding, typical / _DEGREES)
         usual = float(own[own <= most].mean())
         noise, variance = usual, np.maximum(own, usual)
-        changing = self._noise(residual) if in_order else self._noise_at_rest(ratio)
-        changing = max(changing, 2.0 * rounding)
-        if changing < SLOW * usual:
-            noise, variance = changing, changing + SLOW_SHARE**2 * np.maximum(own - changing, 0.0)
+        least = 2.0 * rounding
+        if least < SLOW * usual:  # else rounding and the noise of a converter explain it
+            current -= residual @ self._drawn * _more_by_row(current)
+            changing = self._noise(residual) if in_order else self._noise_at_rest(ratio)
+            if (changing := max(changing, least)) < SLOW * usual:
+                noise, stays = changing, np.maximum(own - changing, 0.0)
+                variance = noise + SLOW_SHARE**2 * stays
+        if in_order:
+            self._residual = residual
         alike = max(0.0, 1.0 - noise / (2.0 * rounding)) * self._current_std**2
         std = np.sqrt(variance / self._ref_square + alike)
         fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
@@ -162,11 +164,12 @@ class PortReader:
 
     def _noise(self, residual: Float) -> float:
         """Variance of a reading [1], from what has changed since the frame before."""
-        before, self._residual = self._residual, residual
-        if before is None:
+        if self._residual is None:
             return np.inf
-        change = ((residual - before) ** 2).sum(axis=2)
-        return float(np.median(change)) / (2.0 * _MEDIAN_CHI2)
+        change = residual - self._residual
+        square = np.einsum("ijk,ijk->ij", change, change)
+        middle = square.size // 2
+        return float(np.partition(square, middle, axis=None)[middle]) / (2.0 * _MEDIAN_CHI2)
 
     def _noise_at_rest(self, ratio: Float) -> float:
         """The same of readings at rest: little in a mean of many scans, else not known."""
@@ -272,6 +275,13 @@ class PortReader:
             if pair := _alike(self._rest_apart[axis], up, line):
                 return f"{pair} conducted alike at rest, and more than others"
         return ""
+
+
+def _more_by_row(current: Float) -> Float:
+    """How much more of what other lines draw comes from the row than from the column, (R, C)."""
+    by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
+    more = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
+    return np.asarray(np.clip(more, -1.0, 1.0))
 
 
 def _alike(apart: Float, up: NDArray[np.bool_], line: str) -> str:
