@@ -155,7 +155,8 @@ class WireBelief:
     def log_wires(self, layers: Float, segments: Float) -> Float:
         """Log resistances (2RC,) from what is normal: of layers (2,), of segments (2RC,)."""
         common = np.repeat(self.away(layers), self.shape[0] * self.shape[1])
-        return common + np.clip(SEGMENT_STD * segments, -MAX_STEP, MAX_STEP)  # it is linear there
+        own = np.minimum(np.maximum(SEGMENT_STD * segments, -MAX_STEP), MAX_STEP)
+        return common + own  # it is linear there
 
     def moved(self, by_layers: Float, log_layers: Float) -> Float:
         """J (m - m'), (m,): change of readings since m' (2,), log_layers then."""

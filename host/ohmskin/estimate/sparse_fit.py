@@ -256,7 +256,8 @@ class FewTouches:
         _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
         self.steps += 1
         is_last = (step * step * np.diagonal(normal)).max() < CLOSE**2
-        return self.log_siemens + np.clip(step, -MAX_STEP, MAX_STEP), bool(is_last)
+        step = np.minimum(np.maximum(step, -MAX_STEP), MAX_STEP)  # faster than np.clip
+        return self.log_siemens + step, bool(is_last)
 
     def asked_for(self) -> tuple[Cells, Float]:
         """Cells that readings ask for, and the conductance that each, alone, would need [S].
