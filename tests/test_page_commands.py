@@ -272,7 +272,11 @@ def test_a_command_prints_what_its_pages_show(
     words, names = line.split(" "), {}
     if words[0] == "make":  # what the target does, without what it needs
         dry = subprocess.run(
-            ["make", "-n", *words[1:]], cwd=ROOT, capture_output=True, text=True, check=True
+            ["make", "-n", "--no-print-directory", *words[1:]],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
         )
         words = dry.stdout.splitlines()[-1].removeprefix(".venv/bin/").split()
     attach(("/dev/ttyACM0", "uno"))
@@ -294,7 +298,10 @@ def test_what_is_not_run_is_on_a_page_and_make_knows_it() -> None:
     for line in NOT_RUN:
         if line.startswith("make "):
             subprocess.run(
-                ["make", "-n", line.split()[1]], cwd=ROOT, check=True, capture_output=True
+                ["make", "-n", "--no-print-directory", line.split()[1]],
+                cwd=ROOT,
+                check=True,
+                capture_output=True,
             )
 
 
