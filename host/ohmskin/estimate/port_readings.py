@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from ohmskin.estimate.base import SkinKnowledge
 
 _DEGREES: Final = READINGS_PER_CELL - 1
+_MEDIAN_CHI2: Final = 2.366  # of so many degrees of freedom
 # Sign of a reading in what the other lines draw: more at the top node, less at the bottom one.
 _DRAWN: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
 # Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
@@ -74,7 +75,6 @@ MOST_OFFSET: Final = 0.008  # of a sense node, ratio to Vdd: what is above it co
 SLOW_SHARE: Final = 0.12
 SLOW: Final = 0.25  # share of the variance that changes: with less, most of it stays
 # Disagreement of a cell's readings, root of its mean square, ratio to Vdd: of most cells, of one.
-_MEDIAN_CHI2: Final = 2.366  # of three degrees of freedom
 DISAGREE_ALL: Final = 0.016
 DISAGREE_ONE: Final = 0.03
 DISAGREE_OVER_NOISE: Final = 6.0
