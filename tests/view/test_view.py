@@ -594,6 +594,20 @@ def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) ->
     assert finish(process) == Done(0, "", "")
 
 
+def test_ctrl_c_counts_from_the_moment_the_address_is_known() -> None:
+    """Python's own handler would end the server while it starts, with a warning on stderr."""
+    handlers = []
+
+    def started(_: str) -> None:
+        handlers.append(signal.getsignal(signal.SIGINT))
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        server.serve(ViewedBoards((), (), Path()), "127.0.0.1", 0, started)
+    assert handlers
+    assert signal.default_int_handler not in handlers
+
+
 def listening(pid: int) -> set[tuple[str, int]]:
     """Addresses and ports at which a process takes connections, or any datagrams."""
     sockets = set()

@@ -53,7 +53,9 @@ _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 _READS: Final = ("GET", "HEAD")
 
 
-def make_app(boards: ViewedBoards, host: str, token: str) -> Starlette:
+def make_app(
+    boards: ViewedBoards, host: str, token: str, started: Callable[[], None] = lambda: None
+) -> Starlette:
     """The page of `boards`, which closes them at its end. host, token: see `Guard`."""
 
     async def ports(request: Request) -> Response:
@@ -92,6 +94,7 @@ def make_app(boards: ViewedBoards, host: str, token: str) -> Starlette:
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        started()  # from here on, Ctrl-C ends the server in order
         yield
         await anyio.to_thread.run_sync(boards.close)
 
@@ -140,9 +143,9 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
             token = secrets.token_urlsafe(16)
             name = socket.gethostname() if host in ("0.0.0.0", "::") else host
             name = f"[{name}]" if ":" in name else name
-            started(f"http://{name}:{listening.getsockname()[1]}/?token={token}")
+            url = f"http://{name}:{listening.getsockname()[1]}/?token={token}"
             config = uvicorn.Config(
-                make_app(boards, host, token),
+                make_app(boards, host, token, lambda: started(url)),
                 ws="wsproto",
                 ws_max_size=_LONGEST_MESSAGE,
                 log_config=None,
