@@ -125,17 +125,21 @@ def wire_coupling_ohm(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[in
     return coupling.reshape(rows * columns, rows * columns)
 
 
-def factorised(root: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire) -> tuple[Float, Float]:
-    """L and L^-1 sqrt(g) E^T with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
+def factorised(
+    root: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire, to_sense: Float | None = None
+) -> tuple[Float, Float]:
+    """L and L^-1 sqrt(g) [E^T F] with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
 
-    The second gives Y = half^T half.
+    The second, without F, gives Y = half^T half.
     """
     system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm, root.shape)
     system *= root.reshape(-1, 1)
     system *= root.reshape(1, -1)
     system.ravel()[:: len(system) + 1] += 1.0
-    factor = cholesky(system)
-    return factor, solve_lower(factor, _incidence(*root.shape) * root.reshape(-1, 1))
+    factor, ends = cholesky(system), _incidence(*root.shape)
+    if to_sense is not None:
+        ends = np.hstack([ends, to_sense])
+    return factor, solve_lower(factor, ends * root.reshape(-1, 1))
 
 
 def admittance_of(half: Float) -> Float:
@@ -183,6 +187,16 @@ def impedance_of(
     return np.asarray(impedance), np.asarray(port_ohm)
 
 
+def _path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
+    """Wire from each cell to the near end of its row, and of its column [ohm], (RC, R+C)."""
+    rows, columns = shape
+    to_cell = np.zeros((rows, columns, rows + columns))
+    along_row, along_column = (np.broadcast_to(w, shape) for w in (top_wire_ohm, bottom_wire_ohm))
+    np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(along_row, 1)
+    np.einsum("ijj->ij", to_cell[..., rows:])[:] = np.cumsum(along_column, 0)
+    return to_cell.reshape(rows * columns, -1)
+
+
 @one_blas_thread
 def end_admittance(skin: Skin) -> Float:
     """Y [S] of both ends of all lines, (2(R+C), 2(R+C)): near ends, rows first, then far ends.
@@ -192,12 +206,8 @@ def end_admittance(skin: Skin) -> Float:
     """
     rows, columns = skin.shape
     cells, lines = rows * columns, rows + columns
-    along_row, along_column = np.cumsum(skin.top_wire_ohm, 1), np.cumsum(skin.bottom_wire_ohm, 0)
-    to_cell = np.zeros((rows, columns, lines))
-    np.einsum("iji->ij", to_cell[..., :rows])[:] = along_row
-    np.einsum("ijj->ij", to_cell[..., rows:])[:] = along_column
-    shared = to_cell.reshape(cells, lines)
-    whole = np.diag(np.concatenate([along_row[:, -1], along_column[-1]]))
+    shared = _path_of_lines(skin.top_wire_ohm, skin.bottom_wire_ohm, skin.shape)
+    whole = np.diag(shared.max(axis=0))
     coupling = wire_coupling_ohm(skin.top_wire_ohm, skin.bottom_wire_ohm, skin.shape)
     sign = np.diag(np.repeat([1.0, -1.0], (rows, columns)))
     ends = np.block([[_incidence(rows, columns), np.zeros((cells, lines))], [sign, -sign]])
@@ -228,26 +238,56 @@ def wire_current(cell_current: Float) -> Float:
 class PortCircuit:
     """Ports of a skin whose cells conduct (g > 0), in row-major order, and what moves them.
 
-    port_ohm: rho (RC,). The others are slopes, d rho / d log r_e = r_e i_e^2 [ohm], i_e the current
-    through resistance e (Tellegen): the currents that give rho give all RC x 3RC derivatives. A
-    port's currents are those of its row less those of its column. Cells (R, C) [S], wires (R, C)
-    [ohm], or one number where all segments of their layer are alike.
+    A port is driven at its near ends, and sensed there or at far ends, where no current flows.
+    port_ohm: voltage between the sensed ends per current through the port (RC,): rho, or at far
+    ends the cell without its wires. drop_ohm (2, RC): what wires lose up to the sensed ends, of
+    row and column. The others are slopes, d port_ohm / d log r_e = r_e i_e j_e [ohm]: i_e is the
+    current through resistance e, j_e that of a current through the sensed ends (Tellegen). So the
+    currents that give port_ohm give all RC x 3RC derivatives. A port's currents are those of its
+    row less those of its column. Cells (R, C) [S], wires (R, C) [ohm], or one number where all
+    segments of their layer are alike. far: whether rows, and columns, are sensed at their far ends.
+
+    F (RC, R+C) is the voltage that current into the sensed end of a line inserts in the paths of
+    its cells: the wire that they share. With Q = E (diag(1/g) + K)^-1 F, the sensed ends have the
+    potentials (Z (1 - Q))^T per current into the near ends.
     """
 
-    def __init__(self, cell_siemens: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire) -> None:
+    def __init__(
+        self,
+        cell_siemens: Float,
+        top_wire_ohm: Wire,
+        bottom_wire_ohm: Wire,
+        far: tuple[bool, bool] = (False, False),
+    ) -> None:
         self.shape, self.rows = cell_siemens.shape, len(cell_siemens)
-        self.wire_ohm = top_wire_ohm, bottom_wire_ohm
-        self._root = np.sqrt(cell_siemens)
-        self.factor, self._half = factorised(self._root, top_wire_ohm, bottom_wire_ohm)
-        self._impedance, port_ohm = impedance_of(admittance_of(self._half), self.rows)
+        self.wire_ohm, self.far = (top_wire_ohm, bottom_wire_ohm), far
+        self._root, to_sense = np.sqrt(cell_siemens), None
+        if any(far):
+            sign = np.repeat([1.0 * far[0], -1.0 * far[1]], self.shape)
+            to_sense = sign * _path_of_lines(top_wire_ohm, bottom_wire_ohm, self.shape)
+        self.factor, self._half = factorised(self._root, *self.wire_ohm, to_sense)
+        near = self._half[:, : sum(self.shape)]
+        self._impedance, port_ohm = impedance_of(admittance_of(near), self.rows)
+        self._sensed = self._impedance
+        if to_sense is not None:
+            lost = self._impedance @ (near.T @ self._half[:, sum(self.shape) :])
+            self._sensed = self._impedance - lost
+            drop = _ends_of_ports(lost, self.rows)
+            self.drop_ohm: Float = np.stack([drop[0], -drop[1]]).reshape(2, -1)
+            port_ohm = port_ohm - self.drop_ohm.sum(axis=0).reshape(self.shape)
         self.port_ohm: Float = port_ohm.ravel()
 
     @cached_property
-    def per_potential(self) -> Float:
-        """Currents through all cells per potential of each electrode, (RC, R+C) [S]."""
+    def _currents(self) -> Float:
+        """Currents through all cells per potential of each electrode, and those that F drives."""
         currents = solve_lower(self.factor, self._half, transposed=True)
         currents *= self._root.reshape(-1, 1)
         return currents
+
+    @property
+    def per_potential(self) -> Float:
+        """Currents through all cells per potential of each electrode, (RC, R+C) [S]."""
+        return self._currents[:, : sum(self.shape)]
 
     @cached_property
     def cell_current(self) -> Float:
@@ -255,34 +295,63 @@ class PortCircuit:
         return (self._impedance @ self.per_potential.T).reshape(-1, *self.shape)
 
     @cached_property
+    def sense_current(self) -> Float:
+        """The same per current into each sensed end."""
+        if not any(self.far):
+            return self.cell_current
+        driven = self._currents[:, sum(self.shape) :].T
+        return (self._sensed.T @ self.per_potential.T + driven).reshape(-1, *self.shape)
+
+    @cached_property
     def _wire_current(self) -> Float:
-        """The same through all wires, (R+C, 2, R, C)."""
+        """Currents through all wires, (R+C, 2, R, C), per current into each electrode."""
         return wire_current(self.cell_current)
 
-    def _slopes(self, current: Float, ohm: Float) -> Float:
+    @cached_property
+    def _wire_sense_current(self) -> Float:
+        """The same per current into each sensed end: it flows back through the whole far line."""
+        if not any(self.far):
+            return self._wire_current
+        current = wire_current(self.sense_current)
+        if self.far[0]:
+            np.einsum("iij->ij", current[: self.rows, 0])[:] -= 1.0
+        if self.far[1]:
+            np.einsum("jij->ij", current[self.rows :, 1])[:] += 1.0
+        return current
+
+    def _slopes(self, current: Float, sensed: Float, ohm: Float) -> Float:
         slopes = port_difference(current.reshape(len(current), -1), self.rows)
-        slopes *= slopes
+        if sensed is current:
+            slopes *= slopes
+        else:
+            slopes *= port_difference(sensed.reshape(len(sensed), -1), self.rows)
         slopes *= ohm.ravel()
         return slopes
 
     def by_cell(self) -> Float:
         """Slopes by the cells, (RC, RC)."""
-        return self._slopes(self.cell_current, self._root**-2.0)
+        return self._slopes(self.cell_current, self.sense_current, self._root**-2.0)
 
     def by_wires(self) -> Float:
         """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
         ohm = np.stack(np.broadcast_arrays(*self.wire_ohm, self._root)[:2])
-        return self._slopes(self._wire_current, ohm)
+        return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
         """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""
-        rows, found = self.rows, []
+        found, lines = [], len(self._impedance)
         for layer, ohm in enumerate(self.wire_ohm):
-            current = self._wire_current[:, layer].reshape(len(self._impedance), -1)
-            power = (current * np.ravel(ohm)) @ current.T
-            own = power.diagonal()
-            found.append((own[:rows, None] + own[rows:] - 2.0 * power[:rows, rows:]).ravel())
+            current = self._wire_current[:, layer].reshape(lines, -1)
+            sensed = self._wire_sense_current[:, layer].reshape(lines, -1)
+            row, column = _ends_of_ports((current * np.ravel(ohm)) @ sensed.T, self.rows)
+            found.append((row - column).ravel())
         return np.transpose(found)
+
+
+def _ends_of_ports(lines: Float, rows: int) -> Float:
+    """At row and at column, (2, R, C), of what each line's current makes at lines, (R+C, R+C)."""
+    own, by_row, by_column = lines.diagonal(), lines[:rows, rows:], lines[rows:, :rows]
+    return np.stack([own[:rows, None] - by_column.T, by_row - own[rows:]])
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:

@@ -176,9 +176,10 @@ class Estimator(ABC):
     """One method for one skin, frame after frame. Raises ValueError for readings it cannot take."""
 
     name: ClassVar[str]
+    takes_far: ClassVar[bool] = False  # readings at far ends
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
-        if knowledge.reading_names != NEAR:
+        if knowledge.reading_names != NEAR and not self.takes_far:
             raise ValueError(
                 f"'{self.name}' takes the readings {' '.join(NEAR)}, not "
                 f"{' '.join(knowledge.reading_names)}: 'ohmskin configure PORT --mode near'"
@@ -227,7 +228,7 @@ class Estimator(ABC):
         Raises ValueError for another shape, or for a reading that is no number in 0..1.
         """
         known = self.knowledge
-        readings = check_ratio(ratio, known.rows, known.columns)
+        readings = check_ratio(ratio, known.rows, known.columns, of=known.reading_names)
         self.rest()
         started = time.perf_counter()
         with one_blas_thread:
@@ -269,6 +270,8 @@ class Estimator(ABC):
     def _chi2(self, ratio: Float, current_siemens: Float) -> float:
         """chi2 per reading of a model that predicts these port currents (R, C) [S]."""
         known = self.knowledge
+        if known.reading_names != NEAR:
+            return float("nan")
         model = ratio_from_current(current_siemens, known.ref_top_ohm, known.ref_bottom_ohm)
         residual = (ratio - model).ravel() / known.ratio_std
         return float(residual @ residual) / residual.size

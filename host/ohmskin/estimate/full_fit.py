@@ -66,6 +66,7 @@ class FullFit:
     ) -> None:
         """Minimise from these cells (RC,); `message` says if that did not converge."""
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
+        self._far = ports.far
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
         self.cell: Float = start
@@ -79,7 +80,7 @@ class FullFit:
         """The circuit at the present state."""
         cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
         wires = np.exp(self._belief.away(self._off_layers))
-        self._circuit = PortCircuit(cell_siemens, *wires)
+        self._circuit = PortCircuit(cell_siemens, *wires, self._far)
         self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
         self._residual = (self._current - self._modelled) * self._weight
         self._centre, self._variance = self._prior.normal(self.cell)

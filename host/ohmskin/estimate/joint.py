@@ -23,6 +23,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution, WireOhm
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
@@ -52,6 +53,7 @@ class JointEstimator(Estimator):
     """Gauss-Newton on all 3RC log resistances; learns the wires from frame to frame."""
 
     name: ClassVar[str] = "joint"
+    takes_far: ClassVar[bool] = True
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
@@ -79,17 +81,24 @@ class JointEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         prior = self._prior_of(ports)
         touches = None
+        if any(ports.far):
+            self._finder = None
         # Under a finger that stays, few touches explain no frame: trying costs time.
         if self._finder is not None and self._touches <= self._finder.most:
             touches = self._finder.find(ports)
         if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)
         start = self._start(prior, ports, touches)
+        if any(ports.far):
+            for _ in range(2):
+                wires = np.exp(self._belief.log_layers)
+                circuit = PortCircuit(np.exp(-start).reshape(self._shape), *wires, ports.far)
+                self._belief.measured(circuit.drop_ohm, ports)
         expected = prior.unsure() if prior.is_soft(start, self._shape) else prior
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.cell)
         message = self._doubt(expected, fit)
-        if not (ports.fault or message or self._touches > CROWDED * start.size):
+        if not (any(ports.far) or ports.fault or message or self._touches > CROWDED * start.size):
             self._learn(fit)
         return self._solution(ports, fit, message)
 

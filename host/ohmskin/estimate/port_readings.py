@@ -23,6 +23,15 @@ Without noise, the four readings of a cell round alike: they agree, and their me
 one. Noise makes them disagree and round differently. Where v is the variance s^2 of rounding twice,
 their errors are independent. (Exact at both ends; between them, s_I is 1.0 to 1.2 times too large.)
 
+Sensed at far ends, a cell is by itself: with D the voltage between the sensed ends, its current
+without wires, and what the wires lose, are
+
+    u = I / (D + R I) ,  R = R_top + R_bottom ,    p = (a - e) / I ,    q = (f - b) / I ,
+    s_u^2 = (D^2 s_I^2 + 2 I^2 s^2) / (D + R I)^4 .
+
+There a node is read at one supply only, so all readings share one offset: median of a + b - 1. What
+lines draw that charge moves all four potentials alike, and so neither I nor D.
+
 A frame is at fault, and its answer not to be relied on, where
 
 - the readings of most cells disagree by far more than noise, or those of one cell so that no three
@@ -35,7 +44,9 @@ A frame is at fault, and its answer not to be relied on, where
   be alike for `ALIKE_FRAMES`;
 - a port has less resistance than it had if every cell were pressed as hard as can be, by the same
   law: a row shorted to a column;
-- a line showed no current at rest, though others did.
+- a line showed no current at rest, though others did;
+- a far end has a potential that is not between those of the near ends: it is open, or of another
+  line.
 """
 
 from __future__ import annotations
@@ -48,14 +59,12 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
+    NEAR,
     READING_OFFSET,
     READING_SENSES_TOP,
     READING_SIGN,
     READINGS_PER_CELL,
-    Skin,
-    current_from_ratio,
-    port_resistance_ohm,
-    ratio_from_current,
+    PortCircuit,
     reference_ohm,
 )
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
@@ -63,8 +72,9 @@ from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
 if TYPE_CHECKING:
     from ohmskin.estimate.base import SkinKnowledge
 
-_DEGREES: Final = READINGS_PER_CELL - 1
-_MEDIAN_CHI2: Final = 2.366  # of so many degrees of freedom
+_MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}  # by degrees of freedom
+# A reading with the supplies exchanged is 1 less that of the same node (../circuit/skin.py).
+_NODES: Final = {"a": "d", "b": "c", "e": "h", "f": "g"}
 # Sign of a reading in what the other lines draw: more at the top node, less at the bottom one.
 _DRAWN: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
 # Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
@@ -91,33 +101,51 @@ WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of i
 
 @dataclass(frozen=True, eq=False)
 class PortReadings:
-    """One frame: ratio (R, C, 4); current, its standard deviation [S] (R, C); fault, or empty."""
+    """One frame: ratio (R, C, 4); current, its standard deviation [S] (R, C); fault, or empty.
+
+    far: whether rows, and columns, are sensed at their far ends. Then current is that of the cell
+    without these wires, drop_ohm (2, R, C) what the wires of row and column lose per current, and
+    drop_std (R, C) the deviation of both [ohm].
+    """
 
     ratio: Float
     current: Float
     current_std: Float
     fault: str = ""
+    far: tuple[bool, bool] = (False, False)
+    drop_ohm: Float | None = None
+    drop_std: Float | None = None
 
 
 class PortReader:
     """Reads the frames of a skin, and compares them with its rest readings and its wires."""
 
     def __init__(self, known: SkinKnowledge) -> None:
-        shape = (known.rows, known.columns)
+        shape, names = (known.rows, known.columns), known.reading_names
+        # Which readings are of a node, and whether supplies are exchanged: row, column, far ends.
+        self._nodes = [
+            [(k, name == low) for k, name in enumerate(names) if name in (high, low)]
+            for high, low in _NODES.items()
+        ]
+        self.far = bool(self._nodes[2]), bool(self._nodes[3])
+        ends = READINGS_PER_CELL if names == NEAR else 2
+        self._degrees, self._is_near = ends - 1, names == NEAR
         self._ref_ohm = (known.ref_top_ohm, known.ref_bottom_ohm)
         self._ratio_std, self._current_std = known.ratio_std, known.current_std
-        self._drawn = _DRAWN / reference_ohm(*self._ref_ohm) / READINGS_PER_CELL
-        self._ref_square = float(np.sum(reference_ohm(*self._ref_ohm) ** 2))
+        reference = reference_ohm(*self._ref_ohm)[:ends]
+        self._drawn = _DRAWN[:ends] / reference / ends
+        self._slope, self._level = READING_SIGN[:ends] * reference, READING_OFFSET[:ends]
+        self._ref_square = float(np.sum(reference**2))
         self._highest_current: Float = np.full(shape, np.inf)
         if known.nominal_wire_ohm.both is not None:
-            top, bottom = (np.full(shape, WIRE_SHARE * ohm) for ohm in known.nominal_wire_ohm.both)
-            pressed = Skin(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
-            self._highest_current = 1.0 / (port_resistance_ohm(pressed) + known.ref_ohm)
+            wires = (WIRE_SHARE * ohm for ohm in known.nominal_wire_ohm.both)
+            pressed = PortCircuit(np.full(shape, HIGHEST_TOUCH_SIEMENS), *wires)
+            self._highest_current = 1.0 / (pressed.port_ohm.reshape(shape) + known.ref_ohm)
         self._rest: PortReadings | None = None
         self._rest_fault = ""
         self.reset()
         if known.rest_ratio is not None:
-            self._rest = rest = self.read(known.rest_ratio)
+            self._rest = rest = self._read_near(known.rest_ratio, in_order=False)[0]
             self._rest_apart = [self._apart(rest, axis) for axis in (0, 1)]
             self._rest_fault = self._fault_at_rest(rest)
 
@@ -132,17 +160,56 @@ class PortReader:
         in_order: they are of the frame after the last such, and what has changed is noise. Others
         are of rest: where they lie between codes, they are a mean of many scans, with little noise.
         """
-        current = current_from_ratio(ratio, *self._ref_ohm)
-        residual = ratio - ratio_from_current(current, *self._ref_ohm)
+        found, variance, alike = self._read_near(ratio, in_order=in_order)
+        if not any(self.far):
+            return found
+        row, column, *far = (self._potential(ratio, node) for node in self._nodes)
+        far_row, far_column = (far[k] if self.far[k] else (row, column)[k] for k in (0, 1))
+        current, ref_ohm = found.current, sum(self._ref_ohm)
+        apart = far_row - far_column
+        current = np.maximum(current, self._current_std)
+        whole = np.maximum(apart, 0.0) + ref_ohm * current
+        by_current = self._current_std / self._ratio_std  # readings that round alike
+        own = apart**2 / self._ref_square + 2.0 * current**2
+        same = (apart * by_current + 2.0 * current) ** 2
+        std = np.sqrt(variance * own + alike * self._ratio_std**2 * same) / whole**2
+        drop, drop_std = np.stack([row - far_row, far_column - column]), (2.0 * variance) ** 0.5
+        drop_std = np.maximum(drop_std, 2.0 * self._ratio_std)
+        fault = found.fault or self._astray(drop, drop_std)
+        drops = drop / current, drop_std / current
+        return PortReadings(ratio, current / whole, std, fault, self.far, *drops)
+
+    def _potential(self, ratio: Float, node: list[tuple[int, bool]]) -> Float:
+        """Of a node, top pin high, over Vdd (R, C): mean of its readings; 0 without any."""
+        found = [1.0 - ratio[..., k] if is_low else ratio[..., k] for k, is_low in node]
+        return np.asarray(sum(found) / max(len(found), 1))
+
+    def _astray(self, drop: Float, std: Float) -> str:
+        """Lines whose far ends are not between the near ends."""
+        for axis, line in enumerate(("row", "column")):
+            below = np.median(drop[axis] + CLEAR_STDS * std, axis=1 - axis)
+            if self.far[axis] and below.min() < 0:
+                return f"{line} {below.argmin()}: its far end does not follow it, is it open?"
+        return ""
+
+    def _read_near(self, ratio: Float, *, in_order: bool) -> tuple[PortReadings, Float, float]:
+        """What near ends show; variance of a reading (R, C) [1], and the share that rounds alike."""
+        if not self._is_near:
+            ends = [self._potential(ratio, node) for node in self._nodes[:2]]
+            ratio = np.stack(ends, axis=-1)
+        current: Float = (ratio - self._level) @ self._slope / self._ref_square
+        residual = ratio - self._level - current[..., None] * self._slope
         # Currents do not show a node's offset: its two readings, A and D, B and C, have it alike.
-        both = 0.5 * (residual[..., :2] + residual[..., :1:-1]).reshape(-1, 2)
-        offset = np.partition(both, len(both) // 2, axis=0)[len(both) // 2, [0, 1, 1, 0]]
+        both = 0.5 * (residual[..., :2] + residual[..., :-3:-1]).reshape(-1, 2)
+        order = [0, 1, 1, 0][: residual.shape[-1]]
+        offset = np.partition(both, len(both) // 2, axis=0)[len(both) // 2, order]
         residual -= np.minimum(np.maximum(offset, -MOST_OFFSET), MOST_OFFSET)
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
-        own, rounding = square / (_DEGREES - 2.0 / square.size), self._ratio_std**2
-        most = _MOST_USUAL * max(rounding, typical / _DEGREES)
+        degrees = max(self._degrees - residual.shape[-1] / (2.0 * square.size), 0.5)
+        own, rounding = square / degrees, self._ratio_std**2
+        most = _MOST_USUAL * max(rounding, typical / self._degrees)
         usual = float(own[own <= most].mean())
         noise, variance = usual, np.maximum(own, usual)
         least = 2.0 * rounding
@@ -154,13 +221,13 @@ class PortReader:
                 variance = noise + SLOW_SHARE**2 * stays
         if in_order:
             self._residual = residual
-        alike = max(0.0, 1.0 - noise / (2.0 * rounding)) * self._current_std**2
-        std = np.sqrt(variance / self._ref_square + alike)
+        alike = max(0.0, 1.0 - noise / (2.0 * rounding))
+        std = np.sqrt(variance / self._ref_square + alike * self._current_std**2)
         fault = self._disagreement(current, std, ratio, square, typical) or self._rest_fault
         found = PortReadings(ratio, current, std)
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
-        return replace(found, fault=fault) if fault else found
+        return (replace(found, fault=fault) if fault else found), variance, alike
 
     def _noise(self, residual: Float) -> float:
         """Variance of a reading [1], from what has changed since the frame before."""
@@ -169,7 +236,7 @@ class PortReader:
         change = residual - self._residual
         square = np.einsum("ijk,ijk->ij", change, change)
         middle = square.size // 2
-        return float(np.partition(square, middle, axis=None)[middle]) / (2.0 * _MEDIAN_CHI2)
+        return float(np.partition(square, middle, axis=None)[middle]) / (2.0 * _MEDIAN_CHI2[self._degrees])
 
     def _noise_at_rest(self, ratio: Float) -> float:
         """The same of readings at rest: little in a mean of many scans, else not known."""
@@ -182,21 +249,21 @@ class PortReader:
         """Readings that disagree; leaves out, in `current` and `std`, one that three others do not
         agree with.
         """
-        most = (typical / _DEGREES) ** 0.5
+        most = (typical / self._degrees) ** 0.5
         if most > DISAGREE_ALL:
-            return f"the four readings of most cells disagree, by {100 * most:.0f} % of Vdd"
+            return f"the readings of most cells disagree, by {100 * most:.0f} % of Vdd"
         limit = max(DISAGREE_ONE, DISAGREE_OVER_NOISE * most)
-        if square.max() <= _DEGREES * limit**2:
+        if square.max() <= self._degrees * limit**2:
             return ""
         fault = ""
-        for index in np.flatnonzero(square > _DEGREES * limit**2):
+        for index in np.flatnonzero(square > self._degrees * limit**2):
             cell = np.unravel_index(index, square.shape)
-            off, without = self._without_one(ratio[cell])
+            off, without = self._without_one(ratio[cell]) if self._is_near else (np.inf, 0.0)
             if off < max(AGREE * self._ratio_std, DISAGREE_OVER_NOISE * most):
                 current[cell] = without
                 std[cell] = 2.0 * std.min()
             else:
-                by = 100 * float(square[cell] / _DEGREES) ** 0.5
+                by = 100 * float(square[cell] / self._degrees) ** 0.5
                 fault = f"{cell_of(index, square)}: its readings disagree by {by:.0f} % of Vdd"
         return fault
 
@@ -205,8 +272,7 @@ class PortReader:
         found = []
         for left_out in range(READINGS_PER_CELL):
             kept = np.arange(READINGS_PER_CELL) != left_out
-            slope = (READING_SIGN * reference_ohm(*self._ref_ohm))[kept]
-            level = (ratio - READING_OFFSET)[kept]
+            slope, level = self._slope[kept], (ratio - self._level)[kept]
             current = float(slope @ level / (slope @ slope))
             off = level - slope * current
             found.append((float(off @ off / (kept.sum() - 1)) ** 0.5, current))
