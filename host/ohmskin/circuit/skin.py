@@ -319,6 +319,15 @@ class PortCircuit:
             np.einsum("jij->ij", current[self.rows :, 1])[:] += 1.0
         return current
 
+    def line_current(self, layer: int) -> Float:
+        """Currents through a port's own row (layer 0), or column, (lines, ports, segments)."""
+        rows, current = self.rows, self._wire_current[:, layer]
+        if layer == 0:
+            own = np.einsum("iik->ik", current[:rows])[:, None]
+            return np.asarray(own - current[rows:].transpose(1, 0, 2))
+        own = np.einsum("jkj->jk", current[rows:])[:, None]
+        return np.asarray(current[:rows].transpose(2, 0, 1) - own)
+
     def _slopes(self, current: Float, sensed: Float, ohm: Float) -> Float:
         slopes = port_difference(current.reshape(len(current), -1), self.rows)
         if sensed is current:

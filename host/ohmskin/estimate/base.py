@@ -129,8 +129,8 @@ class Estimate:
     uniform. It is NaN where the method gives none.
     level, level_std (R, C): what a force is read from: the same, but for `voltage` [1].
     touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C): NaN where the method estimates no wires.
-    chi2: mean of the squared residuals of all readings over the variance of one. It is about 1 or
-    less when the model holds.
+    chi2: mean of the squared residuals of all readings over the variance of one (at far ends: of
+    the ports' currents). It is about 1 or less when the model holds.
     message: empty if the method converged and the readings can be trusted, else why not.
     seconds: wall time of this frame.
     """
@@ -267,11 +267,11 @@ class Estimator(ABC):
             rise_std = np.hypot(rise_std, self._rest.cell_siemens_std)
         return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
 
-    def _chi2(self, ratio: Float, current_siemens: Float) -> float:
-        """chi2 per reading of a model that predicts these port currents (R, C) [S]."""
-        known = self.knowledge
+    def _chi2(self, ports: PortReadings, current_siemens: Float) -> float:
+        """chi2 per reading, or at far ends per port, of a model of these currents (R, C) [S]."""
+        known, ratio = self.knowledge, ports.ratio
         if known.reading_names != NEAR:
-            return float("nan")
+            return float(np.mean(((ports.current - current_siemens) / ports.current_std) ** 2))
         model = ratio_from_current(current_siemens, known.ref_top_ohm, known.ref_bottom_ohm)
         residual = (ratio - model).ravel() / known.ratio_std
         return float(residual @ residual) / residual.size

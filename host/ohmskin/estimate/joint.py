@@ -25,6 +25,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution, WireOhm
+from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings, cell_of
@@ -58,7 +59,11 @@ class JointEstimator(Estimator):
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
         self._shape = (knowledge.rows, knowledge.columns)
-        self._belief = WireBelief(*self._shape, knowledge.nominal_wire_ohm)
+        wires = knowledge.nominal_wire_ohm
+        self._measured: MeasuredWires | None = None
+        self._belief = WireBelief(*self._shape, wires)
+        if any(self._reader.far):
+            self._belief = self._measured = MeasuredWires(*self._shape, wires)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
         self._rest_by_wires = 0.0
@@ -81,7 +86,7 @@ class JointEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         prior = self._prior_of(ports)
         touches = None
-        if any(ports.far):
+        if self._measured is not None:
             self._finder = None
         # Under a finger that stays, few touches explain no frame: trying costs time.
         if self._finder is not None and self._touches <= self._finder.most:
@@ -89,17 +94,14 @@ class JointEstimator(Estimator):
         if touches is not None and (found := self._explained_by(touches, ports)):
             return self._solution(ports, found)
         start = self._start(prior, ports, touches)
-        if any(ports.far):
-            for _ in range(2):
-                wires = np.exp(self._belief.log_layers)
-                circuit = PortCircuit(np.exp(-start).reshape(self._shape), *wires, ports.far)
-                self._belief.measured(circuit.drop_ohm, ports)
+        if self._measured is not None:
+            self._measured.measure(self._circuit(start), ports)
         expected = prior.unsure() if prior.is_soft(start, self._shape) else prior
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.cell)
         message = self._doubt(expected, fit)
-        if not (any(ports.far) or ports.fault or message or self._touches > CROWDED * start.size):
-            self._learn(fit)
+        if not (ports.fault or message or self._touches > CROWDED * start.size):
+            self._learn(fit, ports)
         return self._solution(ports, fit, message)
 
     def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
@@ -115,7 +117,7 @@ class JointEstimator(Estimator):
             cell_siemens=np.exp(-fit.cell).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
             cell_siemens_std_down=wider * down.reshape(self._shape),
-            chi2=self._chi2(ports.ratio, fit.modelled.reshape(self._shape)),
+            chi2=self._chi2(ports, fit.modelled.reshape(self._shape)),
             iterations=fit.iterations,
             message=message,
             top_wire_ohm=top,
@@ -153,12 +155,22 @@ class JointEstimator(Estimator):
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
 
-    def _learn(self, fit: FullFit | Touched) -> None:
+    def _circuit(self, cell: Float) -> PortCircuit:
+        """Of these log resistances of the cells (RC,), with wires as they are believed."""
+        wires = np.exp(self._belief.log_layers)
+        return PortCircuit(np.exp(-cell).reshape(self._shape), *wires, self._reader.far)
+
+    def _learn(self, fit: FullFit | Touched, ports: PortReadings) -> None:
         """Let the wires learn from a frame that is news: frames alike have errors alike."""
         before = self._learned_from
         if before is None or np.abs(fit.cell - before).max() >= MAX_STEP:
             self._learned_from = fit.cell
-            self._belief.learn(*fit.lesson)
+            if self._measured is None:
+                self._belief.learn(*fit.lesson)
+            else:
+                circuit = self._circuit(fit.cell)
+                self._measured.measure(circuit, ports)
+                self._measured.learn_segments(circuit, ports)
 
     def _prior_of(self, ports: PortReadings) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.
@@ -191,9 +203,13 @@ class JointEstimator(Estimator):
         cell: Float = np.full(ports.current.size, -np.log(level))
         for _ in range(REST_FITS):
             std = np.full(cell.size, UNTOUCHED_STD)
+            if self._measured is not None:
+                self._measured.measure(self._circuit(cell), ports)
             wide = CellPrior(np.full(cell.size, np.median(cell)), std)
             fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, cell)
             cell = fit.cell
+        if self._measured is not None:
+            self._measured.settle()
         self._rest_by_wires = float(fit.by_layers.max())
         return cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
 
@@ -208,5 +224,5 @@ class TouchEstimator(JointEstimator):
         if found is None or found.cell_std[found.cells].max(initial=0.0) > HIDDEN:
             return None
         if not ports.fault:
-            self._learn(found)
+            self._learn(found, ports)
         return found

@@ -114,7 +114,7 @@ class MatrixEstimator(Estimator):
         return Solution(
             cell_siemens=fit.cell,
             cell_siemens_std=fit.cell_std(),
-            chi2=self._chi2(ports.ratio, fit.current.reshape(fit.cell.shape)),
+            chi2=self._chi2(ports, fit.current.reshape(fit.cell.shape)),
             iterations=fit.iterations,
             message=fit.message,
         )

@@ -54,7 +54,7 @@ class OhmEstimator(Estimator):
         return Solution(
             cell_siemens=cell,
             cell_siemens_std=(1.0 + cell * ref_ohm) ** 2 * ports.current_std,
-            chi2=self._chi2(ports.ratio, cell / (1.0 + cell * ref_ohm)),
+            chi2=self._chi2(ports, cell / (1.0 + cell * ref_ohm)),
             message=message,
         )
 

@@ -162,29 +162,6 @@ class WireBelief:
         """J (m - m'), (m,): change of readings since m' (2,), log_layers then."""
         return np.asarray(by_layers @ np.linalg.solve(self._root, self.log_layers - log_layers))
 
-    def measured(self, drop_ohm: Float, ports: "PortReadings") -> None:
-        """Take the layers from what their wires lose. drop_ohm (2, RC): the same with these wires.
-
-        A line's wires are s times what is believed, s by least squares over its ports; a layer's
-        are the mean of its lines, each of which differs by its segments' own deviations.
-        """
-        assert ports.drop_ohm is not None and ports.drop_std is not None
-        log_layers, std = self._nominal.copy(), np.sqrt(np.diagonal(self._prior_covariance))
-        weight = ports.drop_std**-2.0
-        for layer, is_far in enumerate(ports.far):
-            if not is_far:
-                continue
-            model = drop_ohm[layer].reshape(self.shape)
-            known = (weight * model * model).sum(axis=1 - layer)
-            times = (weight * model * ports.drop_ohm[layer]).sum(axis=1 - layer) / known
-            precision = 1.0 / (1.0 / known + SEGMENT_STD**2)
-            mean = float(precision @ times / precision.sum())
-            seen = np.log(max(mean, 0.1)) + self.log_layers[layer]
-            share = 1.0 / (1.0 + 1.0 / (precision.sum() * std[layer] ** 2))
-            log_layers[layer] += share * (seen - log_layers[layer])
-            std[layer] *= (1.0 - share) ** 0.5
-        self.log_layers, self._root = log_layers, np.diag(std)
-
     def std(self) -> float:
         """Standard deviation of the log of the layer that is known less."""
         return float(np.linalg.norm(self._root, axis=1).max())

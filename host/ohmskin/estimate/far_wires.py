@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wires, measured: what they lose between the near and the far end of a line.
+
+Symbols, for a line of n cells with as many ports (a row; columns likewise)
+
+====== ======== ================================================================== ==========
+symbol shape    meaning                                                            unit
+====== ======== ================================================================== ==========
+p, s   (n,)     what the line lost per current of its ports, and its deviation     ohm
+c      (n, n)   current through its segments, per current of these ports           1
+q      (n,)     what segments like the layer's mean, as believed, would lose       ohm
+m      scalar   mean segment of the layer                                          ohm
+z      (n,)     the line's segments, in shares of m                                1
+v      scalar   variance of z about 1                                              1
+L, l   (n, n)   information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2
+====== ======== ================================================================== ==========
+
+The circuit gives c and q: they depend little on the wires. So p = m c z is linear. A frame shows
+m by itself, so that a skin may bend; with t the factor by which it exceeds what is believed,
+
+    t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w ,  1 / w = 1 / sum q^2 / s^2 + v.
+
+What single segments have of their own takes many frames, and stays:
+
+    z = 1 + v (1 + v L)^-1 (l - L 1) ,     of covariance v (1 + v L)^-1 .
+"""
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import PortCircuit
+from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.prior import LAYER_STD, SEGMENT_STD, WireBelief
+
+_LEAST = 0.1  # of what is believed, if readings make no sense
+
+
+class MeasuredWires(WireBelief):
+    """What far ends show of the wires of a skin: of layers in a frame, of segments in many."""
+
+    def reset(self) -> None:
+        """Back to the wires at rest, or the nominal ones."""
+        super().reset()
+        self._shares = np.ones((2, *self.shape))
+        self._known = [
+            (np.zeros((lines, n, n)), np.zeros((lines, n)))
+            for lines, n in (self.shape, self.shape[::-1])
+        ]
+
+    def measure(self, circuit: PortCircuit, ports: PortReadings) -> None:
+        """Take the layers' wires from one frame, whose circuit is about this one."""
+        assert ports.drop_ohm is not None and ports.drop_std is not None
+        std = np.sqrt(np.diagonal(self._prior_covariance))
+        layers, weight = self._nominal.copy(), ports.drop_std**-2.0
+        for layer in np.flatnonzero(ports.far):
+            model = circuit.drop_ohm[layer].reshape(self.shape)
+            known = (weight * model * model).sum(axis=1 - layer)
+            times = (weight * model * ports.drop_ohm[layer]).sum(axis=1 - layer) / known
+            precision = 1.0 / (1.0 / known + SEGMENT_STD**2)
+            seen = np.log(max(precision @ times / precision.sum(), _LEAST))
+            prior = 1.0 / (1.0 + precision.sum() * std[layer] ** 2)
+            layers[layer] += (1 - prior) * (self.log_layers[layer] + seen - layers[layer])
+            std[layer] *= prior**0.5
+        self.log_layers, self._root = layers, np.diag(std)
+
+    def settle(self) -> None:
+        """These are the wires at rest: later frames are expected about them, but for a bend."""
+        self._nominal, self._prior_covariance = self.log_layers, LAYER_STD**2 * np.eye(2)
+
+    def learn_segments(self, circuit: PortCircuit, ports: PortReadings) -> None:
+        """Add what a frame that is news says of single segments."""
+        assert ports.drop_ohm is not None and ports.drop_std is not None
+        variance = SEGMENT_STD**2
+        for layer in np.flatnonzero(ports.far):
+            mean = np.exp(self.log_layers[layer])
+            drop, weight = ports.drop_ohm[layer], ports.drop_std**-2.0
+            if layer == 1:
+                drop, weight = drop.T, weight.T
+            current = mean * circuit.line_current(layer)
+            heavy = current * weight[..., None]
+            precision, pull = self._known[layer]
+            precision += np.matmul(heavy.transpose(0, 2, 1), current)
+            pull += np.einsum("lpk,lp->lk", heavy, drop)
+            system = np.eye(len(precision[0])) + variance * precision
+            away = (pull - precision.sum(axis=2))[..., None]
+            share = 1.0 + variance * np.linalg.solve(system, away)[..., 0]
+            self._shares[layer] = share if layer == 0 else share.T
+
+    def layers(self, log_wires: Float) -> tuple[Float, Float]:
+        """Top and bottom segments (R, C) [ohm]: the layers' of these, in the shares learned."""
+        top, bottom = super().layers(log_wires)
+        return top * self._shares[0], bottom * self._shares[1]
