@@ -53,6 +53,24 @@ def test_currents_of_the_touched_network_obey_kirchhoff() -> None:
         np.testing.assert_allclose(current[port].sum(axis=0), np.eye(5)[column], atol=1e-9)
 
 
+def test_voltages_of_single_cells_are_those_of_a_skin_touched_from_the_beginning() -> None:
+    random = np.random.default_rng(4)
+    rest = skin_at_rest(4, 5, random)
+    wires = rest.top_wire_ohm, rest.bottom_wire_ohm
+    net = RestNetwork(rest.cell_siemens, *wires)
+    some = np.array([0, 3, 7, 19])
+    network = TouchedNetwork(net, np.array([3, 11]), np.array([1e-6, 1e-6]))
+    for added in (np.array([1e-4, 1e-3]), np.array([3e-4, 2e-5])):
+        network.conduct(added)
+        touched = rest.cell_siemens.copy()
+        touched.flat[[3, 11]] += added
+        whole = RestNetwork(touched, *wires)
+        np.testing.assert_allclose(network.port_ohm, whole.port_ohm, rtol=1e-9)
+        port_volt, cell_volt = network.own_volt(some)
+        np.testing.assert_allclose(port_volt, whole.own_port_volt[some], rtol=1e-8)
+        np.testing.assert_allclose(cell_volt, whole.own_cell_volt[some], rtol=1e-8)
+
+
 @pytest.mark.parametrize("name", ["random_4x6", "random_8x8", "presses_8x8", "bent_8x8"])
 def test_touch_agrees_with_joint_within_its_standard_deviation(name: str) -> None:
     rounded, arrays = reference(name)

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.small import solve
+from ohmskin.circuit.small import solve, solve_lower
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_STD: Final = 1.0  # of a cell about all cells' level, before its rest is read
@@ -94,10 +94,11 @@ class CellPrior:
         Differences of neighbours have 2 (1 - c) times the variance of single cells, c their
         correlation.
         """
+        if self.touches(log_ohm) <= CROWDED * log_ohm.size:
+            return False
         rise = (self.expected - log_ohm).reshape(shape)
         apart = np.concatenate([np.diff(rise, axis=axis).ravel() for axis in (0, 1)])
-        alike = apart @ apart < 2.0 * (1.0 - SOFT) * rise.var() * apart.size
-        return bool(alike and self.touches(log_ohm) > CROWDED * log_ohm.size)
+        return bool(apart @ apart < 2.0 * (1.0 - SOFT) * rise.var() * apart.size)
 
     def unsure(self) -> "CellPrior":
         """What is expected where rest is no more likely: any cell, of the level at rest."""
@@ -132,7 +133,8 @@ class WireBelief:
 
     def reset(self) -> None:
         """Back to the nominal wires."""
-        self.log_layers, self._root = self._nominal, np.linalg.cholesky(self._prior_covariance)
+        self.log_layers = self._nominal
+        self._root: Float = np.asarray(np.linalg.cholesky(self._prior_covariance), np.float64)
 
     @property
     def mean(self) -> Float:
@@ -145,8 +147,10 @@ class WireBelief:
 
     def root(self, slopes: Float) -> Float:
         """J P^1/2, (m, 2RC + 2), from J (m, 2RC): what each segment has, and what layers share."""
-        by_layer = slopes.reshape(len(slopes), 2, -1).sum(axis=2)
-        return np.hstack([SEGMENT_STD * slopes, self.by_layers(by_layer)])
+        root = np.empty((len(slopes), slopes.shape[1] + 2))
+        np.multiply(slopes, SEGMENT_STD, out=root[:, :-2])
+        root[:, -2:] = self.by_layers(slopes.reshape(len(slopes), 2, -1).sum(axis=2))
+        return root
 
     def away(self, layers: Float) -> Float:
         """Logs of the layers (2,) that are m + C^1/2 away, from what is normal (2,)."""
@@ -160,11 +164,11 @@ class WireBelief:
 
     def moved(self, by_layers: Float, log_layers: Float) -> Float:
         """J (m - m'), (m,): change of readings since m' (2,), log_layers then."""
-        return np.asarray(by_layers @ np.linalg.solve(self._root, self.log_layers - log_layers))
+        return np.asarray(by_layers @ solve_lower(self._root, self.log_layers - log_layers))
 
     def std(self) -> float:
         """Standard deviation of the log of the layer that is known less."""
-        return float(np.linalg.norm(self._root, axis=1).max())
+        return float(np.hypot(*self._root.T).max())
 
     def learned(self) -> tuple[float, float, float]:
         """A `WireOhm`: mean segments of the layers [ohm], deviation of the log of both together."""
@@ -184,12 +188,12 @@ class WireBelief:
         self.log_layers = self.away(gain @ residual)
         covariance = self._root @ (np.eye(2) - gain @ by_layers) @ self._root.T
         covariance += FADE * (self._prior_covariance - covariance)
-        self._root = np.linalg.cholesky(covariance)
+        self._root = np.asarray(np.linalg.cholesky(covariance), np.float64)
 
 
 def path_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
     """Wire between each cell and its electrodes [ohm], (RC,)."""
-    return (np.cumsum(top_wire_ohm, axis=1) + np.cumsum(bottom_wire_ohm, axis=0)).ravel()
+    return np.asarray((top_wire_ohm.cumsum(axis=1) + bottom_wire_ohm.cumsum(axis=0)).ravel())
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

@@ -105,33 +105,36 @@ class TouchedNetwork:
     """
 
     def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
-        self._rest = rest
-        self._cells = cells
-        self._added = added
-        self._coupling = rest.cell_volt[cells]
-        port_volt = rest.port_volt[cells]
-        system = rest.cell_volt[cells[:, None], cells]
-        system.ravel()[:: len(cells) + 1] += 1.0 / added
-        self._system = system
-        _, self._current, _ = lapack.dposv(system, port_volt, lower=1)
-        self.volt = self._current / added[:, None]
-        self.port_ohm = rest.port_ohm - np.einsum("ij,ij->j", port_volt, self._current)
+        self._rest, self.cells = rest, cells
+        self._port_volt = rest.port_volt[cells]
+        self._between = rest.cell_volt[cells[:, None], cells]
+        self.conduct(added)
 
-    def own_volt(self) -> tuple[Float, Float]:
-        """Diagonals of v and of the touched M, (RC,): each cell at its own port, and alone."""
-        _, drawn, _ = lapack.dposv(self._system, self._coupling, lower=1)
-        port = self._rest.own_port_volt - np.einsum("ij,ij->j", self._coupling, self._current)
-        cell = self._rest.own_cell_volt - np.einsum("ij,ij->j", self._coupling, drawn)
-        return port, cell
+    def conduct(self, added: Float) -> None:
+        """Take these for the added conductances."""
+        self._added, self._system = added, self._between.copy()
+        self._system.ravel()[:: added.size + 1] += 1.0 / added
+        _, self._current, _ = lapack.dposv(self._system, self._port_volt, lower=1)
+        self.volt = self._current / added[:, None]
+        self.port_ohm = self._rest.port_ohm - (self._port_volt * self._current).sum(axis=0)
+
+    def own_volt(self, cells: Cells) -> tuple[Float, Float]:
+        """Of some cells, what is diagonal in v and in the touched M: at its own port, and alone."""
+        rest, coupling = self._rest, self._rest.cell_volt[self.cells[:, None], cells]
+        _, drawn, _ = lapack.dposv(self._system, coupling, lower=1)
+        port = rest.own_port_volt[cells] - (coupling * self._current[:, cells]).sum(axis=0)
+        return port, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
 
     def cell_current(self, ports: Cells) -> Float:
         """Current through all cells per current through some ports, (m, RC)."""
         rest = self._rest
-        volt: Float = rest.port_volt[:, ports] - self._coupling.T @ self._current[:, ports]
+        current: Float = (
+            rest.port_volt.T[ports] - self._current.T[ports] @ rest.cell_volt[self.cells]
+        )
         siemens = rest.cell_siemens.copy()
-        siemens[self._cells] += self._added
-        volt *= siemens[:, None]
-        return volt.T
+        siemens[self.cells] += self._added
+        current *= siemens
+        return current
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +209,7 @@ class FewTouches:
         self._measured, self._reading_std = ports.current.ravel(), ports.current_std.ravel()
         self._loose_std = np.sqrt(self._reading_std**2 + skin.slack)
         self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.ref_ohm
+        self._touched: TouchedNetwork | None = None
         self.steps = 0
 
     def _place(self, cells: Cells, log_siemens: Float) -> None:
@@ -214,11 +218,13 @@ class FewTouches:
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
         self._std = self._loose_std
-        self._touched: TouchedNetwork | None = None
         self._current = skin.current
         if cells.size:
             added = self._siemens - skin.net.cell_siemens[cells]
-            self._touched = TouchedNetwork(skin.net, cells, added)
+            if self._touched is not None and self._touched.cells is cells:
+                self._touched.conduct(added)
+            else:
+                self._touched = TouchedNetwork(skin.net, cells, added)
             self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
             self._std = self._loose_std.copy()
             self._std[cells] = self._reading_std[cells]
@@ -234,8 +240,11 @@ class FewTouches:
             moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
             moved = np.minimum(moved, _HIGHEST_LOG)
             stays = moved > self._skin.least_log[self.cells]
-            self._place(self.cells[stays], moved[stays])
-            if is_last and stays.all():
+            if all_stay := bool(stays.all()):
+                self._place(self.cells, moved)
+            else:
+                self._place(self.cells[stays], moved[stays])
+            if is_last and all_stay:
                 return
 
     def _slopes(self) -> Float:
@@ -255,7 +264,7 @@ class FewTouches:
         normal.ravel()[:: self.cells.size + 1] += precision
         _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
         self.steps += 1
-        is_last = (step * step * np.diagonal(normal)).max() < CLOSE**2
+        is_last = (step * step * normal.diagonal()).max() < CLOSE**2
         step = np.minimum(np.maximum(step, -MAX_STEP), MAX_STEP)  # faster than np.clip
         return self.log_siemens + step, bool(is_last)
 
@@ -269,20 +278,24 @@ class FewTouches:
         skin, net = self._skin, self._skin.net
         asks = self._residual > DEMAND
         asks[self.cells] = False
-        if not asks.any():
-            return np.flatnonzero(asks), np.zeros(0)
-        port_volt, cell_volt, port_ohm = net.own_port_volt, net.own_cell_volt, net.port_ohm
-        if self._touched is not None:
-            port_volt, cell_volt = self._touched.own_volt()
+        asked = asks.nonzero()[0]
+        if not asked.size:
+            return asked, np.zeros(0)
+        port_ohm = net.port_ohm
+        port_volt, cell_volt = net.own_port_volt[asked], net.own_cell_volt[asked]
+        if self.cells.size:
+            assert self._touched is not None
             port_ohm = self._touched.port_ohm
+            port_volt, cell_volt = self._touched.own_volt(asked)
         # From rho = target for one cell more.
-        target = np.maximum(self._target_ohm, 0.5 * skin.path_ohm)
-        need = port_volt**2 / np.maximum(port_ohm - target, 1e-9) - cell_volt
-        rise = np.where(asks, 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS), 0.0)
-        map_ = rise.reshape(net.shape)
-        rival = np.maximum(map_.max(axis=1, keepdims=True), map_.max(axis=0, keepdims=True))
-        asked = np.flatnonzero((map_ > 0) & (map_ >= SHARE * rival))
-        return asked, rise[asked]
+        target = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
+        need = port_volt**2 / np.maximum(port_ohm[asked] - target, 1e-9) - cell_volt
+        rise = 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS)
+        map_ = np.zeros(net.shape)
+        map_.ravel()[asked] = rise
+        rival = np.maximum(map_.max(axis=1, keepdims=True), map_.max(axis=0)).ravel()[asked]
+        most = rise >= SHARE * rival
+        return asked[most], rise[most]
 
     @property
     def cell(self) -> Float:
@@ -301,20 +314,19 @@ class FewTouches:
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
-        covariance = gram(wires)
-        np.einsum("ii->i", covariance)[:] += 1.0
+        covariance = gram(wires, onto=np.eye(ports.size, order="F"))
         factor = cholesky(covariance)
         offset = skin.belief.moved(wires[:, -2:], skin.log_layers)
         for _ in range(2):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
-            whitened = solve_lower(factor, np.vstack([slopes[:, ports], residual]).T)
-            own, rest = whitened[:, :-1], whitened[:, -1]
+            own = solve_lower(factor, slopes[:, ports].T)
+            rest = solve_lower(factor, residual)
             free = slopes[:, light]
             normal = free @ free.T + own.T @ own
             pull = free @ self._residual[light] + rest @ own
             moved, is_last = self._stepped(normal, pull)
-            self._place(cells, np.clip(moved, skin.least_log[cells], _HIGHEST_LOG))
+            self._place(cells, np.minimum(np.maximum(moved, skin.least_log[cells]), _HIGHEST_LOG))
             if is_last:
                 break
         residual = self._residual[ports] - offset
@@ -326,10 +338,10 @@ class FewTouches:
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
         of_touches = slopes[:, ports]
-        of_cells = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        of_cells = solve(cholesky(normal), np.eye(cells.size))
         of_layers = of_cells @ own.T @ solve_lower(factor, wires[:, -2:])
         unlimited = cholesky(gram(UNLIMITED_STD * of_touches.T, onto=covariance))
-        by_layers = np.linalg.norm(of_layers, axis=1)
+        by_layers = np.hypot(*of_layers.T)
         return self._answer(of_cells, by_layers, current, (wires[:, -2:], residual, unlimited))
 
     def _answer(
@@ -337,7 +349,7 @@ class FewTouches:
     ) -> Touched:
         prior, cells = self._skin.prior, self.cells
         std, by_all = prior.std.copy(), np.zeros(current.size)
-        std[cells] = np.sqrt(np.diagonal(covariance))
+        std[cells] = np.sqrt(covariance.diagonal())
         by_all[cells] = by_layers
         wires = self._skin.belief.mean
         return Touched(cells, self.cell, std, by_all, wires, current, self.steps, lesson)
@@ -360,8 +372,10 @@ class FewTouches:
         by_cell[:, self.cells] = 0.0
         by_cell *= skin.prior.std
         slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
-        self._loose_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
-        self._place(self.cells, self.log_siemens)
+        self._std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
+        self._std[self.cells] = self._reading_std[self.cells]
+        self._loose_std = self._std
+        self._residual = (self._measured - self._current) / self._std
         wires = net.wires_of(currents)
         wires *= -(square / self._std[ports])[:, None]
         return skin.belief.root(wires)
