@@ -47,7 +47,7 @@ def test_currents_of_the_touched_network_obey_kirchhoff() -> None:
     rest = skin_at_rest(4, 5, random)
     net = RestNetwork(rest.cell_siemens, rest.top_wire_ohm, rest.bottom_wire_ohm)
     network = TouchedNetwork(net, np.array([3, 11]), np.array([1e-4, 1e-3]))
-    current = network.cell_current(np.arange(20)).reshape(20, 4, 5)
+    current = network.cell_current(np.arange(20))[0].reshape(20, 4, 5)
     for port, (row, column) in enumerate(np.ndindex(4, 5)):
         np.testing.assert_allclose(current[port].sum(axis=1), np.eye(4)[row], atol=1e-9)
         np.testing.assert_allclose(current[port].sum(axis=0), np.eye(5)[column], atol=1e-9)
@@ -66,8 +66,8 @@ def test_voltages_of_single_cells_are_those_of_a_skin_touched_from_the_beginning
         touched.flat[[3, 11]] += added
         whole = RestNetwork(touched, *wires)
         np.testing.assert_allclose(network.port_ohm, whole.port_ohm, rtol=1e-9)
-        port_volt, cell_volt = network.own_volt(some)
-        np.testing.assert_allclose(port_volt, whole.own_port_volt[some], rtol=1e-8)
+        slope, cell_volt = network.own_slope(some)
+        np.testing.assert_allclose(slope, whole.own_slope[some], rtol=1e-8)
         np.testing.assert_allclose(cell_volt, whole.own_cell_volt[some], rtol=1e-8)
 
 

@@ -189,12 +189,19 @@ def impedance_of(
 
 def _path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
     """Wire from each cell to the near end of its row, and of its column [ohm], (RC, R+C)."""
+    if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
+        return _unit_path(*shape) * np.repeat([top_wire_ohm, bottom_wire_ohm], shape)
     rows, columns = shape
     to_cell = np.zeros((rows, columns, rows + columns))
-    along_row, along_column = (np.broadcast_to(w, shape) for w in (top_wire_ohm, bottom_wire_ohm))
-    np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(along_row, 1)
-    np.einsum("ijj->ij", to_cell[..., rows:])[:] = np.cumsum(along_column, 0)
+    np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(top_wire_ohm, 1)
+    np.einsum("ijj->ij", to_cell[..., rows:])[:] = np.cumsum(bottom_wire_ohm, 0)
     return to_cell.reshape(rows * columns, -1)
+
+
+@lru_cache(maxsize=8)
+def _unit_path(rows: int, columns: int) -> Float:
+    """The same of wires of 1 ohm a segment."""
+    return _path_of_lines(*np.ones((2, rows, columns)), (rows, columns))
 
 
 @one_blas_thread

@@ -86,8 +86,6 @@ class JointEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         prior = self._prior_of(ports)
         touches = None
-        if self._measured is not None:
-            self._finder = None
         # Under a finger that stays, few touches explain no frame: trying costs time.
         if self._finder is not None and self._touches <= self._finder.most:
             touches = self._finder.find(ports)
@@ -110,7 +108,7 @@ class JointEstimator(Estimator):
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
         top, bottom = self._belief.layers(fit.wires)
-        series_ohm = path_ohm(top, bottom) + self.knowledge.ref_ohm
+        series_ohm = path_ohm(top, bottom, ports.far) + self.knowledge.ref_ohm
         layer_std, wider = self._belief.std(), max(1.0, fit.misfit) ** 0.5
         std, down = siemens_std(-fit.cell, fit.cell_std, fit.by_layers, layer_std, series_ohm)
         return Solution(
@@ -191,7 +189,7 @@ class JointEstimator(Estimator):
             expected, std = self._at_rest(self._reader.read(known.rest_ratio))
         self._prior = CellPrior(expected, std)
         if self._rest_by_wires <= REST_STD:
-            self._finder = SparseFit(self._prior, self._belief, known.ref_ohm)
+            self._finder = SparseFit(self._prior, self._belief, known.ref_ohm, self._reader.far)
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:

@@ -187,8 +187,8 @@ class PortReader:
     def _astray(self, drop: Float, std: Float) -> str:
         """Lines whose far ends are not between the near ends."""
         for axis, line in enumerate(("row", "column")):
-            below = np.median(drop[axis] + CLEAR_STDS * std, axis=1 - axis)
-            if self.far[axis] and below.min() < 0:
+            below = (drop[axis] + CLEAR_STDS * std).sum(axis=1 - axis)
+            if below.min() < 0:
                 return f"{line} {below.argmin()}: its far end does not follow it, is it open?"
         return ""
 

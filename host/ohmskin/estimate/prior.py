@@ -191,9 +191,13 @@ class WireBelief:
         self._root = np.asarray(np.linalg.cholesky(covariance), np.float64)
 
 
-def path_ohm(top_wire_ohm: Float, bottom_wire_ohm: Float) -> Float:
-    """Wire between each cell and its electrodes [ohm], (RC,)."""
-    return np.asarray((top_wire_ohm.cumsum(axis=1) + bottom_wire_ohm.cumsum(axis=0)).ravel())
+def path_ohm(
+    top_wire_ohm: Float, bottom_wire_ohm: Float, far: tuple[bool, bool] = (False, False)
+) -> Float:
+    """Wire between each cell and its electrodes [ohm], (RC,), but that up to sensed far ends."""
+    top, bottom = (0.0 if is_far else 1.0 for is_far in far)
+    path = top * top_wire_ohm.cumsum(axis=1) + bottom * bottom_wire_ohm.cumsum(axis=0)
+    return np.asarray(path.ravel())
 
 
 def rest_level(current_siemens: Float, ref_ohm: float) -> float:

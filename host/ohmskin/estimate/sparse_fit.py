@@ -50,6 +50,7 @@ from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE,
     HIGHEST_TOUCH_SIEMENS,
+    LAYER_STD,
     MAX_ITERATIONS,
     MAX_STEP,
     MISFIT,
@@ -74,11 +75,20 @@ _HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
 class RestNetwork(PortCircuit):
     """rho0, H and M of cells (R, C) [S] that all conduct, and wires [ohm], one number a layer."""
 
-    def __init__(self, cell_siemens: Float, top_wire_ohm: float, bottom_wire_ohm: float) -> None:
-        super().__init__(cell_siemens, top_wire_ohm, bottom_wire_ohm)
+    def __init__(
+        self,
+        cell_siemens: Float,
+        top_wire_ohm: float,
+        bottom_wire_ohm: float,
+        far: tuple[bool, bool] = (False, False),
+    ) -> None:
+        super().__init__(cell_siemens, top_wire_ohm, bottom_wire_ohm, far)
         self.cell_siemens = siemens = cell_siemens.ravel()
         lines = self.cell_current.reshape(-1, siemens.size) / siemens
-        self.port_volt = port_difference(lines, self.rows).T
+        self.port_volt = self.sense_volt = port_difference(lines, self.rows).T
+        if any(far):
+            sensed = self.sense_current.reshape(-1, siemens.size) / siemens
+            self.sense_volt = port_difference(sensed, self.rows).T
         # Currents through cells, by voltages inserted in series with them: with A = sqrt(g) (1 +
         # sqrt(g) K sqrt(g))^-1 sqrt(g) they are A - A E^T Z E A, of which E A is `per_potential`.
         inverse, _ = lapack.dpotri(self.factor, lower=1)
@@ -87,13 +97,21 @@ class RestNetwork(PortCircuit):
         in_series -= self.per_potential @ (lines * siemens)
         self.cell_volt = -in_series / siemens / siemens[:, None]
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
-        self.own_port_volt = self.port_volt.diagonal()
+        self.own_slope = self.port_volt.diagonal() * self.sense_volt.diagonal()
         self.own_cell_volt = self.cell_volt.diagonal()
 
-    def wires_of(self, cell_current: Float) -> Float:
-        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents (m, RC)."""
+    def wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
+        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC)."""
         slopes = wire_current(cell_current.reshape(-1, *self.shape))
-        slopes *= slopes
+        if any(self.far):
+            sensed = wire_current(sense_current.reshape(-1, *self.shape))
+            # A current into a far end flows back through the whole line.
+            rows, columns = np.divmod(ports, self.shape[1])
+            sensed[np.arange(ports.size), 0, rows] -= self.far[0]
+            sensed[np.arange(ports.size), 1, :, columns] -= self.far[1]
+            slopes *= sensed
+        else:
+            slopes *= slopes
         slopes *= np.array(self.wire_ohm).reshape(2, 1, 1)
         return slopes.reshape(len(cell_current), -1)
 
@@ -101,12 +119,12 @@ class RestNetwork(PortCircuit):
 class TouchedNetwork:
     """A `RestNetwork` with conductances `added` (k,) > 0 [S] at `cells` (k,).
 
-    port_ohm: rho (RC,). volt: v of the touched cells (k, RC).
+    port_ohm: rho (RC,). volt, sense_volt: v and v' of the touched cells (k, RC).
     """
 
     def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
         self._rest, self.cells = rest, cells
-        self._port_volt = rest.port_volt[cells]
+        self._port_volt, self._sense_volt = rest.port_volt[cells], rest.sense_volt[cells]
         self._between = rest.cell_volt[cells[:, None], cells]
         self.conduct(added)
 
@@ -115,26 +133,30 @@ class TouchedNetwork:
         self._added, self._system = added, self._between.copy()
         self._system.ravel()[:: added.size + 1] += 1.0 / added
         _, self._current, _ = lapack.dposv(self._system, self._port_volt, lower=1)
-        self.volt = self._current / added[:, None]
-        self.port_ohm = self._rest.port_ohm - (self._port_volt * self._current).sum(axis=0)
+        self._sensed, self.volt = self._current, self._current / added[:, None]
+        self.sense_volt = self.volt
+        if any(self._rest.far):
+            _, self._sensed, _ = lapack.dposv(self._system, self._sense_volt, lower=1)
+            self.sense_volt = self._sensed / added[:, None]
+        self.port_ohm = self._rest.port_ohm - (self._sense_volt * self._current).sum(axis=0)
 
-    def own_volt(self, cells: Cells) -> tuple[Float, Float]:
-        """Of some cells, what is diagonal in v and in the touched M: at its own port, and alone."""
+    def own_slope(self, cells: Cells) -> tuple[Float, Float]:
+        """Of some cells, each at its own port, v v'; and what is diagonal in the touched M."""
         rest, coupling = self._rest, self._rest.cell_volt[self.cells[:, None], cells]
         _, drawn, _ = lapack.dposv(self._system, coupling, lower=1)
-        port = rest.own_port_volt[cells] - (coupling * self._current[:, cells]).sum(axis=0)
-        return port, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
+        port = rest.port_volt[cells, cells] - (coupling * self._current[:, cells]).sum(axis=0)
+        sensed = rest.sense_volt[cells, cells] - (coupling * self._sensed[:, cells]).sum(axis=0)
+        return port * sensed, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
 
-    def cell_current(self, ports: Cells) -> Float:
-        """Current through all cells per current through some ports, (m, RC)."""
-        rest = self._rest
-        current: Float = (
-            rest.port_volt.T[ports] - self._current.T[ports] @ rest.cell_volt[self.cells]
-        )
-        siemens = rest.cell_siemens.copy()
+    def cell_current(self, ports: Cells) -> tuple[Float, Float]:
+        """Current through all cells per current through some ports, and sensed there, (m, RC)."""
+        rest, siemens = self._rest, self._rest.cell_siemens.copy()
         siemens[self.cells] += self._added
-        current *= siemens
-        return current
+        between = rest.cell_volt[self.cells]
+        current: Float = (rest.port_volt.T[ports] - self._current.T[ports] @ between) * siemens
+        if not any(rest.far):
+            return current, current
+        return current, (rest.sense_volt.T[ports] - self._sensed.T[ports] @ between) * siemens
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +181,14 @@ class Touched:
 class SparseFit:
     """Fits the frames of a skin (R, C), each by itself."""
 
-    def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
-        self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
+    def __init__(
+        self,
+        prior: CellPrior,
+        belief: WireBelief,
+        ref_ohm: float,
+        far: tuple[bool, bool] = (False, False),
+    ) -> None:
+        self.prior, self.belief, self.ref_ohm, self.far = prior, belief, ref_ohm, far
         self.most = MOST_PER_LINE * sum(belief.shape)  # with more touches, they are not few
         self.least_log = -prior.expected + TOUCHED * prior.std
         self._solve_rest()
@@ -170,20 +198,24 @@ class SparseFit:
         prior, belief = self.prior, self.belief
         self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers))
+        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), self.far)
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
-        by_cell = self.current**2 * net.port_volt**2 * net.cell_siemens[:, None]
-        wires = net.wires_of((net.port_volt * net.cell_siemens[:, None]).T)
+        siemens = net.cell_siemens[:, None]
+        by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
+        currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
+        wires = net.wires_of(np.arange(siemens.size), *currents)
         # Cells drift and skins bend after their rest readings [S^2].
         self.slack = prior.std**2 @ (by_cell * by_cell)
         root = belief.root(wires * (self.current**2)[:, None])
         self.slack += np.einsum("ij,ij->i", root, root)
-        self.path_ohm = path_ohm(*belief.layers(belief.mean))
+        self.path_ohm = path_ohm(*belief.layers(belief.mean), self.far)
         self.wire_std = float(np.hypot(belief.std(), SEGMENT_STD))
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""
-        if np.abs(self.belief.log_layers - self.log_layers).max() > 0.5 * SEGMENT_STD:
+        # Wires up to sensed far ends are not in the readings.
+        most = LAYER_STD if all(self.far) else SEGMENT_STD
+        if np.abs(self.belief.log_layers - self.log_layers).max() > 0.5 * most:
             self._solve_rest()
         frame = FewTouches(self, ports)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
@@ -250,9 +282,8 @@ class FewTouches:
     def _slopes(self) -> Float:
         """J, (k, RC)."""
         assert self._touched is not None
-        volt = self._touched.volt
-        weight = self._current**2 / self._std
-        return np.asarray(volt * volt * self._siemens[:, None] * weight)
+        slopes = self._touched.volt * self._touched.sense_volt
+        return np.asarray(slopes * self._siemens[:, None] * (self._current**2 / self._std))
 
     def _stepped(self, normal: Float, pull: Float) -> tuple[Float, bool]:
         """x after the step of J J^T and J r (k,), and whether that is the last that matters.
@@ -282,14 +313,14 @@ class FewTouches:
         if not asked.size:
             return asked, np.zeros(0)
         port_ohm = net.port_ohm
-        port_volt, cell_volt = net.own_port_volt[asked], net.own_cell_volt[asked]
+        slope, cell_volt = net.own_slope[asked], net.own_cell_volt[asked]
         if self.cells.size:
             assert self._touched is not None
             port_ohm = self._touched.port_ohm
-            port_volt, cell_volt = self._touched.own_volt(asked)
+            slope, cell_volt = self._touched.own_slope(asked)
         # From rho = target for one cell more.
         target = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
-        need = port_volt**2 / np.maximum(port_ohm[asked] - target, 1e-9) - cell_volt
+        need = slope / np.maximum(port_ohm[asked] - target, 1e-9) - cell_volt
         rise = 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS)
         map_ = np.zeros(net.shape)
         map_.ravel()[asked] = rise
@@ -366,9 +397,9 @@ class FewTouches:
         """Jw; takes the drift of cells at rest from the touched network at these ports."""
         assert self._touched is not None
         skin, net = self._skin, self._skin.net
-        currents = self._touched.cell_current(ports)
+        currents, sensed = self._touched.cell_current(ports)
         square = self._current[ports] ** 2
-        by_cell = currents * currents / net.cell_siemens
+        by_cell = currents * sensed / net.cell_siemens
         by_cell[:, self.cells] = 0.0
         by_cell *= skin.prior.std
         slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
@@ -376,6 +407,6 @@ class FewTouches:
         self._std[self.cells] = self._reading_std[self.cells]
         self._loose_std = self._std
         self._residual = (self._measured - self._current) / self._std
-        wires = net.wires_of(currents)
+        wires = net.wires_of(ports, currents, sensed)
         wires *= -(square / self._std[ports])[:, None]
         return skin.belief.root(wires)
