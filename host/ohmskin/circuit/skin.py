@@ -228,6 +228,9 @@ def port_difference(lines: Float, rows: int) -> Float:
     return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
 
 
+_behind = lru_cache(maxsize=8)(np.tri)
+
+
 def wire_current(cell_current: Float) -> Float:
     """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
 
@@ -235,10 +238,9 @@ def wire_current(cell_current: Float) -> Float:
     """
     _, rows, columns = cell_current.shape
     current = np.empty((len(cell_current), 2, rows, columns))
-    current[:, 0] = (cell_current.reshape(-1, columns) @ np.tri(columns)).reshape(
-        cell_current.shape
-    )
-    np.matmul(np.tri(rows).T, cell_current, out=current[:, 1])
+    by_row = cell_current.reshape(-1, columns) @ _behind(columns)
+    current[:, 0] = by_row.reshape(cell_current.shape)
+    np.matmul(_behind(rows).T, cell_current, out=current[:, 1])
     return current
 
 
@@ -350,7 +352,8 @@ class PortCircuit:
 
     def by_wires(self) -> Float:
         """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
-        ohm = np.stack(np.broadcast_arrays(*self.wire_ohm, self._root)[:2])
+        ohm = np.empty((2, *self.shape))
+        ohm[0], ohm[1] = self.wire_ohm
         return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
@@ -391,12 +394,19 @@ def reference_ohm(ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
     return reference
 
 
+@lru_cache(maxsize=8)
+def _slope_and_weight(ref_top_ohm: float, ref_bottom_ohm: float) -> tuple[Float, Float]:
+    """What the readings change by with the current [ohm], and their weights in it [S], (4,)."""
+    slope = READING_SIGN * reference_ohm(ref_top_ohm, ref_bottom_ohm)
+    return slope, slope / float(slope @ slope)
+
+
 def ratio_from_current(
     current_siemens: ArrayLike, ref_top_ohm: float, ref_bottom_ohm: float
 ) -> Float:
     """y = offset + sign * R_ref * I, shape (..., 4), for currents per Vdd (...) [S]."""
     current = np.asarray(current_siemens, dtype=np.float64)[..., None]
-    slope = READING_SIGN * reference_ohm(ref_top_ohm, ref_bottom_ohm)
+    slope, _ = _slope_and_weight(ref_top_ohm, ref_bottom_ohm)
     return np.asarray(READING_OFFSET + slope * current, dtype=np.float64)
 
 
@@ -406,8 +416,7 @@ def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) 
     Each reading alone gives I_k = s_k (y_k - offset_k) / R_k; weights R_k^2 are the combination of
     least variance when all readings are equally noisy.
     """
-    reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
-    weight = READING_SIGN * reference / np.sum(reference**2)
+    _, weight = _slope_and_weight(ref_top_ohm, ref_bottom_ohm)
     return np.asarray((ratio - READING_OFFSET) @ weight, dtype=np.float64)
 
 
