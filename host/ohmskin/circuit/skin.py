@@ -103,6 +103,9 @@ def _incidence(rows: int, columns: int) -> Float:
     return np.hstack([by_row, -np.tile(np.eye(columns), (rows, 1))])
 
 
+_triangle = lru_cache(maxsize=8)(np.tri)  # ones: which cells are behind a segment
+
+
 @lru_cache(maxsize=8)
 def _unit_coupling(rows: int, columns: int) -> tuple[Float, Float]:
     """K of top wires, and of bottom wires, of 1 ohm a segment."""
@@ -228,9 +231,6 @@ def port_difference(lines: Float, rows: int) -> Float:
     return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
 
 
-_behind = lru_cache(maxsize=8)(np.tri)
-
-
 def wire_current(cell_current: Float) -> Float:
     """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
 
@@ -238,9 +238,9 @@ def wire_current(cell_current: Float) -> Float:
     """
     _, rows, columns = cell_current.shape
     current = np.empty((len(cell_current), 2, rows, columns))
-    by_row = cell_current.reshape(-1, columns) @ _behind(columns)
+    by_row = cell_current.reshape(-1, columns) @ _triangle(columns)
     current[:, 0] = by_row.reshape(cell_current.shape)
-    np.matmul(_behind(rows).T, cell_current, out=current[:, 1])
+    np.matmul(_triangle(rows).T, cell_current, out=current[:, 1])
     return current
 
 
@@ -394,19 +394,12 @@ def reference_ohm(ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
     return reference
 
 
-@lru_cache(maxsize=8)
-def _slope_and_weight(ref_top_ohm: float, ref_bottom_ohm: float) -> tuple[Float, Float]:
-    """What the readings change by with the current [ohm], and their weights in it [S], (4,)."""
-    slope = READING_SIGN * reference_ohm(ref_top_ohm, ref_bottom_ohm)
-    return slope, slope / float(slope @ slope)
-
-
 def ratio_from_current(
     current_siemens: ArrayLike, ref_top_ohm: float, ref_bottom_ohm: float
 ) -> Float:
     """y = offset + sign * R_ref * I, shape (..., 4), for currents per Vdd (...) [S]."""
     current = np.asarray(current_siemens, dtype=np.float64)[..., None]
-    slope, _ = _slope_and_weight(ref_top_ohm, ref_bottom_ohm)
+    slope = READING_SIGN * reference_ohm(ref_top_ohm, ref_bottom_ohm)
     return np.asarray(READING_OFFSET + slope * current, dtype=np.float64)
 
 
@@ -416,7 +409,8 @@ def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) 
     Each reading alone gives I_k = s_k (y_k - offset_k) / R_k; weights R_k^2 are the combination of
     least variance when all readings are equally noisy.
     """
-    _, weight = _slope_and_weight(ref_top_ohm, ref_bottom_ohm)
+    reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
+    weight = READING_SIGN * reference / (reference @ reference)
     return np.asarray((ratio - READING_OFFSET) @ weight, dtype=np.float64)
 
 

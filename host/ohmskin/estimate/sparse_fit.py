@@ -97,7 +97,9 @@ class RestNetwork(PortCircuit):
         in_series -= self.per_potential @ (lines * siemens)
         self.cell_volt = -in_series / siemens / siemens[:, None]
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
-        self.own_slope = self.port_volt.diagonal() * self.sense_volt.diagonal()
+        self.own_port_volt = self.port_volt.diagonal()
+        self.own_sense_volt = self.sense_volt.diagonal()
+        self.own_slope = self.own_port_volt * self.own_sense_volt
         self.own_cell_volt = self.cell_volt.diagonal()
 
     def wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
@@ -123,37 +125,37 @@ class TouchedNetwork:
     """
 
     def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
-        self._rest, self.cells = rest, cells
-        self._port_volt, self._sense_volt = rest.port_volt[cells], rest.sense_volt[cells]
-        self._between = rest.cell_volt[cells[:, None], cells]
-        self.conduct(added)
-
-    def conduct(self, added: Float) -> None:
-        """Take these for the added conductances."""
-        self._added, self._system = added, self._between.copy()
-        self._system.ravel()[:: added.size + 1] += 1.0 / added
-        _, self._current, _ = lapack.dposv(self._system, self._port_volt, lower=1)
+        self._rest, self._cells, self._added = rest, cells, added
+        port_volt, sense_volt = rest.port_volt[cells], rest.sense_volt[cells]
+        self._system = rest.cell_volt[cells[:, None], cells]
+        self._system.ravel()[:: cells.size + 1] += 1.0 / added
+        _, self._current, _ = lapack.dposv(self._system, port_volt, lower=1)
         self._sensed, self.volt = self._current, self._current / added[:, None]
         self.sense_volt = self.volt
-        if any(self._rest.far):
-            _, self._sensed, _ = lapack.dposv(self._system, self._sense_volt, lower=1)
+        if any(rest.far):
+            _, self._sensed, _ = lapack.dposv(self._system, sense_volt, lower=1)
             self.sense_volt = self._sensed / added[:, None]
-        self.port_ohm = self._rest.port_ohm - (self._sense_volt * self._current).sum(axis=0)
+        self.port_ohm = rest.port_ohm - (sense_volt * self._current).sum(axis=0)
 
     def own_slope(self, cells: Cells) -> tuple[Float, Float]:
         """Of some cells, each at its own port, v v'; and what is diagonal in the touched M."""
-        rest, coupling = self._rest, self._rest.cell_volt[self.cells[:, None], cells]
+        rest, coupling = self._rest, self._rest.cell_volt[self._cells[:, None], cells]
         _, drawn, _ = lapack.dposv(self._system, coupling, lower=1)
-        port = rest.port_volt[cells, cells] - (coupling * self._current[:, cells]).sum(axis=0)
-        sensed = rest.sense_volt[cells, cells] - (coupling * self._sensed[:, cells]).sum(axis=0)
-        return port * sensed, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
+        port = rest.own_port_volt[cells] - (coupling * self._current[:, cells]).sum(axis=0)
+        slope = port * port
+        if any(rest.far):
+            sensed = (coupling * self._sensed[:, cells]).sum(axis=0)
+            slope = port * (rest.own_sense_volt[cells] - sensed)
+        return slope, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
 
     def cell_current(self, ports: Cells) -> tuple[Float, Float]:
         """Current through all cells per current through some ports, and sensed there, (m, RC)."""
-        rest, siemens = self._rest, self._rest.cell_siemens.copy()
-        siemens[self.cells] += self._added
-        between = rest.cell_volt[self.cells]
-        current: Float = (rest.port_volt.T[ports] - self._current.T[ports] @ between) * siemens
+        rest, between = self._rest, self._rest.cell_volt[self._cells]
+        siemens = rest.cell_siemens.copy()
+        siemens[self._cells] += self._added
+        current: Float = rest.port_volt.T[ports]
+        current -= self._current.T[ports] @ between
+        current *= siemens
         if not any(rest.far):
             return current, current
         return current, (rest.sense_volt.T[ports] - self._sensed.T[ports] @ between) * siemens
@@ -241,7 +243,6 @@ class FewTouches:
         self._measured, self._reading_std = ports.current.ravel(), ports.current_std.ravel()
         self._loose_std = np.sqrt(self._reading_std**2 + skin.slack)
         self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.ref_ohm
-        self._touched: TouchedNetwork | None = None
         self.steps = 0
 
     def _place(self, cells: Cells, log_siemens: Float) -> None:
@@ -250,13 +251,11 @@ class FewTouches:
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
         self._std = self._loose_std
+        self._touched: TouchedNetwork | None = None
         self._current = skin.current
         if cells.size:
             added = self._siemens - skin.net.cell_siemens[cells]
-            if self._touched is not None and self._touched.cells is cells:
-                self._touched.conduct(added)
-            else:
-                self._touched = TouchedNetwork(skin.net, cells, added)
+            self._touched = TouchedNetwork(skin.net, cells, added)
             self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
             self._std = self._loose_std.copy()
             self._std[cells] = self._reading_std[cells]
@@ -272,11 +271,8 @@ class FewTouches:
             moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
             moved = np.minimum(moved, _HIGHEST_LOG)
             stays = moved > self._skin.least_log[self.cells]
-            if all_stay := bool(stays.all()):
-                self._place(self.cells, moved)
-            else:
-                self._place(self.cells[stays], moved[stays])
-            if is_last and all_stay:
+            self._place(self.cells[stays], moved[stays])
+            if is_last and stays.all():
                 return
 
     def _slopes(self) -> Float:
@@ -312,12 +308,10 @@ class FewTouches:
         asked = asks.nonzero()[0]
         if not asked.size:
             return asked, np.zeros(0)
-        port_ohm = net.port_ohm
-        slope, cell_volt = net.own_slope[asked], net.own_cell_volt[asked]
-        if self.cells.size:
-            assert self._touched is not None
-            port_ohm = self._touched.port_ohm
+        slope, cell_volt, port_ohm = net.own_slope[asked], net.own_cell_volt[asked], net.port_ohm
+        if self._touched is not None:
             slope, cell_volt = self._touched.own_slope(asked)
+            port_ohm = self._touched.port_ohm
         # From rho = target for one cell more.
         target = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
         need = slope / np.maximum(port_ohm[asked] - target, 1e-9) - cell_volt
@@ -351,7 +345,8 @@ class FewTouches:
         for _ in range(2):
             slopes = self._slopes()
             residual = self._residual[ports] - offset
-            own = solve_lower(factor, slopes[:, ports].T)
+            of_touches = slopes[:, ports]
+            own = solve_lower(factor, of_touches.T)
             rest = solve_lower(factor, residual)
             free = slopes[:, light]
             normal = free @ free.T + own.T @ own
@@ -368,7 +363,6 @@ class FewTouches:
             return None
         current = self._current.copy()
         current[ports] += (residual - left + offset) * self._std[ports]
-        of_touches = slopes[:, ports]
         of_cells = solve(cholesky(normal), np.eye(cells.size))
         of_layers = of_cells @ own.T @ solve_lower(factor, wires[:, -2:])
         unlimited = cholesky(gram(UNLIMITED_STD * of_touches.T, onto=covariance))
