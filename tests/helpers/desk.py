@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lockstep import Rig
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, end_admittance, readings
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.link.codes import ratio_from_codes
 from studies.trials import skin_at_rest, touch
 
@@ -30,7 +30,7 @@ class DeskSkin:
     ratios: list[Float]
 
 
-def desk_skin(seed: int, frames: int, **settings: float) -> DeskSkin:
+def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) -> DeskSkin:
     """8x8 at 90 Hz, Uno: the preset `desk` of firmware/sim, with these settings instead of its own.
 
     Offset and gain of the converter are within 2 LSB, its bow within 1.5, drawn from the seed.
@@ -42,22 +42,27 @@ def desk_skin(seed: int, frames: int, **settings: float) -> DeskSkin:
     skins = [touch(rest, int(random.integers(1, TOUCHES + 1)), random) for _ in range(frames)]
     with Rig("uno") as rig:
         rig.sim.set(desk=1)
-        rig.sim.set(**converter | settings)
+        rig.sim.set(**converter | settings | {"far_open": float(mode == "near")})
         rig.run(0.3)
-        _show(rig, rest)
-        rig.start_scan()
+        _show(rig, rest, mode)
+        rig.start_scan(mode=mode)
         rig.sim.hold_log(False)
         rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
         ratios = []
         for skin in skins:
-            _show(rig, skin)
+            _show(rig, skin, mode)
             ratios.append(ratio_from_codes(_scans(rig, SCANS)))
     return DeskSkin(rest, rest_ratio, skins, ratios)
 
 
-def _show(rig: Rig, skin: Skin) -> None:
-    rig.sim.set_table(readings(skin))
-    rig.sim.request("C", bytes([skin.shape[0]]) + near_admittance(skin).tobytes())
+def _show(rig: Rig, skin: Skin, mode: str) -> None:
+    if mode == "far":
+        ends = end_admittance(skin)
+        rig.sim.set_table(all_readings(skin, ends.copy()))
+        rig.sim.request("C", bytes([0x80 | skin.shape[0]]) + ends.tobytes())
+    else:
+        rig.sim.request("C", bytes([skin.shape[0]]) + near_admittance(skin).tobytes())
+        rig.sim.set_table(readings(skin))
 
 
 def near_admittance(skin: Skin) -> Float:

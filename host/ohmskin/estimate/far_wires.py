@@ -63,9 +63,10 @@ class MeasuredWires(WireBelief):
             std[layer] *= prior**0.5
         self.log_layers, self._root = layers, np.diag(std)
 
-    def settle(self) -> None:
+    def settle(self, far: tuple[bool, bool]) -> None:
         """These are the wires at rest: later frames are expected about them, but for a bend."""
-        self._nominal, self._prior_covariance = self.log_layers, LAYER_STD**2 * np.eye(2)
+        variance = np.where(far, LAYER_STD**2, np.diagonal(self._prior_covariance))
+        self._nominal, self._prior_covariance = self.log_layers, np.diag(variance)
 
     def learn_segments(self, circuit: PortCircuit, ports: PortReadings) -> None:
         """Add what a frame that is news says of single segments."""

@@ -207,7 +207,7 @@ class JointEstimator(Estimator):
             fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, cell)
             cell = fit.cell
         if self._measured is not None:
-            self._measured.settle()
+            self._measured.settle(ports.far)
         self._rest_by_wires = float(fit.by_layers.max())
         return cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
 

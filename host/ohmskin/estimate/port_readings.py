@@ -130,6 +130,10 @@ class PortReader:
         self.far = bool(self._nodes[2]), bool(self._nodes[3])
         ends = READINGS_PER_CELL if names == NEAR else 2
         self._degrees, self._is_near = ends - 1, names == NEAR
+        self._slow_share = np.full(shape, SLOW_SHARE)
+        if not self._is_near:
+            # In one of two passes, the first port has settled while the board waited for the scan.
+            self._slow_share[0, 0] = 1.0
         self._ref_ohm = (known.ref_top_ohm, known.ref_bottom_ohm)
         self._ratio_std, self._current_std = known.ratio_std, known.current_std
         reference = reference_ohm(*self._ref_ohm)[:ends]
@@ -160,21 +164,22 @@ class PortReader:
         in_order: they are of the frame after the last such, and what has changed is noise. Others
         are of rest: where they lie between codes, they are a mean of many scans, with little noise.
         """
-        found, variance, alike = self._read_near(ratio, in_order=in_order)
+        found, variance, offset = self._read_near(ratio, in_order=in_order)
         if not any(self.far):
             return found
-        row, column, *far = (self._potential(ratio, node) for node in self._nodes)
-        far_row, far_column = (far[k] if self.far[k] else (row, column)[k] for k in (0, 1))
-        current, ref_ohm = found.current, sum(self._ref_ohm)
-        apart = far_row - far_column
-        current = np.maximum(current, self._current_std)
-        whole = np.maximum(apart, 0.0) + ref_ohm * current
-        by_current = self._current_std / self._ratio_std  # readings that round alike
-        own = apart**2 / self._ref_square + 2.0 * current**2
-        same = (apart * by_current + 2.0 * current) ** 2
-        std = np.sqrt(variance * own + alike * self._ratio_std**2 * same) / whole**2
-        drop, drop_std = np.stack([row - far_row, far_column - column]), (2.0 * variance) ** 0.5
-        drop_std = np.maximum(drop_std, 2.0 * self._ratio_std)
+        current = np.maximum(found.current, self._current_std)
+        # What near ends have in common, but for an offset, is of lines that charge.
+        near = 1.0 - self._ref_ohm[0] * current, self._ref_ohm[1] * current
+        ends = [
+            self._potential(ratio, node) - offset if node else near[axis]
+            for axis, node in enumerate(self._nodes[2:])
+        ]
+        apart = np.maximum(ends[0] - ends[1], 0.0)
+        whole = apart + sum(self._ref_ohm) * current
+        variance = np.maximum(variance, 2.0 * self._ratio_std**2)
+        std = np.sqrt(apart**2 * found.current_std**2 + variance * current**2) / whole**2
+        drop = np.stack([near[0] - ends[0], ends[1] - near[1]])
+        drop_std = np.sqrt(variance)
         fault = found.fault or self._astray(drop, drop_std)
         drops = drop / current, drop_std / current
         return PortReadings(ratio, current / whole, std, fault, self.far, *drops)
@@ -193,7 +198,7 @@ class PortReader:
         return ""
 
     def _read_near(self, ratio: Float, *, in_order: bool) -> tuple[PortReadings, Float, float]:
-        """What near ends show; variance of a reading (R, C) [1], and the share that rounds alike."""
+        """What near ends show; variance of the difference of two others, and their offset [1]."""
         if not self._is_near:
             ends = [self._potential(ratio, node) for node in self._nodes[:2]]
             ratio = np.stack(ends, axis=-1)
@@ -203,7 +208,8 @@ class PortReader:
         both = 0.5 * (residual[..., :2] + residual[..., :-3:-1]).reshape(-1, 2)
         order = [0, 1, 1, 0][: residual.shape[-1]]
         offset = np.partition(both.T, len(both) // 2)[order, len(both) // 2]
-        residual -= np.minimum(np.maximum(offset, -MOST_OFFSET), MOST_OFFSET)
+        offset = np.minimum(np.maximum(offset, -MOST_OFFSET), MOST_OFFSET)
+        residual -= offset
         square = np.einsum("ijk,ijk->ij", residual, residual)
         middle = square.size // 2
         typical = float(np.partition(square, middle, axis=None)[middle])
@@ -219,7 +225,7 @@ class PortReader:
             changing = self._noise(residual) if in_order else self._noise_at_rest(ratio)
             if (changing := max(changing, least)) < SLOW * usual:
                 noise, stays = changing, np.maximum(own - changing, 0.0)
-                variance = noise + SLOW_SHARE**2 * stays
+                variance = noise + self._slow_share**2 * stays
         if in_order:
             self._residual = residual
         alike = max(0.0, 1.0 - noise / (2.0 * rounding))
@@ -228,7 +234,9 @@ class PortReader:
         found = PortReadings(ratio, current, std)
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
-        return (replace(found, fault=fault) if fault else found), variance, alike
+        # Half of what stays is in both of two readings.
+        apart = 2.0 * noise + 0.5 * np.maximum(variance - noise, 0.0)
+        return (replace(found, fault=fault) if fault else found), apart, float(offset[0])
 
     def _noise(self, residual: Float) -> float:
         """Variance of a reading [1], from what has changed since the frame before."""
@@ -237,7 +245,9 @@ class PortReader:
         change = residual - self._residual
         square = np.einsum("ijk,ijk->ij", change, change)
         middle = square.size // 2
-        return float(np.partition(square, middle, axis=None)[middle]) / (2.0 * _MEDIAN_CHI2[self._degrees])
+        return float(np.partition(square, middle, axis=None)[middle]) / (
+            2.0 * _MEDIAN_CHI2[self._degrees]
+        )
 
     def _noise_at_rest(self, ratio: Float) -> float:
         """The same of readings at rest: little in a mean of many scans, else not known."""
@@ -251,9 +261,11 @@ class PortReader:
         agree with.
         """
         most = (typical / self._degrees) ** 0.5
-        if most > DISAGREE_ALL:
+        # Far multiplexers double what charges.
+        times = 1.0 if self._is_near else 2.0
+        if most > times * DISAGREE_ALL:
             return f"the readings of most cells disagree, by {100 * most:.0f} % of Vdd"
-        limit = max(DISAGREE_ONE, DISAGREE_OVER_NOISE * most)
+        limit = max(times * DISAGREE_ONE, DISAGREE_OVER_NOISE * most)
         if square.max() <= self._degrees * limit**2:
             return ""
         fault = ""
