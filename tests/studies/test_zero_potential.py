@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Zero-potential readout: against arithmetic by hand, the node Laplacian and ngspice."""
+
+import numpy as np
+import pytest
+
+from far_scenes import run_ngspice
+from network import skin_network
+from ohmskin.circuit.skin import Skin
+from studies.trials import skin_at_rest, touch, uniform_skin
+from studies.zero_potential import converted, currents, less_path, solved
+
+
+def touched(rows: int, columns: int, touches: int, seed: int, scale: float = 1.0) -> Skin:
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(rows, columns, random, wire_ohm=(100 * scale, 200 * scale))
+    return touch(rest, touches, random)
+
+
+def test_one_cell_by_hand() -> None:
+    # 100 + 10,000 + 200 ohm in series.
+    skin = uniform_skin((1, 1), 1e-4, (100.0, 200.0))
+    np.testing.assert_allclose(currents(skin), [[1 / 10_300]], rtol=1e-12)
+
+
+def test_a_row_of_two_cells_by_hand() -> None:
+    """Cells of 800 ohm, wires of 100 and 200: the first segment carries both cells' currents."""
+    skin = uniform_skin((1, 2), 1 / 800, (100.0, 200.0))
+    # Paths from the first crossing to ground: 800 + 200 = 1,000 and 100 + 800 + 200 = 1,100 ohm,
+    # together 1,100,000 / 2,100 ohm. So its potential is 1,100,000 / (1,100,000 + 210,000).
+    at_crossing = 110 / 131
+    expected = [[at_crossing / 1_000, at_crossing / 1_100]]
+    np.testing.assert_allclose(currents(skin), expected, rtol=1e-12)
+
+
+def test_a_column_of_two_cells_by_hand() -> None:
+    """Cells of 900 ohm, wires of 100 and 200. The row at ground takes current from the column."""
+    skin = uniform_skin((2, 1), 1 / 900, (100.0, 200.0))
+    # Row 0 is driven: 1,000 ohm to B[0]; from there 200 ohm to the amplifier, and 200 + 900 + 100 =
+    # 1,200 ohm to ground by row 1. 200 || 1,200 = 1,200 / 7 ohm.
+    first = (1200 / 7) / (1000 + 1200 / 7) / 200
+    # Row 1 is driven: 1,000 ohm to B[1], 200 ohm to B[0]; from there 200 ohm to the amplifier and
+    # 1,000 ohm to ground by row 0. 200 || 1,000 = 500 / 3 ohm.
+    second = (500 / 3) / (1200 + 500 / 3) / 200
+    np.testing.assert_allclose(currents(skin), [[first], [second]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0])
+def test_currents_agree_with_the_laplacian(scale: float) -> None:
+    skin = touched(4, 6, 8, seed=1, scale=scale)
+    rows, columns = skin.shape
+    found = currents(skin)
+    for driven in range(rows):
+        source_v = {line: float(line == driven) for line in range(rows + columns)}
+        bottom_v = skin_network(skin).node_v(source_v)[-rows * columns :].reshape(rows, columns)
+        expected = bottom_v[0] / skin.bottom_wire_ohm[0]
+        np.testing.assert_allclose(found[driven], expected, rtol=1e-9)
+
+
+@pytest.mark.ngspice
+def test_currents_agree_with_ngspice() -> None:
+    skin = touched(3, 4, 5, seed=2)
+    lines, sources = ["zero-potential readout"], []
+    for driven in range(3):
+        for i, j in np.ndindex(3, 4):
+            cell, n = f"{i}_{j}", f"n{driven}"
+            before_top = f"t{i}_{j - 1}{n}" if j else f"row{i}{n}"
+            before_bottom = f"b{i - 1}_{j}{n}" if i else f"column{j}{n}"
+            lines += [
+                f"rt{cell}{n} {before_top} t{cell}{n} {skin.top_wire_ohm[i, j]:.17g}",
+                f"rb{cell}{n} {before_bottom} b{cell}{n} {skin.bottom_wire_ohm[i, j]:.17g}",
+                f"rc{cell}{n} t{cell}{n} b{cell}{n} {1 / skin.cell_siemens[i, j]:.17g}",
+            ]
+        lines += [f"vr{i}n{driven} row{i}n{driven} 0 {int(i == driven)}" for i in range(3)]
+        lines += [f"vc{j}n{driven} column{j}n{driven} 0 0" for j in range(4)]
+        sources += [f"i(vc{j}n{driven})" for j in range(4)]
+    lines += [".control", "set numdgt=15", "set wr_singlescale", "op"]
+    lines += [f"wrdata readings.txt {' '.join(sources)}", ".endc", ".end", ""]
+    expected = run_ngspice("\n".join(lines)).reshape(3, 4)
+    np.testing.assert_allclose(currents(skin), expected, rtol=1e-6, atol=1e-14)
+
+
+def test_no_wires_no_ghosts() -> None:
+    skin = touched(5, 5, 10, seed=3, scale=1e-6)
+    np.testing.assert_allclose(currents(skin), skin.cell_siemens, rtol=1e-4)
+
+
+def test_a_converter_saturates() -> None:
+    found = converted(np.array([0.0, 0.4e-3, 2e-3]), 1e-3, 10)
+    np.testing.assert_allclose(found, np.array([0.5, 409.5, 1023.5]) / 1024 * 1e-3, rtol=1e-12)
+
+
+def test_the_path_is_all_that_one_cell_needs() -> None:
+    """Cell (1, 2) of 5 kohm: 3 segments of 100 ohm and 2 of 200. All others hardly conduct."""
+    cell = np.full((3, 4), 1e-12)
+    cell[1, 2] = 1 / 5e3
+    skin = Skin(cell, np.full((3, 4), 100.0), np.full((3, 4), 200.0))
+    read = currents(skin)
+    np.testing.assert_allclose(read[1, 2], 1 / 5_700, rtol=1e-6)
+    np.testing.assert_allclose(less_path(read, (100.0, 200.0))[1, 2], 1 / 5e3, rtol=1e-6)
+
+
+def test_known_wires_give_the_cells_back() -> None:
+    random = np.random.default_rng(4)
+    skin = touch(uniform_skin((6, 6)), 8, random)
+    found = solved(currents(skin), (100.0, 200.0))
+    np.testing.assert_allclose(found, skin.cell_siemens, rtol=1e-3)
