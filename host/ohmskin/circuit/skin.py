@@ -193,7 +193,8 @@ def impedance_of(
 def _path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
     """Wire from each cell to the near end of its row, and of its column [ohm], (RC, R+C)."""
     if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
-        return _unit_path(*shape) * np.repeat([top_wire_ohm, bottom_wire_ohm], shape)
+        each = np.repeat([top_wire_ohm, bottom_wire_ohm], shape)
+        return np.asarray(_unit_path(*shape) * each)
     rows, columns = shape
     to_cell = np.zeros((rows, columns, rows + columns))
     np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(top_wire_ohm, 1)
@@ -204,7 +205,8 @@ def _path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, 
 @lru_cache(maxsize=8)
 def _unit_path(rows: int, columns: int) -> Float:
     """The same of wires of 1 ohm a segment."""
-    return _path_of_lines(*np.ones((2, rows, columns)), (rows, columns))
+    ones = np.ones((rows, columns))
+    return _path_of_lines(ones, ones, ones.shape)
 
 
 @one_blas_thread

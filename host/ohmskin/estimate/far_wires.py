@@ -18,7 +18,7 @@ L, l   (n, n)   information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^
 The circuit gives c and q: they depend little on the wires. So p = m c z is linear. A frame shows
 m by itself, so that a skin may bend; with t the factor by which it exceeds what is believed,
 
-    t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w ,  1 / w = 1 / sum q^2 / s^2 + v.
+    t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w , 1/w = 1 / sum(q^2 / s^2) + v .
 
 What single segments have of their own takes many frames, and stays:
 
@@ -49,10 +49,11 @@ class MeasuredWires(WireBelief):
 
     def measure(self, circuit: PortCircuit, ports: PortReadings) -> None:
         """Take the layers' wires from one frame, whose circuit is about this one."""
-        assert ports.drop_ohm is not None and ports.drop_std is not None
         std = np.sqrt(np.diagonal(self._prior_covariance))
         layers, weight = self._nominal.copy(), ports.drop_std**-2.0
-        for layer in np.flatnonzero(ports.far):
+        for layer in (0, 1):
+            if not ports.far[layer]:
+                continue
             model = circuit.drop_ohm[layer].reshape(self.shape)
             known = (weight * model * model).sum(axis=1 - layer)
             times = (weight * model * ports.drop_ohm[layer]).sum(axis=1 - layer) / known
@@ -70,9 +71,10 @@ class MeasuredWires(WireBelief):
 
     def learn_segments(self, circuit: PortCircuit, ports: PortReadings) -> None:
         """Add what a frame that is news says of single segments."""
-        assert ports.drop_ohm is not None and ports.drop_std is not None
         variance = SEGMENT_STD**2
-        for layer in np.flatnonzero(ports.far):
+        for layer in (0, 1):
+            if not ports.far[layer]:
+                continue
             mean = np.exp(self.log_layers[layer])
             drop, weight = ports.drop_ohm[layer], ports.drop_std**-2.0
             if layer == 1:

@@ -80,7 +80,7 @@ class FullFit:
         """The circuit at the present state."""
         cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
         wires = np.exp(self._belief.away(self._off_layers))
-        self._circuit = PortCircuit(cell_siemens, *wires, self._far)
+        self._circuit = PortCircuit(cell_siemens, *wires, far=self._far)
         self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
         self._residual = (self._current - self._modelled) * self._weight
         self._centre, self._variance = self._prior.normal(self.cell)

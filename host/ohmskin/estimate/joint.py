@@ -156,7 +156,7 @@ class JointEstimator(Estimator):
     def _circuit(self, cell: Float) -> PortCircuit:
         """Of these log resistances of the cells (RC,), with wires as they are believed."""
         wires = np.exp(self._belief.log_layers)
-        return PortCircuit(np.exp(-cell).reshape(self._shape), *wires, self._reader.far)
+        return PortCircuit(np.exp(-cell).reshape(self._shape), *wires, far=self._reader.far)
 
     def _learn(self, fit: FullFit | Touched, ports: PortReadings) -> None:
         """Let the wires learn from a frame that is news: frames alike have errors alike."""

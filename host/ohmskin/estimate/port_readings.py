@@ -99,6 +99,9 @@ PAIR_SHARE: Final = 1.15  # of the median line's current: lines that were shorte
 WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of it is pressed
 
 
+NOTHING: Final[Float] = np.zeros((0, 0, 0))
+
+
 @dataclass(frozen=True, eq=False)
 class PortReadings:
     """One frame: ratio (R, C, 4); current, its standard deviation [S] (R, C); fault, or empty.
@@ -113,8 +116,8 @@ class PortReadings:
     current_std: Float
     fault: str = ""
     far: tuple[bool, bool] = (False, False)
-    drop_ohm: Float | None = None
-    drop_std: Float | None = None
+    drop_ohm: Float = NOTHING
+    drop_std: Float = NOTHING
 
 
 class PortReader:
@@ -142,8 +145,8 @@ class PortReader:
         self._ref_square = float(np.sum(reference**2))
         self._highest_current: Float = np.full(shape, np.inf)
         if known.nominal_wire_ohm.both is not None:
-            wires = (WIRE_SHARE * ohm for ohm in known.nominal_wire_ohm.both)
-            pressed = PortCircuit(np.full(shape, HIGHEST_TOUCH_SIEMENS), *wires)
+            top, bottom = (WIRE_SHARE * ohm for ohm in known.nominal_wire_ohm.both)
+            pressed = PortCircuit(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
             self._highest_current = 1.0 / (pressed.port_ohm.reshape(shape) + known.ref_ohm)
         self._rest: PortReadings | None = None
         self._rest_fault = ""

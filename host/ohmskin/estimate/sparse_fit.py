@@ -200,7 +200,7 @@ class SparseFit:
         prior, belief = self.prior, self.belief
         self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), self.far)
+        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), far=self.far)
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         siemens = net.cell_siemens[:, None]
         by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
