@@ -107,6 +107,7 @@ def numbers() -> dict[str, Any]:
     return {
         "reference-resistor": precision,
         "circuit": None,
+        "far-ends": None,
         "slot": slot(),
         "scan-rate": scan_rates(),
     }
@@ -276,9 +277,78 @@ def _draw_circuit(axes: Any) -> None:
     axes.axis("off")
 
 
+def _draw_far_ends(axes: Any) -> None:
+    """A 2x2 skin with multiplexers at both ends: cell (0, 0) selected, pressed alone."""
+    from matplotlib.patches import Rectangle
+
+    grey, current, sense = "#999999", "#b03a2e", "#00795a"
+    rows_y, columns_x, apart = (2.0, 0.0), (2.0, 5.0), 0.9
+
+    def wire(*points: tuple[float, float], colour: str = grey, width: float = 1.2) -> None:
+        axes.plot(*zip(*points, strict=True), color=colour, linewidth=width, zorder=1)
+
+    def resistor(x: float, y: float, name: str, angle: float = 0.0) -> None:
+        box = {"boxstyle": "square,pad=0.25", "facecolor": "white", "edgecolor": "black"}
+        axes.text(x, y, name, rotation=angle, ha="center", va="center", fontsize=7, bbox=box)
+
+    def multiplexer(x: float, y: float, width: float, height: float, name: str) -> None:
+        axes.add_patch(
+            Rectangle((x, y), width, height, facecolor="#eeeeee", edgecolor="black", zorder=2)
+        )
+        upright = 90 if height > width else 0
+        place = (x + width / 2, y + height / 2)
+        axes.text(*place, name, rotation=upright, ha="center", va="center", fontsize=8, zorder=3)
+
+    def node(x: float, y: float, name: str, colour: str, up: int) -> None:
+        axes.plot(x, y, "o", color=colour, markersize=5, zorder=4)
+        place = {"xytext": (0, 6 * up), "textcoords": "offset points", "ha": "center"}
+        beside = {"va": "bottom" if up > 0 else "top", "color": colour, "fontweight": "bold"}
+        axes.annotate(name, (x, y), fontsize=9, **place, **beside)
+
+    for i, y in enumerate(rows_y):
+        wire((-1.0, y), (7.4, y))
+        for j, x in enumerate(columns_x):
+            resistor(x - 1.4, y, f"Rt[{i},{j}]")
+    for j, x in enumerate(columns_x):
+        wire((x + apart, 3.6), (x + apart, -2.1))
+        for i, y in enumerate(rows_y):
+            resistor(x + apart, y + 0.45, f"Rb[{i},{j}]")
+            wire((x, y), (x + apart, y - apart))
+            resistor(x + apart / 2, y - apart / 2, f"g[{i},{j}]", -45)
+    far = {"colour": sense, "width": 2.2}
+    wire((columns_x[0], rows_y[0]), (7.4, rows_y[0]), **far)
+    wire((8.1, 1.0), (8.9, 1.0), **far)
+    wire((columns_x[0] + apart, rows_y[0] - apart), (columns_x[0] + apart, -2.1), **far)
+    wire((4.4, -2.8), (4.4, -3.4), **far)
+    path = [(-3.6, 4.7), (-3.6, 1.0), (-1.7, 1.0)]
+    wire(*path, colour=current, width=2.2)
+    cell = [(2.0, 2.0), (2.9, 1.1), (2.9, 3.6)]
+    wire((-1.0, 2.0), *cell, colour=current, width=2.2)
+    wire((4.4, 4.3), (4.4, 5.0), (8.9, 5.0), colour=current, width=2.2)
+    resistor(-3.6, 3.2, "R_top")
+    resistor(7.3, 5.0, "R_bottom")
+    multiplexer(-1.7, -0.6, 0.7, 3.2, "rows, near")
+    multiplexer(7.4, -0.6, 0.7, 3.2, "rows, far")
+    multiplexer(2.2, 3.6, 4.4, 0.7, "columns, near")
+    multiplexer(2.2, -2.8, 4.4, 0.7, "columns, far")
+    axes.text(-3.6, 4.8, "D2: Vdd", ha="center", va="bottom", fontsize=8)
+    axes.text(9.0, 5.0, "D3: ground", ha="left", va="center", fontsize=8)
+    node(-3.6, 1.0, "a, to A0", current, -1)
+    node(5.6, 5.0, "b, to A1", current, 1)
+    node(8.9, 1.0, "e, to A2", sense, -1)
+    node(4.4, -3.4, "f, to A3", sense, -1)
+    axes.plot([], [], color=current, linewidth=2.2, label="carries the current")
+    axes.plot([], [], color=sense, linewidth=2.2, label="carries none: shows the crossing")
+    axes.plot([], [], color=grey, linewidth=1.2, label="not selected: floats")
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.0), frameon=False, fontsize=8)
+    axes.set(xlim=(-4.6, 10.6), ylim=(-4.1, 5.6), aspect="equal")
+    axes.axis("off")
+
+
 PICTURES = {
     "reference-resistor": (_draw_precision, (7.0, 3.4)),
     "circuit": (_draw_circuit, (8.0, 4.3)),
+    "far-ends": (_draw_far_ends, (8.0, 5.1)),
     "slot": (_draw_slot, (8.0, 3.6)),
     "scan-rate": (_draw_rates, (6.4, 3.8)),
 }
