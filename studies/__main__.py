@@ -6,7 +6,7 @@ from __future__ import annotations
 import typer
 
 from ohmskin.cli.main import run
-from studies.commands import ablate, chart, stability
+from studies.commands import ablate, chart, far, stability
 from studies.force_commands import experiment
 
 app = typer.Typer(
@@ -18,6 +18,7 @@ app = typer.Typer(
 app.command()(chart)
 app.command()(stability)
 app.command()(ablate)
+app.command()(far)
 app.add_typer(experiment, name="experiment")
 
 if __name__ == "__main__":

@@ -18,7 +18,8 @@ from rich.progress import Progress
 from ohmskin.files import whole_file
 from studies import ablate as constants_tried
 from studies import chart as speed_accuracy
-from studies import chart_figure, chart_table, stability_figure
+from studies import chart_figure, chart_table, far_figure, stability_figure
+from studies import far as far_ends
 from studies import stability as verdicts
 from studies.ablate_scenes import Plan
 
@@ -182,5 +183,40 @@ def ablate(
         "frames": frames,
         "seconds": round(time.monotonic() - started_s, 1),
         "moved": constants_tried.moved(rows, tried),
+    }
+    print(json.dumps(answer))  # noqa: T201
+
+
+def far(
+    out: Annotated[
+        Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="fewer frames: rough")] = False,
+) -> None:
+    """Compare lines sensed at both ends with near ends, and with zero potential: a PNG and a CSV.
+
+    Takes minutes on one core. Simulated skins. Tables go to stderr; the last line printed is one
+    JSON object.
+    """
+    chart_figure.require_matplotlib()
+    folder = default_folder() if out is None else out
+    folder.mkdir(parents=True, exist_ok=True)
+    started_s = time.monotonic()
+    messages = Console(stderr=True)
+    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as progress:
+        task = progress.add_task("conditions", total=None)
+
+        def show_progress(done: int, conditions: int) -> None:
+            progress.update(task, completed=done, total=conditions)
+
+        rows = far_ends.measure(far_ends.QUICK if quick else far_ends.FULL, show_progress)
+    picture, table = (folder / f"far-ends.{kind}" for kind in ("png", "csv"))
+    save_whole({picture: far_figure.picture(rows), table: far_ends.csv_text(rows).encode()})
+    messages.print(far_ends.tables(rows), markup=False, highlight=False, soft_wrap=True)
+    answer = {
+        "picture": str(picture),
+        "table": str(table),
+        "quick": quick,
+        "seconds": round(time.monotonic() - started_s, 1),
     }
     print(json.dumps(answer))  # noqa: T201

@@ -14,7 +14,7 @@ import pytest
 
 from command_line import Run
 from places import ROOT
-from studies import ablate, chart, commands, force_commands, force_experiment, stability
+from studies import ablate, chart, commands, far, force_commands, force_experiment, stability
 from studies.conditions import SWEEPS
 from studies.force_experiment import Comparison
 from studies.force_limits import Detection
@@ -39,6 +39,8 @@ def study(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
     """A function that runs ``python -m studies ARGUMENTS``; what is quick is tiny."""
     monkeypatch.setattr(chart, "QUICK", CHART)
     monkeypatch.setattr(stability, "QUICK", STABILITY)
+    monkeypatch.setattr(far, "QUICK", far.Plan(skins=1, frames=2))
+    monkeypatch.setattr(far, "WIRE_OHM", (100.0, 1000.0))
     monkeypatch.setattr(ablate, "measure", partial(ablate.measure, scenes=["ngspice_random"]))
     monkeypatch.setattr(force_experiment, "QUICK", SURFACES)
     monkeypatch.setattr(force_commands, "QUICK_DETECTION", DETECTION)
@@ -80,6 +82,13 @@ def test_stability(answered: Any) -> None:
     assert answer["methods"]["ohm"]["frames"] == sum(len(each.values) for each in SWEEPS.values())
     assert table.startswith("sweep,x,method,frames,right,flagged,wrong_unflagged\n")
     assert "wrong and not flagged" in err
+
+
+def test_far(answered: Any) -> None:
+    _, table, err = answered("far --quick")
+    assert table.startswith("sweep,scene,wire_ohm,bend,bits,readout,")
+    assert {line["readout"] for line in csv.DictReader(table.splitlines())} == set(far.READOUTS)
+    assert "| eight touches, 1000/2000 ohm |" in err
 
 
 def test_ablate(answered: Any, study: Run) -> None:
