@@ -27,7 +27,7 @@ C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h'
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware check-firmware sim \
-        test-host fuzz chart stability ablate experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-desk bench-force bench-view \
+        test-host fuzz chart stability ablate far experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-far bench-desk bench-force bench-view \
         bench-boards clean distclean
 
 help: ## list the targets
@@ -110,6 +110,9 @@ stability: setup ## where methods fail, and whether they say so, simulated: docs
 ablate: setup ## what each number in joint and touch earns, ngspice and simulated: docs/ablate.csv
 	$(STUDY) ablate
 
+far: setup ## lines sensed at both ends, near ends, zero potential, simulated: docs/far-ends.png
+	$(STUDY) far
+
 experiments: setup ## the paper's experiments with force, simulated: docs/force-*.png
 	for each in flat curved timeseries minimum; do $(STUDY) experiment $$each || exit 1; done
 
@@ -127,6 +130,9 @@ bench-estimators: setup-host ## measure the estimators: time, error, stated unce
 
 bench-fingers: setup-host ## measure fingertips where nobody knows the wires, and the paper's method
 	$(ONE_THREAD) PYTHONPATH=. $(BIN)/python benchmarks/bench_fingers.py
+
+bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
+	$(ONE_THREAD) PYTHONPATH=. $(BIN)/python benchmarks/bench_far.py
 
 bench-desk: setup firmware sim ## measure estimates from a board as unkind as one on a desk, simulated
 	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_desk.py
