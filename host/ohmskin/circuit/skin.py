@@ -268,6 +268,7 @@ class PortCircuit:
         cell_siemens: Float,
         top_wire_ohm: Wire,
         bottom_wire_ohm: Wire,
+        *,
         far: tuple[bool, bool] = (False, False),
     ) -> None:
         self.shape, self.rows = cell_siemens.shape, len(cell_siemens)

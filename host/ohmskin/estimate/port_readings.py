@@ -51,7 +51,7 @@ A frame is at fault, and its answer not to be relied on, where
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -99,9 +99,6 @@ PAIR_SHARE: Final = 1.15  # of the median line's current: lines that were shorte
 WIRE_SHARE: Final = 0.5  # of the nominal wires: a skin has no less, if all of it is pressed
 
 
-NOTHING: Final[Float] = np.zeros((0, 0, 0))
-
-
 @dataclass(frozen=True, eq=False)
 class PortReadings:
     """One frame: ratio (R, C, 4); current, its standard deviation [S] (R, C); fault, or empty.
@@ -116,8 +113,8 @@ class PortReadings:
     current_std: Float
     fault: str = ""
     far: tuple[bool, bool] = (False, False)
-    drop_ohm: Float = NOTHING
-    drop_std: Float = NOTHING
+    drop_ohm: Float = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    drop_std: Float = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 class PortReader:

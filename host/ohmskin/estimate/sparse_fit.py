@@ -80,9 +80,10 @@ class RestNetwork(PortCircuit):
         cell_siemens: Float,
         top_wire_ohm: float,
         bottom_wire_ohm: float,
+        *,
         far: tuple[bool, bool] = (False, False),
     ) -> None:
-        super().__init__(cell_siemens, top_wire_ohm, bottom_wire_ohm, far)
+        super().__init__(cell_siemens, top_wire_ohm, bottom_wire_ohm, far=far)
         self.cell_siemens = siemens = cell_siemens.ravel()
         lines = self.cell_current.reshape(-1, siemens.size) / siemens
         self.port_volt = self.sense_volt = port_difference(lines, self.rows).T
