@@ -20,7 +20,8 @@ m by itself, so that a skin may bend; with t the factor by which it exceeds what
 
     t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w , 1/w = 1 / sum(q^2 / s^2) + v .
 
-What single segments have of their own takes many frames, and stays:
+It is weighed against what frames before have shown, which fades. What single segments have of
+their own takes many frames, and stays:
 
     z = 1 + v (1 + v L)^-1 (l - L 1) ,     of covariance v (1 + v L)^-1 .
 """
@@ -30,7 +31,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import LAYER_STD, SEGMENT_STD, WireBelief
+from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
 
 _LEAST = 0.1  # of what is believed, if readings make no sense
 
@@ -41,6 +42,7 @@ class MeasuredWires(WireBelief):
     def reset(self) -> None:
         """Back to the wires at rest, or the nominal ones."""
         super().reset()
+        self._before = self._nominal, np.diagonal(self._prior_covariance)
         self._shares = np.ones((2, *self.shape))
         self._known = [
             (np.zeros((lines, n, n)), np.zeros((lines, n)))
@@ -49,8 +51,8 @@ class MeasuredWires(WireBelief):
 
     def measure(self, circuit: PortCircuit, ports: PortReadings) -> None:
         """Take the layers' wires from one frame, whose circuit is about this one."""
-        std = np.sqrt(np.diagonal(self._prior_covariance))
-        layers, weight = self._nominal.copy(), ports.drop_std**-2.0
+        layers, variance = (of.copy() for of in self._before)
+        weight = ports.drop_std**-2.0
         for layer in (0, 1):
             if not ports.far[layer]:
                 continue
@@ -59,18 +61,23 @@ class MeasuredWires(WireBelief):
             times = (weight * model * ports.drop_ohm[layer]).sum(axis=1 - layer) / known
             precision = 1.0 / (1.0 / known + SEGMENT_STD**2)
             seen = np.log(max(precision @ times / precision.sum(), _LEAST))
-            prior = 1.0 / (1.0 + precision.sum() * std[layer] ** 2)
+            prior = 1.0 / (1.0 + precision.sum() * variance[layer])
             layers[layer] += (1 - prior) * (self.log_layers[layer] + seen - layers[layer])
-            std[layer] *= prior**0.5
-        self.log_layers, self._root = layers, np.diag(std)
+            variance[layer] *= prior
+        self.log_layers, self._root = layers, np.diag(np.sqrt(variance))
 
     def settle(self, far: tuple[bool, bool]) -> None:
         """These are the wires at rest: later frames are expected about them, but for a bend."""
         variance = np.where(far, LAYER_STD**2, np.diagonal(self._prior_covariance))
         self._nominal, self._prior_covariance = self.log_layers, np.diag(variance)
+        self._before = self._nominal, variance
 
-    def learn_segments(self, circuit: PortCircuit, ports: PortReadings) -> None:
-        """Add what a frame that is news says of single segments."""
+    def keep(self, circuit: PortCircuit, ports: PortReadings) -> None:
+        """Learn from a frame that is news: layers as in `measure`, and single segments."""
+        self.measure(circuit, ports)
+        known = np.diagonal(self._root) ** 2
+        most = np.diagonal(self._prior_covariance)
+        self._before = self.log_layers, known + FADE * (most - known)
         variance = SEGMENT_STD**2
         for layer in (0, 1):
             if not ports.far[layer]:

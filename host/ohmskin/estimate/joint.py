@@ -166,9 +166,7 @@ class JointEstimator(Estimator):
             if self._measured is None:
                 self._belief.learn(*fit.lesson)
             else:
-                circuit = self._circuit(fit.cell)
-                self._measured.measure(circuit, ports)
-                self._measured.learn_segments(circuit, ports)
+                self._measured.keep(self._circuit(fit.cell), ports)
 
     def _prior_of(self, ports: PortReadings) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.
