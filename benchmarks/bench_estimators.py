@@ -55,7 +55,7 @@ from bars import at_least, at_most, report  # beside this file
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, MOVING_BEGIN_S, TOP_WIRE_OHM, Scene
+from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -273,7 +273,7 @@ def finger_figures(method: str) -> dict[str, float]:
     )
     estimator = make_estimator(method, knowledge)
     relative, away = [], []
-    for time_s in MOVING_BEGIN_S + np.arange(360) / 90:
+    for time_s in BEGIN_S + np.arange(360) / 90:
         found = estimator.estimate(ratio_from_codes(quantise(scene.ratio(time_s))))
         truth = scene.skin(time_s).cell_siemens
         error = np.abs(found.cell_siemens - truth)

@@ -44,7 +44,7 @@ from ohmskin.arrays import Float
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.circuit.skin import readings
-from ohmskin.emulate.scenes import MOVING_BEGIN_S, Scene
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.base import NO_WIRES, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.reader import SkinReader
@@ -186,7 +186,7 @@ def of_forces(figures: Figures) -> None:
         reader = SkinReader(board, calibration)
         at_rest = Scene("rest", 8, 8, seed=seed).skin(0.0).cell_siemens
         for number in range(270):
-            time_s = number / 90 + MOVING_BEGIN_S
+            time_s = number / 90 + BEGIN_S
             codes = quantise(scene.ratio(time_s))
             found = reader.read(Scan(codes, number, 11_111 * number, number / 90, 0))
             rise = scene.skin(time_s).cell_siemens - at_rest

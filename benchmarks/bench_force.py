@@ -39,7 +39,7 @@ from bars import at_least, at_most, report  # beside this file
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.presses import Calibrator, Presses
-from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, MOVING_BEGIN_S, TOP_WIRE_OHM, Scene
+from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import ForceScan, SkinReader
@@ -95,7 +95,7 @@ def scan_times() -> dict[str, float]:
     assert pressed.rest_ratio is not None
     pressed_rest = ratio_from_codes(quantise(pressed.rest_ratio))
     scene = Scene("moving", 8, 8, seed=1)
-    finger = np.array([scene.ratio(MOVING_BEGIN_S + number / 90) for number in range(SCANS)])
+    finger = np.array([scene.ratio(BEGIN_S + number / 90) for number in range(SCANS)])
     presses = np.tile(pressed.ratio, (-(-SCANS // len(pressed.ratio)), 1, 1, 1))
     figures = {}
     for name, method, rest, ratios in (

@@ -175,7 +175,7 @@ TARGETS: dict[str, Target] = {
 
 def seeds() -> dict[str, Sequence[bytes]]:
     """Inputs that are right, of each target."""
-    board, _, _ = emulated("emulator://2x3?scene=multi")
+    board, _, _ = emulated("emulator://2x3?scene=multi&begin=0")
     decoder = framing.Decoder()
     sent = decoder.feed(board.advance(0.0))
     start = protocol.FRAMES["start"]
@@ -221,7 +221,7 @@ def seeds() -> dict[str, Sequence[bytes]]:
         "calibrations": [(_FOLDER / "input.json").read_bytes()],
         "tables": [presses.encode(), log.encode()],
         "urls": [
-            b"scene=ghost&seed=3&noise=1",
+            b"scene=ghost&begin=0&seed=3&noise=1",
             b"rate=100&wires=2&hum=50&dead=0,1&drop=0.5&reset=1",
         ],
     }

@@ -28,7 +28,7 @@ from places import ROOT
 from ros_stub import Float32MultiArray, PointCloud2, PointField, Ros
 
 EXAMPLES = ROOT / "examples"
-GHOST = "emulator://8x8?scene=ghost&seed=1"
+GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 
 
 def output_of(*command: str) -> str:

@@ -331,7 +331,7 @@ def test_python_of_a_page_runs(page: str) -> None:
         if len(printed) == 3:
             raise Enough
 
-    port, names = "emulator://8x8?scene=ghost&seed=1", {"print": show}
+    port, names = "emulator://8x8?scene=ghost&begin=0&seed=1", {"print": show}
     for code in CODE[page]:
         printed.clear()
         with pytest.raises(Enough):

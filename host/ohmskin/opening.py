@@ -42,8 +42,8 @@ CalibrationLike = Calibration | PathName
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
 # Options of ``emulator://`` that are no faults, and of ``simavr://`` that are no settings.
-_OF_BOARD = ("scene", "plate", "seed", "rate", "noise", "unit", "mode", "foreign")
-_NOT_OF_SIMULATOR = ("scene", "plate", "baud")
+_OF_BOARD = ("scene", "begin", "plate", "seed", "rate", "noise", "unit", "mode", "foreign")
+_NOT_OF_SIMULATOR = ("scene", "begin", "plate", "baud")
 
 
 @overload
@@ -197,8 +197,9 @@ def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None)
         raise ValueError(f"a size is as 8x8, from 1x1 to {most[0]}x{most[1]}, not '{size}'")
     seed = int(options.get("seed", 0))
     plate = load_plate(options["plate"]) if "plate" in options else None
+    begin_s = float(options["begin"]) if "begin" in options else None
     name = options.get("scene", "rest")
-    return Scene(name, rows, columns, seed=seed, faults=faults, plate=plate)
+    return Scene(name, rows, columns, seed=seed, faults=faults, plate=plate, begin_s=begin_s)
 
 
 # ------------------------------------------------------------------------------ several boards

@@ -19,7 +19,7 @@ from calibrations import of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python, well
 from ohmskin.cli.main import app
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
-from ohmskin.emulate.scenes import SCENES, Scene
+from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link import session
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -29,7 +29,7 @@ from places import DATA
 from ports import Attach, Serve
 from waiting import until
 
-EMULATED = "emulator://4x6?scene=ghost&seed=2"
+EMULATED = "emulator://4x6?scene=ghost&begin=0&seed=2"
 
 
 # -------------------------------------------------------------------------------------- boards
@@ -79,7 +79,7 @@ def test_the_environment_names_port_and_calibration(
 ) -> None:
     path = tmp_path / "skin.json"
     of_scene("ghost").save(path)
-    monkeypatch.setenv("OHMSKIN_PORT", "emulator://8x8?scene=ghost&seed=1")
+    monkeypatch.setenv("OHMSKIN_PORT", "emulator://8x8?scene=ghost&begin=0&seed=1")
     monkeypatch.setenv("OHMSKIN_CALIBRATION", str(path))
     assert "8 rows, 8 columns" in well(run("info")).out
     assert "4 rows, 6 columns" in well(run("info", EMULATED)).out
@@ -117,7 +117,7 @@ def test_stream_json_is_one_object_a_scan(run: Run) -> None:
     done = well(run("stream", EMULATED, "--json", "--scans", "7"))
     scans = [json.loads(line) for line in done.out.splitlines()]
     assert [scan["scan"] for scan in scans] == list(range(scans[0]["scan"], scans[0]["scan"] + 7))
-    expected = Scene("ghost", 4, 6, seed=2).ratio(0.0)
+    expected = Scene("ghost", 4, 6, seed=2).ratio(BEGIN_S)
     bare = {"scan", "time_us", "host_time_s", "missed", "reading_names", "ratio"}
     estimate = {"method", "cell_siemens", "cell_siemens_std", "converged", "message"}
     for scan in scans:
@@ -209,12 +209,12 @@ def test_a_stream_into_a_pipe_is_printed_as_it_goes(command: Command) -> None:
 
 
 def test_emulate_serves_other_processes(run: Run, command: Command) -> None:
-    process = command("emulate", "emulator://3x3?scene=single&noise=0")
+    process = command("emulate", "emulator://3x3?scene=single&begin=0&noise=0")
     path = process.stdout.readline().strip()
     with ohmskin.open(path) as skin:
         scan = skin.latest()
         np.testing.assert_array_equal(
-            scan.ratio, ratio_from_codes(quantise(Scene("single", 3, 3).ratio(0.0)))
+            scan.ratio, ratio_from_codes(quantise(Scene("single", 3, 3).ratio(BEGIN_S)))
         )
         assert skin.info.board == "emulated"
     assert json.loads(run("info", path, "--json").out)["rows"] == 3
@@ -258,7 +258,7 @@ def test_demo_shows_a_ghost_and_how_it_goes(run: Run, tmp_path: Path) -> None:
     picture = tmp_path / "demo.png"
     done = run("demo", "--seconds", "0.5", "--picture", str(picture))
     assert done.code == 0
-    assert done.out.startswith("scanning emulator://8x8?scene=ghost&seed=1 for 0.5 s\n")
+    assert done.out.startswith("scanning emulator://8x8?scene=ghost&seed=1&begin=0 for 0.5 s\n")
     for word in ("truth", "ohm", "joint", "0 missed", "0 damaged"):
         assert word in done.out
     verdicts = {

@@ -13,7 +13,7 @@ from calibrations import half_doubtful, of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.force.calibration import load_calibration
 
-GHOST = "emulator://8x8?scene=ghost&seed=1"
+GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 REST = "emulator://8x8?seed=1"
 
 

@@ -89,7 +89,7 @@ FOUND = {
     "8x8?hum=60&hum_lsb=1": ("hum", "whole skin"),
     # Where all cells are alike, only the drive's change leaves something to settle.
     "8x8?tau_us=10": ("settling", "cell (0, 0)"),
-    "8x8?scene=single": ("touched", "cell (4, 4)"),
+    "8x8?scene=single&begin=0": ("touched", "cell (4, 4)"),
     "3x1?short_rows=0,2": ("short_rows", "rows 0 and 2"),
     "2x6?short_rows=0,1": ("short_rows", "rows 0 and 1"),
     "16x16?short_columns=0,15": ("short_columns", "columns 0 and 15"),
@@ -106,8 +106,8 @@ FOUND = {
     "16x16?hum=60": ("hum", "whole skin"),
     "16x16?tau_us=8": ("settling", "cell (0, 0)"),
     "1x1?noise=2": ("noise", "whole skin"),
-    "1x1?scene=single": ("touched", "cell (0, 0)"),
-    "4x4?scene=ghost": ("touched", "cells (1, 1), (1, 2), (2, 1)"),
+    "1x1?scene=single&begin=0": ("touched", "cell (0, 0)"),
+    "4x4?scene=ghost&begin=0": ("touched", "cells (1, 1), (1, 2), (2, 1)"),
 }
 
 
@@ -132,7 +132,7 @@ def test_several_faults_come_in_the_order_in_which_they_matter() -> None:
 
 def test_faults_are_found_beside_a_touch() -> None:
     for fault in ("open_row=3", "short_rows=2,3", "saturated=1,2", "dead=1,2"):
-        url = f"emulator://8x8?scene=single&{fault}"
+        url = f"emulator://8x8?scene=single&begin=0&{fault}"
         assert told(url) == [FOUND[f"8x8?{fault}"], ("touched", "cell (4, 4)")]
 
 

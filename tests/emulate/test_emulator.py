@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import ohmskin
 from lockstep import LockstepSim, elf_of
 from ohmskin.emulate.board import EmulatedBoard
-from ohmskin.emulate.scenes import MOVING_BEGIN_S, Scene
+from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
 from ohmskin.errors import PortError
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
@@ -108,7 +108,7 @@ def test_scans_come_at_their_time_and_read_the_skin() -> None:
     scene = Scene("moving", 5, 3, seed=4)
 
     def ratio(time_s: float, mode: str = "near") -> np.ndarray:
-        return scene.ratio(MOVING_BEGIN_S + time_s, mode)
+        return scene.ratio(BEGIN_S + time_s, mode)
 
     board = EmulatedBoard(ratio, 5, 3, rate_hz=100)
     host = BoardDecoder()
@@ -125,13 +125,26 @@ def test_scans_come_at_their_time_and_read_the_skin() -> None:
         np.testing.assert_array_equal(scan.codes, quantise(ratio(scan.time_us * 1e-6)))
 
 
-@pytest.mark.parametrize("name", ["moving", "corners"])
-def test_a_scene_that_moves_begins_untouched(name: str) -> None:
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "rest"])
+def test_a_scene_begins_untouched(name: str) -> None:
     """Whoever tares first tares the skin at rest: 2 s, as the pages say, and the time to open."""
     scene = Scene(name, 8, 8, seed=1)
     for time_s in np.arange(0, 2.9, 0.1):
         np.testing.assert_array_equal(scene.ratio(time_s), scene.rest_ratio)
     assert any(scene.touched(time_s).any() for time_s in np.arange(3.0, 8.0, 0.1))
+
+
+@pytest.mark.parametrize("name", ["single", "ghost", "multi"])
+def test_touches_that_stay_begin_after_three_seconds_or_when_the_port_says(name: str) -> None:
+    counts = {"single": 1, "ghost": 3, "multi": 5}
+    for option, begin_s in (("", 3.0), ("&begin=0", 0.0), ("&begin=0.5", 0.5)):
+        _, scene, _ = emulated(f"emulator://8x8?scene={name}&seed=1{option}")
+        assert scene.touched(begin_s - 1e-6).sum() == 0
+        assert scene.touched(begin_s).sum() == counts[name]
+        for mode in ("near", "far"):
+            before, after = scene.ratio(begin_s - 1e-6, mode), scene.ratio(begin_s, mode)
+            assert np.abs(after - before).max() > 0.1
+            np.testing.assert_array_equal(scene.ratio(1e6, mode), after)
 
 
 def test_noise_is_that_of_the_seed_and_of_its_size() -> None:
@@ -213,6 +226,8 @@ def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
         ("emulator://8x8?rows=4", "no option 'rows'"),
         ("emulator://8x8?scene=nothing", "no scene"),
         ("emulator://1x1?scene=ghost", "2x2"),
+        ("emulator://8x8?scene=ghost&begin=-1", "begin must be 0 s or later"),
+        ("emulator://8x8?begin=nan", "begin must be 0 s or later"),
         ("emulator://0x4", "1x1 to 16x16"),
         ("emulator://17x4", "1x1 to 16x16"),
         ("emulator://", "a size is as 8x8, from 1x1 to"),

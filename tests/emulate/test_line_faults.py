@@ -15,7 +15,7 @@ from bench_board import Bench
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
 from ohmskin.emulate.board import EmulatorLink
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError
 from ohmskin.link import device, framing, protocol, session
 from ohmskin.link.codes import quantise
@@ -34,9 +34,9 @@ ADC = "clock_250khz"
     "faults", ["drop=0.1", "bitflip=3e-4", "garbage=0.3", "drop=0.05&bitflip=3e-4&garbage=0.1"]
 )
 def test_all_that_was_made_is_counted_and_all_that_came_is_the_truth(faults: str) -> None:
-    bench = Bench(f"emulator://2x2?scene=multi&seed=2&noise=0&rate=100&{faults}")
+    bench = Bench(f"emulator://2x2?scene=multi&begin=0&seed=2&noise=0&rate=100&{faults}")
     found = list(itertools.islice(bench, 5000))
-    expected = quantise(Scene("multi", 2, 2, seed=2).ratio(0.0))
+    expected = quantise(Scene("multi", 2, 2, seed=2).ratio(BEGIN_S))
     assert (np.array([scan.codes for scan in found]) == expected).all()
     steps = np.diff([-1, *(scan.number for scan in found)])
     assert steps.min() > 0
@@ -50,8 +50,8 @@ def test_all_that_was_made_is_counted_and_all_that_came_is_the_truth(faults: str
 
 def test_a_bad_line_at_a_port(pty_board: Serve) -> None:
     faults = "drop=0.05&bitflip=1e-4&garbage=0.3"
-    port = pty_board(f"emulator://8x8?scene=multi&seed=5&noise=0&rate=120&{faults}").path
-    expected = quantise(Scene("multi", 8, 8, seed=5).ratio(0.0))
+    port = pty_board(f"emulator://8x8?scene=multi&begin=0&seed=5&noise=0&rate=120&{faults}").path
+    expected = quantise(Scene("multi", 8, 8, seed=5).ratio(BEGIN_S))
     with ohmskin.open(port) as skin:
         found = list(itertools.islice(skin, 100))
         skin.stop()
@@ -228,10 +228,10 @@ def test_a_port_with_other_things_to_say(
 @pytest.mark.parametrize("board", ["uno", "megaatmega2560"])
 def test_a_board_on_a_desk(board: str) -> None:
     """Its boot loader runs first, as its port opens; then it reads with a desk's errors."""
-    with ohmskin.open(f"simavr://{board}?desk=1&line_pf=1&node_pf=10&scene=ghost") as skin:
+    with ohmskin.open(f"simavr://{board}?desk=1&line_pf=1&node_pf=10&scene=ghost&begin=0") as skin:
         codes = [scan.codes for scan in itertools.islice(skin, 100)]
         assert skin.stats.restarts == 0
-    y = Scene("ghost").ratio(0.0)
+    y = Scene("ghost").ratio(BEGIN_S)
     lsb = 1024 * y + 2 + 2 * y + 1.5 * 4 * y * (1 - y)  # offset, gain, bow
     np.testing.assert_allclose(np.mean(codes, axis=0), lsb, atol=0.4)
 

@@ -8,7 +8,7 @@ from network import Network, laplacian_readings, skin_network
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SKIN_FAULTS, SkinFaults, faults_of
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import PortError
 from ohmskin.link.protocol import MODES
 from ohmskin.opening import emulated
@@ -56,13 +56,13 @@ def test_far_ends_that_are_exchanged_or_open_change_no_near_reading() -> None:
     """Readings a e b f. Exchanged ends read each other's node; open ones what was there before."""
 
     def ratio(**faults: int | tuple[int, int]) -> Float:
-        return Scene("multi", R, C, seed=4, faults=SkinFaults(**faults)).ratio(0.0, "far")
+        return Scene("multi", R, C, seed=4, faults=SkinFaults(**faults)).ratio(BEGIN_S, "far")
 
     a, e, b, f = np.moveaxis(ratio(), -1, 0)
     exchanged = ratio(swap_far_rows=(1, 3), swap_far_columns=(0, 4))
     np.testing.assert_allclose(exchanged[..., ::2], np.stack([a, b], axis=-1), atol=1e-12)
     rows, columns = [0, 3, 2, 1], [4, 1, 2, 3, 0]
-    skin = Scene("multi", R, C, seed=4).skin(0.0)
+    skin = Scene("multi", R, C, seed=4).skin(BEGIN_S)
     far = all_ends(skin)
     i, j = np.indices((R, C))
     np.testing.assert_allclose(exchanged[..., 1], far[i, j, np.take(rows, i)], atol=1e-9)
@@ -95,8 +95,8 @@ def all_ends(skin: Skin) -> Float:
 
 def test_a_dead_cell_never_conducts_and_is_not_called_touched() -> None:
     scene = Scene("single", R, C, faults=SkinFaults(dead=(R // 2, C // 2), saturated=(0, 0)))
-    assert scene.skin(0.0).cell_siemens[R // 2, C // 2] == 0
-    assert not scene.touched(0.0).any()
+    assert scene.skin(BEGIN_S).cell_siemens[R // 2, C // 2] == 0
+    assert not scene.touched(BEGIN_S).any()
 
 
 def test_true_references_and_wires() -> None:
@@ -122,7 +122,7 @@ def test_hum_is_met_by_every_reading_at_its_own_time() -> None:
 
 def test_nodes_settle_slot_by_slot() -> None:
     """Both nodes, stepped one slot at a time, through scan after scan."""
-    ratio = Scene("single", 3, 2).ratio(0.0)
+    ratio = Scene("single", 3, 2).ratio(BEGIN_S)
     settle_s, tau_us = 30e-6, 20.0
     kept = np.exp(-settle_s / (1e-6 * tau_us))
     top = bottom = 0.0
@@ -154,7 +154,7 @@ def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
 
 def test_nodes_settle_slot_by_slot_in_mode_far() -> None:
     """Four nodes under one drive: each heads for its own voltage of the cell, and keeps it."""
-    ratio = Scene("single", 3, 2).ratio(0.0, "far")
+    ratio = Scene("single", 3, 2).ratio(BEGIN_S, "far")
     settle_s, tau_us = 30e-6, 20.0
     kept = np.exp(-settle_s / (1e-6 * tau_us))
     node = np.zeros(4)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ohmskin.circuit.skin import port_resistance_ohm
-from ohmskin.emulate.scenes import MOVING_BEGIN_S, Scene
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
@@ -143,7 +143,7 @@ def test_a_skin_that_bends_is_followed(method: str) -> None:
 def test_a_finger_over_several_cells_is_followed(method: str, seed: int, known: bool) -> None:
     """Two seconds of a fingertip with soft edges, once around half the skin. known: the wires."""
     scene = Scene("moving", 8, 8, seed=seed)
-    times_s = MOVING_BEGIN_S + np.arange(180) / 90
+    times_s = BEGIN_S + np.arange(180) / 90
     rest = scene.skin(0.0).top_wire_ohm, scene.skin(0.0).bottom_wire_ohm
     estimator = make_estimator(method, told(scene.rest_ratio, wires=known))
     errors, away, converged, shares = [], [], [], []

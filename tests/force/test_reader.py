@@ -13,7 +13,7 @@ import pytest
 import ohmskin
 from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, calibration, of_scene
-from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import LEVEL_METHODS
@@ -24,14 +24,13 @@ from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from recordings import write_recording
 
-GHOST = "emulator://8x8?scene=ghost&seed=1"
+GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 Record = Callable[[int, int], str]
 
 
 @pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
 def test_scans_carry_forces_and_contacts(method: str) -> None:
-    scene = Scene("ghost", 8, 8, seed=1)
-    skin = scene.skin(0.0)
+    skin = Scene("ghost", 8, 8, seed=1).skin(BEGIN_S)
     at_rest = Scene("rest", 8, 8, seed=1).skin(0.0)
     true_n = (skin.cell_siemens - at_rest.cell_siemens) / NEWTON_SIEMENS
     with ohmskin.open(GHOST, calibration=of_scene("ghost", method=method)) as board:
@@ -109,7 +108,7 @@ def test_tare_is_refused_while_something_touches_the_skin() -> None:
 
 def test_wires_that_a_session_has_taught_are_kept(tmp_path: Path) -> None:
     untold = replace(of_scene("multi", method="joint"), nominal_wire_ohm=NO_WIRES)
-    with ohmskin.open("emulator://8x8?scene=multi&seed=1", calibration=untold) as board:
+    with ohmskin.open("emulator://8x8?scene=multi&begin=0&seed=1", calibration=untold) as board:
         assert board.calibration.nominal_wire_ohm == NO_WIRES
         assert len(list(islice(board, 5))) == 5
         board.calibration.save(tmp_path / "skin.json")
@@ -152,7 +151,7 @@ def assert_same_forces(first: list[ForceScan], second: list[ForceScan]) -> None:
 
 @pytest.mark.parametrize("method", ["touch", "joint"])
 def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -> None:
-    port, path = "emulator://8x8?scene=multi&seed=1", tmp_path / "skin.mcap"
+    port, path = "emulator://8x8?scene=multi&begin=0&seed=1", tmp_path / "skin.mcap"
     of_skin = of_scene("moving", method=method)
     live: list[ForceScan] = []
     with (

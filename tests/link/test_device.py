@@ -17,17 +17,18 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, ProtocolError
 from ohmskin.link import device, framing, protocol
+from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
 from ports import Serve
 from stepped_link import SteppedLink
 from waiting import until
 
-SCENE = "scene=multi&seed=3"
-EXPECTED = Scene("multi", 8, 8, seed=3).ratio(0.0)
+SCENE = "scene=multi&begin=0&seed=3"
+EXPECTED = Scene("multi", 8, 8, seed=3).ratio(BEGIN_S)
 NOISE_LSB = 0.3  # of the emulator, by default; the simulator has none
 DESK_LSB = 40, 5  # of the preset `desk` of the simulator: largest error of a reading, of their mean
 
@@ -166,7 +167,7 @@ def test_configure_while_scanning(url: str) -> None:
 
 
 def test_scans_say_which_readings_they_hold(url: str) -> None:
-    far = Scene("multi", 8, 8, seed=3).ratio(0.0, "far")
+    far = Scene("multi", 8, 8, seed=3).ratio(BEGIN_S, "far")
     assert np.abs(far - EXPECTED).max() > 0.1
     with ohmskin.open(with_far_ends(url)) as skin:
         assert (skin.info.mode, skin.latest().reading_names) == ("near", tuple("abcd"))
@@ -344,6 +345,15 @@ def test_a_moving_scene_moves_in_the_simulator_too() -> None:
     with ohmskin.open("simavr://uno?scene=moving") as skin:
         codes = [scan.codes for scan in take(iter(skin), 360)]  # touched after 3 s
     assert (codes[0] != codes[-1]).any()
+
+
+@pytest.mark.simavr
+def test_a_scene_begins_untouched_in_the_simulator_too() -> None:
+    with ohmskin.open("simavr://uno?scene=single&begin=1") as skin:
+        codes = [scan.codes for scan in take(iter(skin), 180)]
+    scene = Scene("single", 8, 8)
+    for found, expected in ((codes[0], scene.rest_ratio), (codes[-1], scene.ratio(BEGIN_S))):
+        np.testing.assert_allclose(found, quantise(expected), rtol=0, atol=1)
 
 
 # --------------------------------------------------------------------------------- one backend

@@ -211,7 +211,7 @@ def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:
         paths.append(tmp_path / f"unit{unit}.json")
         siemens = 20e-6 / unit
         of_scene("ghost", unit_id=unit, siemens=siemens).save(paths[-1])
-    urls = units(2, 1, rest="&scene=ghost&seed=1")
+    urls = units(2, 1, rest="&scene=ghost&begin=0&seed=1")
     with ohmskin.open_all(urls, calibrations=paths) as skins:
         assert {unit: skin.calibration.unit_id for unit, skin in skins.items()} == {1: 1, 2: 2}
         largest = {}

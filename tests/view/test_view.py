@@ -27,7 +27,7 @@ from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python
 from ohmskin.arrays import Float
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.link.device import Device
 from ohmskin.record.recording import Tare, load_recording
@@ -39,7 +39,7 @@ from ports import Serve
 from recordings import write_recording
 from waiting import until
 
-GHOST = "emulator://8x8?scene=ghost&seed=1"
+GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 REST = "emulator://8x8?scene=rest&seed=1"
 HOST = "127.0.0.1:8765"
 ORIGIN = f"http://{HOST}"
@@ -150,7 +150,7 @@ def assert_refused(client: TestClient, path: str = "/boards/0", **headers: str) 
 
 
 def test_a_scan_is_shown_with_its_estimate_and_as_it_was_read() -> None:
-    skin = Scene("ghost", 8, 8, seed=1).skin(0.0)
+    skin = Scene("ghost", 8, 8, seed=1).skin(BEGIN_S)
     at_rest = Scene("rest", 8, 8, seed=1).skin(0.0)
     with served(GHOST, calibrations=[of_scene("ghost")]) as client, panel(client) as page:
         state = page.until_state(lambda state: state["status"] == "scanning")
@@ -175,7 +175,7 @@ def test_a_scan_is_shown_with_its_estimate_and_as_it_was_read() -> None:
 
 
 def test_without_a_calibration_there_are_conductances() -> None:
-    truth = Scene("ghost", 8, 8, seed=1).skin(0.0).cell_siemens
+    truth = Scene("ghost", 8, 8, seed=1).skin(BEGIN_S).cell_siemens
     with served(GHOST) as client, panel(client) as page:
         scan = page.scan()
     assert scan["planes"] == ["raw", "raw_touched", "siemens", "siemens_std", "touched"]
@@ -212,7 +212,10 @@ def test_a_page_that_is_slow_gets_the_newest_scan_and_no_other() -> None:
 
 
 def test_a_contact_keeps_its_number_over_scans_that_nobody_saw() -> None:
-    with served("emulator://8x8?scene=ghost&seed=1&rate=5") as client, panel(client) as page:
+    with (
+        served("emulator://8x8?scene=ghost&begin=0&seed=1&rate=5") as client,
+        panel(client) as page,
+    ):
         first = page.scan(lambda scan: scan["contacts"])
         later = page.scan(lambda scan: scan["scan"] >= first["scan"] + 3)
     assert [each[0] for each in later["contacts"]] == [each[0] for each in first["contacts"]]

@@ -22,7 +22,7 @@ from ports import Serve
 
 pytestmark = pytest.mark.browser
 
-GHOST = "emulator://8x8?scene=ghost&seed=1"
+GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 PHONE = {"width": 360, "height": 740}
 LIMIT_MS = 15_000
 
@@ -253,7 +253,7 @@ def test_no_value_below_its_deviation_is_written(page: Any) -> None:
 
 
 def test_what_is_off_the_scale_is_marked(page: Any) -> None:
-    panel = open_board(page, "emulator://8x8?scene=single&seed=1")
+    panel = open_board(page, "emulator://8x8?scene=single&begin=0&seed=1")
     has_text(panel, ".estimate .count", "1 cell touched")
     scale = panel.get_by_label("Scale")
     edge = """canvas => {
@@ -273,7 +273,7 @@ def test_what_is_off_the_scale_is_marked(page: Any) -> None:
 
 
 def test_many_columns_have_their_numbers_on_hover(page: Any) -> None:
-    panel = open_board(page, "emulator://13x13?scene=ghost&seed=1")
+    panel = open_board(page, "emulator://13x13?scene=ghost&begin=0&seed=1")
     cells, hover = panel.locator(".estimate .cells"), panel.locator(".estimate .hover")
     assert hover.is_hidden()
     box = cells.bounding_box()
@@ -355,7 +355,7 @@ def test_a_board_that_is_pulled_out_is_said_and_comes_back(
 def test_two_boards_on_a_phone(new_page: Callable[..., Any], scheme: str) -> None:
     page = new_page(viewport=PHONE, color_scheme=scheme, device_scale_factor=2, has_touch=True)
     one = open_board(page, GHOST)
-    other = open_board(page, "emulator://4x16?scene=multi&seed=3")
+    other = open_board(page, "emulator://4x16?scene=multi&begin=0&seed=3")
     assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
     for panel in (one, other):
         box = panel.locator(".estimate .cells").bounding_box()

@@ -11,7 +11,7 @@ URL: Final = "emulator://8x8?scene=ghost&seed=1"
 
 def demo(
     seconds: Annotated[float, Option(help="how long to scan")] = 3.0,
-    port: Annotated[str, Option(help="an emulator:// URL")] = URL,
+    port: Annotated[str, Option(help="an emulator:// URL")] = f"{URL}&begin=0",
     picture: Annotated[Path, Option(help="PNG to write")] = Path("ohmskin-demo.png"),
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""

@@ -2,7 +2,8 @@
 """Simulated skins, and what touches them, for demos and tests.
 
 A scene is a skin, whose wires and cells at rest are drawn from a seed, and touches that depend on
-time alone. So a scene always gives the same answer for the same time.
+time alone. So a scene always gives the same answer for the same time. It begins untouched, so that
+who tares first tares the skin at rest.
 """
 
 from dataclasses import replace
@@ -27,19 +28,20 @@ _TOUCHED_SIEMENS: Final = 1e-6
 
 SCENES: Final = {
     "rest": "nothing touches the skin",
-    "single": "one touch in the middle, from the start",
-    "ghost": "three corners of a rectangle, from the start: raw readings show a fourth",
-    "multi": "five touches, from the start, at places drawn from the seed",
+    "single": "after 3 s (begin=0: at once, as in every scene), one touch in the middle",
+    "ghost": "after 3 s, three corners of a rectangle: raw readings show a fourth",
+    "multi": "after 3 s, five touches, at places drawn from the seed",
     "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
     "moving": "after 3 s, one fingertip on a closed curve over the whole skin, once in 4 s",
 }
-# The scene "moving": when it begins, its period, the radius and the peak of the finger's pressure.
-MOVING_BEGIN_S: Final = 3.0
+# When touches begin, and those of the scene "corners", before which the doctor examines rest [s].
+BEGIN_S: Final = 3.0
+_CORNERS_BEGIN_S: Final = 5.5
+# The scene "moving": its period, the radius and the peak of the finger's pressure.
 _MOVING_PERIOD_S: Final = 4.0
 _FINGER_CELLS: Final = 0.7
 _FINGER_SIEMENS: Final = 2e-4
-# The scene "corners": its times, and resistances that tremble as fingers do, by a share, at rates.
-_CORNERS_BEGIN_S: Final = 5.5
+# The scene "corners": its step, and resistances that tremble as fingers do, by a share, at rates.
 _CORNERS_HELD_S: Final = 1.5
 _CORNER_OHM: Final = (5e3, 8e3, 6e3)
 _TREMBLE: Final = 0.05
@@ -52,9 +54,10 @@ class Scene:
     Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns). faults: what is
     wrong with the skin; an `EmulatedBoard` adds those that depend on the instant of a reading.
     plate: conductances (R, C) of resistors on wires of no resistance [S], in place of the untouched
-    skin. `moves`: whether touches change with time.
+    skin. begin_s: when touches begin [s]; None: as `SCENES` says. `moves`: whether touches change
+    after that.
 
-    :raises ValueError: no such scene, or a skin too small for it or for the faults.
+    :raises ValueError: no such scene or time, or a skin too small for the scene or the faults.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class Scene:
         seed: int = 0,
         faults: SkinFaults | None = None,
         plate: Float | None = None,
+        begin_s: float | None = None,
     ) -> None:
         if name not in SCENES:
             raise ValueError(f"no scene '{name}': there are {', '.join(SCENES)}")
@@ -75,6 +79,10 @@ class Scene:
         self.rows = rows
         self.columns = columns
         self.moves = name in ("corners", "moving")
+        known_s = {"rest": float("inf"), "corners": _CORNERS_BEGIN_S}.get(name, BEGIN_S)
+        self.begin_s = known_s if begin_s is None else begin_s
+        if not self.begin_s >= 0:
+            raise ValueError(f"begin must be 0 s or later, not {begin_s}")
         self.faults = faults or SkinFaults()
         self.faults.check(rows, columns)
         random = np.random.default_rng(seed)
@@ -89,7 +97,9 @@ class Scene:
                 raise ValueError(f"the plate has {size} cells, the skin {rows}x{columns}")
             self._rest = Skin(plate, np.zeros_like(plate), np.zeros_like(plate))
         self._touches = self._place(random)
-        self._still_ratio = lru_cache(lambda mode: self.faults.readings(self.skin(0.0), mode))
+        self._still_ratio = lru_cache(
+            lambda at_s, mode: self.faults.readings(self.skin(at_s), mode)
+        )
 
     @property
     def rest_ratio(self) -> Float:
@@ -98,7 +108,9 @@ class Scene:
 
     def skin(self, time_s: float) -> Skin:
         """Every resistance of the skin at a time."""
-        if self.name == "corners":
+        if time_s < self.begin_s:
+            touch = np.zeros_like(self._touches)
+        elif self.name == "corners":
             touch = self._corners(time_s)
         else:
             touch = self._finger(time_s) if self.moves else self._touches
@@ -112,8 +124,9 @@ class Scene:
 
     def ratio(self, time_s: float, mode: str = "near") -> Float:
         """Exact readings of a mode at a time, shape (rows, columns, 4)."""
-        still = not self.moves
-        return self._still_ratio(mode) if still else self.faults.readings(self.skin(time_s), mode)
+        if self.moves and time_s >= self.begin_s:
+            return self.faults.readings(self.skin(time_s), mode)
+        return self._still_ratio(self.begin_s if time_s >= self.begin_s else -1.0, mode)
 
     def _place(self, random: np.random.Generator) -> Float:
         touches = np.zeros((self.rows, self.columns))
@@ -132,10 +145,8 @@ class Scene:
 
     def _corners(self, time_s: float) -> Float:
         touches = np.zeros((self.rows, self.columns))
-        if time_s < _CORNERS_BEGIN_S:
-            return touches
         (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
-        across = int((time_s - _CORNERS_BEGIN_S) / _CORNERS_HELD_S) % 2
+        across = int((time_s - self.begin_s) / _CORNERS_HELD_S) % 2
         alone = (bottom, right) if across else (top, left)
         cells = (alone, (top, right), (bottom, left))
         for cell, ohm, hz in zip(cells, _CORNER_OHM, _TREMBLE_HZ, strict=True):
@@ -143,9 +154,7 @@ class Scene:
         return touches
 
     def _finger(self, time_s: float) -> Float:
-        if time_s < MOVING_BEGIN_S:
-            return np.zeros((self.rows, self.columns))
-        angle = 2 * np.pi * (time_s - MOVING_BEGIN_S) / _MOVING_PERIOD_S
+        angle = 2 * np.pi * (time_s - self.begin_s) / _MOVING_PERIOD_S
         row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
         away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
