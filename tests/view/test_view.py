@@ -10,8 +10,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import AsyncMock
 from urllib.error import HTTPError
@@ -339,6 +341,23 @@ def test_a_recording_holds_every_scan_tare_and_mark(tmp_path: Path) -> None:
     assert not again.cut_off  # although the page was ended meanwhile
     np.testing.assert_array_equal(again.tares[0].rest_ratio, whole.tares[0].rest_ratio)
     assert path != second
+
+
+def test_recordings_begun_in_one_second_have_names_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of one board, and of two that nobody has given a unit id."""
+    monkeypatch.setattr(boards, "datetime", SimpleNamespace(now=lambda: datetime(2025, 3, 1)))
+    with served(REST, GHOST, folder=tmp_path) as client:
+        for board in (0, 0, 0, 1):
+            with panel(client, board) as page:
+                page.scan()
+                assert page.command(do="record")["good"]
+                assert page.command(do="stop")["good"]
+    name = "ohmskin-20250301-000000-unit0"
+    assert {each.name for each in tmp_path.iterdir()} == {
+        *(f"{name}.mcap", f"{name}-2.mcap", f"{name}-3.mcap", f"{name}-4.mcap")
+    }
 
 
 def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:

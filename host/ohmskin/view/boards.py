@@ -262,7 +262,9 @@ class ViewedBoard(Closing):
         return recording is not None
 
     def _new_file(self, unit_id: int) -> Path:
-        return self._folder / f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}.mcap"
+        name = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
+        paths = (self._folder / f"{name}{f'-{n}' if n > 1 else ''}.mcap" for n in count(1))
+        return next(path for path in paths if not path.exists())
 
     def _work(self) -> None:
         while not self.closing.is_set():
