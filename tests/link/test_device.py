@@ -492,15 +492,17 @@ def lying(link: SteppedLink, **fields: Any) -> SteppedLink:
 IMPOSSIBLE_HELLO = (
     "rows 0, rows 17, rows 255, columns 0, columns 17, readings_per_cell 0, readings_per_cell 2, "
     "adc_bits 12, ref_top_ohm 0, ref_bottom_ohm 0, clock_hz 0, scan_cycles 0, scan_cycles 1, "
-    "scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, adc_prescaler 7"
+    "scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, adc_prescaler 7, mode 2"
 )
 
 
 @pytest.mark.parametrize("said", IMPOSSIBLE_HELLO.split(", "))
 def test_a_board_that_says_what_cannot_be(said: str) -> None:
     name, value = said.split()
-    text = {"adc_prescaler": "adc_prescaler unknown_7", "scan_cycles 1": "slot_cycles "}
-    with pytest.raises(ProtocolError, match=f"hello says {text.get(name) or text.get(said, said)}"):
+    text = {"scan_cycles 1": "slot_cycles "}
+    if name in ("adc_prescaler", "mode"):
+        text[said] = f"{name} unknown_{value}"
+    with pytest.raises(ProtocolError, match=f"hello says {text.get(said, said)}"):
         Session(lying(SteppedLink("emulator://4x4"), **{name: int(value)}))
 
 

@@ -14,9 +14,15 @@ SCAN = protocol.FRAMES["scan"]
 MINUTE_US = 60_000_000
 
 
-def scan_payload(number: int, time_us: int = 0, dropped: int = 0, rx_errors: int = 0) -> bytes:
+def scan_payload(
+    number: int,
+    time_us: int = 0,
+    dropped: int = 0,
+    rx_errors: int = 0,
+    mode: protocol.Value = "far",
+) -> bytes:
     counters = {"scan": number, "time_us": time_us, "dropped": dropped, "rx_errors": rx_errors}
-    header = SCAN.pack(**counters, rows=1, columns=2, mode="far")
+    header = SCAN.pack(**counters, rows=1, columns=2, mode=mode)
     return header + protocol.pack_codes(np.arange(8, dtype=np.uint16).reshape(1, 2, 4))
 
 
@@ -144,6 +150,7 @@ STRANGE = {
     **{f"type {kind:#x}": (kind, b"abc") for kind in (0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89)},
     **{f"short {name}": (protocol.FRAMES[name].id, x[:-1]) for name, x in PAYLOADS.items()},
     **{f"long {name}": (protocol.FRAMES[name].id, x + b"\0") for name, x in PAYLOADS.items()},
+    "a scan of readings that nobody knows": (SCAN.id, scan_payload(5, mode=2)),
     "an empty hello": (protocol.FRAMES["hello"].id, b""),
     "a hello without its layout": (protocol.FRAMES["hello"].id, b"\1"),
 }

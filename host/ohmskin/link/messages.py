@@ -77,6 +77,7 @@ class Hello:
             "scan_cycles": 0 < self.scan_cycles <= _LONGEST_SCAN_S * self.clock_hz,
             "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,
             "adc_prescaler": self.adc_prescaler in protocol.ENUMS["adc_prescaler"].values,
+            "mode": self.mode in protocol.MODES,
         }
         odd = [f"{name} {getattr(self, name)}" for name, can in can_be.items() if not can]
         return odd[0] if odd else ""
@@ -224,6 +225,8 @@ class BoardDecoder:
         return hello
 
     def _scan(self, values: dict[str, Any], packed: bytes, host_time_s: float) -> Scan:
+        if values["mode"] not in protocol.MODES:
+            raise ValueError(f"no mode {values['mode']}")
         codes = protocol.unpack_codes(packed, values["rows"], values["columns"])
         number, dropped = values["scan"], values["dropped"]
         step = 1 if self._number is None else (number - self._number) % _COUNTER_SPAN
