@@ -26,6 +26,7 @@ from scipy.linalg import expm
 from lockstep import CPU_HZ, LockstepSim
 from ohmskin.emulate import simavr
 from ohmskin.emulate.simavr import PROGRAM, SimulationError
+from ohmskin.link import session
 from waiting import until
 
 pytestmark = pytest.mark.skipif(
@@ -636,6 +637,23 @@ def test_boot_loader_takes_every_byte_for_a_programmer(
         if b"!O" in sent:
             break
     assert (now if b"!O" in sent else math.inf) == pytest.approx(starts, abs=2)
+
+
+def test_a_mega_s_boot_loader_is_done_before_the_host_asks_again(simulate: Simulate) -> None:
+    """It hears the host's first questions, at both speeds, if the board was reset late."""
+    program = "int main(void) { transmitter(); send('!'); send('O'); for (;;) {} }"
+    sim = simulate(program, "megaatmega2560", bootloader="board")
+    question = bytes.fromhex("00058101872500")  # get_hello
+    (_, _, first_s), (_, _, second_s), (_, _, third_s), *_ = session._SELDOM[1:]
+    sim.reset()
+    sim.run(0.7)  # shortly before it starts the program
+    for baud, listen_s in ((500_000, first_s), (1_000_000, second_s)):
+        sim.set_baud(baud)
+        sim.write(question)
+        assert b"!O" not in sim.run(listen_s)
+    sim.set_baud(500_000)
+    assert b"!O" not in sim.run(4.0)  # it did hear them
+    assert b"!O" in sim.run(third_s - 4.0)
 
 
 EEPROM = """

@@ -30,7 +30,9 @@ from ohmskin.link.serial_port import Link
 
 # Until hello: speed of the line, whether to ask for it, time to listen [s]. A board that opening
 # does not reset is asked often. One that it resets says hello by itself: its boot loader takes a
-# byte for the start of an upload, and the Mega's then waits for 5 s after the last one.
+# byte for the start of an upload, and the Mega's then waits for 5 s after the last one. So the
+# questions at both speeds are close to each other, and the silence after them is longer than 5 s:
+# a board that was reset late and heard both says hello 5.0 s after the second.
 _OFTEN = 3 * (4 * [("baud_default", True, 0.3)] + [("baud_fast", True, 0.3)])
 _SELDOM: Final = (
     ("baud_default", False, 2.0),
