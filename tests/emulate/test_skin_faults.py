@@ -23,6 +23,8 @@ FAULTS = {
     "open column": (SkinFaults(open_column=4), {"bottom": ((0, 4), np.inf)}, []),
     "dead": (SkinFaults(dead=(1, 2)), {"cell": ((1, 2), 0.0)}, []),
     "saturated": (SkinFaults(saturated=(3, 0)), {"cell": ((3, 0), 10.0)}, []),
+    "broken row": (SkinFaults(broken_row=(2, 3)), {"top": ((2, 3), np.inf)}, []),
+    "broken column": (SkinFaults(broken_column=(1, 4)), {"bottom": ((1, 4), np.inf)}, []),
     "rows": (SkinFaults(short_rows=(0, 3)), {}, [(0, 3)]),
     "columns": (SkinFaults(short_columns=(2, 1)), {}, [(R + 2, R + 1)]),
     "far rows": (SkinFaults(short_far_rows=(0, 3)), {}, [(R + C, R + C + 3)]),
@@ -105,6 +107,12 @@ def test_true_references_and_wires() -> None:
     assert (skin.ref_top_ohm, skin.ref_bottom_ohm) == (33e3, 29e3)
     np.testing.assert_allclose(skin.top_wire_ohm, 2.5 * sound.top_wire_ohm)
     np.testing.assert_allclose(skin.bottom_wire_ohm, 2.5 * sound.bottom_wire_ohm)
+    crimps = SkinFaults(crimp_row=1, crimp_column=2, crimp_ohm=700.0)
+    crimped = Scene("rest", R, C, faults=crimps).skin(0.0)
+    more = np.zeros((2, R, C))
+    more[0, 1, 0] = more[1, 0, 2] = 700
+    np.testing.assert_allclose(crimped.top_wire_ohm, sound.top_wire_ohm + more[0])
+    np.testing.assert_allclose(crimped.bottom_wire_ohm, sound.bottom_wire_ohm + more[1])
     ratio = Scene("rest", R, C, faults=SkinFaults(ref_top=33e3)).ratio(0.0)
     np.testing.assert_allclose((1 - ratio[..., 0]) / ratio[..., 1], 1.1)
     np.testing.assert_allclose(ratio[..., 3] / (1 - ratio[..., 2]), 1.1)
@@ -143,7 +151,7 @@ def test_nodes_settle_slot_by_slot() -> None:
 
 def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
     assert list(SKIN_FAULTS) == list(SkinFaults.__dataclass_fields__)
-    values = {name: "1,2" for name in SKIN_FAULTS if name.startswith(("short", "swap", "dead"))}
+    values = {name: "1,2" for name in SKIN_FAULTS if name.startswith(("short", "swap", "dead", "broken"))}
     values["saturated"] = "0,0"
     for name in SKIN_FAULTS:
         board, _, _ = emulated(f"emulator://{R}x{C}?{name}={values.get(name, '2')}&noise=0")
@@ -175,6 +183,9 @@ def test_nodes_settle_slot_by_slot_in_mode_far() -> None:
         ("open_column=-1", "no column -1"),
         ("short_rows=1,4", "no row 4"),
         ("open_far_row=4", "no row 4"),
+        ("broken_row=4,0", "no row 4"),
+        ("broken_row=0,5", "no column 5"),
+        ("crimp_column=5", "no column 5"),
         ("swap_far_columns=1,5", "no column 5"),
         ("mode=middle", "no such mode"),
         ("short_rows=1,1", "two different"),

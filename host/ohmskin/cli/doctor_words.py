@@ -47,8 +47,11 @@ def _words(finding: Finding) -> dict[str, Any]:
             beyond = lines == tuple(range(lines[0], values["line_count"]))
             cases = {"one_cell": values["cells_per_line"] == 1, "last_lines": beyond}
             return {"table": "open", "line": line, "first": lines[0], **cases}
-        case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS:
-            return {"table": "short", "line": line, "joined": " and ".join(map(str, lines))}
+        case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS | Kind.SHORT_FAR:
+            table = "short_far" if finding.kind is Kind.SHORT_FAR else "short"
+            return {"table": table, "line": line, "joined": " and ".join(map(str, lines))}
+        case Kind.BROKEN_YARN | Kind.BAD_CRIMP | Kind.BAD_SEGMENT:
+            return {"line": line, "across": "column" if line == "row" else "row"}
         case Kind.REFERENCE_RATIO:
             return {"nominal_ratio": values["ref_top_ohm"] / values["ref_bottom_ohm"]}
         case Kind.OPEN_JOINT | Kind.BRIDGE | Kind.WRONG_RESISTOR:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
+from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, Place
 from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
@@ -65,11 +66,14 @@ def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> 
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
     rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
-    touched, wrong = examine_circuit(rest, diagnosis)
+    far = scans.board.mode == "far"
+    touched, wrong = examine_circuit(near_ends(rest) if far else rest, diagnosis)
+    if far and not moves and not wrong.all():
+        examine_far(rest, evidence.wire_ohm, diagnosis)
     touched = touched if touched.any() else moved
     if touched.any():
         diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
-    if touched.any() or wrong.any():
+    if far or touched.any() or wrong.any():
         return
     diagnosis.nominal_ohm = wire_ohm
     if presses is not None:

@@ -44,6 +44,10 @@ class Kind(Enum):
     OPEN_COLUMN = "open_column", _FAULT, "line_count cells_per_line"
     SHORT_ROWS = "short_rows", _FAULT, ""
     SHORT_COLUMNS = "short_columns", _FAULT, ""
+    SHORT_FAR = "short_far", _FAULT, ""
+    SWAPPED_FAR = "swapped_far", _FAULT, ""
+    OPEN_FAR = "open_far", _FAULT, ""
+    BROKEN_YARN = "broken_yarn", _FAULT, "between"
     DEAD_CELL = "dead_cell", _FAULT, "percent_of_usual"
     SATURATED_CELL = "saturated_cell", _FAULT, "cell_ohm rest_megohm"
     SWAPPED_LINES = "swapped_lines", _FAULT, ""
@@ -61,6 +65,9 @@ class Kind(Enum):
     HUM = "hum", _WARNING, "mains_hz amplitude_lsb most_lsb rate_hz seen_hz"
     NOISE = "noise", _WARNING, "noise_lsb sound_lsb"
     ADC_NOISE = "adc_noise", _WARNING, "clocks most_lsb"
+    BAD_CRIMP = "bad_crimp", _WARNING, "more_ohm std_ohm between"
+    BAD_SEGMENT = "bad_segment", _WARNING, "more_ohm std_ohm between"
+    LINE_WIRE = "line_wire", _WARNING, "ohm std_ohm usual_ohm"
     WIRES = "wires", _WARNING, "share nominal_ohm"
     TOUCHED = "touched", _NOTE, "moves"
     VERSION = "version", _NOTE, "firmware host"
@@ -122,19 +129,32 @@ class WireShare:
     differs: bool
 
 
+@dataclass(frozen=True)
+class LineWire:
+    """A row or a column from its near end to its far end, each of its segments, and deviations."""
+
+    place: Place
+    ohm: float
+    std_ohm: float
+    segment_ohm: list[float]
+    segment_std_ohm: list[float]
+
+
 @dataclass
 class Diagnosis:
     """All that was found. Findings stand in the order of their kinds.
 
     measured: figures by name, None for one that could not be had. nominal_ohm: wires of a segment,
     top and bottom; None if touches or faults hide the wires. pressed: the share of all wires that
-    presses show, then of each row and column; None if nobody was asked to press.
+    presses show, then of each row and column; None if nobody was asked to press. lines: their
+    wires, where far ends show them.
     """
 
     findings: list[Finding] = field(default_factory=list)
     measured: dict[str, Any] = field(default_factory=dict)
     nominal_ohm: tuple[float, float] | None = None
     pressed: list[WireShare] | None = None
+    lines: list[LineWire] = field(default_factory=list)
 
     def add(self, kind: Kind, place: Place = WHOLE_SKIN, /, **values: Any) -> None:
         """Add a finding with these values."""

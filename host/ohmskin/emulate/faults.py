@@ -144,6 +144,11 @@ class SkinFaults:
     short_far_columns: Annotated[Lines, "the same of columns"] = None
     swap_far_rows: Annotated[Lines, "two rows, as 2,3, whose far ends are exchanged"] = None
     swap_far_columns: Annotated[Lines, "the same of columns"] = None
+    broken_row: Annotated[Cell, "row and column of the cell before which the row is broken"] = None
+    broken_column: Annotated[Cell, "row and column of the cell before which the column is"] = None
+    crimp_row: Annotated[Line, "number of a row whose near contact adds crimp_ohm"] = None
+    crimp_column: Annotated[Line, "the same of a column"] = None
+    crimp_ohm: Annotated[Positive, "ohms that a bad contact adds, 500 unless told"] = 500.0
     dead: Annotated[Cell, "row and column, as 1,2, of a cell that never conducts"] = None
     saturated: Annotated[Cell, "row and column, as 1,2, of a cell whose layers are shorted"] = None
     ref_top: Annotated[Positive, "true ohms of the rows' reference resistor"] = DEFAULT_REF_OHM
@@ -156,9 +161,10 @@ class SkinFaults:
     def check(self, rows: int, columns: int) -> None:
         """Raise ValueError for a line or a cell that a rows x columns skin does not have."""
         for axis, (what, count) in enumerate((("row", rows), ("column", columns))):
-            named = [cell[axis] for cell in (self.dead, self.saturated) if cell is not None]
+            cells = (self.dead, self.saturated, self.broken_row, self.broken_column)
+            named = [cell[axis] for cell in cells if cell is not None]
             for name, value in vars(self).items():
-                if what in name and value is not None:
+                if what in name and "broken" not in name and value is not None:
                     named += value if isinstance(value, tuple) else (value,)
             for line in named:
                 if not 0 <= line < count:
@@ -172,10 +178,15 @@ class SkinFaults:
         if self.saturated is not None:
             cell[self.saturated] = SHORT_SIEMENS
         top_ohm, bottom_ohm = self.wires * skin.top_wire_ohm, self.wires * skin.bottom_wire_ohm
-        if self.open_row is not None:
-            top_ohm[self.open_row, 0] = OPEN_OHM
-        if self.open_column is not None:
-            bottom_ohm[0, self.open_column] = OPEN_OHM
+        if self.broken_row is not None:
+            top_ohm[self.broken_row] = OPEN_OHM
+        if self.broken_column is not None:
+            bottom_ohm[self.broken_column] = OPEN_OHM
+        for what, near_ohm in (("row", top_ohm[:, 0]), ("column", bottom_ohm[0])):
+            if (line := getattr(self, f"crimp_{what}")) is not None:
+                near_ohm[line] += self.crimp_ohm
+            if (line := getattr(self, f"open_{what}")) is not None:
+                near_ohm[line] = OPEN_OHM
         return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom)
 
     def readings(self, damaged: Skin, mode: str = "near") -> Float:
