@@ -17,7 +17,7 @@ from ohmskin.cli import doctor_words as words
 from ohmskin.cli.board import Port, Wires, wires_of
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
-from ohmskin.doctor.signal import LEAST_SCANS, REST_S, SETTLED_S, comparison
+from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.estimate.base import WireOhm
 from ohmskin.force.calibration import load_calibration
@@ -57,8 +57,8 @@ def doctor(
     """Say what is wrong with the board at PORT, and what to do. Touch nothing.
 
     Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
-    it says when and where to press. Any rectangle will do: its lines are measured. Exit code 0:
-    sound; 1: something is wrong.
+    it says when and where to press. Any rectangle will do: its lines are measured. In mode far, the
+    wires of all lines are measured without. Exit code 0: sound; 1: something is wrong.
     """
     calibration = calibration or into
     told = None if calibration is None else load_calibration(calibration)
@@ -75,6 +75,8 @@ def doctor(
             with device:
                 if told is not None:
                     told.check(device.info)
+                if press and device.info.mode == "far":
+                    raise ValueError("mode far shows the wires untouched: leave out --press")
                 evidence = gather(device, tell, wire_ohm, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
@@ -161,7 +163,8 @@ def gather(
         with suppress(errors.CommandRefused), put_back(device):
             if other is not None:
                 tell("scanning with a longer settle time")
-                evidence.settled = _look(device, SETTLED_S, **other)
+                far = evidence.board.mode == "far"
+                evidence.settled = _look(device, FAR_S if far else SETTLED_S, **other)
             for clock in ENUMS["adc_prescaler"].values if clocks else ():
                 tell(f"scanning by {clock}")
                 # As fast as it can: a slow clock does not reach the rate of the board.
@@ -249,6 +252,7 @@ def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
             for each in diagnosis.findings
         ],
         "measured": words.measured_in_words(diagnosis),
+        "lines": diagnosis.lines,
     }
 
 
@@ -267,3 +271,7 @@ def print_page(page: dict[str, Any]) -> None:
     for name, value in page["measured"].items():
         shown = ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
         show(f"{name:<18}  {shown}")
+    if page["lines"]:
+        show("\nwires [ohm]         end to end    by segment, from the near end; ?: not known")
+    for line in page["lines"]:
+        show(words.line_wire_in_words(line))

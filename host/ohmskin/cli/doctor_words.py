@@ -5,12 +5,21 @@ import tomllib
 from pathlib import Path
 from typing import Any, Final
 
-from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, WireShare
+from ohmskin.doctor.findings import (
+    WHOLE_SKIN,
+    Diagnosis,
+    Finding,
+    Kind,
+    LineWire,
+    Place,
+    WireShare,
+)
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.protocol import ENUMS
 
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
 MOST_CELLS: Final = 6  # [cells] More are not named one by one.
+SEGMENT_KNOWN: Final = 0.15  # [1] A segment with a larger deviation is not told from the others.
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
@@ -133,6 +142,13 @@ def _ohm(share: WireShare, nominal_ohm: tuple[float, float]) -> str:
         return _WIDE
     top, bottom = (f"{share.share * ohm:.0f}" for ohm in nominal_ohm)
     return f"{_times(share)}: top {top}, bottom {bottom} ohm a segment, if both changed alike"
+
+
+def line_wire_in_words(line: LineWire) -> str:
+    """A line of the table of wires."""
+    pairs = zip(line.segment_ohm, line.segment_std_ohm, strict=True)
+    each = " ".join(f"{ohm:6.0f}" if std < SEGMENT_KNOWN * ohm else "     ?" for ohm, std in pairs)
+    return f"{named(line.place):<18}{line.ohm:6.0f} +- {line.std_ohm:<4.0f}{each}"
 
 
 def guidance(presses: CornerScans) -> tuple[str, str]:

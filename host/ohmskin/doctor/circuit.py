@@ -193,7 +193,8 @@ def _reference_ratio(lit: Float, rest: Rest, diagnosis: Diagnosis) -> float:
     ratio_std = rest.std_lsb * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
     top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
-    if abs(off) >= RATIO_TOLERANCE + RATIO_STDS * ratio_std:
+    doubt = RATIO_STDS * ratio_std + 2 * rest.offset_lsb / float(lit.mean())
+    if abs(off) >= RATIO_TOLERANCE + doubt:
         nominal = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
         diagnosis.add(Kind.REFERENCE_RATIO, ratio=ratio, off_percent=100 * off, **nominal)
     return ratio

@@ -60,13 +60,13 @@ def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> 
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
     moves, scans = bool(moved.any()), usual
-    if settled is not None and not moves and examine_settling(usual, settled, diagnosis):
+    far = usual.board.mode == "far"
+    if settled is not None and not moves and (examine_settling(usual, settled, diagnosis) or far):
         scans = settled
     wire_ohm, presses = evidence.wire_ohm or WIRE_OHM, evidence.presses
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
     rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
-    far = scans.board.mode == "far"
     touched, wrong = examine_circuit(near_ends(rest) if far else rest, diagnosis)
     if far and not moves and not wrong.all():
         examine_far(rest, evidence.wire_ohm, diagnosis)

@@ -39,6 +39,7 @@ from ohmskin.link.protocol import ADC_BITS
 SPREAD: Final = 2 * SEGMENT_STD  # [1] Segments of a line scatter by up to this share of m.
 MODEL_STD: Final = 0.01  # [1] A, and so A r, is known to this share.
 ROUNDS: Final = 3  # [1] Each makes the error of A smaller by the share of the wires in a port.
+OFFSET_LSB: Final = 4.0  # [LSB] Offset and gain of 2 LSB each: 1 - a has more by it, or b less.
 LOST_CHI2: Final = 25.0  # [1] Five deviations: an end that is connected has less a reading.
 MOST_LINE_OHM: Final = 50e3  # [ohm] A line of 16 segments of 2 kOhm has less.
 CLEAR_STDS: Final = 5.0  # [deviations] Of hundreds of segments, none is so far off by chance.
@@ -237,7 +238,8 @@ def near_ends(rest: Rest) -> Rest:
     """What mode near would have read of a skin that was read in mode far: c = 1 - b, d = 1 - a."""
     a, _, b, _ = np.moveaxis(rest.codes, -1, 0)
     codes = np.stack([a, b, 2**ADC_BITS - 1 - b, 2**ADC_BITS - 1 - a], axis=-1)
-    return replace(rest, board=replace(rest.board, mode="near"), codes=codes)
+    board = replace(rest.board, mode="near")
+    return replace(rest, board=board, codes=codes, offset_lsb=OFFSET_LSB)
 
 
 def examine_far(rest: Rest, nominal_ohm: tuple[float, float] | None, diagnosis: Diagnosis) -> None:

@@ -44,6 +44,7 @@ Complex = NDArray[np.complex128]
 
 REST_S: Final = 2.5  # [s] The first look takes this long: with all else, less than 10 s pass.
 SETTLED_S: Final = 1.6  # [s] The second look takes this long: it need not tell noise.
+FAR_S: Final = 4.0  # [s] In mode far, it tells the wires.
 LEAST_SCANS: Final = 16  # [scans] Noise and hum are not judged by fewer.
 
 MAINS_HZ: Final = (50.0, 60.0)  # [Hz] The world has these mains.
@@ -72,6 +73,7 @@ UNSETTLED_LSB: Final = 1.0  # [LSB] A longer settle time changes settled reading
 SETTLED_NOISE_LSB: Final = 0.5  # [LSB] Scatter is taken for this at least: rounding hides as much.
 LONGER: Final = 4  # [1] The second look settles for so many times as long.
 LEAST_LONGER_US: Final = 100  # [us] It settles at least for this: ten time constants of 10 us.
+LONGER_FAR_US: Final = 300  # [us] Of far ends, even a tenth of a code counts: wires show a few.
 NOT_LONGER: Final = 1.2  # [1] A settle time that is longer by less than this shows nothing new.
 LEAST_LOOK_HZ: Final = 4.0  # [Hz] The second look is not slower, unless the board is.
 
@@ -126,7 +128,7 @@ class Rest:
 
     codes: means (R, C, 4) of so many scans. noise_lsb: of a reading, without hum. wire_ohm: nominal
     ones of a segment, top and bottom. moves: something touches the skin and moves, so that the
-    means are of no one skin.
+    means are of no one skin. offset_lsb: of the converter, where no second drive cancels it.
     """
 
     board: Hello
@@ -135,6 +137,7 @@ class Rest:
     noise_lsb: float
     wire_ohm: tuple[float, float]
     moves: bool = False
+    offset_lsb: float = 0.0
 
     @property
     def ratio(self) -> Float:
@@ -312,7 +315,8 @@ def comparison(board: Hello) -> dict[str, Any] | None:
     readings = board.rows * board.columns * board.readings_per_cell
     spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
     most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
-    longer_us = min(max(LONGER * board.settle_us, LEAST_LONGER_US), most_us)
+    least_us = LONGER_FAR_US if board.mode == "far" else LEAST_LONGER_US
+    longer_us = min(max(LONGER * board.settle_us, least_us), most_us)
     if longer_us <= NOT_LONGER * board.settle_us and not _hidden_hz(board.rate_hz, REST_S):
         return None
     slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
