@@ -222,9 +222,11 @@ def _rest_ratio(given: Recording, rest_s: float) -> Float:
         first_s = given.scans[0].host_time_s
         untouched = [scan.ratio for scan in given.scans if scan.host_time_s - first_s <= rest_s]
         return np.asarray(np.mean(untouched, axis=0))
-    if not given.tares:
-        raise ValueError("no tare in it: say --rest 2 if nothing touched the skin for 2 s at first")
-    return given.tares[0].rest_ratio
+    tares = [tare for tare in given.tares if tare.is_of(given.scans[-1])]
+    if not tares:
+        what = f"no tare in mode {given.scans[-1].mode} in it" if given.tares else "no tare in it"
+        raise ValueError(f"{what}: say --rest 2 if nothing touched the skin for 2 s at first")
+    return tares[0].rest_ratio
 
 
 def _from_table(calibrator: Calibrator, table: PressTable, source: Path, out: Path) -> None:

@@ -206,6 +206,7 @@ def put_back(device: Device) -> Iterator[None]:
                 rate_hz=board.rate_asked_mhz / 1000,
                 settle_us=board.settle_asked_us,
                 adc_prescaler=board.adc_prescaler,
+                mode=board.mode,
             )
 
 

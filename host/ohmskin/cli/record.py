@@ -156,7 +156,7 @@ class PressDisplay:
         self._seen_s = scan.host_time_s
         if self._reader is None:
             self._reader = SkinReader(self._recorder.board, rest_ratio=tare.rest_ratio)
-        if scan.codes.shape == tare.rest_ratio.shape:
+        if tare.is_of(scan):
             found = self._reader.estimate(scan.ratio)
             pressed = pressed_cells(self._reader.rise(found), found.touched)
             if self._on.see(scan.host_time_s, pressed) and len(self._on.cells) == 1:

@@ -58,7 +58,8 @@ def verify(
     with terminal() as tell, ohmskin.open(port, start=False) as device, put_back(device):
         rows, columns = exam.plate.shape
         rate_hz = device.info.rate_asked_mhz / 1000
-        device.configure(rows=rows, columns=columns, rate_hz=rate_hz)
+        # Far ends add nothing: a plate has its lines' potential at both ends.
+        device.configure(rows=rows, columns=columns, rate_hz=rate_hz, mode="near")
         evidence = gather(device, tell, seconds=seconds, clocks=True)
     evidence.loss = loss
     diagnosis = examine(evidence, exam.examine)

@@ -161,7 +161,7 @@ class SkinReader:
             remedy = "take everything off the skin, or force the tare if nothing is on it"
             raise TareRefused(touched_cells(touched), remedy)
         self._rests.append(Untouched(rest_ratio, now()))
-        return _recorded(rest_ratio)
+        return self._recorded(rest_ratio)
 
     def undo_tare(self) -> Tare | None:
         """Return to the rest before the last tare. Returns that, for a `Recorder`, if it is known.
@@ -171,7 +171,12 @@ class SkinReader:
         if not self.is_tared:
             raise TareRefused("there is no tare to undo")
         self._rests.pop()
-        return None if self.rest is None else _recorded(self.rest.ratio)
+        return None if self.rest is None else self._recorded(self.rest.ratio)
+
+    def _recorded(self, rest_ratio: Float) -> Tare:
+        from ohmskin.record.recording import Tare  # its library is loaded when needed
+
+        return Tare(rest_ratio, time.monotonic(), self.board.mode)
 
     def estimate(self, ratio: Float) -> Estimate:
         """What readings (R, C, 4) show, without forces. Raises ValueError for other cells."""
@@ -297,12 +302,6 @@ class CalibratedSkin(Closing):
     def close(self) -> None:
         """Close the device. May be called again."""
         self.device.close()
-
-
-def _recorded(rest_ratio: Float) -> Tare:
-    from ohmskin.record.recording import Tare  # the library of recordings is loaded when needed
-
-    return Tare(rest_ratio, time.monotonic())
 
 
 def now() -> str:

@@ -17,7 +17,6 @@ from typing import Final
 import numpy as np
 from mcap.writer import Writer
 
-from ohmskin.arrays import Float
 from ohmskin.errors import RecordingError
 from ohmskin.files import Closing, PathName
 from ohmskin.link.device import Device
@@ -211,7 +210,7 @@ def record(
     :raises DeviceLost: as `ForceSensor.take`.
     """
     first_s: float | None = None
-    untouched: list[Float] = []
+    untouched: list[Scan] = []
     try:
         for scan in scans:
             first_s = scan.host_time_s if first_s is None else first_s
@@ -220,11 +219,11 @@ def record(
                 recorder.add(skin.info)
             recorder.add(scan)
             if tare_s and elapsed_s <= tare_s:
-                if untouched and untouched[0].shape != scan.ratio.shape:
+                if untouched and not _mean(untouched[:1]).is_of(scan):
                     untouched.clear()  # somebody has configured the board
-                untouched.append(scan.ratio)
+                untouched.append(scan)
             elif untouched:
-                recorder.add(Tare(np.mean(untouched, axis=0), time.monotonic()))
+                recorder.add(_mean(untouched))
                 untouched.clear()
             for sample in sensor.take() if sensor is not None else ():
                 recorder.add(sample)
@@ -234,4 +233,9 @@ def record(
                 return
     finally:
         if untouched:
-            recorder.add(Tare(np.mean(untouched, axis=0), time.monotonic()))
+            recorder.add(_mean(untouched))
+
+
+def _mean(scans: list[Scan]) -> Tare:
+    rest_ratio = np.mean([scan.ratio for scan in scans], axis=0)
+    return Tare(rest_ratio, time.monotonic(), scans[0].mode)

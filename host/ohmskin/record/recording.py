@@ -74,10 +74,18 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class Tare:
-    """Mean readings of the untouched skin, `rest_ratio` of shape (rows, columns, 4)."""
+    """Mean readings of the untouched skin, `rest_ratio` of shape (rows, columns, 4).
+
+    mode: which readings these are. A scan of another mode has another rest: see `is_of`.
+    """
 
     rest_ratio: Float
     host_time_s: float
+    mode: str = "near"
+
+    def is_of(self, scan: Scan) -> bool:
+        """Whether it is the rest of such scans: of the same cells and mode."""
+        return (self.rest_ratio.shape, self.mode) == (scan.codes.shape, scan.mode)
 
 
 @dataclass(frozen=True)
@@ -128,6 +136,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     },
     "tare": {
         "host_time_s": _HOST_TIME,
+        "mode": _is("string", "that of the scans it was taken of"),
         **_SIZE,
         "rest_ratio": _is("array", f"V/Vdd: {_ORDER}", items={"type": "number"}),
     },
@@ -175,7 +184,7 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
     :raises RecordingError: as `load_recording`.
     """
     topics: dict[int, str] = {}
-    known = ended = False
+    known, ended, mode = False, False, "near"  # older recordings know no other
     try:
         with open(path, "rb") as file:
             for record in _records(_Bounded(file)):
@@ -183,7 +192,8 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
                     case Channel(message_encoding="json", topic=topic) if topic.startswith(TOPIC):
                         topics[record.id] = topic.removeprefix(TOPIC)
                     case McapMessage() if topics.get(record.channel_id) in SCHEMAS:
-                        message = _message(topics[record.channel_id], record.data)
+                        message = _message(topics[record.channel_id], record.data, mode)
+                        mode = getattr(message, "mode", mode)
                         if not known and not isinstance(message, Hello):
                             raise ValueError("no board says hello in it before the first message")
                         known = True
@@ -255,13 +265,14 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
         raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
 
 
-def _message(name: str, octets: bytes) -> Recorded:
+def _message(name: str, octets: bytes, mode: str) -> Recorded:
+    """A message; mode: that of the one before, for those that do not say theirs."""
     if len(octets) > _LARGEST_MESSAGE:
         raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
-    content.setdefault("mode", "near")  # older recordings know no other
+    content.setdefault("mode", mode if name == "tare" else "near")
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
@@ -347,7 +358,7 @@ def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
 def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
     """The arrays of a readings file, and besides those of `_OF_SCAN`.
 
-    `rest_ratio` is the last tare of this size. `ratio` in single precision is exact.
+    `rest_ratio` is the last tare of this size and mode. `ratio` in single precision is exact.
     """
     board = recording.hellos[0]
     codes = np.array([scan.codes for scan in scans])
@@ -364,7 +375,7 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
         **{name: [getattr(scan, name) for scan in scans] for name in _OF_SCAN},
     }
     for tare in recording.tares:
-        if tare.rest_ratio.shape == codes.shape[1:]:
+        if tare.is_of(scans[0]):
             arrays["rest_ratio"] = tare.rest_ratio
     return {name: np.array(each) for name, each in arrays.items()}
 

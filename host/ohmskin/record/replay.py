@@ -2,10 +2,10 @@
 """A recording as a source of scans: ``replay://FILE.mcap?speed=1``.
 
 Scans come as they were recorded, with the same codes, numbers, board times and gaps. Each carries
-the tare that was in force (``rest_ratio``), if one was recorded before it. ``speed``: 1 as they
-came, 2 twice as fast, 0 as fast as they are taken: then nothing is lost however slow the reader is,
-and `latest` gives each scan in turn. Nothing comes before somebody first asks for scans. A pause
-longer than `LONGEST_PAUSE_S` is shortened.
+the tare that was in force (``rest_ratio``), if one of its mode was recorded before it. ``speed``: 1
+as they came, 2 twice as fast, 0 as fast as they are taken: then nothing is lost however slow the
+reader is, and `latest` gives each scan in turn. Nothing comes before somebody first asks for scans.
+A pause longer than `LONGEST_PAUSE_S` is shortened.
 
 At the recording's end iterators end, and `latest` raises `RecordingEnded`. Commands other than
 start and stop, which let the replay run and pause, raise `CommandRefused`.
@@ -79,17 +79,18 @@ class Replay(Device):
         super().close()
 
     def _play(self) -> None:
-        rest_ratio = None
+        tare: Tare | None = None
         for message in self._messages:
             if isinstance(message, Hello | Scan) and not self._wait_for(message):
                 return
             match message:
                 case Scan():
+                    rest_ratio = tare.rest_ratio if tare and tare.mode == message.mode else None
                     self._play_scan(replace(message, rest_ratio=rest_ratio))
                 case Hello():
                     self._hello = message
                 case Tare():
-                    rest_ratio = message.rest_ratio
+                    tare = message
         raise RecordingEnded(f"{self.name} has been played to its end")
 
     def _play_scan(self, scan: Scan) -> None:

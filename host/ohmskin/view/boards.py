@@ -214,7 +214,7 @@ class ViewedBoard(Closing):
                 raise OhmskinError(f"{running.recorder.path} is being recorded already")
             recorder = Recorder(self._new_file(reader.board.unit_id), skin.info)
             if reader.is_tared and reader.rest is not None:
-                recorder.add(Tare(reader.rest.ratio, time.monotonic()))
+                recorder.add(Tare(reader.rest.ratio, time.monotonic(), reader.board.mode))
             self._recording = _Recording(skin, recorder, self._changed)
         return "recording: every scan, whatever is shown"
 
