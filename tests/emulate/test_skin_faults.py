@@ -151,7 +151,9 @@ def test_nodes_settle_slot_by_slot() -> None:
 
 def test_every_fault_has_a_name_an_explanation_and_an_option() -> None:
     assert list(SKIN_FAULTS) == list(SkinFaults.__dataclass_fields__)
-    values = {name: "1,2" for name in SKIN_FAULTS if name.startswith(("short", "swap", "dead", "broken"))}
+    values = {
+        name: "1,2" for name in SKIN_FAULTS if name.startswith(("short", "swap", "dead", "broken"))
+    }
     values["saturated"] = "0,0"
     for name in SKIN_FAULTS:
         board, _, _ = emulated(f"emulator://{R}x{C}?{name}={values.get(name, '2')}&noise=0")

@@ -215,7 +215,7 @@ class PortReader:
         typical = float(np.partition(square, middle, axis=None)[middle])
         degrees = max(self._degrees - residual.shape[-1] / (2.0 * square.size), 0.5)
         own, rounding = square / degrees, self._ratio_std**2
-        most = _MOST_USUAL * max(rounding, typical / self._degrees)
+        most = _MOST_USUAL * max(rounding, typical / _MEDIAN_CHI2[self._degrees])
         small = own[own <= most]
         usual = float(small.sum()) / small.size  # faster than mean
         noise, variance = usual, np.maximum(own, usual)

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`joint` and `touch` on readings at far ends: against ngspice, and against Laplacians."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from network import laplacian_readings  # tests/helpers
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import PortCircuit, Skin, all_readings, end_admittance
+from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.port_readings import PortReader
+from ohmskin.link.protocol import MODES
+from places import DATA
+from skins import ten_bits
+from studies.trials import skin_at_rest, touch
+
+ALL = "abcdefgh"
+ENDS = [(True, True), (True, False), (False, True), (False, False)]
+
+
+def seen(skin: Skin, names: str = "aebf") -> Float:
+    """Exact readings of these names."""
+    found = all_readings(skin, end_admittance(skin))
+    return np.asarray(found[..., [ALL.index(name) for name in names]])
+
+
+def knowledge(rest: Float, names: str = "aebf", bits: int | None = 10) -> SkinKnowledge:
+    return SkinKnowledge(
+        *rest.shape[:2], adc_bits=bits, rest_ratio=rest, reading_names=tuple(names)
+    )
+
+
+def sensed_ohm(skin: Skin, far: tuple[bool, bool]) -> Float:
+    """Voltage between the sensed ends per current of each port, by a Laplacian."""
+    a, b, e, f = np.moveaxis(laplacian_readings(skin, names="abef"), -1, 0)
+    row, column = (e if far[0] else a), (f if far[1] else b)
+    return np.asarray((row - column) * skin.ref_bottom_ohm / b)
+
+
+@pytest.mark.parametrize("far", ENDS)
+@pytest.mark.parametrize("size", [(1, 1), (1, 4), (3, 1), (3, 4)])
+def test_sensed_ports_and_their_slopes_are_a_laplacians(
+    size: tuple[int, int], far: tuple[bool, bool]
+) -> None:
+    random = np.random.default_rng(3)
+    logs = random.uniform(np.log(50), np.log(50e3), (3, *size))
+
+    def skin(logs: Float) -> Skin:
+        cell, top, bottom = np.exp(logs)
+        return Skin(1 / cell, top, bottom)
+
+    whole = skin(logs)
+    circuit = PortCircuit(whole.cell_siemens, whole.top_wire_ohm, whole.bottom_wire_ohm, far=far)
+    expected = sensed_ohm(whole, far)
+    np.testing.assert_allclose(circuit.port_ohm, expected.ravel(), rtol=1e-8)
+    slopes = np.hstack([circuit.by_cell(), circuit.by_wires()])
+    for number in range(logs.size):
+        ends = []
+        for step in (-1e-4, 1e-4):
+            moved = logs.copy()
+            moved.flat[number] += step
+            ends.append(sensed_ohm(skin(moved), far).ravel())
+        slope = (ends[1] - ends[0]) / 2e-4
+        np.testing.assert_allclose(slopes[:, number], slope, atol=3e-6 * expected.max())
+    layers = circuit.by_wires().reshape(-1, 2, whole.cell_siemens.size).sum(axis=2)
+    np.testing.assert_allclose(circuit.by_layers(), layers, atol=1e-9 * expected.max())
+
+
+def test_what_wires_lose_is_the_current_through_their_segments() -> None:
+    random = np.random.default_rng(5)
+    skin = touch(skin_at_rest(3, 5, random, spread=0.3), 4, random)
+    wires = skin.top_wire_ohm, skin.bottom_wire_ohm
+    circuit = PortCircuit(skin.cell_siemens, *wires, far=(True, True))
+    a, e, b, f = np.moveaxis(seen(skin), -1, 0)
+    current = b / skin.ref_bottom_ohm
+    row = np.einsum("ipk,ik->ip", circuit.line_current(0), wires[0])
+    column = np.einsum("jpk,kj->pj", circuit.line_current(1), wires[1])
+    for lost, shown, model in zip((a - e, f - b), (row, column), circuit.drop_ohm, strict=True):
+        np.testing.assert_allclose(shown, lost / current, rtol=1e-8)
+        np.testing.assert_allclose(model, shown.ravel(), rtol=1e-8)
+
+
+def scored(method: str, kind: str) -> tuple[Float, Float, Float]:
+    """Pressed cells of cold frames, nothing told: errors, stated deviations; ghosts [uS]."""
+    errors, stds, ghosts = [], [], []
+    for number in (0, 1):
+        with np.load(DATA / "far" / f"{kind}_{number}.npz", allow_pickle=False) as file:
+            arrays = dict(file)
+        pick = [list(arrays["reading_names"]).index(name) for name in MODES["far"]]
+        rest = 1 / arrays["rest_ohm"]
+        estimator = make_estimator(method, knowledge(ten_bits(arrays["rest_ratio"][..., pick])))
+        for ratio, ohm in zip(arrays["ratio"][..., pick], arrays["cell_ohm"], strict=True):
+            estimator.reset()
+            found = estimator.estimate(ten_bits(ratio))
+            pressed = 1 / ohm > 1.5 * rest
+            errors.append(np.abs(found.cell_siemens * ohm - 1)[pressed])
+            stds.append((found.cell_siemens_std * ohm)[pressed])
+            ghosts.append(1e6 * (found.cell_siemens - 1 / ohm)[~pressed].max(initial=0.0))
+    return np.concatenate(errors), np.concatenate(stds), np.array(ghosts)
+
+
+# Errors of pressed cells: median, 90th percentile.
+BARS = {
+    "random_8x8": (0.004, 0.02),
+    "random_5x9": (0.004, 0.02),
+    "harsh_8x8": (0.005, 0.03),
+    "finger_8x8": (0.012, 0.05),
+}
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize("kind", BARS)
+def test_whoever_knows_no_wires_reads_cells_at_far_ends(kind: str, method: str) -> None:
+    errors, stds, ghosts = scored(method, kind)
+    assert np.median(errors) < BARS[kind][0]
+    assert np.percentile(errors, 90) < BARS[kind][1]
+    assert np.mean(errors < 4 * stds) > 0.97
+    assert np.median(stds / np.maximum(errors, 1e-9)) < 4
+    assert np.percentile(ghosts, 95) < 0.5
+
+
+def one_frame(names: str) -> Estimate:
+    random = np.random.default_rng(11)
+    rest = skin_at_rest(6, 7, random)
+    touched = touch(rest, 4, random)
+    known = knowledge(ten_bits(seen(rest, names)), names)
+    return make_estimator("joint", known).estimate(ten_bits(seen(touched, names)))
+
+
+@pytest.mark.parametrize("names", ["abef", "dcgh", "cdhg", "abeg", "fbea"])
+def test_readings_may_come_in_any_order_and_polarity(names: str) -> None:
+    expected, found = one_frame("aebf"), one_frame(names)
+    # Rounding down is up where supplies are exchanged.
+    np.testing.assert_allclose(found.cell_siemens, expected.cell_siemens, rtol=0.03)
+    assert found.converged
+
+
+@pytest.mark.parametrize("names", ["abe", "abf", "dch"])
+def test_one_far_end_is_better_than_none(names: str) -> None:
+    random = np.random.default_rng(12)
+    off: dict[str, list[Float]] = {names: [], "ab": []}
+    for _ in range(6):
+        rest = skin_at_rest(6, 6, random, wire_ohm=(300.0, 300.0))
+        touched = touch(rest, 3, random)
+        for each, found in off.items():
+            known = knowledge(ten_bits(seen(rest, each)), each)
+            cell = make_estimator("joint", known).estimate(ten_bits(seen(touched, each)))
+            pressed = touched.cell_siemens > 1.5 * rest.cell_siemens
+            found.append(np.abs(cell.cell_siemens / touched.cell_siemens - 1)[pressed])
+    one, none = (np.median(np.concatenate(found)) for found in off.values())
+    assert one < 0.7 * none
+
+
+def test_methods_without_wires_say_what_they_take() -> None:
+    rest = seen(skin_at_rest(3, 3, np.random.default_rng(1)))
+    for method in set(METHODS) - {"joint", "touch"}:
+        with pytest.raises(ValueError, match=f"'{method}' takes the readings a b c d, not a e b f"):
+            make_estimator(method, knowledge(rest))
+
+
+@pytest.mark.parametrize("codes", [0.0, 1.5])
+def test_errors_of_currents_at_far_ends_are_as_large_as_stated(codes: float) -> None:
+    random = np.random.default_rng(4)
+    rest = skin_at_rest(8, 8, random)
+    reader = PortReader(knowledge(ten_bits(seen(rest))))
+    away = []
+    for _ in range(40):
+        exact = seen(touch(rest, 5, random))
+        current = exact[..., 2] / 30e3
+        bare = current / (exact[..., 1] - exact[..., 3] + 60e3 * current)
+        noisy = exact + codes / 1024 * random.standard_normal(exact.shape)
+        found = reader.read(ten_bits(np.clip(noisy, 0, 1)))
+        away.append((found.current - bare) / found.current_std)
+    assert 0.5 < np.sqrt(np.mean(np.square(away))) < 1.2
+
+
+def test_an_offset_of_the_converter_is_in_all_readings_alike() -> None:
+    random = np.random.default_rng(6)
+    rest = skin_at_rest(5, 5, random)
+    touched = touch(rest, 3, random)
+    known = knowledge(seen(rest) + 3 / 1024, bits=None)
+    found = make_estimator("joint", known).estimate(seen(touched) + 3 / 1024)
+    np.testing.assert_allclose(found.cell_siemens, touched.cell_siemens, rtol=2e-3)
+    np.testing.assert_allclose(np.median(found.top_wire_ohm), 100, rtol=0.1)
+
+
+def test_a_far_end_that_floats_is_named() -> None:
+    random = np.random.default_rng(2)
+    rest = skin_at_rest(5, 6, random)
+    ratio = ten_bits(seen(touch(rest, 3, random)))
+    ratio[3, :, 1] = 0.95  # the far end of row 3, above its near end
+    found = make_estimator("joint", knowledge(ten_bits(seen(rest)))).estimate(ratio)
+    assert found.message.startswith("row 3: its far end does not follow it, is it open?")
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_segments_are_learned_from_touches(method: str) -> None:
+    random = np.random.default_rng(9)
+    rest = skin_at_rest(8, 8, random, wire_ohm=(300.0, 200.0))
+    estimator = make_estimator(method, knowledge(ten_bits(seen(rest))))
+    for _ in range(50):
+        found = estimator.estimate(ten_bits(seen(touch(rest, 6, random))))
+    pairs = (found.top_wire_ohm, rest.top_wire_ohm), (found.bottom_wire_ohm, rest.bottom_wire_ohm)
+    off = np.concatenate([np.abs(found / truth - 1).ravel() for found, truth in pairs])
+    assert np.median(off) < 0.055  # 0.067 of those whose layer alone is known
+    known = estimator.wires()
+    assert known.top == pytest.approx(300, rel=0.05)
+    assert known.bottom == pytest.approx(200, rel=0.05)
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_bent_skin_is_read_as_the_same_at_once(method: str) -> None:
+    random = np.random.default_rng(10)
+    rest = skin_at_rest(8, 8, random)
+    estimator = make_estimator(method, knowledge(ten_bits(seen(rest))))
+    bent = replace(
+        rest,
+        top_wire_ohm=1.35 * rest.top_wire_ohm,
+        bottom_wire_ohm=1.35 * rest.bottom_wire_ohm,
+    )
+    off = []
+    for _ in range(20):
+        touched = touch(bent, 4, random)
+        found = estimator.estimate(ten_bits(seen(touched)))
+        pressed = touched.cell_siemens > 1.5 * rest.cell_siemens
+        off.append(np.abs(found.cell_siemens / touched.cell_siemens - 1)[pressed])
+    assert np.median(np.concatenate(off)) < 0.005
