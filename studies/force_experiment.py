@@ -31,6 +31,7 @@ from ohmskin.estimate.base import NO_WIRES
 from ohmskin.estimate.methods import METHODS, VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.force.regression import ForceRegression, fit_power
+from ohmskin.link.protocol import MODES
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 from studies.press import PressModel
 from studies.trials import PAPER_METHODS
@@ -39,6 +40,7 @@ Progress = Callable[[int, int], None]
 
 TRUTH: Final = "truth"
 UNTOLD: Final = "joint, wires not told"
+FAR: Final = "joint, far ends, wires not told"
 LINE: Final = "line"
 SQUARES: Final = "squares"
 CHOICE: Final = "choice"
@@ -70,9 +72,9 @@ class Comparison:
 
 # The second: so few frames that the paper's methods can be run on them as well.
 FULL: Final = (
-    Comparison(2, 2, Plan(), (*FAST, UNTOLD), tuple(CELLS)),
+    Comparison(2, 2, Plan(), (*FAST, UNTOLD, FAR), tuple(CELLS)),
     Comparison(2, 2, Plan(4, 5, 4, 1), ALL, ("whole",)),
-    Comparison(8, 8, Plan(4, 6, 3, 3), (*FAST, UNTOLD), tuple(CELLS)),
+    Comparison(8, 8, Plan(4, 6, 3, 3), (*FAST, UNTOLD, FAR), tuple(CELLS)),
 )
 QUICK: Final = (
     Comparison(2, 2, Plan(1, 6, 2, 2), FAST, tuple(CELLS)),
@@ -155,12 +157,16 @@ def rises(method: str, trial: ForceTrial) -> Float:
         return trial.rise_siemens
     if method == VOLTAGE:
         return voltage_level(trial.ratio) - voltage_level(trial.rest_ratio)
-    knowledge = trial.knowledge
-    if method == UNTOLD:
-        method, knowledge = "joint", replace(knowledge, nominal_wire_ohm=NO_WIRES)
-    estimator = make_estimator(method, knowledge)
-    rest = estimator.estimate(trial.rest_ratio).cell_siemens
-    return np.array([estimator.estimate(frame).cell_siemens - rest for frame in trial.ratio])
+    knowledge, ratio = trial.knowledge, trial.ratio
+    if method in (UNTOLD, FAR):
+        knowledge = replace(knowledge, nominal_wire_ohm=NO_WIRES)
+    if method == FAR:
+        names, ratio = MODES["far"], trial.far_ratio
+        knowledge = replace(knowledge, rest_ratio=trial.far_rest_ratio, reading_names=names)
+    estimator = make_estimator("joint" if method in (UNTOLD, FAR) else method, knowledge)
+    assert knowledge.rest_ratio is not None
+    rest = estimator.estimate(knowledge.rest_ratio).cell_siemens
+    return np.array([estimator.estimate(frame).cell_siemens - rest for frame in ratio])
 
 
 def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], Float]:

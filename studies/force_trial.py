@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, readings
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link import protocol
 from ohmskin.link.framing import encode
 from ohmskin.link.messages import BoardDecoder, Scan
+from ohmskin.link.protocol import ENUMS, MODES
 from studies.press import LEAVE_S, PressModel, robot_presses
 from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest
 
@@ -53,7 +54,8 @@ class ForceTrial:
     """F frames of one skin, in order of time, and the truth behind them.
 
     time_s (F,). ratio (F, R, C, 4): as read. rest_ratio (R, C, 4): mean of the readings of the
-    untouched skin. force_n, rise_siemens (F, R, C): the truth. cell (F,): flat index of the cell
+    untouched skin. far_ratio, far_rest_ratio: the same in mode far. force_n, rise_siemens (F, R,
+    C): the truth. cell (F,): flat index of the cell
     that the robot presses. press (F,): number of its press. group (F,): of the test, -1 in the
     calibration.
     """
@@ -61,6 +63,8 @@ class ForceTrial:
     time_s: Float
     ratio: Float
     rest_ratio: Float
+    far_ratio: Float
+    far_rest_ratio: Float
     force_n: Float
     rise_siemens: Float
     cell: NDArray[np.intp]
@@ -166,18 +170,22 @@ class Choreography:
         forces_n = np.stack([np.interp(steps_s, *knots) for knots in self._knots], axis=-1)
         rises = self.model.rise(steps_s, forces_n.reshape(-1, *self.shape))
         seen = np.searchsorted(steps_s, time_s)
-        board = OneFrameBoard(self.shape, int(self.random.integers(1 << 32)))
-        untouched = [
-            board.read(index / DEFAULT_RATE_HZ, self._skin) for index in range(REST_FRAMES)
-        ]
-        ratio = [
-            board.read(float(now_s), self._skin_at(float(now_s), rise))
-            for now_s, rise in zip(time_s, rises[seen], strict=True)
-        ]
+        seed = int(self.random.integers(1 << 32))
+        read: dict[str, tuple[Float, Float]] = {}
+        for mode in MODES:
+            board = OneFrameBoard(self.shape, seed, mode)
+            untouched = [
+                board.read(index / DEFAULT_RATE_HZ, self._skin) for index in range(REST_FRAMES)
+            ]
+            ratio = [
+                board.read(float(now_s), self._skin_at(float(now_s), rise))
+                for now_s, rise in zip(time_s, rises[seen], strict=True)
+            ]
+            read[mode] = np.array(ratio), np.mean(untouched, axis=0)
         return ForceTrial(
-            time_s=time_s,
-            ratio=np.array(ratio),
-            rest_ratio=np.mean(untouched, axis=0),
+            time_s,
+            *read["near"],
+            *read["far"],
             force_n=forces_n[seen].reshape(-1, *self.shape),
             rise_siemens=rises[seen],
             cell=cell.astype(np.intp),
@@ -235,20 +243,25 @@ def _arrangements(
 class OneFrameBoard:
     """An emulated board that is started for one frame at a time."""
 
-    def __init__(self, shape: tuple[int, int], seed: int) -> None:
-        self._ratio = np.empty(0)
+    def __init__(self, shape: tuple[int, int], seed: int, mode: str = "near") -> None:
+        self._ratio, self._mode = np.empty(0), mode
         self._board = EmulatedBoard(
             lambda _time_s, _mode: self._ratio,
             *shape,
             rate_hz=DEFAULT_RATE_HZ,
             noise_lsb=NOISE_LSB,
             seed=seed,
+            mode=mode,
         )
         self._decoder = BoardDecoder()
 
     def read(self, time_s: float, skin: Skin) -> Float:
         """Readings (R, C, 4) of a frame begun at a time, or when the frame before is over."""
-        self._ratio = readings(skin)
+        if self._mode == "near":
+            self._ratio = readings(skin)
+        else:
+            every = all_readings(skin, end_admittance(skin))
+            self._ratio = every[..., [ENUMS["reading"].values[n] for n in MODES[self._mode]]]
         board = self._board
         octets = board.advance(time_s)
         self._command("start")
