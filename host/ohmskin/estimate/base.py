@@ -128,7 +128,8 @@ class Estimate:
     the method neglects: about 58 % of cells lie within one, 98 % within two, because rounding is
     uniform. It is NaN where the method gives none.
     level, level_std (R, C): what a force is read from: the same, but for `voltage` [1].
-    touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C): NaN where the method estimates no wires.
+    touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C), and their deviations: of each segment, NaN
+    where the method estimates no wires.
     chi2: mean of the squared residuals of all readings over the variance of one (at far ends: of
     the ports' currents). It is about 1 or less when the model holds.
     message: empty if the method converged and the readings can be trusted, else why not.
@@ -142,6 +143,8 @@ class Estimate:
     touched: NDArray[np.bool_]
     top_wire_ohm: Float
     bottom_wire_ohm: Float
+    top_wire_ohm_std: Float
+    bottom_wire_ohm_std: Float
     chi2: float
     iterations: int
     converged: bool
@@ -157,8 +160,9 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a method finds; `Estimator.estimate` adds the rest. Wires None: not estimated.
+    """What a method finds; `Estimator.estimate` adds the rest.
 
+    wire_ohm, wire_ohm_std (2, R, C): top, bottom; None: not estimated.
     cell_siemens_std_down: where an error downwards is not as likely as upwards.
     """
 
@@ -167,8 +171,8 @@ class Solution:
     chi2: float
     iterations: int = 1
     message: str = ""
-    top_wire_ohm: Float | None = None
-    bottom_wire_ohm: Float | None = None
+    wire_ohm: Float | None = None
+    wire_ohm_std: Float | None = None
     cell_siemens_std_down: Float | None = None
 
 
@@ -237,15 +241,19 @@ class Estimator(ABC):
         message = "; ".join(filter(None, (ports.fault, found.message)))
         touched = self._touched(found)
         level, level_std = self._level(readings, found)
-        unknown = np.full((known.rows, known.columns), np.nan)
+        unknown = np.full((2, known.rows, known.columns), np.nan)
+        wires = unknown if found.wire_ohm is None else found.wire_ohm
+        wires_std = unknown if found.wire_ohm_std is None else found.wire_ohm_std
         return Estimate(
             cell_siemens=found.cell_siemens,
             cell_siemens_std=found.cell_siemens_std,
             level=level,
             level_std=level_std,
             touched=touched,
-            top_wire_ohm=unknown if found.top_wire_ohm is None else found.top_wire_ohm,
-            bottom_wire_ohm=unknown if found.bottom_wire_ohm is None else found.bottom_wire_ohm,
+            top_wire_ohm=wires[0],
+            bottom_wire_ohm=wires[1],
+            top_wire_ohm_std=wires_std[0],
+            bottom_wire_ohm_std=wires_std[1],
             chi2=found.chi2,
             iterations=found.iterations,
             converged=not message,

@@ -44,6 +44,7 @@ class MeasuredWires(WireBelief):
         super().reset()
         self._before = self._nominal, np.diagonal(self._prior_covariance)
         self._shares = np.ones((2, *self.shape))
+        self._own_std = np.full((2, *self.shape), SEGMENT_STD)
         self._known = [
             (np.zeros((lines, n, n)), np.zeros((lines, n)))
             for lines, n in (self.shape, self.shape[::-1])
@@ -93,10 +94,16 @@ class MeasuredWires(WireBelief):
             pull += np.einsum("lpk,lp->lk", heavy, drop)
             system = np.eye(len(precision[0])) + variance * precision
             away = (pull - precision.sum(axis=2))[..., None]
-            share = 1.0 + variance * np.linalg.solve(system, away)[..., 0]
+            inverse = np.linalg.inv(system)
+            share = 1.0 + variance * (inverse @ away)[..., 0]
+            own_std = np.sqrt(variance * np.einsum("lkk->lk", inverse))
             self._shares[layer] = share if layer == 0 else share.T
+            self._own_std[layer] = own_std if layer == 0 else own_std.T
 
-    def layers(self, log_wires: Float) -> tuple[Float, Float]:
-        """Top and bottom segments (R, C) [ohm]: the layers' of these, in the shares learned."""
-        top, bottom = super().layers(log_wires)
-        return top * self._shares[0], bottom * self._shares[1]
+    def layers(self, log_wires: Float) -> Float:
+        """Segments (2, R, C) [ohm]: the layers' of these, in the shares learned."""
+        return np.asarray(super().layers(log_wires) * self._shares)
+
+    def segment_std(self) -> Float:
+        """As of layers that are known, and what readings leave of each segment's own."""
+        return np.asarray(np.hypot(np.diagonal(self._root)[:, None, None], self._own_std))

@@ -107,8 +107,8 @@ class JointEstimator(Estimator):
         return None
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
-        top, bottom = self._belief.layers(fit.wires)
-        series_ohm = path_ohm(top, bottom, ports.far) + self.knowledge.ref_ohm
+        wires = self._belief.layers(fit.wires)
+        series_ohm = path_ohm(*wires, far=ports.far) + self.knowledge.ref_ohm
         layer_std, wider = self._belief.std(), max(1.0, fit.misfit) ** 0.5
         std, down = siemens_std(-fit.cell, fit.cell_std, fit.by_layers, layer_std, series_ohm)
         return Solution(
@@ -118,8 +118,8 @@ class JointEstimator(Estimator):
             chi2=self._chi2(ports, fit.modelled.reshape(self._shape)),
             iterations=fit.iterations,
             message=message,
-            top_wire_ohm=top,
-            bottom_wire_ohm=bottom,
+            wire_ohm=wires,
+            wire_ohm_std=wires * self._belief.segment_std(),
         )
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:

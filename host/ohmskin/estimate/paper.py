@@ -199,8 +199,7 @@ class PaperEstimator(Estimator):
             chi2=float(np.mean(residual**2)),
             iterations=sum(optimum.iterations for each in answers for optimum in each.optima),
             message=message,
-            top_wire_ohm=found.top_wire_ohm,
-            bottom_wire_ohm=found.bottom_wire_ohm,
+            wire_ohm=np.stack([found.top_wire_ohm, found.bottom_wire_ohm]),
         )
 
     def _afresh(self, ratio: Float, cell_ohm: Float) -> _Answer:

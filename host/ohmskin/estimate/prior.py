@@ -175,10 +175,13 @@ class WireBelief:
         top, bottom = np.exp(self.log_layers)
         return float(top), float(bottom), float(np.linalg.norm(self._root.sum(axis=0)) / 2)
 
-    def layers(self, log_wires: Float) -> tuple[Float, Float]:
-        """Top and bottom segments (R, C) [ohm] of these log resistances (2RC,)."""
-        top, bottom = np.exp(log_wires).reshape(2, *self.shape)
-        return top, bottom
+    def layers(self, log_wires: Float) -> Float:
+        """Top and bottom segments (2, R, C) [ohm] of these log resistances (2RC,)."""
+        return np.asarray(np.exp(log_wires).reshape(2, *self.shape))
+
+    def segment_std(self) -> Float:
+        """Standard deviation of the log of each segment, for (2, R, C)."""
+        return np.asarray(np.hypot(np.hypot(*self._root.T), SEGMENT_STD)[:, None, None])
 
     def learn(self, by_layers: Float, residual: Float, factor: Float) -> None:
         """One Kalman step from a `Lesson`. residual: z (m,) at the mean; factor: of S (m, m)."""
@@ -192,7 +195,7 @@ class WireBelief:
 
 
 def path_ohm(
-    top_wire_ohm: Float, bottom_wire_ohm: Float, far: tuple[bool, bool] = (False, False)
+    top_wire_ohm: Float, bottom_wire_ohm: Float, *, far: tuple[bool, bool] = (False, False)
 ) -> Float:
     """Wire between each cell and its electrodes [ohm], (RC,), but that up to sensed far ends."""
     top, bottom = (0.0 if is_far else 1.0 for is_far in far)

@@ -211,7 +211,7 @@ class SparseFit:
         self.slack = prior.std**2 @ (by_cell * by_cell)
         root = belief.root(wires * (self.current**2)[:, None])
         self.slack += np.einsum("ij,ij->i", root, root)
-        self.path_ohm = path_ohm(*belief.layers(belief.mean), self.far)
+        self.path_ohm = path_ohm(*belief.layers(belief.mean), far=self.far)
         self.wire_std = float(np.hypot(belief.std(), SEGMENT_STD))
 
     def find(self, ports: PortReadings) -> "FewTouches | None":

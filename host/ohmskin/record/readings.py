@@ -16,9 +16,10 @@ adc_bits                scalar                       absent: the readings are ex
 reading_names           4, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
 
-Out: cell_ohm, cell_siemens, cell_siemens_std, top_wire_ohm, bottom_wire_ohm (F, R, C; NaN where the
-method does not estimate them), touched (F, R, C, bool), converged (F, bool), message (F, text: why
-a frame is not converged, or what is wrong with its readings), chi2 (F, per reading),
+Out: cell_ohm, cell_siemens, cell_siemens_std, top_wire_ohm, bottom_wire_ohm, top_wire_ohm_std,
+bottom_wire_ohm_std (F, R, C; NaN where the method does not estimate them), touched (F, R, C, bool),
+converged (F, bool), message (F, text: why a frame is not converged, or what is wrong with its
+readings), chi2 (F, per reading),
 iterations (F), seconds (F).
 """
 
@@ -44,7 +45,8 @@ _NAMES: Final = tuple(ENUMS["reading"].values)
 # What is told of each frame, in this order.
 _OUT: Final = (
     *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched", "top_wire_ohm", "bottom_wire_ohm"),
-    *("converged", "message", "chi2", "iterations", "seconds"),
+    *("top_wire_ohm_std", "bottom_wire_ohm_std", "converged", "message", "chi2", "iterations"),
+    *("seconds",),
 )
 
 
