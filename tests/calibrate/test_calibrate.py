@@ -14,7 +14,7 @@ from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
-from ohmskin.record.recording import ForceSample, load_recording
+from ohmskin.record.recording import ForceSample, Tare, load_recording
 from recordings import (
     HOST_BEGIN_S,
     PRESSES,
@@ -162,6 +162,12 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
         calibrate(run, presses, "--method", "joint"), "presses.mcap: no tare in it: say --rest 2"
     )
     given = load_recording(recording)
+    tare = Tare(given.scans[0].ratio, 0.0, "far")
+    write_recording(tmp_path / "far.mcap", given.hellos[0], [tare, *given.scans[:2]])
+    assert_one_line(
+        calibrate(run, (tmp_path / "far.mcap", forces, out), "--method", "joint"),
+        "far.mcap: no tare in mode near in it: say --rest 2",
+    )
     edited(forces, lambda t, f: (t[t < SENSOR_BEGIN_S + 21], f[t < SENSOR_BEGIN_S + 21]))
     few = [scan for scan in given.scans if scan.time_us < 5e6]
     for name, scans, words in (("none", [], ": no scan in it"), ("one", few, "")):

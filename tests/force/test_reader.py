@@ -91,6 +91,12 @@ def test_scans_of_another_mode_are_refused() -> None:
         reader.read(replace(next(scans), mode="far"))
 
 
+def test_a_tare_says_the_mode_of_the_board() -> None:
+    bench = Bench("emulator://4x4")
+    reader = SkinReader(bench.info)
+    assert reader.tare(next(iter(bench)).ratio).mode == "near"
+
+
 def test_tare_is_refused_while_something_touches_the_skin() -> None:
     before = of_scene("ghost")
     with ohmskin.open(GHOST, calibration=before) as board:

@@ -40,6 +40,7 @@ from ohmskin.opening import emulated
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import (
+    SCHEMAS,
     ForceSample,
     Mark,
     Recording,
@@ -54,6 +55,7 @@ from waiting import until
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 URL = "emulator://3x4?scene=multi&begin=0&seed=3&rate=400"
+TARE = Tare(np.full((3, 4, 4), 0.25), 1.0)
 # Scans reach the file within half a second; on a busy machine, within this [s].
 LATE_S = 3.0
 
@@ -643,6 +645,44 @@ def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
     assert rests[1] is rests[2]
     for found, tare in ((rests[2], tares[0]), (rests[3], tares[1])):
         np.testing.assert_array_equal(found, tare.rest_ratio)
+
+
+def test_a_tare_is_the_rest_of_scans_of_its_mode_alone(
+    tmp_path: Path, path: Path, hello: Hello
+) -> None:
+    far = replace(hello, mode="far")
+    tares = [Tare(np.full((3, 4, 4), 0.25), 1.0), Tare(np.full((3, 4, 4), 0.75), 1.0, "far")]
+    of_far = [replace(scan(n), mode="far") for n in (1, 2)]
+    write_recording(path, hello, [tares[0], scan(0), far, of_far[0], tares[1], of_far[1]])
+    assert [each.mode for each in load_recording(path).tares] == ["near", "far"]
+    first, other, last = (each.rest_ratio for each in replayed(path))
+    assert other is None
+    np.testing.assert_array_equal([first, last], [each.rest_ratio for each in tares])
+    export(load_recording(path), tmp_path / "far.npz", begin_s=0.004)
+    np.testing.assert_array_equal(load_readings(tmp_path / "far.npz").rest_ratio, last)
+    write_recording(tmp_path / "near.mcap", far, [tares[0], *of_far])
+    export(load_recording(tmp_path / "near.mcap"), tmp_path / "none.npz")
+    assert load_readings(tmp_path / "none.npz").rest_ratio is None
+
+
+def test_a_tare_that_says_no_mode_has_that_of_the_scans_before(path: Path, hello: Hello) -> None:
+    """As recordings had them before tares said theirs."""
+    properties = SCHEMAS["tare"]
+    mode = properties.pop("mode")
+    try:
+        far = replace(hello, mode="far")
+        write_recording(path, hello, [TARE, far, TARE])
+    finally:
+        properties["mode"] = mode
+    assert [each.mode for each in load_recording(path).tares] == ["near", "far"]
+
+
+def test_a_tare_is_recorded_with_the_mode_of_its_scans(tmp_path: Path) -> None:
+    bench = Bench("emulator://3x4?mode=far")
+    with Recorder(tmp_path / "far.mcap", bench.info) as recorder:
+        record(bench, recorder, bench, count=20, tare_s=0.1)
+    [tare] = load_recording(tmp_path / "far.mcap").tares
+    assert tare.mode == "far"
 
 
 # -------------------------------------------------------------------------------------- export

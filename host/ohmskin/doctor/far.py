@@ -203,18 +203,18 @@ class _Layer:
             self._compare(told, nominal_ohm, diagnosis)
         ohm, covariance, cost = _fit(self.of, usual_ohm)
         for n in told if len(self.told) > 2 else ():
-            k = int(cost[:-1, n].argmin())
-            may_be = np.flatnonzero(cost[:-1, n] < cost[k, n] + ALIKE_COST)
+            costs = cost[:-1, n]
+            may_be = np.flatnonzero(costs < costs.min() + ALIKE_COST)
+            k = int(may_be[0])  # contacts fail more often than yarn
             more_ohm = float(ohm[k, n, k]) - usual_ohm
-            clear = cost[k, n] < min(self.cost[n] + ALIKE_COST, cost[-1, n] - CLEAR_STDS**2)
+            clear = costs[k] < min(self.cost[n] + ALIKE_COST, cost[-1, n] - CLEAR_STDS**2)
             if not clear or more_ohm < CHANGED * len(self.across) * usual_ohm:
                 self._compare([n], usual_ohm, diagnosis)
                 continue
             self.ohm[n], self.covariance[n] = ohm[k, n], covariance[k, n]
             values = {"more_ohm": more_ohm, "std_ohm": float(covariance[k, n, k, k]) ** 0.5}
-            before = self.across[may_be[0] - 1] if may_be[0] else -1
-            kind = Kind.BAD_SEGMENT if may_be[0] else Kind.BAD_CRIMP
-            between = before, self.across[may_be[-1]]
+            between = self.across[k - 1] if k else -1, self.across[may_be[-1]]
+            kind = Kind.BAD_SEGMENT if k else Kind.BAD_CRIMP
             diagnosis.add(kind, self.place([n]), between=between, **values)
         for n in told:
             std_ohm = self.covariance[n].diagonal() ** 0.5
@@ -228,7 +228,8 @@ class _Layer:
         std_ohm = float(np.median(self.covariance[lines].sum(axis=(1, 2)) ** 0.5))
         usual_ohm = len(self.across) * segment_ohm
         scatter_ohm = (2 / len(self.across)) ** 0.5 * SEGMENT_STD * max(ohm, usual_ohm)
-        doubt_ohm = LINE_STDS * float(np.hypot(std_ohm, scatter_ohm))
+        both_ohm = (1 + np.pi / 2 / len(self.told)) ** 0.5 * std_ohm  # the usual one is a median
+        doubt_ohm = LINE_STDS * float(np.hypot(both_ohm, scatter_ohm))
         if abs(ohm - usual_ohm) > CHANGED * usual_ohm + doubt_ohm:
             values = {"ohm": ohm, "std_ohm": std_ohm, "usual_ohm": usual_ohm}
             diagnosis.add(Kind.LINE_WIRE, self.place(lines), **values)

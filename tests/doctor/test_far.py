@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ohmskin doctor` in mode far: wires of every line, and what is wrong with far ends.
+
+Truths are those of ngspice (tests/data/far_harsh_8x8.npz), of the scene behind an emulated board
+(its faults are checked against a node Laplacian in tests/emulate), and of the skin that the AVR
+simulator reads.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_doctor import told
+
+import ohmskin
+from bench_board import Bench, evidence
+from command_line import Run, assert_one_line, well
+from lockstep import Rig, elf_of
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance
+from ohmskin.cli.doctor import gather
+from ohmskin.cli.doctor_words import verdict, words_of
+from ohmskin.doctor.circuit import examine_circuit
+from ohmskin.doctor.examine import examine
+from ohmskin.doctor.far import examine_far, near_ends
+from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
+from ohmskin.doctor.signal import Rest
+from ohmskin.emulate.simavr import PROGRAM
+from ohmskin.link.codes import quantise
+from ohmskin.opening import emulated
+
+FAR = "emulator://8x8?mode=far&seed=1"
+HARSH = Path(__file__).parents[1] / "data" / "far_harsh_8x8.npz"
+WIRES = (0.2, 1.0, 10.0)  # times 100 and 200 ohm: from 20 ohm to 2 kOhm a segment
+
+
+def of_lines(top_ohm: Float, bottom_ohm: Float) -> dict[str, Float]:
+    """Segments of each line, from its near end."""
+    rows = {f"row {i}": each for i, each in enumerate(top_ohm)}
+    return rows | {f"column {j}": each for j, each in enumerate(bottom_ohm.T)}
+
+
+def name_of(line: LineWire) -> str:
+    [axis] = (
+        {"row": line.place.rows, "column": line.place.columns}.items()
+        - {("row", ())}
+        - {("column", ())}
+    )
+    return f"{axis[0]} {axis[1][0]}"
+
+
+def errors_of(lines: list[LineWire], truth: dict[str, Float]) -> tuple[Float, Float, Float]:
+    """Shares by which lines are off, the same in deviations, and segments in deviations."""
+    whole = {name_of(line): line.ohm - truth[name_of(line)].sum() for line in lines}
+    share = [whole[name_of(line)] / truth[name_of(line)].sum() for line in lines]
+    in_std = [whole[name_of(line)] / line.std_ohm for line in lines]
+    segments = [
+        (np.array(line.segment_ohm) - truth[name_of(line)]) / line.segment_std_ohm for line in lines
+    ]
+    return np.array(share), np.array(in_std), np.concatenate(segments)
+
+
+def diagnosis_of(ratio: Float, noise_lsb: float, scans: int = 225) -> Diagnosis:
+    """What the means of so many noisy scans of mode far show, readings (R, C, 4)."""
+    random = np.random.default_rng(1)
+    noisy = ratio + noise_lsb / 1024 * random.standard_normal((scans, *ratio.shape))
+    codes = quantise(np.clip(noisy, 0, 1)).mean(axis=0)
+    board = replace(Bench(FAR).info, rows=ratio.shape[0], columns=ratio.shape[1])
+    seen_lsb = float(np.hypot(noise_lsb, 12**-0.5))
+    rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0)), Diagnosis()
+    examine_circuit(near_ends(rest), diagnosis)
+    examine_far(rest, None, diagnosis)
+    return diagnosis
+
+
+# ------------------------------------------------------------------------------- sound skins
+
+
+@pytest.mark.parametrize("wires", WIRES)
+@pytest.mark.parametrize("noise", [0, 0.3, 0.5])
+def test_no_sound_skin_has_a_finding_and_lines_are_as_stated(wires: float, noise: float) -> None:
+    """Nine times eight skins of six sizes."""
+    in_std = []
+    for seed, size in enumerate(("8x8", "8x8", "8x8", "4x12", "3x3", "2x2", "1x1", "16x1")):
+        url = f"emulator://{size}?mode=far&seed={seed}&wires={wires}&noise={noise}"
+        diagnosis, skin = examine(evidence(url)), emulated(url)[1].skin(0.0)
+        assert diagnosis.findings == [], url
+        assert verdict(diagnosis) == "sound: nothing is wrong"
+        assert len(diagnosis.lines) == sum(skin.shape)
+        truth = of_lines(skin.top_wire_ohm, skin.bottom_wire_ohm)
+        off, deviations, _ = errors_of(diagnosis.lines, truth)
+        in_std += deviations.tolist()
+        if size == "8x8" and wires >= 1:
+            assert np.median(np.abs(off)) < (0.04 if noise else 0.1)
+    assert np.abs(in_std).max() < 4
+    assert np.sqrt(np.mean(np.square(in_std))) < 1.2
+
+
+def test_lines_against_ngspice() -> None:
+    """1 and 2 kOhm a segment, untouched and touched, with the noise of a sound converter."""
+    data = np.load(HARSH)
+    names = data["reading_names"].tolist()
+    far = [names.index(name) for name in "aebf"]
+    shares = []
+    for k, ratio in [(0, data["rest_ratio"]), *enumerate(data["ratio"])]:
+        diagnosis = diagnosis_of(ratio[..., far], 0.3)
+        assert [each for each in diagnosis.findings if each.kind is not Kind.TOUCHED] == []
+        truth = of_lines(data["top_wire_ohm"][k], data["bottom_wire_ohm"][k])
+        off, in_std, of_segments = errors_of(diagnosis.lines, truth)
+        assert len(off) == 16
+        assert max(np.abs(in_std).max(), np.abs(of_segments).max()) < 3
+        shares += np.abs(off).tolist()
+    assert np.median(shares) < 0.02
+    assert max(shares) < 0.05
+
+
+def test_touches_show_segments() -> None:
+    """Four touches on row 1: segments are known between them, and at rest they are not."""
+    skin = emulated("emulator://3x4?seed=2")[1].skin(0.0)
+    top_ohm = skin.top_wire_ohm.copy()
+    top_ohm[1] = 90, 110, 140, 70
+    cells = skin.cell_siemens.copy()
+    untouched = replace(skin, top_wire_ohm=top_ohm)
+    cells[1] = 1 / 5e3
+    stds = []
+    for each in (replace(untouched, cell_siemens=cells), untouched):
+        ratio = all_readings(each, end_admittance(each))[..., [0, 4, 1, 5]]
+        line = diagnosis_of(ratio, 0.4).lines[1]
+        assert np.all(
+            np.abs(np.subtract(line.segment_ohm, top_ohm[1])) < 3.5 * np.array(line.segment_std_ohm)
+        )
+        stds.append(np.array(line.segment_std_ohm))
+    assert np.all(stds[0] < 12)
+    assert np.all(stds[1] > 12)
+
+
+@pytest.mark.simavr
+@pytest.mark.skipif(not (PROGRAM.is_file() and elf_of("uno").is_file()), reason="make firmware sim")
+def test_lines_of_the_firmware_on_a_desk() -> None:
+    """As built, in the simulator, with the converter's errors and all capacitances."""
+    skin = emulated("emulator://8x8?seed=3")[1].skin(0.0)
+    admittance = end_admittance(skin)
+    with Rig("uno") as rig:
+        rig.sim.set_table(all_readings(skin, admittance.copy()))
+        rig.sim.set(desk=1, far_open=0)
+        rig.sim.request("C", bytes([0x80 | 8]) + admittance.tobytes())
+        rig.run(0.05)
+        rig.start_scan(mode="far", settle_us=300, rate_mhz=0)
+        rig.run(3.0)
+        codes = np.array([scan.codes for scan in rig.scans[2:]], dtype=float)
+    board = Bench(FAR).info
+    noise_lsb = float(np.sqrt(np.mean(np.diff(codes, axis=0) ** 2) / 2))
+    rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb, (100.0, 200.0)), Diagnosis()
+    examine_circuit(near_ends(rest), diagnosis)
+    examine_far(rest, None, diagnosis)
+    assert diagnosis.findings == []
+    truth = of_lines(skin.top_wire_ohm, skin.bottom_wire_ohm)
+    off, in_std, _ = errors_of(diagnosis.lines, truth)
+    assert np.median(np.abs(off)) < 0.05
+    assert np.abs(in_std).max() < 4
+
+
+# ------------------------------------------------------------------------------------ faults
+
+
+FOUND = {
+    "open_far_row=5": ("open_far", "far end of row 5"),
+    "open_far_row=0": ("open_far", "far end of row 0"),
+    "open_far_column=4": ("open_far", "far end of column 4"),
+    "swap_far_rows=2,3": ("swapped_far", "far ends of rows 2, 3"),
+    "swap_far_columns=0,7": ("swapped_far", "far ends of columns 0, 7"),
+    "short_far_rows=2,3": ("short_far", "far ends of rows 2 and 3"),
+    "short_far_columns=0,7": ("short_far", "far ends of columns 0 and 7"),
+    "short_rows=2,3": ("short_rows", "rows 2 and 3"),
+    "short_columns=0,7": ("short_columns", "columns 0 and 7"),
+    "broken_row=4,3": ("broken_yarn", "row 4, between columns 2 and 3"),
+    "broken_row=4,7": ("broken_yarn", "row 4, between columns 6 and 7"),
+    "broken_column=1,5": ("broken_yarn", "column 5, between rows 0 and 1"),
+    "crimp_row=1": ("bad_crimp", "row 1, near end"),
+    "crimp_column=6&crimp_ohm=900": ("bad_crimp", "column 6, near end"),
+    "open_row=3": ("open_row", "row 3"),
+    "dead=1,2": ("dead_cell", "cell (1, 2)"),
+    "saturated=1,2": ("saturated_cell", "cell (1, 2)"),
+    "ref_top=36000": ("reference_ratio", "reference resistors"),
+}
+
+
+@pytest.mark.parametrize("fault", FOUND)
+def test_every_fault_is_named_and_no_other(fault: str) -> None:
+    for seed, noise in ((1, 0.3), (2, 0.5)):
+        assert told(f"emulator://8x8?mode=far&seed={seed}&noise={noise}&{fault}") == [FOUND[fault]]
+
+
+@pytest.mark.parametrize("wires", WIRES)
+def test_far_ends_are_judged_with_all_wires(wires: float) -> None:
+    for fault in ("open_far_row=5", "open_far_column=4", "swap_far_rows=2,3", "broken_row=4,3"):
+        assert told(f"{FAR}&wires={wires}&noise=0.4&{fault}") == [FOUND[fault]]
+
+
+def test_a_crimp_is_measured_and_counts_in_its_line() -> None:
+    sound = {name_of(each): each.ohm for each in examine(evidence(FAR)).lines}
+    for ohm in (400, 1500):
+        diagnosis = examine(evidence(f"{FAR}&crimp_row=1&crimp_ohm={ohm}"))
+        [finding] = diagnosis.findings
+        assert finding.kind.severity is Severity.WARNING
+        more_ohm, std_ohm = finding.values["more_ohm"], finding.values["std_ohm"]
+        assert abs(more_ohm - ohm) < 3 * std_ohm < 0.5 * ohm
+        line = diagnosis.lines[1]
+        assert abs(line.ohm - sound["row 1"] - ohm) < 3 * line.std_ohm
+
+
+def bad_skin(segments: Float) -> Skin:
+    """A skin whose row 2 has these segments [ohm]."""
+    skin = emulated("emulator://8x8?seed=5")[1].skin(0.0)
+    top_ohm = skin.top_wire_ohm.copy()
+    top_ohm[2] = segments
+    return replace(skin, top_wire_ohm=top_ohm)
+
+
+def test_a_bad_segment_and_an_odd_line_are_told_apart() -> None:
+    worn = np.full(8, 100.0)
+    worn[4] = 1500.0
+    for segments, kind in ((worn, Kind.BAD_SEGMENT), (np.full(8, 250.0), Kind.LINE_WIRE)):
+        skin = bad_skin(segments)
+        ratio = all_readings(skin, end_admittance(skin))[..., [0, 4, 1, 5]]
+        diagnosis = diagnosis_of(ratio, 0.4)
+        [finding] = diagnosis.findings
+        assert (finding.kind, finding.place.rows) == (kind, (2,))
+        if kind is Kind.BAD_SEGMENT:
+            first, last = finding.values["between"]
+            assert first < 4 <= last
+        else:
+            assert finding.values["ohm"] == pytest.approx(2000, rel=0.1)
+            assert finding.values["usual_ohm"] == pytest.approx(800, rel=0.1)
+        assert all(words_of(finding).values())
+
+
+def test_wires_that_are_not_nominal_are_told() -> None:
+    found = evidence(f"{FAR}&wires=2", wire_ohm=(100.0, 200.0))
+    rows, columns = examine(found).findings
+    assert {rows.kind, columns.kind} == {Kind.LINE_WIRE}
+    assert rows.place.rows == columns.place.columns == tuple(range(8))
+    assert rows.values["ohm"] == pytest.approx(2 * rows.values["usual_ohm"], rel=0.1)
+    assert examine(replace(found, wire_ohm=(200.0, 400.0))).findings == []
+
+
+def test_all_far_ends_are_open_where_there_is_no_second_pair() -> None:
+    """Sense nodes that are connected to nothing keep what they had."""
+    read = evidence(FAR)
+    board, scans = read.settled or (read.board, read.scans)
+    assert scans[0].mode == "far"
+    for scan in scans:
+        scan.codes[..., 1] = np.roll(scan.codes[..., 0].T.ravel(), 1).reshape(8, 8).T
+        scan.codes[..., 3] = np.roll(scan.codes[..., 2].T.ravel(), 1).reshape(8, 8).T
+    rows, columns = examine(replace(read, board=board, scans=scans, settled=None)).findings
+    assert (rows.kind, columns.kind) == (Kind.OPEN_FAR, Kind.OPEN_FAR)
+    assert rows.place.rows == columns.place.columns == tuple(range(8))
+
+
+# ------------------------------------------------------------------------------- the command
+
+
+@pytest.fixture
+def benches(monkeypatch: pytest.MonkeyPatch) -> list[Bench]:
+    """The boards that commands open, in simulated time."""
+    opened: list[Bench] = []
+
+    def connect(url: str, **_: object) -> Bench:
+        opened.append(Bench(url))
+        return opened[-1]
+
+    monkeypatch.setattr(ohmskin, "open", connect)
+    return opened
+
+
+def test_page_and_json(run: Run, benches: list[Bench]) -> None:
+    done = well(run("doctor", FAR))
+    assert benches[0].now_s < 8
+    table = done.out[done.out.index("wires [ohm]") :].splitlines()
+    assert len(table) == 1 + 16
+    assert table[1].startswith("row 0 ")
+    assert " +- " in table[16]
+    answer = json.loads(run("doctor", FAR, "--json").out)
+    assert [each["place"]["rows"] for each in answer["lines"][:8]] == [[n] for n in range(8)]
+    assert answer["lines"][9]["place"]["columns"] == [1]
+    assert len(answer["lines"][9]["segment_ohm"]) == 8
+    assert json.loads(run("doctor", "emulator://2x2", "--json").out)["lines"] == []
+
+
+@pytest.mark.usefixtures("benches")
+def test_presses_are_not_asked_for(run: Run) -> None:
+    done = run("doctor", FAR, "--press")
+    assert_one_line(done, "mode far shows the wires untouched: leave out --press")
+
+
+def test_the_board_stays_in_its_mode() -> None:
+    bench = Bench(FAR)
+    before = bench.info
+    gather(bench, clocks=True)
+    assert bench.info == before
+
+
+def test_a_plate_is_verified_by_the_near_ends(
+    run: Run, benches: list[Bench], tmp_path: Path
+) -> None:
+    plate = tmp_path / "plate.csv"
+    plate.write_text("10000,open\n22000,47000\n")
+    url = f"emulator://2x2?mode=far&plate={plate}"
+    answer = json.loads(run("verify", url, str(plate), "--seconds", "1", "--json", "-").out)
+    assert answer["findings"] == []
+    assert answer["hello"]["mode"] == "near"
+    assert benches[0].info.mode == "far"
