@@ -5,15 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Final
 
-from ohmskin.doctor.findings import (
-    WHOLE_SKIN,
-    Diagnosis,
-    Finding,
-    Kind,
-    LineWire,
-    Place,
-    WireShare,
-)
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, LineWire, Place, WireShare
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.protocol import ENUMS
 
@@ -56,8 +48,8 @@ def _words(finding: Finding) -> dict[str, Any]:
             beyond = lines == tuple(range(lines[0], values["line_count"]))
             cases = {"one_cell": values["cells_per_line"] == 1, "last_lines": beyond}
             return {"table": "open", "line": line, "first": lines[0], **cases}
-        case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS | Kind.SHORT_FAR:
-            table = "short_far" if finding.kind is Kind.SHORT_FAR else "short"
+        case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS | Kind.SHORT_FAR as kind:
+            table = kind.id.removesuffix("_rows").removesuffix("_columns")
             return {"table": table, "line": line, "joined": " and ".join(map(str, lines))}
         case Kind.BROKEN_YARN | Kind.BAD_CRIMP | Kind.BAD_SEGMENT:
             return {"line": line, "across": "column" if line == "row" else "row"}

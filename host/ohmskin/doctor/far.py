@@ -175,11 +175,11 @@ class _Layer:
         chi2 = np.mean(((self.of[1] - ends_ohm) / self.of[2]) ** 2, axis=2)
         np.fill_diagonal(chi2, np.inf)
         self.lost &= [not self._is_broken(n, diagnosis) for n in range(len(self.lost))]
-        elsewhere = self.lost & (chi2.min(axis=0) < LOST_CHI2)
-        ends = (Kind.SWAPPED_FAR, elsewhere), (Kind.OPEN_FAR, self.lost & ~elsewhere)
-        for kind, lines in ends:
-            if lines.any():
-                diagnosis.add(kind, self.place(lines))
+        swapped = self.lost & (chi2.min(axis=0) < LOST_CHI2)
+        if swapped.any():
+            diagnosis.add(Kind.SWAPPED_FAR, self.place(swapped))
+        if (self.lost & ~swapped).any():
+            diagnosis.add(Kind.OPEN_FAR, self.place(self.lost & ~swapped))
 
     def _is_broken(self, n: int, diagnosis: Diagnosis) -> bool:
         """Add a lost line that is dead from some cell on, in place of these dead cells."""

@@ -74,10 +74,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class Tare:
-    """Mean readings of the untouched skin, `rest_ratio` of shape (rows, columns, 4).
-
-    mode: which readings these are. A scan of another mode has another rest: see `is_of`.
-    """
+    """Mean readings of the untouched skin, `rest_ratio` of shape (rows, columns, 4), of a mode."""
 
     rest_ratio: Float
     host_time_s: float
@@ -184,7 +181,7 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
     :raises RecordingError: as `load_recording`.
     """
     topics: dict[int, str] = {}
-    known, ended, mode = False, False, "near"  # older recordings know no other
+    known = ended = False
     try:
         with open(path, "rb") as file:
             for record in _records(_Bounded(file)):
@@ -192,8 +189,7 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
                     case Channel(message_encoding="json", topic=topic) if topic.startswith(TOPIC):
                         topics[record.id] = topic.removeprefix(TOPIC)
                     case McapMessage() if topics.get(record.channel_id) in SCHEMAS:
-                        message = _message(topics[record.channel_id], record.data, mode)
-                        mode = getattr(message, "mode", mode)
+                        message = _message(topics[record.channel_id], record.data)
                         if not known and not isinstance(message, Hello):
                             raise ValueError("no board says hello in it before the first message")
                         known = True
@@ -265,14 +261,13 @@ def _records(file: _Bounded) -> Iterator[McapRecord]:
         raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
 
 
-def _message(name: str, octets: bytes, mode: str) -> Recorded:
-    """A message; mode: that of the one before, for those that do not say theirs."""
+def _message(name: str, octets: bytes) -> Recorded:
     if len(octets) > _LARGEST_MESSAGE:
         raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
-    content.setdefault("mode", mode if name == "tare" else "near")
+    content.setdefault("mode", "near")  # older recordings know no other
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
