@@ -43,12 +43,8 @@ def of_lines(top_ohm: Float, bottom_ohm: Float) -> dict[str, Float]:
 
 
 def name_of(line: LineWire) -> str:
-    [axis] = (
-        {"row": line.place.rows, "column": line.place.columns}.items()
-        - {("row", ())}
-        - {("column", ())}
-    )
-    return f"{axis[0]} {axis[1][0]}"
+    axis, numbers = ("row", line.place.rows) if line.place.rows else ("column", line.place.columns)
+    return f"{axis} {numbers[0]}"
 
 
 def errors_of(lines: list[LineWire], truth: dict[str, Float]) -> tuple[Float, Float, Float]:
@@ -81,7 +77,7 @@ def diagnosis_of(ratio: Float, noise_lsb: float, scans: int = 225) -> Diagnosis:
 @pytest.mark.parametrize("wires", WIRES)
 @pytest.mark.parametrize("noise", [0, 0.3, 0.5])
 def test_no_sound_skin_has_a_finding_and_lines_are_as_stated(wires: float, noise: float) -> None:
-    """Nine times eight skins of six sizes."""
+    """In all, 72 skins of six sizes."""
     in_std = []
     for seed, size in enumerate(("8x8", "8x8", "8x8", "4x12", "3x3", "2x2", "1x1", "16x1")):
         url = f"emulator://{size}?mode=far&seed={seed}&wires={wires}&noise={noise}"
@@ -138,13 +134,16 @@ def test_touches_show_segments() -> None:
 
 @pytest.mark.simavr
 @pytest.mark.skipif(not (PROGRAM.is_file() and elf_of("uno").is_file()), reason="make firmware sim")
-def test_lines_of_the_firmware_on_a_desk() -> None:
-    """As built, in the simulator, with the converter's errors and all capacitances."""
+@pytest.mark.parametrize("far_open", [0, 1])
+def test_the_firmware_on_a_desk(far_open: int) -> None:
+    """As built, in the simulator, with the converter's errors and all capacitances; and the same
+    without far multiplexers: then all far ends are open.
+    """
     skin = emulated("emulator://8x8?seed=3")[1].skin(0.0)
     admittance = end_admittance(skin)
     with Rig("uno") as rig:
         rig.sim.set_table(all_readings(skin, admittance.copy()))
-        rig.sim.set(desk=1, far_open=0)
+        rig.sim.set(desk=1, far_open=far_open)
         rig.sim.request("C", bytes([0x80 | 8]) + admittance.tobytes())
         rig.run(0.05)
         rig.start_scan(mode="far", settle_us=300, rate_mhz=0)
@@ -155,6 +154,10 @@ def test_lines_of_the_firmware_on_a_desk() -> None:
     rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb, (100.0, 200.0)), Diagnosis()
     examine_circuit(near_ends(rest), diagnosis)
     examine_far(rest, None, diagnosis)
+    if far_open:
+        assert [each.kind for each in diagnosis.findings] == [Kind.OPEN_FAR, Kind.OPEN_FAR]
+        assert diagnosis.lines == []
+        return
     assert diagnosis.findings == []
     truth = of_lines(skin.top_wire_ohm, skin.bottom_wire_ohm)
     off, in_std, _ = errors_of(diagnosis.lines, truth)
@@ -197,6 +200,27 @@ def test_every_fault_is_named_and_no_other(fault: str) -> None:
 def test_far_ends_are_judged_with_all_wires(wires: float) -> None:
     for fault in ("open_far_row=5", "open_far_column=4", "swap_far_rows=2,3", "broken_row=4,3"):
         assert told(f"{FAR}&wires={wires}&noise=0.4&{fault}") == [FOUND[fault]]
+
+
+def test_several_faults_are_named_at_once() -> None:
+    ends = "swap_far_rows=1,2&open_far_column=5"
+    assert sorted(told(f"{FAR}&{ends}&broken_row=6,3&crimp_column=2&dead=0,0")) == [
+        ("bad_crimp", "column 2, near end"),
+        ("broken_yarn", "row 6, between columns 2 and 3"),
+        ("dead_cell", "cell (0, 0)"),
+        ("open_far", "far end of column 5"),
+        ("swapped_far", "far ends of rows 1, 2"),
+    ]
+
+
+@pytest.mark.parametrize("scene", ["single", "ghost", "multi", "moving"])
+def test_a_touch_is_no_fault(scene: str) -> None:
+    """While something moves, far ends are not judged."""
+    for seed, size in enumerate(("3x3", "8x8")):
+        bench = Bench(f"emulator://{size}?mode=far&scene={scene}&seed={seed}", now_s=5.0)
+        diagnosis = examine(gather(bench))
+        assert [each.kind for each in diagnosis.findings] == [Kind.TOUCHED], (scene, size)
+        assert len(diagnosis.lines) == (0 if scene == "moving" else 6 if size == "3x3" else 16)
 
 
 def test_a_crimp_is_measured_and_counts_in_its_line() -> None:
