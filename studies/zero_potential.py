@@ -5,7 +5,7 @@ One row electrode is at Vdd and all others are at ground. An operational amplifi
 electrode holds it at ground, too, and gives the current I that flows there. Without wires every
 other cell has no voltage, so I / Vdd is the conductance of the cell. Wires change that: the voltage
 that they lose is missing at the cell, and what the lines carry for other cells adds to it.
-(D'Alessio 1999, Saxena et al. 2011 describe such circuits.)
+(Such circuits: Hidalgo-López et al., Sensors 17, 2513, 2017; Wu et al., Sensors 16, 720, 2016.)
 
 Symbols, for one driven row k
 
