@@ -38,7 +38,7 @@ _STYLES: Final[dict[str, dict[str, Any]]] = {
     ZERO_SOLVED: {"color": "#0072b2", "marker": "P", "label": "…, solved with the wires told"},
 }
 _APART: Final = {WIRES: 1.06, BEND: 1.006}  # from readout to readout, that bars do not hide bars
-_LIMITS: Final = (0.03, 130.0)  # per cent
+_LIMITS: Final = (0.03, 200.0)  # per cent
 _NOTE: Final = (
     "Simulation: 8x8 cells, 1 MΩ at rest, touches of 1 to 100 kΩ at random places, or a fingertip "
     "over some 20 cells; wire segments spread by 10 %. Told: the middle of the segments of each "
