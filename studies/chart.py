@@ -23,6 +23,7 @@ from ohmskin.arrays import Float
 from ohmskin.estimate.methods import METHODS
 from ohmskin.record.readings import estimate_file
 from studies import casadi_circuit, published
+from studies.far import seen
 from studies.information import information_limit
 from studies.trials import PAPER_METHODS, Trial, random_trial, trial_of
 
@@ -30,6 +31,8 @@ from studies.trials import PAPER_METHODS, Trial, random_trial, trial_of
 PAPER_CELLS: Final = 9
 TAIL: Final = 0.9  # the quantile beside each median
 RANDOM: Final = "random"
+FAR: Final = "random, far ends"  # both ends of all lines are sensed: another board
+FAR_METHODS: Final = ("joint", "touch")
 BOARD: Final = "board"  # the paper's own skin
 LINEARISATION: Final = "linearisation"
 MEASURED: Final = "measured"
@@ -82,6 +85,11 @@ class Plan:
             if size.cells <= PAPER_CELLS or method not in PAPER_METHODS
         ]
 
+    @property
+    def far_methods(self) -> list[str]:
+        """Those that take readings at far ends."""
+        return [method for method in FAR_METHODS if method in self.methods]
+
 
 FULL: Final = Plan(skins=8, frames=33)
 QUICK: Final = Plan(skins=2, frames=11, repeats=2)
@@ -91,10 +99,12 @@ QUICK: Final = Plan(skins=2, frames=11, repeats=2)
 class Row:
     """One method on one kind of frames; a line of the CSV. None: there is no such number.
 
-    scene: "random", the paper's "cell_sweep" or "wire_sweep", or "board", the paper's own skin; or
-    "linearisation", no frame, but port resistances and all their derivatives once, as `joint` needs
-    them several times a frame: method is "numpy", "casadi" (its virtual machine) or "casadi_c" (the
-    C that it generates; no row without a compiler), and all but the times is None.
+    scene: "random"; "random, far ends", the same frames on a board that senses both ends of all
+    lines, told no wires, and on no front; the paper's "cell_sweep" or "wire_sweep"; "board", the
+    paper's own skin; or "linearisation", no frame, but port resistances and all their derivatives
+    once, as `joint` needs them several times a frame: method is "numpy", "casadi" (its virtual
+    machine) or "casadi_c" (the C that it generates; no row without a compiler), and all but the
+    times is None.
     source: "measured", or "Su2024" for what the paper printed. ms: of a frame, median and 90th
     percentile. error_percent: of the conductance of pressed cells, over the true one, likewise.
     rmse_megohm: over all cells of a frame, likewise over the frames. on_front: no other method of
@@ -138,7 +148,7 @@ class Row:
     @property
     def judged_by(self) -> float | None:
         """The error by which the front is found."""
-        return self.error_percent if self.scene == RANDOM else self.rmse_megohm
+        return self.error_percent if self.scene in (RANDOM, FAR) else self.rmse_megohm
 
 
 # ------------------------------------------------------------------------------------ measuring
@@ -166,7 +176,7 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
 
 
 def _frames(plan: Plan) -> int:
-    random = sum(len(plan.methods_for(size)) for size in plan.sizes)
+    random = sum(len(plan.methods_for(size)) + len(plan.far_methods) for size in plan.sizes)
     conditions = sum(map(len, published.CONDITIONS_MEGOHM.values()))
     return random * len(plan.bits) * plan.skins * plan.frames + len(plan.methods) * conditions * (
         plan.repeats + 1
@@ -244,18 +254,25 @@ def _random_rows(
     size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, count: _Count
 ) -> list[Row]:
     tallies: dict[str, _Tally] = defaultdict(_Tally)
+    of_far: dict[str, _Tally] = defaultdict(_Tally)
     # Method by method within a skin, so that a slow minute of the machine hits all alike.
     for trial in trials:
         readings = trial.rounded(bits)
         for method in plan.methods_for(size):
             answers = estimate_file(readings, method, watch=count.watch)
             tallies[method].add(answers, trial, plan.warm_up)
+        readings = seen(trial, "far", bits)
+        for method in plan.far_methods:
+            answers = estimate_file(readings, method, watch=count.watch)
+            of_far[method].add(answers, trial, plan.warm_up)
     limits = _limits(trials, bits, plan.warm_up)
+    place: dict[str, Any] = {"rows": size.rows, "columns": size.columns, "bits": bits}
     return [
-        tally.row(
-            scene=RANDOM, rows=size.rows, columns=size.columns, bits=bits, method=method, **limits
-        )
-        for method, tally in tallies.items()
+        *(
+            tally.row(scene=RANDOM, method=name, **place, **limits)
+            for name, tally in tallies.items()
+        ),
+        *(tally.row(scene=FAR, method=name, **place) for name, tally in of_far.items()),
     ]
 
 
@@ -342,7 +359,7 @@ def _with_front(rows: Sequence[Row]) -> list[Row]:
     for row in rows:
         by_place[row.place].append(row)
     return [
-        replace(row, on_front=on_front)
+        replace(row, on_front=on_front and row.scene != FAR)
         for rivals in by_place.values()
         for row, on_front in zip(
             rivals,

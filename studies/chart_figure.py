@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ohmskin.errors import OhmskinError
 from ohmskin.estimate.methods import METHODS
 from studies.casadi_circuit import EVALUATIONS, GENERATED_C, MACHINE, NUMPY
-from studies.chart import BOARD, LINEARISATION, MEASURED, PAPER, RANDOM, Row, or_nan
+from studies.chart import BOARD, FAR, LINEARISATION, MEASURED, PAPER, RANDOM, Row, or_nan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,11 +35,14 @@ _EVALUATIONS: Final[dict[str, dict[str, Any]]] = {
     MACHINE: {"label": "CasADi", "color": _FAINT, "marker": "o", "markerfacecolor": "white"},
     GENERATED_C: {"label": "CasADi's C", "color": _FAINT, "marker": "x", "linestyle": ":"},
 }
+_STAR: Final[dict[str, Any]] = {"marker": "*", "markersize": 12, "linestyle": ""}
 _PANELS_FOR_NOTES: Final = 2
 _NOTES: Final = (
     "Upper rows: the same random skins for all methods, 1 to 100 kΩ where touched, each frame "
     "touched anew and started from the one before. A percentage under a marker: so many frames "
     "converged; the others count as well. Without it: all did.",
+    "Stars: the same frames, read by a board that senses both ends of all lines, by 'joint' and "
+    "'touch', which are told nothing of the wires there. Near ends are told the nominal wires.",
     "Limit: the median error of the best possible estimator of one frame alone, from the posterior "
     "at the truth (0.67 of its standard deviation, if all cells had the same). Upper edge: "
     "told which cells are pressed, else with the priors of 'joint'; lower edge: told the cells at "
@@ -87,6 +90,7 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
             first = first or axes
             of_panel = [row for row in random if (row.rows, row.columns, row.bits) == (*size, bits)]
             _random_panel(axes, of_panel)
+            _far_points(axes, [row for row in rows if row.place == (FAR, *size, bits)])
             _mark_times(axes, [row for row in rows if row.place == (BOARD, *size, bits)])
             axes.tick_params(labelleft=column == 0)
             if line == 0:
@@ -152,6 +156,17 @@ def _random_panel(axes: Axes, rows: Sequence[Row]) -> None:
             fontsize=_SMALL,
             color=_FAINT,
         )
+
+
+def _far_points(axes: Axes, rows: Sequence[Row]) -> None:
+    """What far ends give: stars, and pale lines up to the 90th percentile."""
+    for row in rows:
+        colour = method_style(row.method)["color"]
+        if row.ms is None or row.error_percent is None or row.error_p90_percent is None:
+            continue
+        tail = [row.error_percent, row.error_p90_percent]
+        axes.plot([row.ms, row.ms], tail, color=colour, alpha=0.3, linewidth=4, zorder=1.5)
+        axes.plot([row.ms], [row.error_percent], **_STAR, color=colour, zorder=4)
 
 
 def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
@@ -290,6 +305,7 @@ def _explain(figure: Figure, title: str, methods: set[str]) -> None:
         Line2D([], [], **mark, marker="o", markerfacecolor="white", label="median"),
         Line2D([], [], color=_FAINT, alpha=0.5, linewidth=4, label="up to the 90th percentile"),
         Line2D([], [], color=_FAINT, linestyle=":", label="90 Hz: 11.1 ms"),
+        Line2D([], [], color=_INK, **_STAR, label="far ends, wires not told"),
         Patch(color=_BAND, label="limit of one frame"),
         Line2D([], [], color=_INK, linestyle=_PRINTED, label="printed RMSE, no time"),
         Line2D([], [], **mark, marker="^", markersize=8.5, label="printed time, no error"),

@@ -12,7 +12,7 @@ from dataclasses import fields
 from rich.table import Table
 
 from studies.casadi_circuit import COMPILER, GENERATED_C
-from studies.chart import LINEARISATION, MEASURED, RANDOM, Row, or_nan
+from studies.chart import FAR, LINEARISATION, MEASURED, RANDOM, Row, or_nan
 
 
 def csv_text(rows: Iterable[Row]) -> str:
@@ -65,7 +65,8 @@ def summary(rows: Iterable[Row]) -> Table:
     for row in rows:
         if row.source != MEASURED:
             continue
-        size = f"{row.rows}x{row.columns} {row.resolution if row.scene == RANDOM else row.scene}"
+        names = {RANDOM: row.resolution, FAR: f"{row.resolution}, far ends"}
+        size = f"{row.rows}x{row.columns} {names.get(row.scene, row.scene)}"
         share = row.converged_share
         table.add_row(
             size if row.place != before else "",

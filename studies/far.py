@@ -129,14 +129,16 @@ def _conditions() -> Iterator[tuple[str, str, float, float]]:
         yield BEND, SCENES[1], BENT_OHM, bend
 
 
-def seen(trial: Trial, mode: str, bits: int, *, told: bool = False) -> Readings:
-    """The trial's readings in a mode, rounded; its nominal wires only if they are told."""
+def seen(trial: Trial, mode: str, bits: int | None, *, told: bool = False) -> Readings:
+    """The trial's readings in a mode; its nominal wires only if they are told. bits None: exact."""
     chosen = [_NAMES.index(name) for name in MODES[mode]]
     exact = [
         all_readings(skin, end_admittance(skin))[..., chosen]
         for skin in (trial.rest, *trial.frames)
     ]
-    rest, *frames = (ratio_from_codes(quantise(each, bits), bits) for each in exact)
+    if bits is not None:
+        exact = [ratio_from_codes(quantise(each, bits), bits) for each in exact]
+    rest, *frames = exact
     readings = replace(
         trial.readings,
         ratio=np.array(frames),

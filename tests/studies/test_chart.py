@@ -77,11 +77,22 @@ def test_all_methods_get_the_same_frames(rows: list[Row]) -> None:
             assert 0 <= row.error_percent <= row.error_p90_percent
 
 
+def test_far_ends_read_the_same_frames(rows: list[Row]) -> None:
+    for bits in (None, 10):
+        (near,) = of(rows, scene="random", bits=bits, method="joint")
+        (far,) = of(rows, scene="random, far ends", bits=bits)
+        assert (far.method, far.on_front) == ("joint", False)
+        assert (far.frames, far.pressed_cells) == (near.frames, near.pressed_cells)
+        assert 0 < far.ms <= far.ms_p90
+        assert 0 <= far.error_percent < 2  # per cent; measured: 0.3 at 10 bits
+    assert "2x2 10 bit, far ends" in {*chart_table.summary(rows).columns[0].cells}
+
+
 def test_progress_counts_every_frame() -> None:
     seen = list[tuple[int, int]]()
-    plan = replace(TINY, methods=("ohm", "matrix"), bits=(10,))
+    plan = replace(TINY, methods=("ohm", "touch"), bits=(10,))
     chart.measure(plan, lambda done, frames: seen.append((done, frames)))
-    total = 2 * 8 + 2 * 10 * 2
+    total = (2 + 1) * 8 + 2 * 10 * 2  # touch at far ends as well
     assert seen == [(done, total) for done in range(1, total + 1)]
 
 
@@ -175,7 +186,7 @@ def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
     table = list(csv.DictReader(io.StringIO(chart_table.csv_text(rows))))
     evaluations = len(of(rows, scene="linearisation"))
     assert evaluations >= 2
-    assert len(table) == len(rows) == 2 * 3 + 2 * 3 + evaluations + 2 + 6
+    assert len(table) == len(rows) == 2 * (3 + 1) + 2 * 3 + evaluations + 2 + 6
     assert list(table[0]) == [column.name for column in fields(Row)]
     assert list(table[0])[:6] == ["scene", "source", "rows", "columns", "bits", "method"]
     for line, row in zip(table, rows, strict=True):
