@@ -43,11 +43,11 @@ _NOTES: Final = (
     "converged; the others count as well. Without it: all did.",
     "Stars: the same frames, read by a board that senses both ends of all lines, by 'joint' and "
     "'touch', which are told nothing of the wires there. Near ends are told the nominal wires.",
-    "Limit: the median error of the best possible estimator of one frame alone, from the posterior "
-    "at the truth (0.67 of its standard deviation, if all cells had the same). Upper edge: "
-    "told which cells are pressed, else with the priors of 'joint'; lower edge: told the cells at "
-    "rest and each layer's mean wire as well. What learns the wires from earlier frames can fall "
-    "below.",
+    "Limit, of near ends: the median error of the best possible estimator of one frame alone, from "
+    "the posterior at the truth (0.67 of its standard deviation, if all cells had the same). Upper "
+    "edge: told which cells are pressed, else with the priors of 'joint'; lower edge: told the "
+    "cells at rest and each layer's mean wire as well. What learns the wires from earlier frames "
+    "can fall below.",
     "Paper (Su et al. 2024): of its 2x2 skin it prints the time (AMD 7940HS), and no error of "
     "resistance; of simulated 3x3 skins errors, and no time. Lines: median of its five conditions.",
     "Sweeps: exact readings, each frame cold. All methods are told the true wires and the readings "
@@ -306,7 +306,7 @@ def _explain(figure: Figure, title: str, methods: set[str]) -> None:
         Line2D([], [], color=_FAINT, alpha=0.5, linewidth=4, label="up to the 90th percentile"),
         Line2D([], [], color=_FAINT, linestyle=":", label="90 Hz: 11.1 ms"),
         Line2D([], [], color=_INK, **_STAR, label="far ends, wires not told"),
-        Patch(color=_BAND, label="limit of one frame"),
+        Patch(color=_BAND, label="limit of one frame, near ends"),
         Line2D([], [], color=_INK, linestyle=_PRINTED, label="printed RMSE, no time"),
         Line2D([], [], **mark, marker="^", markersize=8.5, label="printed time, no error"),
     ]

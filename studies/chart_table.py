@@ -65,7 +65,7 @@ def summary(rows: Iterable[Row]) -> Table:
     for row in rows:
         if row.source != MEASURED:
             continue
-        names = {RANDOM: row.resolution, FAR: f"{row.resolution}, far ends"}
+        names = {RANDOM: row.resolution, FAR: f"{row.resolution} far"}
         size = f"{row.rows}x{row.columns} {names.get(row.scene, row.scene)}"
         share = row.converged_share
         table.add_row(
