@@ -67,6 +67,7 @@ NOT_RUN = {
     "make chart": "takes minutes; tests/studies runs small ones of its kind",
     "make stability": "takes minutes; tests/studies runs small ones of its kind",
     "make ablate": "takes minutes; tests/studies runs small ones of its kind",
+    "make far": "takes minutes; tests/studies runs small ones of its kind",
     "make experiments": "takes minutes; tests/studies runs small ones of its kind",
     "python benchmarks/paper_table.py": "takes minutes",
     "ohmskin flash uno --port /dev/ttyACM0": "needs a boot loader; tests/cli/test_flash.py has one",

@@ -123,8 +123,9 @@ def test_scans_keep_their_mode(tmp_path: Path, path: Path, hello: Hello) -> None
     readings = load_readings(tmp_path / "far.npz")
     assert readings.reading_names == ("a", "e", "b", "f")
     np.testing.assert_array_equal(readings.ratio, [each.ratio for each in scans[2:]])
-    with pytest.raises(ValueError, match="'joint' takes the readings a b c d, not a e b f"):
-        estimate_file(readings, "joint")
+    with pytest.raises(ValueError, match="'matrix' takes the readings a b c d, not a e b f"):
+        estimate_file(readings, "matrix")
+    assert len(estimate_file(readings, "joint")["cell_siemens"]) == len(scans[2:])
     header = (tmp_path / "far.csv").read_text().splitlines()[0].split(",")
     assert header[4:8] == ["r0c0a", "r0c0e", "r0c0b", "r0c0f"]
 
