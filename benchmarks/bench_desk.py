@@ -12,6 +12,7 @@ which the last is judged. The wires are told: 100 and 200 ohm, of which segments
 
 desk_*      the board on a desk
 exact_*     the same skins as readings of 10 bits, which are exact otherwise
+far_*       the same skins on a board in mode far; there the wires are not told
 
 *_percent            median error of a pressed cell, and its 90th percentile
 *_within_4           pressed cells within 4 stated deviations [%]
@@ -32,9 +33,10 @@ from bars import at_least, at_most, report  # beside this file
 
 from desk import DeskSkin, desk_skin  # tests/helpers
 from ohmskin.circuit.skin import readings
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.protocol import MODES
 from studies.trials import BOTTOM_WIRE_OHM, PRESSED, TOP_WIRE_OHM
 
 SKINS, FRAMES = 10, 24
@@ -50,12 +52,21 @@ def exact(skin: DeskSkin) -> DeskSkin:
     return DeskSkin(skin.rest, rest, skin.frames, [np.array([each] * 3) for each in frames])
 
 
-def judged(skins: list[DeskSkin], method: str, wire_std: float | None) -> dict[str, float]:
+def told(wire_std: float | None) -> WireOhm:
+    return WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM, wire_std)
+
+
+def judged(
+    skins: list[DeskSkin], method: str, wires: WireOhm, mode: str = "near"
+) -> dict[str, float]:
     error, stated, wrong = [], [], []
     for skin in skins:
-        wires = WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM, wire_std)
         knowledge = SkinKnowledge(
-            8, 8, adc_bits=10, rest_ratio=skin.rest_ratio, nominal_wire_ohm=wires
+            *(8, 8),
+            adc_bits=10,
+            rest_ratio=skin.rest_ratio,
+            nominal_wire_ohm=wires,
+            reading_names=MODES[mode],
         )
         estimator = make_estimator(method, knowledge)
         for truth, ratios in zip(skin.frames, skin.ratios, strict=True):
@@ -81,13 +92,20 @@ def main() -> int:
     figures: dict[str, float] = {}
     for name, skins in (("desk", desk), ("exact", [exact(skin) for skin in desk])):
         for method in METHODS:
-            told = judged(skins, method, None)
-            figures |= {f"{name}_{method}_{key}": value for key, value in told.items()}
-            measured = judged(skins, method, MEASURED_STD)
+            found = judged(skins, method, told(None))
+            figures |= {f"{name}_{method}_{key}": value for key, value in found.items()}
+            measured = judged(skins, method, told(MEASURED_STD))
             figures[f"{name}_{method}_stated_measured"] = measured["stated"]
+    far = [desk_skin(seed, FRAMES, mode="far") for seed in range(SKINS)]
+    for method in METHODS:
+        found = judged(far, method, NO_WIRES, "far")
+        figures |= {f"far_{method}_{key}": value for key, value in found.items()}
     bars = []
     for method in METHODS:
         bars += [
+            at_most(f"far_{method}_percent", 1.5),
+            at_least(f"far_{method}_within_4", 98),
+            at_most(f"far_{method}_wrong", 1),
             at_most(f"desk_{method}_percent", 1.5),
             at_least(f"desk_{method}_within_4", 98),
             at_most(f"desk_{method}_wrong", 1),
