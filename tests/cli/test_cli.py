@@ -104,8 +104,9 @@ def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:
     assert facts["mode"] == "far"
     (line,) = run("stream", path, "--method", "none", "--json", "--scans", "1").out.splitlines()
     assert json.loads(line)["reading_names"] == ["a", "e", "b", "f"]
-    for refused in (run("stream", path, "--scans", "1"), run("doctor", path)):
-        assert_one_line(refused, "takes the readings a b c d, not a e b f", "--mode near")
+    refused = run("stream", path, "--scans", "1")
+    assert_one_line(refused, "takes the readings a b c d, not a e b f", "--mode near")
+    assert "\nwires [ohm] " in run("doctor", path).out
     assert "8x8 at 90.00 Hz, mode near" in run("configure", path, "--defaults").out
     assert json.loads(run("info", path, "--json").out)["unit_id"] == 0
 
