@@ -9,21 +9,24 @@ symbol shape    meaning                                                         
 p, s   (n,)     what the line lost per current of its ports, and its deviation     ohm
 c      (n, n)   current through its segments, per current of these ports           1
 q      (n,)     what segments like the layer's mean, as believed, would lose       ohm
-m      scalar   mean segment of the layer                                          ohm
-z      (n,)     the line's segments, in shares of m                                1
-v      scalar   variance of z about 1                                              1
+m      scalar   reference: mean segment of the layer, as first seen                ohm
+z      (n,)     the line's segments, in shares of m; y their mean                  1
+v      scalar   variance of z about y                                              1
 L, l   (n, n)   information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2
 ====== ======== ================================================================== ==========
 
 The circuit gives c and q: they depend little on the wires. So p = m c z is linear. A frame shows
-m by itself, so that a skin may bend; with t the factor by which it exceeds what is believed,
+the layer by itself: with t the factor by which it exceeds what is believed,
 
-    t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w , 1/w = 1 / sum(q^2 / s^2) + v .
+    t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w , 1/w = 1 / sum(q^2 / s^2) + v ,
 
-It is weighed against what frames before have shown, which fades. What single segments have of
-their own takes many frames, and stays:
+weighed against what frames before have shown, which fades: a skin bends. What single segments have
+of their own takes many frames. It does not fade, in shares of a reference m, which stays until the
+layer differs from it by more than a segment does:
 
-    z = 1 + v (1 + v L)^-1 (l - L 1) ,     of covariance v (1 + v L)^-1 .
+    z = y + v (1 + v L)^-1 (l - L y) , y = sum_lines 1^T (1 + v L)^-1 l / sum 1^T (1 + v L)^-1 L 1 ,
+
+of covariance v (1 + v L)^-1.
 """
 
 import numpy as np
@@ -43,7 +46,8 @@ class MeasuredWires(WireBelief):
         """Back to the wires at rest, or the nominal ones."""
         super().reset()
         self._before = self._nominal, np.diagonal(self._prior_covariance)
-        self._shares = np.ones((2, *self.shape))
+        self._reference = self._nominal
+        self._segments: Float | None = None
         self._own_std = np.full((2, *self.shape), SEGMENT_STD)
         self._known = [
             (np.zeros((lines, n, n)), np.zeros((lines, n)))
@@ -79,30 +83,34 @@ class MeasuredWires(WireBelief):
         known = np.diagonal(self._root) ** 2
         most = np.diagonal(self._prior_covariance)
         self._before = self.log_layers, known + FADE * (most - known)
-        variance = SEGMENT_STD**2
+        segments, variance = self.layers(self.mean), SEGMENT_STD**2
         for layer in (0, 1):
             if not ports.far[layer]:
                 continue
-            mean = np.exp(self.log_layers[layer])
+            if abs(self.log_layers[layer] - self._reference[layer]) > SEGMENT_STD:
+                self._reference = self._reference.copy()
+                self._reference[layer] = self.log_layers[layer]
             drop, weight = ports.drop_ohm[layer], ports.drop_std**-2.0
             if layer == 1:
                 drop, weight = drop.T, weight.T
-            current = mean * circuit.line_current(layer)
+            ohm = np.exp(self._reference[layer])
+            current = ohm * circuit.line_current(layer)
             heavy = current * weight[..., None]
             precision, pull = self._known[layer]
             precision += np.matmul(heavy.transpose(0, 2, 1), current)
             pull += np.einsum("lpk,lp->lk", heavy, drop)
-            system = np.eye(len(precision[0])) + variance * precision
-            away = (pull - precision.sum(axis=2))[..., None]
-            inverse = np.linalg.inv(system)
-            share = 1.0 + variance * (inverse @ away)[..., 0]
+            inverse = np.linalg.inv(np.eye(len(precision[0])) + variance * precision)
+            told = np.matmul(inverse, np.stack([pull, precision.sum(axis=2)], axis=2))
+            mean = told[..., 0].sum() / told[..., 1].sum()
+            share = mean + variance * (told[..., 0] - mean * told[..., 1])
             own_std = np.sqrt(variance * np.einsum("lkk->lk", inverse))
-            self._shares[layer] = share if layer == 0 else share.T
+            segments[layer] = ohm * (share if layer == 0 else share.T)
             self._own_std[layer] = own_std if layer == 0 else own_std.T
+        self._segments = segments
 
     def layers(self, log_wires: Float) -> Float:
-        """Segments (2, R, C) [ohm]: the layers' of these, in the shares learned."""
-        return np.asarray(super().layers(log_wires) * self._shares)
+        """Segments (2, R, C) [ohm], as learned, or these if no frame has been news."""
+        return super().layers(log_wires) if self._segments is None else self._segments.copy()
 
     def segment_std(self) -> Float:
         """As of layers that are known, and what readings leave of each segment's own."""
