@@ -25,12 +25,13 @@ time_KIND_METHOD*       time of a frame in mode far over that in mode near, fram
                         frame counts: other work on the machine only adds. The same frames, of four
                         skins from the circuit that ngspice was compared with: `random`, touched
                         anew; `finger`, one or two small fingertips that move.
-MODE_wires_METHOD       after 50 frames of up to 8 touches, on 6 skins of 8x8 with 100 and 200 ohm a
-                        segment: median error of a segment [%]. Segments are spread by 10 %, so
+MODE_wires_METHOD       after 50 frames of up to 8 touches, on 12 skins of 8x8: median error of a
+                        segment [%]. Six have 100 and 200 ohm a segment, six 150 and 300, as the
+                        `random` scenes; `_100_200`: the first six. Segments are spread by 10 %, so
                         whoever knows the middle of each layer is off by 6.7 %.
 far_wires_limit_percent what these frames allow: the same of normal errors with the deviations of
                         the posterior at the truth, for whoever knows which cells are pressed, with
-                        the priors of `joint`. Two of the skins.
+                        the priors of `joint`. Two of the skins, one of each.
 MODE_bent_METHOD        wires 35 % above those at the calibration, rest readings and a force curve
                         of each cell unchanged: median error of a pressed cell's force over that of
                         the unbent skin. 3 skins of 8x8, 60 frames of up to 8 touches, in order. A
@@ -40,9 +41,10 @@ MODE_bent_METHOD_p90    the same of the 90th percentiles.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -60,7 +62,7 @@ from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.record.readings import Readings, estimate_file
 from studies.far import seen
 from studies.information import PRESSED_STD
-from studies.trials import PRESSED, Trial, finger_trial, random_trial, trial_of
+from studies.trials import PRESSED, Trial, finger_trial, random_trial, skin_at_rest, touch, trial_of
 
 FOLDER = Path(__file__).resolve().parents[1] / "tests" / "data" / "far"
 KINDS = {
@@ -74,6 +76,7 @@ SEED = 7000
 WARM_UP = 3  # frames
 PASSES = 3
 BEND = 1.35
+SEGMENT_OHM = ((100.0, 200.0), (150.0, 300.0))  # of the random skins of tests/data/far
 CALIBRATED_SIEMENS = np.geomspace(1e-5, 1e-3, 9)
 
 
@@ -171,10 +174,17 @@ def seconds(read: dict[str, Readings], method: str) -> Float:
 # ------------------------------------------------------------------------------- wires and forces
 
 
-def wires(mode: str, method: str) -> float:
+def wire_trial(wire_ohm: tuple[float, float], number: int) -> Trial:
+    random = np.random.default_rng(SEED + 100 + number)
+    rest = skin_at_rest(8, 8, random, wire_ohm=wire_ohm)
+    counts = random.integers(0, 9, 50)
+    return trial_of(rest, [touch(rest, int(count), random) for count in counts])
+
+
+def wires(mode: str, method: str, kinds: Sequence[tuple[float, float]]) -> float:
     off = []
-    for number in range(6):
-        trial = random_trial(8, 8, 8, 50, SEED + 100 + number)
+    for wire_ohm, number in itertools.product(kinds, range(6)):
+        trial = wire_trial(wire_ohm, number)
         out = estimate_file(seen(trial, mode, 10), method)
         truth = trial.rest.top_wire_ohm, trial.rest.bottom_wire_ohm
         for name, ohm in zip(("top_wire_ohm", "bottom_wire_ohm"), truth, strict=True):
@@ -189,7 +199,7 @@ def wires_limit() -> float:
     std = ratio_std(10)
     away = []
     for number in range(2):
-        trial = random_trial(8, 8, 8, 50, SEED + 100 + number)
+        trial = wire_trial(SEGMENT_OHM[number], number)
         cells = trial.rest.cell_siemens.size
         shared = np.kron(np.eye(2), np.full((cells, cells), UNKNOWN_LAYER_STD**2))
         information = np.linalg.inv(shared + SEGMENT_STD**2 * np.eye(2 * cells))
@@ -311,7 +321,9 @@ def main() -> int:
     figures |= times()
     for mode in ("far", "near"):
         for method in METHODS:
-            figures[f"{mode}_wires_{method}_percent"] = wires(mode, method)
+            figures[f"{mode}_wires_{method}_percent"] = wires(mode, method, SEGMENT_OHM)
+            thin = wires(mode, method, SEGMENT_OHM[:1])
+            figures[f"{mode}_wires_{method}_100_200_percent"] = thin
             figures |= bent(mode, method)
     figures["far_wires_limit_percent"] = wires_limit()
     all_met = report(figures, [bar for method in METHODS for bar in bars_of(method)])
