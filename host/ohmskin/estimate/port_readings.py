@@ -164,7 +164,7 @@ class PortReader:
         in_order: they are of the frame after the last such, and what has changed is noise. Others
         are of rest: where they lie between codes, they are a mean of many scans, with little noise.
         """
-        found, variance, offset = self._read_near(ratio, in_order=in_order)
+        found, noise, variance, offset = self._read_near(ratio, in_order=in_order)
         if not any(self.far):
             return found
         current = np.maximum(found.current, self._current_std)
@@ -176,6 +176,8 @@ class PortReader:
         ]
         apart = np.maximum(ends[0] - ends[1], 0.0)
         whole = apart + sum(self._ref_ohm) * current
+        # Of the difference of two readings: half of what stays is in both.
+        variance = 2.0 * noise + 0.5 * np.maximum(variance - noise, 0.0)
         variance = np.maximum(variance, 2.0 * self._ratio_std**2)
         std = np.sqrt(apart**2 * found.current_std**2 + variance * current**2) / whole**2
         drop = np.stack([near[0] - ends[0], ends[1] - near[1]])
@@ -197,8 +199,10 @@ class PortReader:
                 return f"{line} {below.argmin()}: its far end does not follow it, is it open?"
         return ""
 
-    def _read_near(self, ratio: Float, *, in_order: bool) -> tuple[PortReadings, Float, float]:
-        """What near ends show; variance of the difference of two others, and their offset [1]."""
+    def _read_near(
+        self, ratio: Float, *, in_order: bool
+    ) -> tuple[PortReadings, float, Float, float]:
+        """What near ends show; variance of noise, and of all that is off, and their offset [1]."""
         if not self._is_near:
             ends = [self._potential(ratio, node) for node in self._nodes[:2]]
             ratio = np.stack(ends, axis=-1)
@@ -234,9 +238,8 @@ class PortReader:
         found = PortReadings(ratio, current, std)
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
-        # Half of what stays is in both of two readings.
-        apart = 2.0 * noise + 0.5 * np.maximum(variance - noise, 0.0)
-        return (replace(found, fault=fault) if fault else found), apart, float(offset[0])
+        found = replace(found, fault=fault) if fault else found
+        return found, noise, variance, float(offset[0])
 
     def _noise(self, residual: Float) -> float:
         """Variance of a reading [1], from what has changed since the frame before."""
