@@ -34,9 +34,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
-
-_LEAST = 0.1  # of what is believed, if readings make no sense
+from ohmskin.estimate.prior import FADE, LAYER_STD, MAX_STEP, SEGMENT_STD, WireBelief
 
 
 class MeasuredWires(WireBelief):
@@ -65,7 +63,7 @@ class MeasuredWires(WireBelief):
             known = (weight * model * model).sum(axis=1 - layer)
             times = (weight * model * ports.drop_ohm[layer]).sum(axis=1 - layer) / known
             precision = 1.0 / (1.0 / known + SEGMENT_STD**2)
-            seen = np.log(max(precision @ times / precision.sum(), _LEAST))
+            seen = np.log(max(precision @ times / precision.sum(), np.exp(-MAX_STEP)))
             prior = 1.0 / (1.0 + precision.sum() * variance[layer])
             layers[layer] += (1 - prior) * (self.log_layers[layer] + seen - layers[layer])
             variance[layer] *= prior
