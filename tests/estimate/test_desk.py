@@ -7,6 +7,7 @@ import pytest
 from desk import DeskSkin, desk_skin
 from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.link.protocol import MODES
 
 
 @pytest.fixture(scope="module")
@@ -33,3 +34,30 @@ def test_errors_are_small_and_stated(skins: list[DeskSkin], method: str) -> None
     assert np.median(errors) < 0.015
     assert np.mean(errors < 4 * stds) > 0.98
     assert np.median(stds / errors) < 5  # 10 where all of a disagreement counts as noise
+
+
+@pytest.fixture(scope="module")
+def far_skins() -> list[DeskSkin]:
+    return [desk_skin(seed, 8, mode="far") for seed in range(2)]
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_far_ends_need_no_wires(far_skins: list[DeskSkin], method: str) -> None:
+    """Near ends err by 10 LSB alike, which looks like an offset; far ends hardly."""
+    error, stated = [], []
+    for skin in far_skins:
+        known = SkinKnowledge(
+            8, 8, adc_bits=10, rest_ratio=skin.rest_ratio, reading_names=MODES["far"]
+        )
+        estimator = make_estimator(method, known)
+        for truth, ratios in zip(skin.frames, skin.ratios, strict=True):
+            *_, found = (estimator.estimate(ratio) for ratio in ratios)
+            pressed = truth.cell_siemens > 1.5 * skin.rest.cell_siemens
+            error.append(np.abs(found.cell_siemens / truth.cell_siemens - 1)[pressed])
+            stated.append((found.cell_siemens_std / truth.cell_siemens)[pressed])
+        assert np.median(found.top_wire_ohm) == pytest.approx(100, rel=0.3)
+        assert np.median(found.bottom_wire_ohm) == pytest.approx(200, rel=0.3)
+    errors, stds = np.concatenate(error), np.concatenate(stated)
+    assert np.median(errors) < 0.01
+    assert np.mean(errors < 4 * stds) > 0.98
+    assert np.median(stds / errors) < 4

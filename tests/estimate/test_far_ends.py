@@ -161,6 +161,13 @@ def test_methods_without_wires_say_what_they_take() -> None:
             make_estimator(method, knowledge(rest))
 
 
+@pytest.mark.parametrize("names", ["efgh", "aehd", "b"])
+def test_both_near_ends_are_needed(names: str) -> None:
+    rest = seen(skin_at_rest(3, 3, np.random.default_rng(1)), names)
+    with pytest.raises(ValueError, match="of each near end, one is needed"):
+        make_estimator("joint", knowledge(rest, names))
+
+
 @pytest.mark.parametrize("codes", [0.0, 1.5])
 def test_errors_of_currents_at_far_ends_are_as_large_as_stated(codes: float) -> None:
     random = np.random.default_rng(4)

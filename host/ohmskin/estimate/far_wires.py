@@ -16,9 +16,11 @@ L, l   (n, n)   information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^
 ====== ======== ================================================================== ==========
 
 The circuit gives c and q: they depend little on the wires. So p = m c z is linear. A frame shows
-the layer by itself: with t the factor by which it exceeds what is believed,
+the layers by itself, and an offset o that far ends may have against near ones: rows lose too much
+by it, columns too little (h, per deviation of o, as I changes from port to port). With t the factor
+by which a layer exceeds what is believed, minimised is, over t of both layers and o,
 
-    t = sum_lines w (sum p q / s^2) / (sum q^2 / s^2) / sum_lines w , 1/w = 1 / sum(q^2 / s^2) + v ,
+    sum_lines (p - t q -+ o h)^T (s^2 + v q q^T)^-1 (p - t q -+ o h) + o^2 ,
 
 weighed against what frames before have shown, which fades: a skin bends. What single segments have
 of their own takes many frames. It does not fade, in shares of a reference m, which stays until the
@@ -56,18 +58,37 @@ class MeasuredWires(WireBelief):
         """Take the layers' wires from one frame, whose circuit is about this one."""
         layers, variance = (of.copy() for of in self._before)
         weight = ports.drop_std**-2.0
-        for layer in (0, 1):
+        normal, right = np.eye(3), np.zeros(3)  # of t of both layers, and of the shift
+        for layer, sign in ((0, 1.0), (1, -1.0)):
             if not ports.far[layer]:
                 continue
             model = circuit.drop_ohm[layer].reshape(self.shape)
-            known = (weight * model * model).sum(axis=1 - layer)
-            times = (weight * model * ports.drop_ohm[layer]).sum(axis=1 - layer) / known
-            precision = 1.0 / (1.0 / known + SEGMENT_STD**2)
-            seen = np.log(max(precision @ times / precision.sum(), np.exp(-MAX_STEP)))
-            prior = 1.0 / (1.0 + precision.sum() * variance[layer])
-            layers[layer] += (1 - prior) * (self.log_layers[layer] + seen - layers[layer])
-            variance[layer] *= prior
+            shift = sign * ports.drop_shift
+            # Sums over each line, of which the segments' own deviation is taken out.
+            own, shared, seen, both, read = (
+                (weight * one * other).sum(axis=1 - layer)
+                for one, other in (
+                    *((model, model), (model, shift), (model, ports.drop_ohm[layer])),
+                    *((shift, shift), (shift, ports.drop_ohm[layer])),
+                )
+            )
+            less = 1.0 / (1.0 / SEGMENT_STD**2 + own)
+            normal[layer, layer] = (own - less * own * own).sum()
+            normal[layer, 2] = normal[2, layer] = (shared - less * own * shared).sum()
+            normal[2, 2] += (both - less * shared * shared).sum()
+            right[layer] = (seen - less * own * seen).sum()
+            right[2] += (read - less * shared * seen).sum()
+        covariance = np.linalg.inv(normal)
+        found = covariance @ right
+        for layer in (0, 1):
+            if ports.far[layer]:
+                times = max(found[layer], np.exp(-MAX_STEP))
+                prior = 1.0 / (1.0 + variance[layer] * times**2 / covariance[layer, layer])
+                seen_log = self.log_layers[layer] + np.log(times)
+                layers[layer] += (1 - prior) * (seen_log - layers[layer])
+                variance[layer] *= prior
         self.log_layers, self._root = layers, np.diag(np.sqrt(variance))
+        self._shift = found[2], covariance[2, 2]
 
     def settle(self, far: tuple[bool, bool]) -> None:
         """These are the wires at rest: later frames are expected about them, but for a bend."""
@@ -88,7 +109,9 @@ class MeasuredWires(WireBelief):
             if abs(self.log_layers[layer] - self._reference[layer]) > SEGMENT_STD:
                 self._reference = self._reference.copy()
                 self._reference[layer] = self.log_layers[layer]
-            drop, weight = ports.drop_ohm[layer], ports.drop_std**-2.0
+            shift = (1 - 2 * layer) * ports.drop_shift
+            drop = ports.drop_ohm[layer] - self._shift[0] * shift
+            weight = 1.0 / (ports.drop_std**2 + self._shift[1] * shift**2)
             if layer == 1:
                 drop, weight = drop.T, weight.T
             ohm = np.exp(self._reference[layer])

@@ -105,7 +105,8 @@ class PortReadings:
 
     far: whether rows, and columns, are sensed at their far ends. Then current is that of the cell
     without these wires, drop_ohm (2, R, C) what the wires of row and column lose per current, and
-    drop_std (R, C) the deviation of both [ohm].
+    drop_std (R, C) the deviation of both [ohm], drop_shift (R, C) that of an offset that the row's
+    may have too much of, and the column's too little.
     """
 
     ratio: Float
@@ -115,6 +116,7 @@ class PortReadings:
     far: tuple[bool, bool] = (False, False)
     drop_ohm: Float = field(default_factory=lambda: np.zeros((2, 0, 0)))
     drop_std: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    drop_shift: Float = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 class PortReader:
@@ -127,6 +129,8 @@ class PortReader:
             [(k, name == low) for k, name in enumerate(names) if name in (high, low)]
             for high, low in _NODES.items()
         ]
+        if not (self._nodes[0] and self._nodes[1]):
+            raise ValueError(f"readings {' '.join(names)}: of each near end, one is needed")
         self.far = bool(self._nodes[2]), bool(self._nodes[3])
         ends = READINGS_PER_CELL if names == NEAR else 2
         self._degrees, self._is_near = ends - 1, names == NEAR
@@ -164,7 +168,7 @@ class PortReader:
         in_order: they are of the frame after the last such, and what has changed is noise. Others
         are of rest: where they lie between codes, they are a mean of many scans, with little noise.
         """
-        found, noise, variance, offset = self._read_near(ratio, in_order=in_order)
+        found, noise, usual, variance, offset = self._read_near(ratio, in_order=in_order)
         if not any(self.far):
             return found
         current = np.maximum(found.current, self._current_std)
@@ -183,7 +187,9 @@ class PortReader:
         drop = np.stack([near[0] - ends[0], ends[1] - near[1]])
         drop_std = np.sqrt(variance)
         fault = found.fault or self._astray(drop, drop_std)
-        drops = drop / current, drop_std / current
+        # Lines that charge in most readings look like an offset.
+        shift = (usual + offset * offset) ** 0.5
+        drops = drop / current, drop_std / current, shift / current
         return PortReadings(ratio, current / whole, std, fault, self.far, *drops)
 
     def _potential(self, ratio: Float, node: list[tuple[int, bool]]) -> Float:
@@ -201,8 +207,8 @@ class PortReader:
 
     def _read_near(
         self, ratio: Float, *, in_order: bool
-    ) -> tuple[PortReadings, float, Float, float]:
-        """What near ends show; variance of noise, and of all that is off, and their offset [1]."""
+    ) -> tuple[PortReadings, float, float, Float, float]:
+        """What near ends show; variances of noise, usual, and of what is off; their offset [1]."""
         if not self._is_near:
             ends = [self._potential(ratio, node) for node in self._nodes[:2]]
             ratio = np.stack(ends, axis=-1)
@@ -239,7 +245,7 @@ class PortReader:
         if not fault:
             fault = self._short(found) or (self._change(found) if self._rest is not None else "")
         found = replace(found, fault=fault) if fault else found
-        return found, noise, variance, float(offset[0])
+        return found, noise, usual, variance, float(offset[0])
 
     def _noise(self, residual: Float) -> float:
         """Variance of a reading [1], from what has changed since the frame before."""
