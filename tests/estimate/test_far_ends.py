@@ -194,6 +194,42 @@ def test_an_offset_of_the_converter_is_in_all_readings_alike() -> None:
     np.testing.assert_allclose(np.median(found.top_wire_ohm), 100, rtol=0.1)
 
 
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_lines_that_charge_move_near_ends_alike_and_cells_little(method: str) -> None:
+    """Of the first port, one near end alone: the other has settled before the scan."""
+    random = np.random.default_rng(13)
+    rest = skin_at_rest(6, 6, random)
+    touched = touch(rest, 3, random)
+    charge = 12 / 1024 * random.choice([-1.0, 1.0], (6, 6))
+    ratio = seen(touched)
+    ratio[..., 0] += charge
+    ratio[..., 2] += charge
+    ratio[0, 0] = seen(touched)[0, 0] + [0, 0, 24 / 1024, 0]
+    estimator = make_estimator(method, knowledge(ten_bits(seen(rest))))
+    for _ in range(3):
+        found = estimator.estimate(ten_bits(ratio))
+        assert found.converged
+    off = np.abs(found.cell_siemens - touched.cell_siemens)
+    pressed = touched.cell_siemens > 1.5 * rest.cell_siemens
+    assert np.all(off < 4 * found.cell_siemens_std)
+    assert np.median((off / touched.cell_siemens)[pressed]) < 0.02
+
+
+def test_wires_that_nobody_expects_are_measured_before_the_fit() -> None:
+    """Wires of 1 and 2 kOhm, without rest readings: the prior is 150 Ohm."""
+    random = np.random.default_rng(14)
+    rest = skin_at_rest(8, 8, random, wire_ohm=(1000.0, 2000.0))
+    known = replace(knowledge(seen(rest)), rest_ratio=None)
+    estimator, off = make_estimator("joint", known), []
+    for _ in range(10):
+        touched = touch(rest, 4, random)
+        estimator.reset()
+        found = estimator.estimate(ten_bits(seen(touched)))
+        pressed = touched.cell_siemens > 1.5 * rest.cell_siemens
+        off.append(np.abs(found.cell_siemens / touched.cell_siemens - 1)[pressed])
+    assert np.median(np.concatenate(off)) < 0.01
+
+
 def test_a_far_end_that_floats_is_named() -> None:
     random = np.random.default_rng(2)
     rest = skin_at_rest(5, 6, random)
@@ -228,6 +264,8 @@ def test_a_bent_skin_is_read_as_the_same_at_once(method: str) -> None:
         top_wire_ohm=1.35 * rest.top_wire_ohm,
         bottom_wire_ohm=1.35 * rest.bottom_wire_ohm,
     )
+    for _ in range(10):
+        estimator.estimate(ten_bits(seen(touch(rest, 4, random))))
     off = []
     for _ in range(20):
         touched = touch(bent, 4, random)
@@ -235,3 +273,5 @@ def test_a_bent_skin_is_read_as_the_same_at_once(method: str) -> None:
         pressed = touched.cell_siemens > 1.5 * rest.cell_siemens
         off.append(np.abs(found.cell_siemens / touched.cell_siemens - 1)[pressed])
     assert np.median(np.concatenate(off)) < 0.005
+    assert np.median(found.top_wire_ohm) == pytest.approx(135, rel=0.07)
+    assert np.median(found.bottom_wire_ohm) == pytest.approx(270, rel=0.07)

@@ -53,19 +53,28 @@ def test_currents_of_the_touched_network_obey_kirchhoff() -> None:
         np.testing.assert_allclose(current[port].sum(axis=0), np.eye(5)[column], atol=1e-9)
 
 
-def test_voltages_of_single_cells_are_those_of_a_skin_touched_from_the_beginning() -> None:
+@pytest.mark.parametrize("far", [(False, False), (True, True), (False, True)])
+def test_voltages_of_single_cells_are_those_of_a_skin_touched_from_the_beginning(
+    far: tuple[bool, bool],
+) -> None:
     random = np.random.default_rng(4)
     rest = skin_at_rest(4, 5, random)
-    wires = rest.top_wire_ohm, rest.bottom_wire_ohm
-    net = RestNetwork(rest.cell_siemens, *wires)
+    wires = float(rest.top_wire_ohm.mean()), float(rest.bottom_wire_ohm.mean())
+    net = RestNetwork(rest.cell_siemens, *wires, far=far)
     some = np.array([0, 3, 7, 19])
     added = np.array([1e-4, 1e-3])
     touched = rest.cell_siemens.copy()
     touched.flat[[3, 11]] += added
-    whole = RestNetwork(touched, *wires)
-    slope, cell_volt = TouchedNetwork(net, np.array([3, 11]), added).own_slope(some)
+    whole = RestNetwork(touched, *wires, far=far)
+    network = TouchedNetwork(net, np.array([3, 11]), added)
+    slope, cell_volt = network.own_slope(some)
     np.testing.assert_allclose(slope, whole.own_slope[some], rtol=1e-8)
     np.testing.assert_allclose(cell_volt, whole.own_cell_volt[some], rtol=1e-8)
+    np.testing.assert_allclose(network.port_ohm, whole.port_ohm, rtol=1e-8)
+    np.testing.assert_allclose(network.sense_volt, whole.sense_volt[[3, 11]], rtol=1e-6, atol=1e-9)
+    slopes = net.wires_of(some, *network.cell_current(some))
+    expected = whole.by_wires()[some]
+    np.testing.assert_allclose(slopes, expected, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", ["random_4x6", "random_8x8", "presses_8x8", "bent_8x8"])

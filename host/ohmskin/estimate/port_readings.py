@@ -29,8 +29,8 @@ without wires, and what the wires lose, are
     u = I / (D + R I) ,  R = R_top + R_bottom ,    p = (a - e) / I ,    q = (f - b) / I ,
     s_u^2 = (D^2 s_I^2 + 2 I^2 s^2) / (D + R I)^4 .
 
-There a node is read at one supply only, so all readings share one offset: median of a + b - 1. What
-lines draw that charge moves all four potentials alike, and so neither I nor D.
+There a node is read at one supply only. What a and b have in common may be an offset of all four
+readings, or be of lines that charge. Neither moves I or D; `far_wires` tells them apart.
 
 A frame is at fault, and its answer not to be relied on, where
 
@@ -172,10 +172,10 @@ class PortReader:
         if not any(self.far):
             return found
         current = np.maximum(found.current, self._current_std)
-        # What near ends have in common, but for an offset, is of lines that charge.
+        # What near ends have in common is of lines that charge, or an offset.
         near = 1.0 - self._ref_ohm[0] * current, self._ref_ohm[1] * current
         ends = [
-            self._potential(ratio, node) - offset if node else near[axis]
+            self._potential(ratio, node) if node else near[axis]
             for axis, node in enumerate(self._nodes[2:])
         ]
         apart = np.maximum(ends[0] - ends[1], 0.0)
@@ -187,7 +187,7 @@ class PortReader:
         drop = np.stack([near[0] - ends[0], ends[1] - near[1]])
         drop_std = np.sqrt(variance)
         fault = found.fault or self._astray(drop, drop_std)
-        # Lines that charge in most readings look like an offset.
+        # Of an offset, which these near ends have not, but far ends may have.
         shift = (usual + offset * offset) ** 0.5
         drops = drop / current, drop_std / current, shift / current
         return PortReadings(ratio, current / whole, std, fault, self.far, *drops)
