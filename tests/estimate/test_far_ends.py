@@ -194,30 +194,23 @@ def test_an_offset_of_the_converter_is_in_all_readings_alike() -> None:
     np.testing.assert_allclose(np.median(found.top_wire_ohm), 100, rtol=0.1)
 
 
-@pytest.mark.parametrize("method", ["joint", "touch"])
-def test_lines_that_charge_move_near_ends_alike_and_cells_little(method: str) -> None:
+def test_lines_that_charge_move_near_ends_alike_which_is_no_fault() -> None:
     """Of the first port, one near end alone: the other has settled before the scan."""
     random = np.random.default_rng(13)
     rest = skin_at_rest(6, 6, random)
-    touched = touch(rest, 3, random)
+    exact = seen(touch(rest, 3, random))
     charge = 14 / 1024 * random.choice([-1.0, 0.0, 1.0], (6, 6), p=[0.4, 0.2, 0.4])
-    ratio = seen(touched)
+    ratio = exact.copy()
     ratio[..., 0] += charge
     ratio[..., 2] += charge
-    ratio[0, 0] = seen(touched)[0, 0] + [0, 0, 24 / 1024, 0]
-    known = knowledge(ten_bits(seen(rest)))
-    estimator, reader = make_estimator(method, known), PortReader(known)
-    for _ in range(3):
-        found = estimator.estimate(ten_bits(ratio))
-        assert found.converged
-        ports = reader.read(ten_bits(ratio), in_order=True)
-    a, e, b, f = seen(touched)[0, 0]
-    assert abs(ports.current[0, 0] - b / (e - f + 2 * b) / 30e3) < 4 * ports.current_std[0, 0]
+    ratio[0, 0] = exact[0, 0] + [0, 0, 24 / 1024, 0]
+    reader = PortReader(knowledge(ten_bits(seen(rest))))
+    a, e, b, f = exact[0, 0]
     assert a > e > f > b
-    off = np.abs(found.cell_siemens - touched.cell_siemens)
-    pressed = touched.cell_siemens > 1.5 * rest.cell_siemens
-    assert np.all(off < 4 * found.cell_siemens_std)
-    assert np.median((off / touched.cell_siemens)[pressed]) < 0.02
+    for _ in range(3):
+        ports = reader.read(ten_bits(ratio), in_order=True)
+        assert not ports.fault
+        assert abs(ports.current[0, 0] - b / (e - f + 2 * b) / 30e3) < 4 * ports.current_std[0, 0]
 
 
 def test_wires_that_nobody_expects_are_measured_before_the_fit() -> None:

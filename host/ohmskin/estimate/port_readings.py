@@ -328,7 +328,10 @@ class PortReader:
             if known or found.current.shape[1 - axis] < 3:
                 continue
             apart = self._apart(found, axis)
-            apart[self._rest_apart[axis] <= 2 * SAME_STDS] = np.inf  # nobody can tell
+            # By the deviations of this frame, perhaps nobody can tell.
+            coarser = float(np.max(np.maximum(found.current_std, self._current_std)))
+            coarser /= float(np.max(np.maximum(rest.current_std, self._current_std)))
+            apart[self._rest_apart[axis] <= 2 * SAME_STDS * max(coarser, 1.0)] = np.inf
             # Between one and two times the limit, noise may be what differs.
             self._alike_frames[axis] = frames = np.where(apart > 2 * SAME_STDS, 0, frames + 1)
             apart[frames < ALIKE_FRAMES] = np.inf
