@@ -16,6 +16,7 @@ from test_doctor import told
 
 import ohmskin
 from bench_board import Bench, evidence
+from calibrations import calibration
 from command_line import Run, assert_one_line, well
 from lockstep import Rig, elf_of
 from ohmskin.arrays import Float
@@ -28,7 +29,11 @@ from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
 from ohmskin.doctor.signal import Rest
 from ohmskin.emulate.simavr import PROGRAM
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.calibration import Rest as CalibratedRest
 from ohmskin.link.codes import quantise
+from ohmskin.link.protocol import MODES
 from ohmskin.opening import emulated
 
 FAR = "emulator://8x8?mode=far&seed=1"
@@ -317,6 +322,52 @@ def test_page_and_json(run: Run, benches: list[Bench]) -> None:
 def test_presses_are_not_asked_for(run: Run) -> None:
     done = run("doctor", FAR, "--press")
     assert_one_line(done, "mode far shows the wires untouched: leave out --press")
+
+
+def far_calibration() -> Calibration:
+    """Told nothing of the wires. Its readings are of the emulated skin, and its forces made up."""
+    scene = emulated(FAR)[1]
+    made = calibration(scene.rest_ratio)
+    known = SkinKnowledge(
+        8, 8, adc_bits=10, rest_ratio=scene.ratio(0, "far"), reading_names=MODES["far"]
+    )
+    rest = CalibratedRest.of("touch", known, made.date)
+    return replace(made, rest=rest, nominal_wire_ohm=WireOhm(), mode="far")
+
+
+@pytest.mark.usefixtures("benches")
+def test_a_calibration_takes_the_wires_that_far_ends_show(run: Run, tmp_path: Path) -> None:
+    """They are those of the scene, within four of the deviations that are kept with them."""
+    path, told = tmp_path / "skin.json", far_calibration()
+    for wires in (0.6, 4.0, 1.0):
+        told.save(path)
+        url = f"{FAR}&noise=0.4&wires={wires}"
+        well(run("doctor", url, "--into", str(path)))
+        top, bottom, log_std = load_calibration(path).nominal_wire_ohm
+        skin = emulated(url)[1].skin(0.0)
+        off = np.log([top / skin.top_wire_ohm.mean(), bottom / skin.bottom_wire_ohm.mean()])
+        assert np.abs(off).max() < 4 * log_std < 0.3
+    crimp = f"{url}&crimp_row=1"  # one bad line does not count
+    told.save(path)
+    assert run("doctor", crimp, "--into", str(path)).code == 1
+    with_crimp = load_calibration(path).nominal_wire_ohm
+    np.testing.assert_allclose(with_crimp.both, (top, bottom), rtol=0.03)
+
+
+@pytest.mark.usefixtures("benches")
+def test_wires_that_are_not_told_are_not_kept(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "skin.json"
+    far_calibration().save(path)
+    before = path.read_bytes()
+    moving = f"{FAR}&scene=moving&begin=0"  # a skin that moves has no rest
+    rounded = f"{FAR}&noise=0&wires=0.1"  # wires lose less than a code
+    for url in (moving, rounded):
+        done = run("doctor", url, "--into", str(path))
+        assert done.code == 2
+        assert "skin.json is as it was: neither presses nor far ends have told" in done.err
+        assert path.read_bytes() == before
+    near = run("doctor", "emulator://8x8?seed=1", "--into", str(path))
+    assert_one_line(near, "this calibration is of mode far, not near")
 
 
 def test_the_board_stays_in_its_mode() -> None:

@@ -29,6 +29,7 @@ cells j and k share the wire up to the nearer of them, so K is a sum of segments
 and wires of zero ohm need no special value. What is factorised is 1 + sqrt(g) K sqrt(g).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Final
@@ -404,6 +405,14 @@ def ratio_from_current(
     current = np.asarray(current_siemens, dtype=np.float64)[..., None]
     slope = READING_SIGN * reference_ohm(ref_top_ohm, ref_bottom_ohm)
     return np.asarray(READING_OFFSET + slope * current, dtype=np.float64)
+
+
+def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
+    """Readings a to d of those of these names, (..., n): without c and d, 1 - b and 1 - a."""
+    if tuple(reading_names) == NEAR:
+        return ratio
+    a, b = (ratio[..., reading_names.index(name)] for name in "ab")
+    return np.stack([a, b, 1 - b, 1 - a], axis=-1)
 
 
 def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) -> Float:

@@ -16,6 +16,7 @@ from ohmskin import errors
 from ohmskin.cli import doctor_words as words
 from ohmskin.cli.board import Port, Wires, wires_of
 from ohmskin.doctor.examine import Evidence, examine
+from ohmskin.doctor.far import segments_of
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
@@ -58,14 +59,13 @@ def doctor(
 
     Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
     it says when and where to press. Any rectangle will do: its lines are measured. In mode far, the
-    wires of all lines are measured without. Exit code 0: sound; 1: something is wrong.
+    wires of all lines are measured without, and --into takes them. Exit code 0: sound; 1: something
+    is wrong.
     """
     calibration = calibration or into
     told = None if calibration is None else load_calibration(calibration)
     nominal = wires_of(wires)
     wire_ohm = nominal.both or (None if told is None else told.nominal_wire_ohm.both)
-    if into is not None and not (press and wire_ohm):
-        raise ValueError("--into takes what --press measures, and it needs nominal --wires")
     with terminal() as tell:
         try:
             device = ohmskin.open(port, start=False)
@@ -75,8 +75,11 @@ def doctor(
             with device:
                 if told is not None:
                     told.check(device.info)
-                if press and device.info.mode == "far":
-                    raise ValueError("mode far shows the wires untouched: leave out --press")
+                if device.info.mode == "far":
+                    if press:
+                        raise ValueError("mode far shows the wires untouched: leave out --press")
+                elif into is not None and not (press and wire_ohm):
+                    raise ValueError("in mode near, --into needs --press and nominal --wires")
                 evidence = gather(device, tell, wire_ohm, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
@@ -84,19 +87,21 @@ def doctor(
         print(json.dumps(page, default=asdict))  # noqa: T201
     else:
         print_page(page)
-    if into is not None and wire_ohm is not None:
+    if into is not None:
         _keep_wires(diagnosis, wire_ohm, into)
     if diagnosis.worse:
         raise SystemExit(1)
 
 
-def _keep_wires(diagnosis: Diagnosis, wire_ohm: tuple[float, float], into: Path) -> None:
-    """Write the wires that presses showed into a calibration, with their deviation."""
-    if not (diagnosis.pressed and diagnosis.pressed[0].known):
-        raise ValueError(f"{into} is as it was: the presses do not tell the wires")
-    whole = diagnosis.pressed[0]
-    top, bottom = (whole.share * ohm for ohm in wire_ohm)
-    measured = WireOhm(top, bottom, whole.std / whole.share)
+def _keep_wires(diagnosis: Diagnosis, wire_ohm: tuple[float, float] | None, into: Path) -> None:
+    """Write the wires that presses or far ends showed into a calibration, with their deviation."""
+    measured = segments_of(diagnosis.lines)
+    if wire_ohm and diagnosis.pressed and diagnosis.pressed[0].known:
+        whole = diagnosis.pressed[0]
+        top, bottom = (whole.share * ohm for ohm in wire_ohm)
+        measured = WireOhm(top, bottom, whole.std / whole.share)
+    if measured is None:
+        raise ValueError(f"{into} is as it was: neither presses nor far ends have told the wires")
     replace(load_calibration(into), nominal_wire_ohm=measured).save(into)
 
 

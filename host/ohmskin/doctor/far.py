@@ -22,6 +22,7 @@ neither fits, or less well than u = k w, which is of an end that floats. The cir
 far ends have while a port is selected: if that of another line fits, the ends are swapped.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -31,7 +32,8 @@ from ohmskin.arrays import Float
 from ohmskin.circuit import skin as circuit
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Place
 from ohmskin.doctor.signal import Rest
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.doctor.wires import KNOWN
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD
 from ohmskin.link.protocol import ADC_BITS
@@ -56,7 +58,7 @@ class _Skin:
         before = np.roll(ratio.swapaxes(0, 1).reshape(-1, 4), 1, axis=0)
         before = before.reshape(ratio.shape[1], -1, 4).swapaxes(0, 1)[np.ix_(*kept)]
         a, e, b, f = np.moveaxis(ratio[np.ix_(*kept)], -1, 0)
-        near, drop = np.stack([a, b, 1 - b, 1 - a], axis=-1), np.stack([a - e, f - b])
+        near, drop = circuit.as_near(ratio[np.ix_(*kept)], "aebf"), np.stack([a - e, f - b])
         self.shape = a.shape[0], a.shape[1]
         self.current = np.maximum(circuit.current_from_ratio(near, *self.refs), 1e-9)
         std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * drop)
@@ -241,6 +243,20 @@ def near_ends(rest: Rest) -> Rest:
     codes = np.stack([a, b, 2**ADC_BITS - 1 - b, 2**ADC_BITS - 1 - a], axis=-1)
     board = replace(rest.board, mode="near")
     return replace(rest, board=board, codes=codes, offset_lsb=OFFSET_LSB)
+
+
+def segments_of(lines: Sequence[LineWire]) -> WireOhm | None:
+    """Segment of each layer [ohm], the median of its lines'. None if the lines do not tell both.
+
+    The deviation is the mean of both layers': their errors may be the same.
+    """
+    means, stds = [0.0, 0.0], [np.inf, np.inf]
+    for k, axis in enumerate(("rows", "columns")):
+        if layer := [each for each in lines if getattr(each.place, axis)]:
+            ohm, std_ohm = np.median([(each.ohm, each.std_ohm) for each in layer], axis=0).tolist()
+            means[k] = ohm / len(layer[0].segment_ohm)
+            stds[k] = std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5
+    return WireOhm(means[0], means[1], sum(stds) / 2) if max(stds) <= KNOWN else None
 
 
 def examine_far(rest: Rest, nominal_ohm: tuple[float, float] | None, diagnosis: Diagnosis) -> None:
