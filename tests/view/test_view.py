@@ -29,6 +29,7 @@ from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.force.calibration import Calibration
 from ohmskin.link.device import Device
@@ -260,6 +261,35 @@ def test_a_method_is_switched_and_back() -> None:
         page.refused("joint", do="method", method="magic")
         assert page.command(do="method", method="touch")["good"]
         assert "force" in page.scan(lambda scan: scan["method"] == "touch")
+
+
+def test_far_ends_are_shown_beside_what_the_near_ends_read(tmp_path: Path) -> None:
+    """The raw plane is by Ohm's law from readings a and b, as it is of mode near."""
+    skin = Scene("ghost", 8, 8, seed=1).skin(BEGIN_S)
+    port_siemens = 1 / port_resistance_ohm(skin)  # by the node Laplacian: with wires and ghosts
+    with served(f"{GHOST}&mode=far", folder=tmp_path) as client, panel(client) as page:
+        scan = page.scan(lambda scan: scan["touched"].sum() == 3)
+        assert page.until_state(lambda state: state["status"] == "scanning")
+        assert page.state["methods"] == ["joint", "touch"]
+        # A code of I is 1 / (1024 * 30 kOhm); references in series are 60 kOhm.
+        off = 1 / (1 / scan["raw"] + 60e3) - 1 / (1 / port_siemens + 60e3)
+        assert np.abs(off).max() < 1.1 / 1024 / 30e3
+        assert scan["raw"][5, 5] > 10 * scan["siemens"][5, 5]  # the ghost
+        pressed = scan["touched"].astype(bool)
+        truth = skin.cell_siemens[pressed]
+        np.testing.assert_allclose(scan["siemens"][pressed], truth, rtol=0.02)
+        page.refused("'ohm' takes the readings a b c d, not a e b f", do="method", method="ohm")
+        assert page.command(do="method", method="touch")["good"]
+        assert page.scan(lambda scan: scan["method"] == "touch")["touched"].sum() == 3
+        assert page.state["status"] == "scanning"
+        page.refused("are touched", do="tare", force=False)
+        assert page.command(do="record")["good"]
+        assert page.command(do="tare", force=True)["good"]
+        assert page.command(do="stop")["good"]
+    (path,) = tmp_path.glob("*.mcap")
+    recorded = load_recording(path)
+    assert {scan.mode for scan in recorded.scans} == {"far"}
+    assert [tare.mode for tare in recorded.tares] == ["far"]
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

@@ -186,7 +186,8 @@ class Estimator(ABC):
         if knowledge.reading_names != NEAR and not self.takes_far:
             raise ValueError(
                 f"'{self.name}' takes the readings {' '.join(NEAR)}, not "
-                f"{' '.join(knowledge.reading_names)}: 'ohmskin configure PORT --mode near'"
+                f"{' '.join(knowledge.reading_names)}: use 'joint' or 'touch', or scan with "
+                "'ohmskin configure PORT --mode near'"
             )
         self.knowledge = knowledge
         self._reader = PortReader(knowledge)

@@ -22,12 +22,14 @@ METHODS: Final = tuple(name for name in LEVEL_METHODS if name != VOLTAGE)
 
 
 def make_estimator(method: str, knowledge: SkinKnowledge) -> Estimator:
-    """The estimator called `method`, one of `LEVEL_METHODS`.
+    """The estimator called `method`. Raises ValueError as `kind_of`, and for what it refuses."""
+    return kind_of(method)(knowledge)
 
-    Raises ValueError, with the names there are, for any other name.
-    """
+
+def kind_of(method: str) -> type[Estimator]:
+    """The class of a method, one of `LEVEL_METHODS`. Raises ValueError for any other name."""
     if method not in _WHERE:
         raise ValueError(f"no method '{method}': choose one of {', '.join(LEVEL_METHODS)}")
     module, name = _WHERE[method]
-    estimator: type[Estimator] = getattr(import_module(f"ohmskin.estimate.{module}"), name)
-    return estimator(knowledge)
+    kind: type[Estimator] = getattr(import_module(f"ohmskin.estimate.{module}"), name)
+    return kind

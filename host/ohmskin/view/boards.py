@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from itertools import count, takewhile
 from operator import attrgetter
@@ -19,9 +20,10 @@ import numpy as np
 
 from ohmskin import opening
 from ohmskin.arrays import Bool, Float
+from ohmskin.circuit.skin import as_near
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.estimate.base import Estimate, SkinKnowledge
-from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.methods import METHODS, kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
@@ -64,7 +66,7 @@ class Shown(NamedTuple):
 
 
 def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, **more: Any) -> Shown:
-    """raw: by the method `ohm`, what the electrodes read, ghosts included. more: of the header."""
+    """raw: by the method `ohm`, what the near electrodes read, with ghosts. more: of the header."""
     estimate = scan.estimate
     planes: dict[str, Float | Bool] = {
         "raw": raw.cell_siemens,
@@ -182,8 +184,8 @@ class ViewedBoard(Closing):
     def use(self, method: str) -> str:
         """Estimate by another method. Commands return what was done, and raise why it was not."""
         _, reader = self._there()
-        if method not in (known := _methods(reader)):
-            raise ValueError(f"no method '{method[:40]}': there are {', '.join(known)}")
+        if method not in (*LIVE_METHODS, reader.force_method):
+            raise ValueError(f"no method '{method[:40]}': there are {', '.join(_methods(reader))}")
         reader.use(method)
         self._changed()
         return f"method {method}"
@@ -290,15 +292,16 @@ class ViewedBoard(Closing):
         with opening.open(self.port) as skin:
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
-            raw = make_estimator("ohm", SkinKnowledge.of(reader.board))
+            raw = make_estimator("ohm", SkinKnowledge.of(replace(reader.board, mode="near")))
             try:
                 while not self.closing.is_set():
                     scan, running = skin.latest(), self._running()
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
                     if self.watchers:
+                        near_ratio = as_near(scan.ratio, scan.reading_names)
                         self.shown = _shown(
-                            *(reader.read(scan), raw.estimate(scan.ratio), reader.has_forces),
+                            *(reader.read(scan), raw.estimate(near_ratio), reader.has_forces),
                             method=reader.method,
                             missed=skin.stats.missed,
                             rate_hz=skin.info.rate_hz,
@@ -337,9 +340,10 @@ class ViewedBoard(Closing):
 
 
 def _methods(reader: SkinReader) -> tuple[str, ...]:
-    """The methods that the page offers."""
-    own = reader.force_method
-    return LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
+    """The methods that the page offers: those that take what the board reads."""
+    own, is_near = reader.force_method, reader.board.mode == "near"
+    live = LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
+    return tuple(name for name in live if is_near or kind_of(name).takes_far)
 
 
 class ViewedBoards(Closing, dict[int, ViewedBoard]):
