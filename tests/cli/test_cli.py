@@ -68,6 +68,7 @@ def test_info(run: Run) -> None:
 def test_info_is_in_peoples_units(run: Run) -> None:
     said = dict(re.findall(r"^ ([a-z ]+?)  +(.*?) *$", well(run("info", EMULATED)).out, re.M))
     assert said["cells"] == "4 rows, 6 columns"
+    assert said["mode"] == "near: readings a b c d of each cell"
     assert said["rate"] == "90.00 Hz (asked: 90.00 Hz)"
     assert said["references"] == "30000 Ohm top, 30000 Ohm bottom"
     assert said["settings"] == ENUMS["settings"].docs["defaults_blank"]
@@ -104,7 +105,8 @@ def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:
     assert facts["mode"] == "far"
     (line,) = run("stream", path, "--method", "none", "--json", "--scans", "1").out.splitlines()
     assert json.loads(line)["reading_names"] == ["a", "e", "b", "f"]
-    refused = run("stream", path, "--scans", "1")
+    well(run("stream", path, "--scans", "1"))
+    refused = run("stream", path, "--method", "matrix", "--scans", "1")
     assert_one_line(refused, "takes the readings a b c d, not a e b f", "--mode near")
     assert "\nwires [ohm] " in run("doctor", path).out
     assert "8x8 at 90.00 Hz, mode near" in run("configure", path, "--defaults").out

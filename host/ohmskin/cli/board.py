@@ -104,6 +104,7 @@ def _said_of(board: Hello) -> dict[str, str]:
         "board": f"{board.board}, firmware {board.version}, layout 0x{board.layout_crc:04X}",
         "unit id": str(board.unit_id),
         "cells": f"{board.rows} rows, {board.columns} columns",
+        "mode": f"{board.mode}: readings {' '.join(MODES[board.mode])} of each cell",
         "rate": f"{board.rate_hz:.2f} Hz (asked: {rate})",
         "settle time": f"{board.settle_us} us or more (asked: {settle})",
         "converter": f"{board.adc_bits} bits, {board.adc_prescaler}",
