@@ -3,6 +3,8 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +107,67 @@ def test_a_recording_and_its_forces_make_a_calibration(
         done = well(command())
         slopes.append(load_calibration(out).model.slope)
     np.testing.assert_allclose(*slopes, rtol=0.02)
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_presses_that_far_ends_have_read(
+    run: Run, presses: tuple[Path, Path, Path], method: str
+) -> None:
+    """Forces of a replay against what pressed the skin. Nothing is told of the wires."""
+    (_, forces, out), recording = presses, presses[0].with_name("far.mcap")
+    record_presses(recording, SECONDS, "far")
+    told = ("--forces", str(forces), "--indenter-mm2", "80", "--rest", "1.5")
+    well(run("calibrate", "recording", str(recording), str(out), *told, "--method", method))
+    found = load_calibration(out)
+    assert (found.mode, found.method) == ("far", method)
+    assert not found.model.pooled.any()
+    with ohmskin.open(f"replay://{recording}?speed=0", calibration=out) as skin:
+        scans = list(islice(skin, 1200))
+    true_n = np.array([PRESSES.force_n(1e-6 * scan.time_us) for scan in scans])
+    force_n = np.array([scan.force_n for scan in scans])
+    pressed = true_n > 0.3
+    assert pressed.sum() > 100
+    assert np.sqrt(np.mean((force_n - true_n)[pressed] ** 2)) < 0.15 * true_n.max()
+    assert np.abs(force_n[~pressed & (true_n == 0)]).max() < 0.3
+
+
+def test_other_methods_refuse_what_far_ends_have_read(
+    run: Run, presses: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    (_, forces, out), recording = presses, tmp_path / "far.mcap"
+    readings, answers = tmp_path / "readings.npz", tmp_path / "answers.npz"
+    record_presses(recording, 5.0, "far")
+    told = ("--forces", str(forces), "--indenter-mm2", "80", "--rest", "1.5")
+    well(run("export", str(recording), str(readings)))
+    for method in ("ohm", "matrix", "lsq", "regularized", "voltage"):
+        words = f"'{method}' takes the readings a b c d, not a e b f: use 'joint' or 'touch', or"
+        asked = ("--method", method)
+        assert_one_line(
+            run("calibrate", "recording", str(recording), str(out), *told, *asked), words
+        )
+        if method != "voltage":
+            assert_one_line(run("stream", f"replay://{recording}", *asked), words)
+            assert_one_line(run("estimate", str(readings), *asked, "--out", str(answers)), words)
+    assert not out.exists()
+    assert not answers.exists()
+
+
+def test_presses_read_in_two_modes_are_refused(
+    run: Run, presses: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    given = load_recording(presses[0])
+    hello, half = given.hellos[0], len(given.scans) // 2
+    far = [replace(scan, mode="far") for scan in given.scans]
+    for name, first, messages in (
+        ("first", hello, [*given.scans[:half], replace(hello, mode="far"), *far[half:]]),
+        ("later", replace(hello, mode="far"), [*far[:half], hello, *given.scans[half:]]),
+        ("hello", hello, far),
+    ):
+        path = tmp_path / f"{name}.mcap"
+        write_recording(path, first, messages)
+        words = f"{name}.mcap: modes near and far are mixed in it: record the presses in one mode"
+        assert_one_line(calibrate(run, (path, *presses[1:])), words)
+        assert not presses[2].exists()
 
 
 @pytest.mark.parametrize("method", ["voltage", "touch"])

@@ -2,6 +2,7 @@
 """A skin that a robot presses with known forces; its cells follow `studies.press`."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class PressScene(Scene):
             self._histories.append((times_s, forces_n, model.rise(times_s, forces_n)))
         self._starts_s = np.array(starts_s)
 
-    def board(self, **settings: float) -> EmulatedBoard:
+    def board(self, **settings: Any) -> EmulatedBoard:
         return EmulatedBoard(self.ratio, self.rows, self.columns, **settings)
 
     def skin(self, time_s: float) -> Skin:

@@ -28,9 +28,9 @@ def write_recording(path: Path, hello: Hello, messages: Iterable[Recorded]) -> N
             recorder.add(each)
 
 
-def record_presses(path: Path, seconds: float) -> None:
+def record_presses(path: Path, seconds: float, mode: str = "near") -> None:
     """Record what a board reads of `PRESSES`, with a jitter of 1 ms in host times."""
-    board = PRESSES.board(rate_hz=30.0, unit_id=3, seed=1, noise_lsb=0.3)
+    board = PRESSES.board(rate_hz=30.0, unit_id=3, seed=1, noise_lsb=0.3, mode=mode)
     bench, random = Bench(board), np.random.default_rng(2)
     hello = bench.info
 

@@ -130,6 +130,8 @@ def recording(
     with naming(recording):
         if log is None and not given.forces:
             raise ValueError("no force in it: say --forces LOG.csv")
+        if any(scan.mode != given.hellos[-1].mode for scan in given.scans):
+            raise ValueError("modes near and far are mixed in it: record the presses in one mode")
         if log is None:  # the scans have the same clock
             samples = np.array([(each.host_time_s, each.force_n) for each in given.forces])
             log = ForceLog(*samples.T)
