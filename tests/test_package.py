@@ -7,9 +7,12 @@ import sys
 import tarfile
 import venv
 import zipfile
+from email import message_from_bytes
+from email.message import Message
 from importlib.metadata import Distribution, distribution, distributions
 from pathlib import Path
 
+from markdown_it import MarkdownIt
 from packaging.requirements import Requirement
 
 from places import ROOT
@@ -24,11 +27,16 @@ assert (ohmskin.cli.board._FIRMWARE / "uno.hex").is_file()
 """
 
 
-def run(*command: str | Path, place: Path) -> str:
+def run(*command: str | Path, place: Path, **variables: str) -> str:
     # Nothing of this checkout, nor of this environment, may help.
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    foreign = ("PYTHON", "OHMSKIN")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
     done = subprocess.run(
-        [str(part) for part in command], cwd=place, env=kept, capture_output=True, text=True
+        [str(part) for part in command],
+        cwd=place,
+        env=kept | variables,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -44,6 +52,80 @@ def link_requirements(of: Distribution, place: Path) -> None:
                 if not (place / name).exists():
                     (place / name).symlink_to(needed.locate_file(name))
             link_requirements(needed, place)
+
+
+def metadata_of_wheel(place: Path, source: Path, url: str | None) -> Message:
+    """Of a wheel that is built of `source` with OHMSKIN_URL."""
+    variables = {} if url is None else {"OHMSKIN_URL": url}
+    run(
+        sys.executable,
+        "-m",
+        "hatchling",
+        "build",
+        "-d",
+        place,
+        "-t",
+        "wheel",
+        place=source,
+        **variables,
+    )
+    (wheel,) = place.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+        return message_from_bytes(archive.read(name))
+
+
+def body(metadata: Message) -> str:
+    described = metadata.get_payload(decode=True)
+    assert isinstance(described, bytes)
+    return described.decode()
+
+
+def links_of(markdown: str) -> list[str]:
+    """Addresses of links and pictures, as a parser that is not ours sees them."""
+    tokens = MarkdownIt().enable("table").parse(markdown)
+    inside = [token for each in tokens for token in each.children or ()]
+    both = [token.attrs.get("href") or token.attrs.get("src") for token in inside]
+    return [str(link) for link in both if link]
+
+
+def test_without_an_address_the_readme_is_packaged_as_it_is(tmp_path: Path) -> None:
+    readme = (ROOT / "README.md").read_text()
+    for number, url in enumerate((None, "")):
+        metadata = metadata_of_wheel(tmp_path / str(number), ROOT, url)
+        assert body(metadata).strip() == readme.strip()
+        assert metadata["Description-Content-Type"] == "text/markdown"
+        assert metadata.get_all("Project-URL") is None
+        assert metadata.get_all("Dynamic") is None
+
+
+def test_with_an_address_all_links_are_below_it_and_lead_to_files(tmp_path: Path) -> None:
+    url = "https://example.org/ohmskin"
+    readme = (ROOT / "README.md").read_text()
+    metadata = metadata_of_wheel(tmp_path, ROOT, f"{url}/")
+    before, after = links_of(readme), links_of(body(metadata))
+    assert len(before) > 20
+    assert after == [f"{url}/{link}" for link in before]
+    assert all((ROOT / link).is_file() for link in before)
+    assert metadata.get_all("Project-URL") == [
+        f"Homepage, {url}",
+        f"Documentation, {url}/docs",
+        f"Source, {url}",
+        f"Issues, {url}/issues",
+        f"Changelog, {url}/CHANGELOG.md",
+    ]
+    assert metadata.get_all("Dynamic") is None
+
+
+def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
+    build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path, "-t", "wheel")
+    for url in ("example.org/ohmskin", "ftp://example.org", "https://a b"):
+        variables = {**os.environ, "OHMSKIN_URL": url}
+        done = subprocess.run(build, cwd=ROOT, env=variables, capture_output=True, text=True)
+        assert done.returncode != 0
+        assert "OHMSKIN_URL is" in done.stderr
+        assert "unset it" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Path) -> None:
