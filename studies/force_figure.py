@@ -12,7 +12,7 @@ import numpy as np
 from ohmskin.estimate.methods import METHODS, VOLTAGE
 from ohmskin.estimate.ohm import voltage_level
 from studies.chart_figure import method_style, require_matplotlib
-from studies.force_experiment import CHOICE, EVERY_GROUP, TRUTH, Row, learn, rises
+from studies.force_experiment import CHOICE, EVERY_GROUP, FAR, TRUTH, UNTOLD, Row, learn, rises
 from studies.force_limits import ALONE, BESIDE, PRESSED_CELL, SmallestForce
 from studies.force_trial import ForceTrial
 from studies.published import FORCE_RMSE_N
@@ -32,7 +32,11 @@ def surface_picture(rows: Sequence[Row]) -> bytes:
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    shown = [row for row in rows if (row.regression, row.cells) == (CHOICE, "whole")]
+    shown = [
+        row
+        for row in rows
+        if (row.regression, row.cells) == (CHOICE, "whole") and row.method != UNTOLD
+    ]
     places = list(dict.fromkeys((row.rows, row.columns, row.frames) for row in shown))
     figure = Figure(figsize=(15.5, 8.2), layout="constrained")
     surface = shown[0].surface
@@ -58,7 +62,8 @@ def surface_picture(rows: Sequence[Row]) -> bytes:
             grid[1, column].set_xlabel(meaning, color=_INK)
     grid[0, 0].set_ylabel("RMSE on the robot's cell [N]", color=_INK)
     grid[1, 0].set_ylabel("RMSE over every cell [N]", color=_INK)
-    _explain(figure, [row.method for row in shown if row.frames == places[1][2]])
+    paper = [row.method for row in shown if row.frames == places[1][2]]
+    _explain(figure, [*paper, *(row.method for row in shown if row.method == FAR)])
     return _png(figure)
 
 
@@ -265,6 +270,8 @@ def _prepare(axes: Axes) -> None:
 def _fill(method: str) -> dict[str, Any]:
     if method in METHODS:
         return {"color": method_style(method)["color"]}
+    if method == FAR:
+        return {"color": "#7fd4b8"}
     return {"color": "#cc3311" if method == VOLTAGE else "#c8c8c8"}
 
 
