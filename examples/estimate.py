@@ -9,16 +9,8 @@ import ohmskin
 
 def main(port: str, seconds: float = float("inf")) -> None:
     with ohmskin.open(port) as skin:
-        board = skin.info
         rest = skin.latest().ratio  # nothing may touch the skin now
-        knowledge = ohmskin.SkinKnowledge(
-            board.rows,
-            board.columns,
-            ref_top_ohm=board.ref_top_ohm,
-            ref_bottom_ohm=board.ref_bottom_ohm,
-            adc_bits=board.adc_bits,
-            rest_ratio=rest,
-        )
+        knowledge = ohmskin.SkinKnowledge.of(skin.info, rest)
         estimator = ohmskin.make_estimator("touch", knowledge)
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:

@@ -18,4 +18,5 @@ with ohmskin.open_all(sys.argv[1:] or None) as skins:
     print(f"units {', '.join(map(str, skins))}", flush=True)
     for unit_id, scan, time_s in skins.scans():
         text = f"{time_s:.4f} s: unit {unit_id}, scan {scan.number}, missed {scan.missed}, "
-        print(f"{text}{scan.ratio[0, 0, 1]:.3f}", flush=True)
+        b = scan.ratio[0, 0, scan.reading_names.index("b")]
+        print(f"{text}{b:.3f}", flush=True)

@@ -95,7 +95,7 @@ def frames(octets: bytes) -> None:
                         make_estimator("ohm", SkinKnowledge.of(board)).estimate(message.ratio)
                     except ValueError as error:
                         one_line(error)
-                        assert board.mode != "near"  # the only one that estimators take
+                        assert board.mode != "near"  # the only one that `ohm` takes
 
 
 def forces(octets: bytes) -> None:

@@ -22,6 +22,7 @@ import ohmskin
 from calibrations import half_doubtful, of_scene
 from command_line import Run, python, well
 from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
 from places import ROOT
@@ -73,6 +74,20 @@ def test_estimate_prints_the_moving_finger() -> None:
     assert all(float(value) > 0 for *_, value, _ in touches)
 
 
+def test_estimate_knows_the_readings_of_far_ends() -> None:
+    """Against the scene that the board is given, within the noise of its codes."""
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import estimate; "
+        "estimate.main('emulator://8x8?scene=ghost&seed=1&mode=far', seconds=4.5)"
+    )
+    text = output_of("-c", code, str(EXAMPLES))
+    touches = re.findall(r"\((\d), (\d)\): ([\d.]+) \+- ([\d.]+) microsiemens", text)
+    assert {(int(row), int(column)) for row, column, *_ in touches} == {(2, 2), (2, 5), (5, 2)}
+    truth_us = 1e6 * Scene("ghost", 8, 8, seed=1).skin(BEGIN_S).cell_siemens
+    for row, column, us, _ in touches:
+        assert float(us) == pytest.approx(truth_us[int(row), int(column)], rel=0.02)
+
+
 def test_forces_prints_contacts(skin_json: str) -> None:
     lines = first_lines(6, str(EXAMPLES / "forces.py"), GHOST, skin_json)
     pattern = r"[\d.]+ \+- [\d.]+ N at \((\d\.\d), (\d\.\d)\)\n"
@@ -103,11 +118,13 @@ def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> Non
 
 
 def test_two_boards_have_one_clock() -> None:
-    urls = ("emulator://8x8?unit=1", "emulator://8x8?unit=2")
+    urls = ("emulator://8x8?unit=1", "emulator://8x8?unit=2&mode=far")
     begin_s = time.monotonic()
     head, *lines = first_lines(40, str(EXAMPLES / "two_boards.py"), *urls)
     assert head == "units 1, 2\n"
-    scans = [re.match(r"([\d.]+) s: unit (\d), scan (\d+), missed 0, 0\.\d+$", x) for x in lines]
+    scans = [
+        re.match(r"([\d.]+) s: unit (\d), scan (\d+), missed 0, 0\.(?:09|1\d)\d$", x) for x in lines
+    ]
     times_s = [float(each[1]) for each in scans if each]
     assert len(times_s) == 39
     assert all(b - a > -0.002 for a, b in pairwise(times_s))
