@@ -77,6 +77,8 @@ class JointEstimator(Estimator):
         """Forget the frames before, and what they revealed of the wires."""
         super().reset()
         self._learned_from: Float | None = None
+        # What follows from the wires as they are believed, for `touch`.
+        self._believed: tuple[Float, tuple[Float, Float, Float]] | None = None
         self._without_wires: Float | None = None
         self._touches = 0  # of the last fit
         self._belief.reset()
@@ -107,8 +109,7 @@ class JointEstimator(Estimator):
         return None
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
-        wires = self._belief.layers(fit.wires)
-        series_ohm = path_ohm(*wires, far=ports.far) + self.knowledge.ref_ohm
+        wires, wires_std, series_ohm = self._wires_of(fit)
         layer_std, wider = self._belief.std(), max(1.0, fit.misfit) ** 0.5
         std, down = siemens_std(-fit.cell, fit.cell_std, fit.by_layers, layer_std, series_ohm)
         return Solution(
@@ -119,8 +120,22 @@ class JointEstimator(Estimator):
             iterations=fit.iterations,
             message=message,
             wire_ohm=wires,
-            wire_ohm_std=wires * self._belief.segment_std(),
+            wire_ohm_std=wires_std,
         )
+
+    def _wires_of(self, fit: FullFit | Touched) -> tuple[Float, Float, Float]:
+        """Segments and their deviations (2, R, C), and what is in series with each cell [ohm]."""
+        of = self._belief.log_layers
+        if isinstance(fit, FullFit) or self._believed is None or self._believed[0] is not of:
+            wires = self._belief.layers(fit.wires)
+            series_ohm = path_ohm(*wires, far=self._reader.far) + self.knowledge.ref_ohm
+            found = wires, wires * self._belief.segment_std(), series_ohm
+            if isinstance(fit, FullFit):
+                return found
+            for each in found:
+                each.setflags(write=False)  # they are in more than one estimate
+            self._believed = of, found
+        return self._believed[1]
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:
         """Why this fit cannot be the answer; empty if it can."""
