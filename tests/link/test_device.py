@@ -492,7 +492,7 @@ def lying(link: SteppedLink, **fields: Any) -> SteppedLink:
 IMPOSSIBLE_HELLO = (
     "rows 0, rows 17, rows 255, columns 0, columns 17, readings_per_cell 0, readings_per_cell 2, "
     "adc_bits 12, ref_top_ohm 0, ref_bottom_ohm 0, clock_hz 0, scan_cycles 0, scan_cycles 1, "
-    "scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, adc_prescaler 7, mode 2"
+    "baud 0, scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, adc_prescaler 7, mode 2"
 )
 
 

@@ -73,6 +73,7 @@ class Hello:
             "adc_bits": self.adc_bits == protocol.ADC_BITS,
             "ref_top_ohm": 0 < self.ref_top_ohm <= _MOST_REF_OHM,
             "ref_bottom_ohm": 0 < self.ref_bottom_ohm <= _MOST_REF_OHM,
+            "baud": self.baud > 0,
             "clock_hz": self.clock_hz > 0,
             "scan_cycles": 0 < self.scan_cycles <= _LONGEST_SCAN_S * self.clock_hz,
             "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,
