@@ -33,19 +33,6 @@ from recordings import write_recording
 
 
 @pytest.fixture
-def benches(monkeypatch: pytest.MonkeyPatch) -> list[Bench]:
-    """The boards that the doctor opens, in simulated time."""
-    opened: list[Bench] = []
-
-    def connect(url: str, **_: object) -> Bench:
-        opened.append(Bench(url))
-        return opened[-1]
-
-    monkeypatch.setattr(ohmskin, "open", connect)
-    return opened
-
-
-@pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """For boards in real time."""
     monkeypatch.setattr(doctor_command, "REST_S", 0.2)

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from test_doctor import told
 
-import ohmskin
 from bench_board import Bench, evidence
 from calibrations import calibration
 from command_line import Run, assert_one_line, well
@@ -289,19 +288,6 @@ def test_all_far_ends_are_open_where_there_is_no_second_pair() -> None:
 
 
 # ------------------------------------------------------------------------------- the command
-
-
-@pytest.fixture
-def benches(monkeypatch: pytest.MonkeyPatch) -> list[Bench]:
-    """The boards that commands open, in simulated time."""
-    opened: list[Bench] = []
-
-    def connect(url: str, **_: object) -> Bench:
-        opened.append(Bench(url))
-        return opened[-1]
-
-    monkeypatch.setattr(ohmskin, "open", connect)
-    return opened
 
 
 def test_page_and_json(run: Run, benches: list[Bench]) -> None:

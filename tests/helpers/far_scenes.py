@@ -11,15 +11,12 @@ for each direction of the current, and all circuits are instances of one subcirc
 
 from __future__ import annotations
 
-import subprocess
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from spice import Array, solved  # beside this file
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "far"
 NAMES = "abcdefgh"
@@ -33,7 +30,6 @@ FINGER_SIEMENS = (3e-5, 1.5e-4)  # its peak in each frame, log-uniform
 FRAMES = 40
 SEED = 20_261_122
 STEP = 2.0**-30  # what readings in the files are rounded to: 1e-9 of Vdd
-RESULT_FILE = "readings.txt"
 
 
 @dataclass(frozen=True)
@@ -93,66 +89,9 @@ def finger(rest_ohm: Array, random: np.random.Generator) -> Array:
     return np.asarray(1 / siemens)
 
 
-# ------------------------------------------------------------------------------------- ngspice
-
-
-def netlist(cell_ohm: Array, top_ohm: Array, bottom_ohm: Array) -> str:
-    """SPICE that writes readings a to h of every cell, in the order of (R, C, 8); Vdd is 1 V."""
-    rows, columns = cell_ohm.shape
-    inside, ports, sensed = [], [], []
-    for i in range(rows):
-        for j in range(columns):
-            cell = f"{i}_{j}"
-            before_top = f"t{i}_{j - 1}" if j else f"row{i}"
-            before_bottom = f"b{i - 1}_{j}" if i else f"column{j}"
-            inside += [
-                f"rt{cell} {before_top} t{cell} {top_ohm[i, j]:.17g}",
-                f"rb{cell} {before_bottom} b{cell} {bottom_ohm[i, j]:.17g}",
-                f"rc{cell} t{cell} b{cell} {cell_ohm[i, j]:.17g}",
-            ]
-    near = [f"row{i}" for i in range(rows)] + [f"column{j}" for j in range(columns)]
-    far = [f"t{i}_{columns - 1}" for i in range(rows)] + [
-        f"b{rows - 1}_{j}" for j in range(columns)
-    ]
-    for i in range(rows):
-        for j in range(columns):
-            for direction, top_end, bottom_end in (("ab", "vdd", "0"), ("cd", "0", "vdd")):
-                port = f"{direction}{i}_{j}"
-                ends = [f"{name}{port}" for name in near + far]
-                ports += [
-                    f"rt{port} {top_end} row{i}{port} {REF_OHM:.17g}",
-                    f"rb{port} {bottom_end} column{j}{port} {REF_OHM:.17g}",
-                    f"x{port} {' '.join(ends)} skin",
-                ]
-            a, c = f"ab{i}_{j}", f"cd{i}_{j}"
-            far_row, far_column = far[i], far[rows + j]
-            sensed += [f"row{i}{a}", f"column{j}{a}", f"column{j}{c}", f"row{i}{c}"]
-            sensed += [far_row + a, far_column + a, far_column + c, far_row + c]
-    vectors = " ".join(f"v({node})" for node in sensed)
-    lines = ["all readings of a skin", f".subckt skin {' '.join(near + far)}", *inside, ".ends"]
-    lines += ["vdd vdd 0 1", *ports]
-    lines += [".control", "set numdgt=15", "set wr_singlescale", "op"]
-    lines += [f"wrdata {RESULT_FILE} {vectors}", ".endc", ".end", ""]
-    return "\n".join(lines)
-
-
-def run_ngspice(circuit: str) -> Array:
-    """The numbers that a netlist writes to its file."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "skin.cir").write_text(circuit)
-        command = ["ngspice", "-n", "-b", "skin.cir"]
-        run = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
-        if not (folder / RESULT_FILE).exists():
-            raise RuntimeError(f"ngspice wrote no result: {run.stdout}{run.stderr}")
-        # The first number is the scale, of which an operating point has none.
-        return np.loadtxt(folder / RESULT_FILE)[1:]
-
-
-def solved(cell_ohm: Array, top_ohm: Array, bottom_ohm: Array) -> Array:
-    """Readings a to h of one frame, (R, C, 8)."""
-    ratio = run_ngspice(netlist(cell_ohm, top_ohm, bottom_ohm)).reshape(*cell_ohm.shape, 8)
-    return np.asarray(np.round(ratio / STEP) * STEP)
+def rounded(cell_ohm: Array, top_ohm: Array, bottom_ohm: Array) -> Array:
+    """Readings a to h of one frame, (R, C, 8), as the files have them."""
+    return np.asarray(np.round(solved(cell_ohm, top_ohm, bottom_ohm) / STEP) * STEP)
 
 
 def main() -> None:
@@ -162,8 +101,8 @@ def main() -> None:
             cell_ohm, rest_ohm, *wires = skin(kind, number)
             np.savez_compressed(
                 FOLDER / f"{name}_{number}.npz",
-                ratio=np.array([solved(cells, *wires) for cells in cell_ohm]),
-                rest_ratio=solved(rest_ohm, *wires),
+                ratio=np.array([rounded(cells, *wires) for cells in cell_ohm]),
+                rest_ratio=rounded(rest_ohm, *wires),
                 reading_names=np.array(list(NAMES)),
                 cell_ohm=cell_ohm,
                 rest_ohm=rest_ohm,

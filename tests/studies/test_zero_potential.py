@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from far_scenes import run_ngspice
 from network import skin_network
 from ohmskin.circuit.skin import Skin
+from spice import resistors, run_ngspice
 from studies.trials import skin_at_rest, touch, uniform_skin
 from studies.zero_potential import converted, currents, less_path, solved
 
@@ -60,23 +60,14 @@ def test_currents_agree_with_the_laplacian(scale: float) -> None:
 @pytest.mark.ngspice
 def test_currents_agree_with_ngspice() -> None:
     skin = touched(3, 4, 5, seed=2)
-    lines, sources = ["zero-potential readout"], []
+    lines: list[str] = []
     for driven in range(3):
-        for i, j in np.ndindex(3, 4):
-            cell, n = f"{i}_{j}", f"n{driven}"
-            before_top = f"t{i}_{j - 1}{n}" if j else f"row{i}{n}"
-            before_bottom = f"b{i - 1}_{j}{n}" if i else f"column{j}{n}"
-            lines += [
-                f"rt{cell}{n} {before_top} t{cell}{n} {skin.top_wire_ohm[i, j]:.17g}",
-                f"rb{cell}{n} {before_bottom} b{cell}{n} {skin.bottom_wire_ohm[i, j]:.17g}",
-                f"rc{cell}{n} t{cell}{n} b{cell}{n} {1 / skin.cell_siemens[i, j]:.17g}",
-            ]
+        wires = skin.top_wire_ohm, skin.bottom_wire_ohm
+        lines += resistors(1 / skin.cell_siemens, *wires, end=f"n{driven}")
         lines += [f"vr{i}n{driven} row{i}n{driven} 0 {int(i == driven)}" for i in range(3)]
         lines += [f"vc{j}n{driven} column{j}n{driven} 0 0" for j in range(4)]
-        sources += [f"i(vc{j}n{driven})" for j in range(4)]
-    lines += [".control", "set numdgt=15", "set wr_singlescale", "op"]
-    lines += [f"wrdata readings.txt {' '.join(sources)}", ".endc", ".end", ""]
-    expected = run_ngspice("\n".join(lines)).reshape(3, 4)
+    wanted = [f"i(vc{j}n{driven})" for driven in range(3) for j in range(4)]
+    expected = run_ngspice(lines, wanted).reshape(3, 4)
     np.testing.assert_allclose(currents(skin), expected, rtol=1e-6, atol=1e-14)
 
 

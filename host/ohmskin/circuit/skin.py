@@ -51,6 +51,9 @@ READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
 READING_SIGN: Final[Float] = np.array([-1.0, 1.0, -1.0, 1.0])
 READING_SENSES_TOP: Final[NDArray[np.bool_]] = np.array([True, False, False, True])
 
+# Readings of the same node with the supplies exchanged: near and far row, near and far column.
+EXCHANGED: Final = {"a": "d", "b": "c", "e": "h", "f": "g"}
+
 DEFAULT_REF_OHM: Final = 30_000.0
 
 
@@ -407,11 +410,26 @@ def ratio_from_current(
     return np.asarray(READING_OFFSET + slope * current, dtype=np.float64)
 
 
+def node_ratio(ratio: Float, reading_names: Sequence[str], node: str) -> Float:
+    """Potential over Vdd, top pin high, where reading `node` (a, b, e, f) is taken, (...).
+
+    Mean of what readings (..., n) of these names have of it: with the supplies exchanged, each is 1
+    less. Raises ValueError if none of them is of this node.
+    """
+    high = [ratio[..., k] for k, name in enumerate(reading_names) if name == node]
+    low = [1 - ratio[..., k] for k, name in enumerate(reading_names) if name == EXCHANGED[node]]
+    if not (high or low):
+        raise ValueError(
+            f"readings {' '.join(reading_names)}: neither {node} nor {EXCHANGED[node]}"
+        )
+    return np.asarray(sum(high + low) / len(high + low), dtype=np.float64)
+
+
 def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
-    """Readings a to d of those of these names, (..., n): without c and d, 1 - b and 1 - a."""
+    """Readings a to d, from (..., n) of these names, which have both near ends."""
     if tuple(reading_names) == NEAR:
         return ratio
-    a, b = (ratio[..., reading_names.index(name)] for name in "ab")
+    a, b = (node_ratio(ratio, reading_names, node) for node in "ab")
     return np.stack([a, b, 1 - b, 1 - a], axis=-1)
 
 

@@ -59,12 +59,15 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
+    EXCHANGED,
     NEAR,
     READING_OFFSET,
     READING_SENSES_TOP,
     READING_SIGN,
     READINGS_PER_CELL,
     PortCircuit,
+    as_near,
+    node_ratio,
     reference_ohm,
 )
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
@@ -73,8 +76,6 @@ if TYPE_CHECKING:
     from ohmskin.estimate.base import SkinKnowledge
 
 _MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}  # by degrees of freedom
-# A reading with the supplies exchanged is 1 less that of the same node (../circuit/skin.py).
-_NODES: Final = {"a": "d", "b": "c", "e": "h", "f": "g"}
 # Sign of a reading in what the other lines draw: more at the top node, less at the bottom one.
 _DRAWN: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
 # Variances of rounding, and of the median cell: a cell that disagrees by more is not usual.
@@ -124,14 +125,10 @@ class PortReader:
 
     def __init__(self, known: SkinKnowledge) -> None:
         shape, names = (known.rows, known.columns), known.reading_names
-        # Which readings are of a node, and whether supplies are exchanged: row, column, far ends.
-        self._nodes = [
-            [(k, name == low) for k, name in enumerate(names) if name in (high, low)]
-            for high, low in _NODES.items()
-        ]
-        if not (self._nodes[0] and self._nodes[1]):
+        has = {node: node in names or low in names for node, low in EXCHANGED.items()}
+        if not (has["a"] and has["b"]):
             raise ValueError(f"readings {' '.join(names)}: of each near end, one is needed")
-        self.far = bool(self._nodes[2]), bool(self._nodes[3])
+        self._names, self.far = names, (has["e"], has["f"])
         ends = READINGS_PER_CELL if names == NEAR else 2
         self._degrees, self._is_near = ends - 1, names == NEAR
         self._slow_share = np.full(shape, SLOW_SHARE)
@@ -175,8 +172,8 @@ class PortReader:
         # What near ends have in common is of lines that charge, or an offset.
         near = 1.0 - self._ref_ohm[0] * current, self._ref_ohm[1] * current
         ends = [
-            self._potential(ratio, node) if node else near[axis]
-            for axis, node in enumerate(self._nodes[2:])
+            node_ratio(ratio, self._names, node) if is_far else by_current
+            for node, is_far, by_current in zip("ef", self.far, near, strict=True)
         ]
         apart = np.maximum(ends[0] - ends[1], 0.0)
         whole = apart + sum(self._ref_ohm) * current
@@ -192,11 +189,6 @@ class PortReader:
         drops = drop / current, drop_std / current, shift / current
         return PortReadings(ratio, current / whole, std, fault, self.far, *drops)
 
-    def _potential(self, ratio: Float, node: list[tuple[int, bool]]) -> Float:
-        """Of a node, top pin high, over Vdd (R, C): mean of its readings; 0 without any."""
-        found = [1.0 - ratio[..., k] if is_low else ratio[..., k] for k, is_low in node]
-        return np.asarray(sum(found) / max(len(found), 1))
-
     def _astray(self, drop: Float, std: Float) -> str:
         """Lines whose far ends are not between the near ends."""
         for axis, line in enumerate(("row", "column")):
@@ -210,8 +202,7 @@ class PortReader:
     ) -> tuple[PortReadings, float, float, Float, float]:
         """What near ends show; variances of noise, usual, and of what is off; their offset [1]."""
         if not self._is_near:
-            ends = [self._potential(ratio, node) for node in self._nodes[:2]]
-            ratio = np.stack(ends, axis=-1)
+            ratio = as_near(ratio, self._names)[..., :2]
         current: Float = (ratio - self._level) @ self._slope / self._ref_square
         residual = ratio - self._level - current[..., None] * self._slope
         # Currents do not show a node's offset: its two readings, A and D, B and C, have it alike.
