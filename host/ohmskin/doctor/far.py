@@ -70,20 +70,16 @@ class _Skin:
 
     def layers(self, wire_ohm: Float) -> tuple[list[Float], list[Float]]:
         """A, u, s and w of the rows, and of the columns, if the segments are so, (2, R, C)."""
-        refs_ohm, (rows, columns) = sum(self.refs), self.shape
+        refs_ohm = sum(self.refs)
         wired = circuit.PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
         wired -= circuit.PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
         port_ohm = np.maximum(1 / self.current - refs_ohm - wired.reshape(self.shape), 1.0)
         ratio = circuit.ratio_from_current(1 / (port_ohm + refs_ohm), *self.refs)
         self.cell_siemens = self._matrix.estimate(ratio).cell_siemens
-        by_line = circuit.PortCircuit(self.cell_siemens, *wire_ohm).cell_current
-        by_port = circuit.port_difference(by_line.reshape(rows + columns, -1), rows)
-        share = circuit.wire_current(by_port.reshape(-1, *self.shape))
-        share = share.reshape(*self.shape, 2, *self.shape)
-        of_rows, of_columns = np.einsum("ijik->ijk", share[:, :, 0]), share[:, :, 1]
+        wired_skin = circuit.PortCircuit(self.cell_siemens, *wire_ohm)
         return (
-            [of_rows, *self.readings_ohm[0]],
-            [np.einsum("ijkj->jik", of_columns), *self.readings_ohm[1].swapaxes(1, 2)],
+            [wired_skin.line_current(0), *self.readings_ohm[0]],
+            [wired_skin.line_current(1), *self.readings_ohm[1].swapaxes(1, 2)],
         )
 
     def ends(self, wire_ohm: Float) -> tuple[Float, Float]:
