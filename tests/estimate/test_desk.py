@@ -33,7 +33,7 @@ def test_errors_are_small_and_stated(skins: list[DeskSkin], method: str) -> None
     errors, stds = np.concatenate(error), np.concatenate(stated)
     assert np.median(errors) < 0.015
     assert np.mean(errors < 4 * stds) > 0.98
-    assert np.median(stds / errors) < 5  # 10 where all of a disagreement counts as noise
+    assert np.median(stds / errors) < 4  # 10 where all of a disagreement counts as noise
 
 
 @pytest.fixture(scope="module")

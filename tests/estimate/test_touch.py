@@ -269,3 +269,55 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     before = np.log([100.0, 200.0])
     moved = belief.moved(belief.by_layers(some @ layers), before)
     np.testing.assert_allclose(moved, some @ (belief.mean - layers @ before), rtol=1e-9)
+
+
+def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
+    """The belief is that of a skin that the first frame of the touch never taught."""
+    random = np.random.default_rng(9)
+    slopes = random.normal(size=(3, 5, 2))  # of three frames, by the logs of the layers
+    residual, noise = random.normal(size=(3, 5)), np.diag(random.uniform(1, 2, 5))
+    nominal = np.log([100.0, 200.0])
+
+    def teach(belief: WireBelief, frame: int, *, instead: bool = False) -> None:
+        left = residual[frame] - slopes[frame] @ (belief.log_layers - nominal)
+        by_layers = belief.by_layers(slopes[frame])
+        system = by_layers @ by_layers.T + noise
+        belief.learn(by_layers, left, np.linalg.cholesky(system), instead=instead)
+
+    taught, never = (WireBelief(2, 3, (100.0, 200.0, None)) for _ in range(2))
+    teach(taught, 0)
+    teach(taught, 1)
+    teach(taught, 2, instead=True)
+    teach(never, 0)
+    teach(never, 2)
+    np.testing.assert_allclose(taught.log_layers, never.log_layers, rtol=1e-9)
+    np.testing.assert_allclose(taught.by_layers(np.eye(2)), never.by_layers(np.eye(2)), atol=1e-9)
+
+
+def test_a_touch_alone_does_not_take_the_lesson_before_it_away() -> None:
+    belief = WireBelief(2, 3, (100.0, 200.0, None))
+    lesson = belief.by_layers(np.ones((2, 2))), np.ones(2), 3.0 * np.eye(2)
+    belief.learn(*lesson)
+    taught = belief.log_layers
+    nothing = np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0))
+    belief.learn(*nothing)
+    belief.learn(*nothing, instead=True)
+    assert belief.log_layers is taught
+    belief.learn(*lesson, instead=True)
+    assert np.all(np.abs(belief.log_layers) > np.abs(taught))
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_noise_as_a_touch_begins_does_not_spoil_what_it_teaches(method: str) -> None:
+    """Each touch: one frame with 12 LSB of noise, one without; wires 35 % above nominal."""
+    trial, random = bent_trial(8, 8, 8, 30, seed=6), np.random.default_rng(1)
+    readings = trial.rounded(10)
+    estimators = [make_estimator(method, readings.knowledge(0)) for _ in range(2)]
+    for ratio in readings.ratio:
+        noise = 12 / 1024 * random.standard_normal(ratio.shape)
+        estimators[0].estimate(ten_bits(np.clip(ratio + noise, 0, 1)))
+        for estimator in estimators:
+            estimator.estimate(ratio)
+    noisy, calm = (estimator.wires() for estimator in estimators)
+    assert noisy[:2] == pytest.approx(calm[:2], rel=0.1)
+    assert noisy.log_std == pytest.approx(calm.log_std, rel=0.3)

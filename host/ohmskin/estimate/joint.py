@@ -77,6 +77,7 @@ class JointEstimator(Estimator):
         """Forget the frames before, and what they revealed of the wires."""
         super().reset()
         self._learned_from: Float | None = None
+        self._lesson_noise = 0.0  # of the frame that was learned from
         # What follows from the wires as they are believed, for `touch`.
         self._believed: tuple[Float, tuple[Float, Float, Float]] | None = None
         self._without_wires: Float | None = None
@@ -174,14 +175,19 @@ class JointEstimator(Estimator):
         return PortCircuit(np.exp(-cell).reshape(self._shape), *wires, far=self._reader.far)
 
     def _learn(self, fit: FullFit | Touched, ports: PortReadings) -> None:
-        """Let the wires learn from a frame that is news: frames alike have errors alike."""
-        before = self._learned_from
-        if before is None or np.abs(fit.cell - before).max() >= MAX_STEP:
-            self._learned_from = fit.cell
-            if self._measured is None:
-                self._belief.learn(*fit.lesson)
-            else:
-                self._measured.keep(self._circuit(fit.cell), ports)
+        """Let the wires learn from a frame that is news: frames alike have errors alike.
+
+        A frame that is alike, but calmer, takes the place of the one that was news.
+        """
+        before, noise = self._learned_from, float(ports.current_std.mean())
+        news = before is None or np.abs(fit.cell - before).max() >= MAX_STEP
+        if not news and (self._measured is not None or noise >= self._lesson_noise):
+            return
+        self._learned_from, self._lesson_noise = fit.cell, noise
+        if self._measured is None:
+            self._belief.learn(*fit.lesson, instead=not news)
+        else:
+            self._measured.keep(self._circuit(fit.cell), ports)
 
     def _prior_of(self, ports: PortReadings) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.

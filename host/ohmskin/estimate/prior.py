@@ -20,6 +20,11 @@ A frame is one step of a Kalman filter: with z the residual at the mean and S = 
 
     m += C L J^T S^-1 z ,     C -= C L J^T S^-1 J L^T C .
 
+The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
+its step starts from m and C as they were before the touch. What its readings alone say is
+
+    A = L J^T N^-1 J L^T = C^-1/2 (1 - X)^-1 X C^-1/2 ,     X = C^1/2 L J^T S^-1 J L^T C^1/2 .
+
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
 cells as noise without limit. After it C grows back towards C0: a skin bends. What single segments
 have of their own is not learned: frames say too little of it.
@@ -135,6 +140,7 @@ class WireBelief:
         """Back to the nominal wires."""
         self.log_layers = self._nominal
         self._root: Float = np.asarray(np.linalg.cholesky(self._prior_covariance), np.float64)
+        self._untaught = self.log_layers, self._root  # before the last lesson
 
     @property
     def mean(self) -> Float:
@@ -183,13 +189,25 @@ class WireBelief:
         """Standard deviation of the log of each segment, for (2, R, C)."""
         return np.asarray(np.hypot(np.hypot(*self._root.T), SEGMENT_STD)[:, None, None])
 
-    def learn(self, by_layers: Float, residual: Float, factor: Float) -> None:
-        """One Kalman step from a `Lesson`. residual: z (m,) at the mean; factor: of S (m, m)."""
+    def learn(
+        self, by_layers: Float, residual: Float, factor: Float, *, instead: bool = False
+    ) -> None:
+        """One Kalman step from a `Lesson`. residual: z (m,) at the mean; factor: of S (m, m).
+
+        instead: of the last lesson, which is forgotten.
+        """
+        if not instead:
+            self._untaught = self.log_layers, self._root
         if len(residual) < 2:
             return
-        gain = solve(factor, by_layers).T
-        self.log_layers = self.away(gain @ residual)
-        covariance = self._root @ (np.eye(2) - gain @ by_layers) @ self._root.T
+        left = solve(factor, by_layers).T
+        of_log = np.linalg.inv(self._root)
+        alone = of_log.T @ np.linalg.inv(np.eye(2) - left @ by_layers) @ left
+        information = alone @ by_layers @ of_log
+        before, root = self._untaught
+        pull = alone @ residual + information @ (self.log_layers - before)
+        covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + information)
+        self.log_layers = before + covariance @ pull
         covariance += FADE * (self._prior_covariance - covariance)
         self._root = np.asarray(np.linalg.cholesky(covariance), np.float64)
 
