@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bench_board import Bench, evidence
+from desk import examined
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
@@ -231,3 +232,18 @@ def test_corners_that_are_asked_for() -> None:
             assert moved_across((corner, beside, below)) == ((rows - 1, columns - 1), below, beside)
     with pytest.raises(ValueError, match="1x8 skin has no rectangle"):
         suggested_corners(1, 8)
+
+
+@pytest.mark.simavr
+def test_wires_on_a_board_as_on_a_desk() -> None:
+    """There, lines that float move readings by 30 LSB: the doctor sees the wires all the same."""
+    off = []
+    for seed in range(3):
+        diagnosis = examined(seed, NOMINAL)
+        assert diagnosis.findings == []
+        assert diagnosis.pressed is not None
+        whole = diagnosis.pressed[0]
+        assert whole.std < 0.05
+        off.append(whole.share - 1)
+    assert np.abs(off).max() < 0.08
+    assert np.mean(off) == pytest.approx(0, abs=0.05)

@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans of touched skins that the built firmware reads in simavr, on a board as on a desk."""
+"""Scans of skins that the built firmware reads in simavr, on a board as unkind as one on a desk."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench_board import Bench
 from lockstep import Rig
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
+from ohmskin.doctor.examine import Evidence, examine
+from ohmskin.doctor.findings import Diagnosis
+from ohmskin.doctor.wires import CornerScans, moved_across, suggested_corners
 from ohmskin.link.codes import ratio_from_codes
+from ohmskin.link.messages import Scan
 from studies.trials import skin_at_rest, touch
 
 REST_SCANS, SCANS = 20, 3
+LOOK_SCANS = 60  # of the doctor
 TOUCHES = 8
+PRESS_OHM = 5e3  # firmly, as the doctor asks
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +39,13 @@ class DeskSkin:
     ratios: list[Float]
 
 
-def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) -> DeskSkin:
-    """8x8 at 90 Hz, Uno: the preset `desk` of firmware/sim, with these settings instead of its own.
-
-    Offset and gain of the converter are within 2 LSB, its bow within 1.5, drawn from the seed.
-    """
+@contextmanager
+def _on_desk(seed: int, mode: str = "near", **settings: float) -> Iterator[tuple[Rig, Skin, Any]]:
+    """A board that scans an untouched skin, that skin, and the source of randomness behind both."""
     random = np.random.default_rng([77, seed])
     converter = dict(zip(("offset_lsb", "gain_lsb"), random.uniform(-2, 2, 2), strict=True))
     converter |= {"inl_lsb": random.uniform(-1.5, 1.5), "seed": seed}
     rest = skin_at_rest(8, 8, random)
-    skins = [touch(rest, int(random.integers(1, TOUCHES + 1)), random) for _ in range(frames)]
     with Rig("uno") as rig:
         rig.sim.set(desk=1)
         rig.sim.set(**converter | settings | {"far_open": float(mode == "near")})
@@ -47,12 +53,38 @@ def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) 
         _show(rig, rest, mode)
         rig.start_scan(mode=mode)
         rig.sim.hold_log(False)
+        yield rig, rest, random
+
+
+def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) -> DeskSkin:
+    """8x8 at 90 Hz, Uno: the preset `desk` of firmware/sim, with these settings instead of its own.
+
+    Offset and gain of the converter are within 2 LSB, its bow within 1.5, drawn from the seed.
+    """
+    with _on_desk(seed, mode, **settings) as (rig, rest, random):
+        skins = [touch(rest, int(random.integers(1, TOUCHES + 1)), random) for _ in range(frames)]
         rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
         ratios = []
         for skin in skins:
             _show(rig, skin, mode)
             ratios.append(ratio_from_codes(_scans(rig, SCANS)))
     return DeskSkin(rest, rest_ratio, skins, ratios)
+
+
+def examined(seed: int, nominal: tuple[float, float]) -> Diagnosis:
+    """What the doctor says of that skin on that board, wires among it: corners are pressed."""
+    board = Bench("emulator://8x8").info
+    presses, corners = CornerScans(board), suggested_corners(8, 8)
+    with _on_desk(seed) as (rig, rest, _):
+        rest_codes = _scans(rig, LOOK_SCANS)
+        scans = [Scan(codes, n, n * 10**6 // 90, n / 90, 0) for n, codes in enumerate(rest_codes)]
+        for cells in (corners, moved_across(corners)):
+            siemens = rest.cell_siemens.copy()
+            siemens[tuple(np.transpose(cells))] += 1 / PRESS_OHM
+            _show(rig, replace(rest, cell_siemens=siemens), "near")
+            for codes in _scans(rig, LOOK_SCANS):
+                presses.take(Scan(codes, 0, 0, 0.0, 0))
+    return examine(Evidence(board, scans, wire_ohm=nominal, presses=presses))
 
 
 def _show(rig: Rig, skin: Skin, mode: str) -> None:

@@ -43,11 +43,12 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import PortCircuit, current_from_ratio, current_std
+from ohmskin.circuit.skin import PortCircuit, current_std
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
 from ohmskin.doctor.signal import Rest, RestScans, rounding_std_lsb, settling
 from ohmskin.estimate.base import Estimator, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -79,14 +80,14 @@ CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations 
 def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Float, Float, Float]:
     """Port resistances of readings (R, C, 4), their deviations, and log resistances of the cells.
 
-    std_lsb: deviation of a port's reading, one for all or (R, C). All (RC,) [ohm].
+    std_lsb: deviation of a port's reading, one for all or (R, C). All (RC,) [ohm]. The currents are
+    those that estimators use: without the converter's offset, and what floating lines draw.
     """
     known = matrix.knowledge
-    refs = (known.ref_top_ohm, known.ref_bottom_ohm)
-    loop_ohm = (1 / np.maximum(current_from_ratio(ratio, *refs), 1e-9)).ravel()
-    std_siemens = current_std(2.0**-ADC_BITS, *refs) * np.ravel(std_lsb)
+    loop_ohm = (1 / np.maximum(PortReader(known).read(ratio).current, 1e-9)).ravel()
+    std_siemens = current_std(2.0**-ADC_BITS, known.ref_top_ohm, known.ref_bottom_ohm)
     log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
-    return loop_ohm - known.ref_ohm, std_siemens * loop_ohm**2, log_ohm
+    return loop_ohm - known.ref_ohm, std_siemens * np.ravel(std_lsb) * loop_ohm**2, log_ohm
 
 
 def suggested_corners(rows: int, columns: int) -> Corners:
