@@ -321,9 +321,10 @@ def test_a_tare_makes_a_conductance_certain() -> None:
 
 
 def test_one_thing_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    told, mean_ratio = threading.Event(), Device.mean_ratio
+    begun, told, mean_ratio = threading.Event(), threading.Event(), Device.mean_ratio
 
     def mean_ratio_when_told(skin: Device, seconds: float) -> Float:
+        begun.set()
         told.wait(LIMIT_S)
         return mean_ratio(skin, seconds)
 
@@ -331,6 +332,7 @@ def test_one_thing_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     with served(REST) as client, panel(client) as page, panel(client) as other:
         page.scan()
         page.say(do="tare", force=False)
+        assert begun.wait(LIMIT_S)
         page.refused("one thing at a time", do="record")
         other.refused("one thing at a time", do="tare", force=False)
         told.set()
