@@ -74,7 +74,7 @@ def test_page_and_json(run: Run) -> None:
 def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[Bench]) -> None:
     arguments = ("emulator://8x8?scene=corners&wires=1.5", "--wires", "100,200", "--press")
     done = run("doctor", *arguments, "--json")
-    assert benches[0].now_s < 15
+    assert benches[0].now_s < 18
     assert done.code == 1
     [finding] = json.loads(done.out)["findings"]
     assert (finding["id"], finding["where"]) == ("wires", "rows and columns")
@@ -87,7 +87,7 @@ def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[Bench
     ]
 
 
-@pytest.mark.parametrize(("tau_us", "slow"), [(0, False), (3, False), (7, True), (10, True)])
+@pytest.mark.parametrize(("tau_us", "slow"), [(0, False), (5, False), (8, True), (10, True)])
 def test_slow_nodes_are_seen_while_pressed(
     run: Run, benches: list[Bench], tau_us: int, slow: bool
 ) -> None:
@@ -105,10 +105,19 @@ def test_slow_nodes_are_seen_while_pressed(
         assert np.log(1024 / 0.5) - 2 < needed_us / tau_us < 1.5 * np.log(1024 / 0.5)
 
 
+@pytest.mark.simavr
+def test_wires_of_the_simulated_desk_are_measured(run: Run) -> None:
+    """Behind a bootloader, which takes its time before rest can be examined."""
+    url = "simavr://uno?scene=corners&desk=1&seed=1"
+    answer = json.loads(run("doctor", url, "--press", "--wires", "100,200", "--json").out)
+    assert [each["id"] for each in answer["findings"]] == ["settling"]  # 100 pF a line
+    assert answer["measured"]["wires"].startswith("0.9")
+
+
 def test_drift_of_a_press_is_no_slow_node() -> None:
     """The resistance of all corners falls by a tenth meanwhile."""
     scene = Scene("corners", 8, 8)
-    pressed = scene.skin(6.0)
+    pressed = scene.skin(9.0)
 
     def ratio(time_s: float, _mode: str) -> Float:
         siemens = scene.skin(min(time_s, 5.0)).cell_siemens

@@ -31,12 +31,13 @@ SCENES: Final = {
     "single": "after 3 s (begin=0: at once, as in every scene), one touch in the middle",
     "ghost": "after 3 s, three corners of a rectangle: raw readings show a fourth",
     "multi": "after 3 s, five touches, at places drawn from the seed",
-    "corners": "after 5.5 s, three corners of a rectangle; every 1.5 s one of them moves across",
+    "corners": "after 8 s, three corners of a rectangle; every 1.5 s one of them moves across",
     "moving": "after 3 s, one fingertip on a closed curve over the whole skin, once in 4 s",
 }
-# When touches begin, and those of the scene "corners", before which the doctor examines rest [s].
+# When touches begin, and those of the scene "corners" [s]: the doctor has examined rest by then,
+# behind a bootloader too.
 BEGIN_S: Final = 3.0
-_CORNERS_BEGIN_S: Final = 5.5
+_CORNERS_BEGIN_S: Final = 8.0
 # The scene "moving": its period, the radius and the peak of the finger's pressure.
 _MOVING_PERIOD_S: Final = 4.0
 _FINGER_CELLS: Final = 0.7
