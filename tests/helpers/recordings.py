@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+import ohmskin
 from bench_board import Bench
 from ohmskin.arrays import Float
 from ohmskin.link.messages import Hello, Scan
@@ -15,6 +16,7 @@ from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recorded
 from press_scene import PressScene
 
+URL = "emulator://3x4?scene=multi&begin=0&seed=3&rate=400"
 HOST_BEGIN_S = 1000.0
 PRESSES = PressScene(1, 2, seed=1)
 SENSOR_HZ = 80
@@ -26,6 +28,26 @@ def write_recording(path: Path, hello: Hello, messages: Iterable[Recorded]) -> N
     with Recorder(path, hello) as recorder:
         for each in messages:
             recorder.add(each)
+
+
+def scan(number: int, rows: int = 3, columns: int = 4, at_s: float | None = None) -> Scan:
+    codes = np.random.default_rng(number).integers(0, 1024, (rows, columns, 4)).astype(np.uint16)
+    at_s = number / 400 if at_s is None else at_s
+    return Scan(codes, number, 2500 * number, at_s, 0)
+
+
+def assert_same(found: list[Scan], expected: list[Scan], host_time: bool = True) -> None:
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert one.codes.dtype == other.codes.dtype
+        np.testing.assert_array_equal(one.codes, other.codes)
+        assert (one.number, one.time_us, one.missed) == (other.number, other.time_us, other.missed)
+        assert one.host_time_s == other.host_time_s or not host_time
+
+
+def replayed(path: Path, speed: float = 0) -> list[Scan]:
+    with ohmskin.open(f"replay://{path}?speed={speed}") as skin:
+        return list(skin)
 
 
 def record_presses(path: Path, seconds: float, mode: str = "near") -> None:

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board's hello and a place for its recording, for several test files."""
+
+from pathlib import Path
+
+import pytest
+
+from bench_board import Bench
+from ohmskin.link.messages import Hello
+from recordings import URL
+
+
+@pytest.fixture(scope="session")
+def hello() -> Hello:
+    return Bench(URL).info
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where a recording is written."""
+    return tmp_path / "a.mcap"
