@@ -85,9 +85,6 @@ def test_timer0_polled_overflows(simulate: Simulate, preload: str, ticks: int) -
     assert set(sent) == {0}
 
 
-# ---- UART --------------------------------------------------------------------------------------
-
-
 @BOARDS
 @pytest.mark.parametrize(("frame", "cycles"), [("0x06", 320), ("0x0E", 352), ("0x26", 352)])
 def test_back_to_back_bytes(simulate: Simulate, board: str, frame: str, cycles: int) -> None:
@@ -172,8 +169,6 @@ def test_baud_mismatch_garbles_both_ways(simulate: Simulate) -> None:
         assert len(answer) == len(frames)
         assert (answer == frames) == (baud == 0)  # else it is garbled on the way back as well
 
-
-# ---- resets, EEPROM, idle time -----------------------------------------------------------------
 
 RESETS = """
 #include <avr/wdt.h>

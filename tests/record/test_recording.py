@@ -161,9 +161,6 @@ def test_the_record_loop(
         np.testing.assert_allclose(found.tares[0].rest_ratio, expected, rtol=1e-12)
 
 
-# -------------------------------------------------------------------------------------- replay
-
-
 def test_replay_is_the_recording_bit_for_bit(path: Path, hello: Hello) -> None:
     scans = list(islice(Bench(f"{URL}&drop=0.05"), 300))
     assert any(each.missed for each in scans)
@@ -315,9 +312,6 @@ def test_a_tare_is_recorded_with_the_mode_of_its_scans(tmp_path: Path) -> None:
         record(bench, recorder, bench, count=20, tare_s=0.1)
     [tare] = load_recording(tmp_path / "far.mcap").tares
     assert tare.mode == "far"
-
-
-# -------------------------------------------------------------------------------------- export
 
 
 @pytest.fixture
