@@ -6,10 +6,10 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -22,6 +22,11 @@ from studies import chart_figure, chart_table, far_figure, stability_figure
 from studies import far as far_ends
 from studies import stability as verdicts
 from studies.ablate_scenes import Plan
+
+Out = Annotated[
+    Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
+]
+Jobs = Annotated[int, typer.Option(min=0, help="processes; 0: one a core")]
 
 
 def _machine() -> str:
@@ -48,10 +53,50 @@ def save_whole(contents: Mapping[Path, bytes]) -> None:
             file.flush()
 
 
+class StudyRun:
+    """One command: where it writes, what it says on stderr, and its answer.
+
+    is_quiet: neither a progress bar nor `messages`. least_width: of these, where stderr is a file.
+    """
+
+    def __init__(
+        self, out: Path | None, *, draws: bool = True, is_quiet: bool = False, least_width: int = 0
+    ) -> None:
+        if draws:
+            chart_figure.require_matplotlib()
+        self._folder = default_folder() if out is None else out
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._started_s = time.monotonic()
+        self._written: dict[str, str] = {}
+        self.messages = Console(stderr=True, quiet=is_quiet)
+        self.messages.width = max(self.messages.width, least_width)
+
+    @contextmanager
+    def progress(self, what: str, redraws_hz: float = 10.0) -> Iterator[Callable[[int, int], None]]:
+        """A function that shows how many are done, and how many there are."""
+        hidden = self.messages.quiet or not self.messages.is_terminal
+        with Progress(
+            console=self.messages, transient=True, disable=hidden, refresh_per_second=redraws_hz
+        ) as bar:
+            task = bar.add_task(what, total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+
+    def write(self, files: Mapping[str, bytes]) -> None:
+        """Write all of these pictures (.png) and tables (.csv), by name, or none."""
+        paths = {self._folder / name: content for name, content in files.items()}
+        save_whole(paths)
+        kinds = {".png": "picture", ".csv": "table"}
+        self._written = {kinds[path.suffix]: str(path) for path in paths}
+
+    def answer(self, asked: dict[str, Any], **found: Any) -> None:
+        """Print the answer: what was written, asked and found."""
+        seconds = round(time.monotonic() - self._started_s, 1)
+        answer = {**self._written, **asked, "seconds": seconds, **found}
+        print(json.dumps(answer, allow_nan=False))  # noqa: T201
+
+
 def chart(
-    out: Annotated[
-        Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
-    ] = None,
+    out: Out = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="fewer frames: rough, in a minute")
     ] = False,
@@ -60,95 +105,55 @@ def chart(
 
     Takes a few minutes on one core. The last line printed is one JSON object.
     """
-    chart_figure.require_matplotlib()
-    folder = default_folder() if out is None else out
-    folder.mkdir(parents=True, exist_ok=True)
-    started_s = time.monotonic()
-    messages = Console(stderr=True)
+    run = StudyRun(out)
+    plan = speed_accuracy.QUICK if quick else speed_accuracy.FULL
     # Redrawn seldom, because the bar's thread runs beside what is being timed.
-    with Progress(
-        console=messages, transient=True, disable=not messages.is_terminal, refresh_per_second=2
-    ) as progress:
-        task = progress.add_task("frames", total=None)
-
-        def show_progress(done: int, frames: int) -> None:
-            progress.update(task, completed=done, total=frames)
-
-        plan = speed_accuracy.QUICK if quick else speed_accuracy.FULL
-        rows = speed_accuracy.measure(plan, show_progress)
-    picture, table = (folder / f"speed-accuracy.{kind}" for kind in ("png", "csv"))
-    save_whole(
+    with run.progress("frames", redraws_hz=2) as show:
+        rows = speed_accuracy.measure(plan, show)
+    run.write(
         {
-            picture: chart_figure.picture(rows, _machine()),
-            table: chart_table.csv_text(rows).encode(),
+            "speed-accuracy.png": chart_figure.picture(rows, _machine()),
+            "speed-accuracy.csv": chart_table.csv_text(rows).encode(),
         }
     )
-    messages.print(chart_table.summary(rows))
-    answer = {
-        "picture": str(picture),
-        "table": str(table),
-        "quick": quick,
-        "seconds": round(time.monotonic() - started_s, 1),
-        "fronts": chart_table.fronts(rows),
-    }
-    print(json.dumps(answer))  # noqa: T201
+    run.messages.print(chart_table.summary(rows))
+    run.answer({"quick": quick}, fronts=chart_table.fronts(rows))
 
 
 def stability(
-    out: Annotated[
-        Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
-    ] = None,
+    out: Out = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="fewer frames, smaller skins: rough, in a minute")
     ] = False,
-    jobs: Annotated[int, typer.Option(min=0, help="processes; 0: one a core")] = 0,
+    jobs: Jobs = 0,
 ) -> None:
     """Count where methods are wrong and do not say so, under faults and extremes: a PNG and a CSV.
 
     Takes minutes. Simulated skins; the verdicts do not depend on --jobs. The last line printed is
     one JSON object.
     """
-    chart_figure.require_matplotlib()
-    folder = default_folder() if out is None else out
-    folder.mkdir(parents=True, exist_ok=True)
-    started_s = time.monotonic()
-    messages = Console(stderr=True)
+    run = StudyRun(out)
     tasks = verdicts.tasks_of(verdicts.QUICK if quick else verdicts.FULL)
-    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as progress:
-        task = progress.add_task("skins", total=len(tasks))
-
-        def show_progress(done: int) -> None:
-            progress.update(task, completed=done)
-
-        rows = verdicts.measure(tasks, jobs=jobs or -1, progress=show_progress)
-    picture, table = (folder / f"stability.{kind}" for kind in ("png", "csv"))
-    save_whole(
+    with run.progress("skins") as show:
+        rows = verdicts.measure(tasks, jobs=jobs or -1, progress=show)
+    run.write(
         {
-            picture: stability_figure.picture(rows),
-            table: verdicts.csv_text(rows).encode(),
+            "stability.png": stability_figure.picture(rows),
+            "stability.csv": verdicts.csv_text(rows).encode(),
         }
     )
-    messages.print(verdicts.summary(rows))
-    answer = {
-        "picture": str(picture),
-        "table": str(table),
-        "quick": quick,
-        "seconds": round(time.monotonic() - started_s, 1),
-        "methods": verdicts.shares(rows),
-    }
-    print(json.dumps(answer))  # noqa: T201
+    run.messages.print(verdicts.summary(rows))
+    run.answer({"quick": quick}, methods=verdicts.shares(rows))
 
 
 def ablate(
-    out: Annotated[
-        Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
-    ] = None,
+    out: Out = None,
     skins: Annotated[int, typer.Option(min=2, help="simulated skins of a kind")] = Plan.skins,
     frames: Annotated[int, typer.Option(min=2, help="frames of each")] = Plan.frames,
     only: Annotated[
         str, typer.Option(metavar="NAME,...", help="constants: NAME, or MODULE.NAME")
     ] = "",
-    jobs: Annotated[int, typer.Option(min=0, help="processes; 0: one a core")] = 0,
+    jobs: Jobs = 0,
 ) -> None:
     """Halve, double and put off each number in joint and touch, and count what it earns: a CSV.
 
@@ -162,35 +167,18 @@ def ablate(
         if names - known:
             raise typer.BadParameter(f"no constant {', '.join(sorted(names - known))}")
         tried = [each for each in tried if names & {each.name, each.label}]
-    folder = default_folder() if out is None else out
-    folder.mkdir(parents=True, exist_ok=True)
-    started_s = time.monotonic()
-    messages = Console(stderr=True)
-    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as progress:
-        task = progress.add_task("constants on sets of frames", total=None)
-
-        def show_progress(done: int, tasks: int) -> None:
-            progress.update(task, completed=done, total=tasks)
-
+    run = StudyRun(out, draws=False)
+    with run.progress("constants on sets of frames") as show:
         plan = Plan(skins, frames)
-        rows = constants_tried.measure(tried, plan, jobs=jobs or -1, progress=show_progress)
-    table = folder / "ablate.csv"
-    save_whole({table: constants_tried.csv_text(rows).encode()})
-    messages.print(constants_tried.summary(rows, tried))
-    answer = {
-        "table": str(table),
-        "skins": skins,
-        "frames": frames,
-        "seconds": round(time.monotonic() - started_s, 1),
-        "moved": constants_tried.moved(rows, tried),
-    }
-    print(json.dumps(answer))  # noqa: T201
+        rows = constants_tried.measure(tried, plan, jobs=jobs or -1, progress=show)
+    run.write({"ablate.csv": constants_tried.csv_text(rows).encode()})
+    run.messages.print(constants_tried.summary(rows, tried))
+    asked = {"skins": skins, "frames": frames}
+    run.answer(asked, moved=constants_tried.moved(rows, tried))
 
 
 def far(
-    out: Annotated[
-        Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
-    ] = None,
+    out: Out = None,
     quick: Annotated[bool, typer.Option("--quick", help="fewer frames: rough")] = False,
 ) -> None:
     """Compare lines sensed at both ends with near ends, and with zero potential: a PNG and a CSV.
@@ -198,25 +186,14 @@ def far(
     Takes minutes on one core. Simulated skins. Tables go to stderr; the last line printed is one
     JSON object.
     """
-    chart_figure.require_matplotlib()
-    folder = default_folder() if out is None else out
-    folder.mkdir(parents=True, exist_ok=True)
-    started_s = time.monotonic()
-    messages = Console(stderr=True)
-    with Progress(console=messages, transient=True, disable=not messages.is_terminal) as progress:
-        task = progress.add_task("conditions", total=None)
-
-        def show_progress(done: int, conditions: int) -> None:
-            progress.update(task, completed=done, total=conditions)
-
-        rows = far_ends.measure(far_ends.QUICK if quick else far_ends.FULL, show_progress)
-    picture, table = (folder / f"far-ends.{kind}" for kind in ("png", "csv"))
-    save_whole({picture: far_figure.picture(rows), table: far_ends.csv_text(rows).encode()})
-    messages.print(far_ends.tables(rows), markup=False, highlight=False, soft_wrap=True)
-    answer = {
-        "picture": str(picture),
-        "table": str(table),
-        "quick": quick,
-        "seconds": round(time.monotonic() - started_s, 1),
-    }
-    print(json.dumps(answer))  # noqa: T201
+    run = StudyRun(out)
+    with run.progress("conditions") as show:
+        rows = far_ends.measure(far_ends.QUICK if quick else far_ends.FULL, show)
+    run.write(
+        {
+            "far-ends.png": far_figure.picture(rows),
+            "far-ends.csv": far_ends.csv_text(rows).encode(),
+        }
+    )
+    run.messages.print(far_ends.tables(rows), markup=False, highlight=False, soft_wrap=True)
+    run.answer({"quick": quick})

@@ -3,30 +3,19 @@
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 
-from studies import chart_figure, force_experiment, force_figure, force_limits, force_table
-from studies.commands import default_folder as default_folder
-from studies.commands import save_whole
+from studies import force_experiment, force_figure, force_limits, force_table
+from studies.commands import Out, StudyRun
 
 experiment = typer.Typer(
     help="The paper's experiments with force, on simulated skins.", no_args_is_help=True
 )
 
-Out = Annotated[
-    Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
-]
 Quick = Annotated[bool, typer.Option("--quick", help="fewer skins and frames: rough, in seconds")]
 Json = Annotated[bool, typer.Option("--json", help="no tables and no progress bar: JSON alone")]
 _TABLE_WIDTH: Final = 128  # where stderr is a file, tables are not cut to 80 columns
@@ -39,7 +28,7 @@ def flat(out: Out = None, quick: Quick = False, only_json: Json = False) -> None
 
     Errors of force of all methods on a flat skin. The last line printed is one JSON object.
     """
-    _surface(_Run("force-flat.png", out, quick, only_json), curved=False)
+    _surface(_run(out, only_json), "flat", quick)
 
 
 @experiment.command()
@@ -48,7 +37,7 @@ def curved(out: Out = None, quick: Quick = False, only_json: Json = False) -> No
 
     About two minutes. The last line printed is one JSON object.
     """
-    _surface(_Run("force-curved.png", out, quick, only_json), curved=True)
+    _surface(_run(out, only_json), "curved", quick)
 
 
 @experiment.command()
@@ -57,14 +46,12 @@ def timeseries(out: Out = None, quick: Quick = False, only_json: Json = False) -
 
     About two minutes. The last line printed is one JSON object.
     """
-    run = _Run("force-timeseries.png", out, quick, only_json)
-    with run.progress() as show:
+    run = _run(out, only_json)
+    with run.progress("steps") as show:
         trial, rows = force_limits.cross_talk(1 if quick else 8, 0 if quick else 2, show)
-    run.finish(
-        force_figure.series_picture(trial),
-        [force_table.talk_table(rows)],
-        {"cross_talk": [asdict(row) for row in rows]},
-    )
+    run.write({"force-timeseries.png": force_figure.series_picture(trial)})
+    run.messages.print(force_table.talk_table(rows))
+    run.answer(_asked(quick), cross_talk=[asdict(row) for row in rows])
 
 
 @experiment.command()
@@ -73,62 +60,29 @@ def minimum(out: Out = None, quick: Quick = False, only_json: Json = False) -> N
 
     About two minutes. The last line printed is one JSON object.
     """
-    run = _Run("force-minimum.png", out, quick, only_json)
-    with run.progress() as show:
+    run = _run(out, only_json)
+    with run.progress("steps") as show:
         plan = QUICK_DETECTION if quick else force_limits.Detection()
         rows = force_limits.smallest_forces(plan, show)
-    run.finish(
-        force_figure.smallest_picture(rows),
-        [force_table.smallest_table(rows)],
-        {"smallest_forces": [asdict(row) for row in rows]},
-    )
+    run.write({"force-minimum.png": force_figure.smallest_picture(rows)})
+    run.messages.print(force_table.smallest_table(rows))
+    run.answer(_asked(quick), smallest_forces=[asdict(row) for row in rows])
 
 
-@dataclass
-class _Run:
-    """One command: where it writes, and what it says."""
-
-    name: str
-    out: Path | None
-    quick: bool
-    only_json: bool
-
-    def __post_init__(self) -> None:
-        chart_figure.require_matplotlib()
-        self._folder = default_folder() if self.out is None else self.out
-        self._folder.mkdir(parents=True, exist_ok=True)
-        wide = Console(stderr=True).width
-        self._messages = Console(stderr=True, width=max(wide, _TABLE_WIDTH))
-        self._started_s = time.monotonic()
-
-    @contextmanager
-    def progress(self) -> Iterator[force_experiment.Progress]:
-        shown = self._messages.is_terminal and not self.only_json
-        with Progress(console=self._messages, transient=True, disable=not shown) as bar:
-            task = bar.add_task("steps", total=None)
-            yield lambda done, steps: bar.update(task, completed=done, total=steps)
-
-    def finish(self, picture: bytes, tables: list[Table], answer: dict[str, Any]) -> None:
-        path = self._folder / self.name
-        save_whole({path: picture})
-        if not self.only_json:
-            for table in tables:
-                self._messages.print(table)
-        heading = {
-            "simulated": True,
-            "picture": str(path),
-            "quick": self.quick,
-            "seconds": round(time.monotonic() - self._started_s, 1),
-        }
-        print(json.dumps({**heading, **answer}, allow_nan=False))  # noqa: T201
+def _run(out: Path | None, only_json: bool) -> StudyRun:
+    return StudyRun(out, is_quiet=only_json, least_width=_TABLE_WIDTH)
 
 
-def _surface(run: _Run, *, curved: bool) -> None:
-    plan = force_experiment.QUICK if run.quick else force_experiment.FULL
-    with run.progress() as show:
-        rows = force_experiment.measure(plan, curved=curved, progress=show)
-    run.finish(
-        force_figure.surface_picture(rows),
-        force_table.surface_tables(rows),
-        {"best": force_table.best_of_ours(rows), "rows": [asdict(row) for row in rows]},
-    )
+def _asked(quick: bool) -> dict[str, Any]:
+    return {"simulated": True, "quick": quick}
+
+
+def _surface(run: StudyRun, surface: str, quick: bool) -> None:
+    plan = force_experiment.QUICK if quick else force_experiment.FULL
+    with run.progress("steps") as show:
+        rows = force_experiment.measure(plan, curved=surface == "curved", progress=show)
+    run.write({f"force-{surface}.png": force_figure.surface_picture(rows)})
+    for table in force_table.surface_tables(rows):
+        run.messages.print(table)
+    best = force_table.best_of_ours(rows)
+    run.answer(_asked(quick), best=best, rows=[asdict(row) for row in rows])

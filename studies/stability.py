@@ -190,12 +190,12 @@ def measure(
     tasks: Sequence[Task],
     *,
     jobs: int | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Do all tasks: a row a condition and method, in the order of `SWEEPS` and `METHODS`.
 
     jobs: processes, -1 for one a core; None for what a `joblib.parallel_backend` around this call
-    says, which may be a cluster, else one. progress: called with the number of tasks done.
+    says, which may be a cluster, else one. progress: called with the tasks done and all tasks.
     """
     found: dict[tuple[str, float | str, str], Row] = {}
     parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
@@ -206,7 +206,7 @@ def measure(
                 key = (row.sweep, row.x, row.method)
                 found[key] = found[key].plus(row) if key in found else row
             if progress is not None:
-                progress(done)
+                progress(done, len(tasks))
     order = [(s.name, x, method) for s in SWEEPS.values() for x in s.values for method in METHODS]
     return [found[key] for key in order if key in found]
 

@@ -170,10 +170,10 @@ def test_the_results_do_not_depend_on_processes_or_threads(rows: list[Row]) -> N
 
 
 def test_progress_counts_every_task() -> None:
-    seen: list[int] = []
+    seen: list[tuple[int, int]] = []
     tasks = tiny_tasks()[:5]
-    stability.measure(tasks, jobs=1, progress=seen.append)
-    assert seen == [1, 2, 3, 4, 5]
+    stability.measure(tasks, jobs=1, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(done, 5) for done in range(1, 6)]
 
 
 def test_every_method_meets_every_condition() -> None:
