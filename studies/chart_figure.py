@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DEADLINE_MS: Final = 1e3 / 90  # a scan of the board at its usual rate
+INK: Final = "#333333"
 _COLOURS: Final = ("#666666", "#0072b2", "#e69f00", "#d55e00", "#009e73", "#aa3fb4", "#000000")
 _MARKERS: Final = ("s", "D", "^", "v", "o", "P", "X")
-_INK: Final = "#333333"
 _FAINT: Final = "#777777"
 _BAND: Final = "#f5e3ad"
 _SMALL: Final = 8.0  # points
@@ -31,7 +31,7 @@ _SWEEPS: Final = {
     "wire_sweep": "the paper's wire sweep, 3x3",
 }
 _EVALUATIONS: Final[dict[str, dict[str, Any]]] = {
-    NUMPY: {"label": "NumPy", "color": _INK, "marker": "o"},
+    NUMPY: {"label": "NumPy", "color": INK, "marker": "o"},
     MACHINE: {"label": "CasADi", "color": _FAINT, "marker": "o", "markerfacecolor": "white"},
     GENERATED_C: {"label": "CasADi's C", "color": _FAINT, "marker": "x", "linestyle": ":"},
 }
@@ -94,22 +94,22 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
             _mark_times(axes, [row for row in rows if row.place == (BOARD, *size, bits)])
             axes.tick_params(labelleft=column == 0)
             if line == 0:
-                axes.set_title(f"{size[0]}x{size[1]}", fontsize=13, fontweight="bold", color=_INK)
+                axes.set_title(f"{size[0]}x{size[1]}", fontsize=13, fontweight="bold", color=INK)
             if line == len(resolutions) - 1:
-                axes.set_xlabel("time a frame [ms]", color=_INK)
+                axes.set_xlabel("time a frame [ms]", color=INK)
             if column == 0:
                 readings = "exact readings" if bits is None else f"{bits}-bit readings"
-                axes.set_ylabel(f"{readings}\nerror of pressed cells [%]", color=_INK)
+                axes.set_ylabel(f"{readings}\nerror of pressed cells [%]", color=INK)
     below: Axes | None = None
     for column, (scene, title) in enumerate(_SWEEPS.items()):
         axes = figure.add_subplot(grid[-1, column], sharex=first, sharey=below)
         below = below or axes
         _sweep_panel(axes, [row for row in rows if row.scene == scene])
-        axes.set_title(title, fontsize=10.5, color=_INK)
-        axes.set_xlabel("time a frame [ms]", color=_INK)
+        axes.set_title(title, fontsize=10.5, color=INK)
+        axes.set_xlabel("time a frame [ms]", color=INK)
         axes.tick_params(labelleft=column == 0)
         if column == 0:
-            axes.set_ylabel("exact readings\nRMSE of all cells [MΩ]", color=_INK)
+            axes.set_ylabel("exact readings\nRMSE of all cells [MΩ]", color=INK)
     for axes in figure.axes:
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -120,9 +120,7 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
     title = f"Time a frame against error: simulated skins, one thread on {machine}"
     _explain(figure, title, {row.method for row in rows})
     _write_notes(figure.add_subplot(grid[-1, len(_SWEEPS) + 1 :]))
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=120)
-    return png.getvalue()
+    return png_of(figure, dpi=120)
 
 
 def method_style(method: str) -> dict[str, Any]:
@@ -137,11 +135,25 @@ def method_style(method: str) -> dict[str, Any]:
     }
 
 
+def prepare(axes: Axes, *, colour: str = "#e4e4e4", **grid: Any) -> None:
+    """A faint grid below all else, and no frame."""
+    axes.set_axisbelow(True)
+    axes.grid(color=colour, linewidth=0.7, **grid)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def png_of(figure: Figure, dpi: int = 110) -> bytes:
+    """The picture as a file."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=dpi)
+    return png.getvalue()
+
+
 # --------------------------------------------------------------------------------------- panels
 
 
 def _random_panel(axes: Axes, rows: Sequence[Row]) -> None:
-    _prepare(axes)
+    _prepare_panel(axes)
     limits = (rows[0].limit_told_percent, rows[0].limit_percent)
     if limits[0] is not None and limits[1] is not None:
         axes.axhspan(limits[0], limits[1], color=_BAND, zorder=0.5, linewidth=0)
@@ -170,7 +182,7 @@ def _far_points(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
-    _prepare(axes)
+    _prepare_panel(axes)
     measured = [row for row in rows if row.source == MEASURED]
     _points(axes, [(row, row.rmse_megohm, row.rmse_p90_megohm) for row in measured])
     for row in rows:
@@ -181,12 +193,10 @@ def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
 
 def _evaluation_panel(axes: Axes, rows: Sequence[Row]) -> None:
     """Time by size, quietly: it is no method's result."""
-    axes.set_title("one evaluation in 'joint', by size", fontsize=10.5, color=_INK)
-    axes.set_xlabel("time [ms]", color=_INK)
+    axes.set_title("one evaluation in 'joint', by size", fontsize=10.5, color=INK)
+    axes.set_xlabel("time [ms]", color=INK)
     axes.set_xscale("log")
-    axes.grid(which="major", axis="x", color="#e4e4e4", linewidth=0.7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    prepare(axes, axis="x")
     sizes = list(dict.fromkeys((row.rows, row.columns) for row in rows))
     for name in EVALUATIONS:
         of_name = [row for row in rows if row.method == name]
@@ -205,22 +215,19 @@ def _evaluation_panel(axes: Axes, rows: Sequence[Row]) -> None:
             textcoords="offset points",
             va="center",
             fontsize=_SMALL,
-            color=_INK,
+            color=INK,
         )
     axes.set_yticks([])
     axes.set_xlim(right=5 * axes.get_xlim()[1])  # for the last of these words
     axes.invert_yaxis()
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.legend(loc="lower left", frameon=False, fontsize=_SMALL, labelcolor=_INK, handlelength=1.5)
+    axes.legend(loc="lower left", frameon=False, fontsize=_SMALL, labelcolor=INK, handlelength=1.5)
 
 
-def _prepare(axes: Axes) -> None:
+def _prepare_panel(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.grid(which="major", color="#e4e4e4", linewidth=0.7)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    prepare(axes)
     axes.axvline(DEADLINE_MS, color=_FAINT, linestyle=":", linewidth=1.3, zorder=1)
 
 
@@ -262,7 +269,7 @@ def _points(axes: Axes, points: Sequence[tuple[Row, float | None, float | None]]
             said.append(row.ms)
     if front:
         times, errors = zip(*sorted(front), strict=True)
-        axes.plot(times, errors, drawstyle="steps-post", color=_INK, linewidth=1.1, zorder=2)
+        axes.plot(times, errors, drawstyle="steps-post", color=INK, linewidth=1.1, zorder=2)
 
 
 def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
@@ -281,7 +288,7 @@ def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
         transform=at_axis,
         ha="right",
         fontsize=_SMALL,
-        color=_INK,
+        color=INK,
         backgroundcolor="white",
     )
 
@@ -299,15 +306,15 @@ def _explain(figure: Figure, title: str, methods: set[str]) -> None:
         for method in METHODS
         if method in methods
     ]
-    mark: dict[str, Any] = {"color": _INK, "linestyle": ""}
+    mark: dict[str, Any] = {"color": INK, "linestyle": ""}
     handles += [
-        Line2D([], [], color=_INK, linewidth=1.1, label="Pareto front (filled markers)"),
+        Line2D([], [], color=INK, linewidth=1.1, label="Pareto front (filled markers)"),
         Line2D([], [], **mark, marker="o", markerfacecolor="white", label="median"),
         Line2D([], [], color=_FAINT, alpha=0.5, linewidth=4, label="up to the 90th percentile"),
         Line2D([], [], color=_FAINT, linestyle=":", label="90 Hz: 11.1 ms"),
-        Line2D([], [], color=_INK, **_STAR, label="far ends, wires not told"),
+        Line2D([], [], color=INK, **_STAR, label="far ends, wires not told"),
         Patch(color=_BAND, label="limit of one frame, near ends"),
-        Line2D([], [], color=_INK, linestyle=_PRINTED, label="printed RMSE, no time"),
+        Line2D([], [], color=INK, linestyle=_PRINTED, label="printed RMSE, no time"),
         Line2D([], [], **mark, marker="^", markersize=8.5, label="printed time, no error"),
     ]
     legend = figure.legend(
@@ -319,7 +326,7 @@ def _explain(figure: Figure, title: str, methods: set[str]) -> None:
         title=title,
         title_fontsize=14,
     )
-    legend.get_title().set_color(_INK)
+    legend.get_title().set_color(INK)
 
 
 def _write_notes(axes: Axes) -> None:
@@ -332,7 +339,7 @@ def _write_notes(axes: Axes) -> None:
         transform=axes.transAxes,
         va="top",
         fontsize=_SMALL,
-        color=_INK,
+        color=INK,
         linespacing=1.35,
     )
     notes.set_in_layout(False)  # its length is not the panels' business

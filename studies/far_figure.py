@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from studies.chart_figure import require_matplotlib
+from studies.chart_figure import INK, png_of, prepare, require_matplotlib
 from studies.far import (
     BEND,
     BENT_OHM,
@@ -28,7 +27,6 @@ from studies.far import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_INK: Final = "#333333"
 _STYLES: Final[dict[str, dict[str, Any]]] = {
     FAR: {"color": "#009e73", "marker": "o", "linewidth": 2.2, "label": "far ends, nothing told"},
     NEAR: {"color": "#d55e00", "marker": "v", "label": "near ends, nothing told"},
@@ -65,21 +63,19 @@ def picture(rows: Sequence[Row]) -> bytes:
             ]
             _panel(axes, chosen, WIRES)
         _panel(line[-1], [row for row in rows if (row.sweep, row.bits) == (BEND, bits)], BEND)
-        line[0].set_ylabel(f"{bits} bit\nerror of a pressed cell [%]", color=_INK)
+        line[0].set_ylabel(f"{bits} bit\nerror of a pressed cell [%]", color=INK)
     for axes, title in zip(grid[0], (*SCENES, f"{SCENES[1]}, the skin bent"), strict=True):
-        axes.set_title(title, fontsize=11.5, color=_INK)
+        axes.set_title(title, fontsize=11.5, color=INK)
     for axes in grid[-1, :-1]:
-        axes.set_xlabel(f"row segment [Ω]; column: x {COLUMN_OVER_ROW:g}", color=_INK)
+        axes.set_xlabel(f"row segment [Ω]; column: x {COLUMN_OVER_ROW:g}", color=INK)
     grid[-1, -1].set_xlabel(
         f"all wires over those at rest ({BENT_OHM:g} and {COLUMN_OVER_ROW * BENT_OHM:g} Ω)",
-        color=_INK,
+        color=INK,
     )
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-    figure.supxlabel(textwrap.fill(_NOTE, 190), fontsize=8, color=_INK)
-    octets = io.BytesIO()
-    figure.savefig(octets, format="png", dpi=110)
-    return octets.getvalue()
+    figure.supxlabel(textwrap.fill(_NOTE, 190), fontsize=8, color=INK)
+    return png_of(figure)
 
 
 def _panel(axes: Axes, rows: Sequence[Row], sweep: str) -> None:
@@ -88,10 +84,7 @@ def _panel(axes: Axes, rows: Sequence[Row], sweep: str) -> None:
     axes.set_ylim(*_LIMITS)
     if sweep == WIRES:
         axes.set_xscale("log")
-    axes.grid(which="major", color="#e4e4e4", linewidth=0.7)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    prepare(axes)
     for number, (readout, style) in enumerate(_STYLES.items()):
         of_readout = [row for row in rows if row.readout == readout]
         shift = _APART[sweep] ** (number - (len(_STYLES) - 1) / 2)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ohmskin.estimate.methods import METHODS
-from studies.chart_figure import method_style, require_matplotlib
+from studies.chart_figure import INK, method_style, png_of, prepare, require_matplotlib
 from studies.conditions import SWEEPS, Sweep
 from studies.stability import Row, Verdict, totals
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BAR_PERCENT: Final = 1.0
-_INK: Final = "#333333"
 _RED: Final = "#b3001b"
 _RED_TINT: Final = "#fdeae8"
 _GROUP_WIDTH: Final = 0.8  # of the distance between two labels
@@ -47,7 +45,7 @@ def picture(rows: Sequence[Row]) -> bytes:
 
     measured = {row.sweep for row in rows}
     figure = Figure(figsize=(17.0, 12.6), layout="constrained")
-    figure.suptitle("Where methods fail, and whether they say so", fontsize=17, color=_INK)
+    figure.suptitle("Where methods fail, and whether they say so", fontsize=17, color=INK)
     # Labels need more room than numbers: to the right, and below.
     lines = figure.add_gridspec(3, 1, height_ratios=(5.0, 5.6, 1.3))
     for line, labelled in enumerate((False, True)):
@@ -62,9 +60,7 @@ def picture(rows: Sequence[Row]) -> bytes:
             _prepare(upper, lower, sweep, leftmost=column == 0)
             _draw(upper, lower, sweep, rows)
     _explain(figure.add_subplot(lines[2]), rows)
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=110)
-    return png.getvalue()
+    return png_of(figure)
 
 
 def _draw(upper: Axes, lower: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
@@ -91,7 +87,7 @@ def _draw(upper: Axes, lower: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
 
 
 def _prepare(upper: Axes, lower: Axes, sweep: Sweep, leftmost: bool) -> None:
-    upper.set_title(sweep.title, fontsize=13, fontweight="bold", color=_INK, pad=9)
+    upper.set_title(sweep.title, fontsize=13, fontweight="bold", color=INK, pad=9)
     upper.set_ylim(0, 100)
     # Linear to the bar, logarithmic from there on: both 0.2 % and 60 % can be read.
     lower.set_yscale("symlog", linthresh=BAR_PERCENT, linscale=0.5)
@@ -103,19 +99,16 @@ def _prepare(upper: Axes, lower: Axes, sweep: Sweep, leftmost: bool) -> None:
     lower.axhspan(0, BAR_PERCENT, color="white", zorder=0.6, linewidth=0)
     lower.axhline(BAR_PERCENT, color=_RED, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3.9)
     for axes, grey in ((upper, "#e4e4e4"), (lower, "#f0cfcb")):
-        axes.set_axisbelow(True)
-        axes.grid(axis="y", color=grey, linewidth=0.7)
+        prepare(axes, colour=grey, axis="y")
         axes.tick_params(labelleft=leftmost)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
     upper.tick_params(labelbottom=False)
     if leftmost:
-        upper.set_ylabel("right [% of frames]", color=_INK)
+        upper.set_ylabel("right [% of frames]", color=INK)
         lower.set_ylabel("wrong and\nnot flagged [%]", color=_RED)
     if sweep.labelled:
         _prepare_labels(upper, lower, sweep)
         return
-    lower.set_xlabel(sweep.axis, color=_INK)
+    lower.set_xlabel(sweep.axis, color=INK)
     values = [float(x) for x in sweep.values]
     if sweep.logarithmic:
         upper.set_xscale("log")
@@ -168,7 +161,7 @@ def _explain(axes: Axes, rows: Sequence[Row]) -> None:
         va="top",
         ha="center",
         fontsize=9,
-        color=_INK,
+        color=INK,
         linespacing=1.4,
     )
 
