@@ -62,7 +62,16 @@ from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.record.readings import Readings, estimate_file
 from studies.far import seen
 from studies.information import PRESSED_STD
-from studies.trials import PRESSED, Trial, finger_trial, random_trial, skin_at_rest, touch, trial_of
+from studies.trials import (
+    PRESSED,
+    Trial,
+    finger_trial,
+    random_trial,
+    skin_at_rest,
+    stretched,
+    touch,
+    trial_of,
+)
 
 FOLDER = Path(__file__).resolve().parents[1] / "tests" / "data" / "far"
 KINDS = {
@@ -267,15 +276,8 @@ def bent(mode: str, method: str) -> dict[str, float]:
         curve, rest = curves(trial, mode, method), trial.rest.cell_siemens
         true_n = force_n(trial.cell_siemens - rest)
         for factor, found in off.items():
-            frames = [
-                replace(
-                    skin,
-                    top_wire_ohm=factor * skin.top_wire_ohm,
-                    bottom_wire_ohm=factor * skin.bottom_wire_ohm,
-                )
-                for skin in trial.frames
-            ]
-            read = seen(replace(trial, frames=tuple(frames)), mode, 10)
+            frames = tuple(stretched(skin, factor) for skin in trial.frames)
+            read = seen(replace(trial, frames=frames), mode, 10)
             siemens = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
             force = by_curve(siemens - rest, curve)
             found.append(np.abs(force / np.where(trial.pressed, true_n, 1) - 1)[trial.pressed])

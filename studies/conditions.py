@@ -27,10 +27,10 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.emulate.faults import OPEN_OHM, joined_readings
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
-from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest, touch
+from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, knowledge_of, skin_at_rest, touch
 
 Random = np.random.Generator
 Shape = tuple[int, int]
@@ -109,17 +109,7 @@ def _case(
     rest_ratio: Float,
     wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
 ) -> Case:
-    rows, columns, _ = rest_ratio.shape
-    return Case(
-        SkinKnowledge(
-            rows,
-            columns,
-            adc_bits=ADC_BITS,
-            rest_ratio=rest_ratio,
-            nominal_wire_ohm=WireOhm(wire_ohm[0], wire_ohm[1]),
-        ),
-        tuple(frames),
-    )
+    return Case(knowledge_of(rest_ratio, wire_ohm), tuple(frames))
 
 
 def _touched(rest: Skin, random: Random) -> Skin:

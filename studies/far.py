@@ -33,12 +33,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, all_readings, end_admittance
+from ohmskin.circuit.skin import all_readings, end_admittance
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.record.readings import Readings, estimate_file
 from studies import zero_potential
-from studies.trials import Trial, finger_trial, skin_at_rest, touch, trial_of
+from studies.trials import Trial, finger_trial, skin_at_rest, stretched, touch, trial_of
 
 NEAR, NEAR_TOLD, FAR = "near", "near, told", "far"
 ZERO, ZERO_BEST = "zero", "zero, best scale"
@@ -167,15 +167,7 @@ def _trial(scene: str, wire_ohm: float, bend: float, frames: int, seed: int) -> 
         rest = skin_at_rest(SIZE, SIZE, random, wire_ohm=wires)
         touches = 1 if scene == "one touch" else 8
         skins = [touch(rest, touches, random) for _ in range(frames)]
-    return trial_of(rest, [_bent(skin, bend) for skin in skins], wires)
-
-
-def _bent(skin: Skin, factor: float) -> Skin:
-    return replace(
-        skin,
-        top_wire_ohm=factor * skin.top_wire_ohm,
-        bottom_wire_ohm=factor * skin.bottom_wire_ohm,
-    )
+    return trial_of(rest, [stretched(skin, bend) for skin in skins], wires)
 
 
 _Answer = tuple[Float, Float | None, NDArray[np.bool_] | None]

@@ -18,16 +18,9 @@ from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.link import protocol
 from studies.force_experiment import FAST, REGRESSIONS, SLOW, TRUTH, Progress, learn, rises
-from studies.force_trial import (
-    REST_FRAMES,
-    Choreography,
-    ForceTrial,
-    OneFrameBoard,
-    Plan,
-    knowledge_of,
-)
+from studies.force_trial import REST_FRAMES, Choreography, ForceTrial, OneFrameBoard, Plan
 from studies.press import PressModel
-from studies.trials import skin_at_rest
+from studies.trials import knowledge_of, skin_at_rest
 
 SHAPE: Final = (2, 2)
 PRESSED_CELL: Final = 3  # (2, 2), as in the paper's figure

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.link import protocol
 from ohmskin.link.framing import encode
 from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.press import LEAVE_S, PressModel, robot_presses
-from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, skin_at_rest
+from studies.trials import SPREAD, knowledge_of, skin_at_rest
 
 NOISE_LSB: Final = 0.3  # as emulated boards have it
 WEIGHT_N: Final = 0.981  # 100 g
@@ -55,9 +55,8 @@ class ForceTrial:
 
     time_s (F,). ratio (F, R, C, 4): as read. rest_ratio (R, C, 4): mean of the readings of the
     untouched skin. far_ratio, far_rest_ratio: the same in mode far. force_n, rise_siemens (F, R,
-    C): the truth. cell (F,): flat index of the cell
-    that the robot presses. press (F,): number of its press. group (F,): of the test, -1 in the
-    calibration.
+    C): the truth. cell (F,): flat index of the cell that the robot presses. press (F,): number of
+    its press. group (F,): of the test, -1 in the calibration.
     """
 
     time_s: Float
@@ -75,18 +74,6 @@ class ForceTrial:
     def knowledge(self) -> SkinKnowledge:
         """What estimators are told of this skin."""
         return knowledge_of(self.rest_ratio)
-
-
-def knowledge_of(rest_ratio: Float) -> SkinKnowledge:
-    """What estimators are told: rest readings (R, C, 4) as measured, nominal wires, no more."""
-    rows, columns = rest_ratio.shape[:2]
-    return SkinKnowledge(
-        rows,
-        columns,
-        adc_bits=protocol.ADC_BITS,
-        rest_ratio=rest_ratio,
-        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
-    )
 
 
 class Choreography:

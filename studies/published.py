@@ -58,8 +58,6 @@ FORCE_RMSE_N: Final = {
         ("solved", "estimation"): (2.208, 1.686, 3.509, 2.380),
     },
 }
-# What the text of section V.B says of these, "reduced the RMSE by" [%].
-FORCE_REDUCED_PERCENT: Final = {"flat": 27.3, "curved": 26.4}
 _PRESSED: Final = ([0, 0, 1], [0, 1, 0])  # three corners of a rectangle
 _PRESSED_OHM: Final = 1e3  # in the wire sweep, by its caption
 _WIRE_OHM: Final = 1e3  # in the cell sweep

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
+from ohmskin.estimate.base import SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import Readings
 
 REST_OHM: Final = 1e6
@@ -25,9 +27,9 @@ SPREAD: Final = 0.1  # of the log of rest resistances and wires
 TOUCH_OHM: Final = (1e3, 1e5)
 # A cell counts as pressed from here on, as a multiple of its conductance at rest.
 PRESSED: Final = 1.5
-# A fingertip: radius of its pressure, range of its peaks, frames of its way round a circle.
 # The paper's programmes: they take minutes for a frame of 8x8 cells.
 PAPER_METHODS: Final = ("lsq", "regularized")
+# A fingertip: radius of its pressure, range of its peaks, frames of its way round a circle.
 FINGER_CELLS: Final = 0.7
 FINGER_SIEMENS: Final = (5e-5, 5e-4)
 FINGER_FRAMES: Final = 40
@@ -104,6 +106,29 @@ def touch(skin: Skin, touches: int, random: np.random.Generator) -> Skin:
     return replace(skin, cell_siemens=cell)
 
 
+def stretched(skin: Skin, factor: float) -> Skin:
+    """`skin` with all wires of so many times their resistance."""
+    return replace(
+        skin,
+        top_wire_ohm=factor * skin.top_wire_ohm,
+        bottom_wire_ohm=factor * skin.bottom_wire_ohm,
+    )
+
+
+def knowledge_of(
+    rest_ratio: Float, nominal_wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+) -> SkinKnowledge:
+    """What estimators of 10-bit readings are told: rest (R, C, 4), nominal wires, no more."""
+    rows, columns, _ = rest_ratio.shape
+    return SkinKnowledge(
+        rows,
+        columns,
+        adc_bits=ADC_BITS,
+        rest_ratio=rest_ratio,
+        nominal_wire_ohm=WireOhm(*nominal_wire_ohm),
+    )
+
+
 def trial_of(
     rest: Skin,
     frames: list[Skin],
@@ -133,28 +158,16 @@ def bent_trial(rows: int, columns: int, touches: int, frames: int, seed: int) ->
     """As `random_trial`, on a skin bent since its rest readings: wires 35 % above nominal."""
     random = np.random.default_rng(seed)
     rest = skin_at_rest(rows, columns, random)
-    bent = replace(
-        rest,
-        top_wire_ohm=1.35 * rest.top_wire_ohm,
-        bottom_wire_ohm=1.35 * rest.bottom_wire_ohm,
-    )
+    now = stretched(rest, 1.35)
     counts = random.integers(0, touches + 1, frames)
-    return trial_of(rest, [touch(bent, int(count), random) for count in counts])
+    return trial_of(rest, [touch(now, int(count), random) for count in counts])
 
 
 def jump_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
     """As `random_trial`, but from the middle frame on all wires have 1.5 times their resistance."""
     trial = random_trial(rows, columns, touches, frames, seed)
-    wires = [JUMP if number >= frames // 2 else 1.0 for number in range(frames)]
-    jumped = [
-        replace(
-            skin,
-            top_wire_ohm=factor * skin.top_wire_ohm,
-            bottom_wire_ohm=factor * skin.bottom_wire_ohm,
-        )
-        for skin, factor in zip(trial.frames, wires, strict=True)
-    ]
-    return trial_of(trial.rest, jumped)
+    before, after = trial.frames[: frames // 2], trial.frames[frames // 2 :]
+    return trial_of(trial.rest, [*before, *(stretched(skin, JUMP) for skin in after)])
 
 
 def finger_trial(
