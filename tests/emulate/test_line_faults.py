@@ -14,7 +14,7 @@ import ohmskin
 from bench_board import Bench
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
-from ohmskin.emulate.board import EmulatorLink
+from ohmskin.emulate.board import EmulatorLink, PtyServer
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError
 from ohmskin.link import device, framing, protocol, session
@@ -46,6 +46,11 @@ def test_all_that_was_made_is_counted_and_all_that_came_is_the_truth(faults: str
     assert stats.scans + stats.missed == found[-1].number + 1
     assert (stats.missed > 300) == (faults != "garbage=0.3")
     assert (stats.line.damaged > 300) == (faults != "drop=0.1")
+
+
+def test_a_served_board_may_be_closed_again() -> None:
+    with PtyServer(emulated("emulator://1x1")[0]) as server:
+        server.close()
 
 
 def test_a_bad_line_at_a_port(pty_board: Serve) -> None:

@@ -366,10 +366,11 @@ class PtyServer(_Running, Closing):
         except ImportError as exc:
             raise PortError("this system has no pseudo-terminals: use emulator:// itself") from exc
         super().__init__(board, faults)
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
+        self._master, slave = os.openpty()
+        self._files = [self._master, slave]
+        tty.setraw(slave)
         os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        self.path = os.ttyname(slave)
 
     def serve(self, seconds: float = float("inf")) -> None:
         """Serve for `seconds`, or until the faults let the board vanish."""
@@ -386,6 +387,6 @@ class PtyServer(_Running, Closing):
             os.write(self._master, octets)
 
     def close(self) -> None:
-        """Take the pseudo-terminal away."""
-        os.close(self._master)
-        os.close(self._slave)
+        """Take the pseudo-terminal away. May be called again."""
+        while self._files:
+            os.close(self._files.pop())
