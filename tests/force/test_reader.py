@@ -97,6 +97,14 @@ def test_a_tare_says_the_mode_of_the_board() -> None:
     assert reader.tare(next(iter(bench)).ratio).mode == "near"
 
 
+def test_readings_of_another_mode_are_no_tare() -> None:
+    with ohmskin.open(GHOST, calibration=of_scene("ghost")) as board:
+        board.device.configure(mode="far")
+        with pytest.raises(ValueError, match="scanned in mode near, now in far"):
+            board.tare(0.1, force=True)
+        assert board.calibration.tare is None
+
+
 def test_tare_is_refused_while_something_touches_the_skin() -> None:
     before = of_scene("ghost")
     with ohmskin.open(GHOST, calibration=before) as board:

@@ -17,16 +17,19 @@ import numpy as np
 import pytest
 
 import ohmskin
+from bench_board import Bench
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, ProtocolError
 from ohmskin.link import device, framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
+from ohmskin.link.protocol import MODES
 from ohmskin.link.session import Session
 from ports import Serve
 from stepped_link import SteppedLink
 from waiting import until
 
+REST = "emulator://3x4?scene=rest&rate=100"
 SCENE = "scene=multi&begin=0&seed=3"
 EXPECTED = Scene("multi", 8, 8, seed=3).ratio(BEGIN_S)
 NOISE_LSB = 0.3  # of the emulator, by default; the simulator has none
@@ -422,6 +425,14 @@ def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda _: skin.close(), range(2)))
     assert closed == ["once"]
+
+
+def test_a_mean_is_not_of_scans_of_two_modes() -> None:
+    """Where somebody configures the board meanwhile, the mean is of the scans after that."""
+    near, far = (list(itertools.islice(Bench(f"{REST}&mode={mode}"), 9)) for mode in MODES)
+    mean = ohmskin.Device.mean_ratio([*near[:4], *far], 0.05)  # type: ignore[arg-type]
+    np.testing.assert_allclose(mean, np.mean([scan.ratio for scan in far[:6]], axis=0))
+    assert np.abs(mean - near[0].ratio).max() > 0.3
 
 
 def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:

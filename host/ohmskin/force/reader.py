@@ -182,6 +182,11 @@ class SkinReader:
         """What readings (R, C, 4) show, without forces. Raises ValueError for other cells."""
         return self._estimator.estimate(ratio)
 
+    def check_mode(self, mode: str) -> None:
+        """Raise ValueError if the board scans in another mode now."""
+        if mode != self.board.mode:
+            raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
+
     def rise(self, found: Estimate) -> Float:
         """Level above rest, (R, C) [S; 1 for `voltage`]; above its median where rest is unknown."""
         at_rest = float(np.median(found.level)) if self._rest_level is None else self._rest_level
@@ -189,8 +194,7 @@ class SkinReader:
 
     def read(self, scan: Scan) -> ForceScan:
         """What a scan shows. Raises ValueError if it is of other cells, or of another mode."""
-        if scan.mode != self.board.mode:
-            raise ValueError(f"the board scanned in mode {self.board.mode}, now in {scan.mode}")
+        self.check_mode(scan.mode)
         if scan.rest_ratio is not None and scan.rest_ratio.shape == scan.codes.shape:
             self._replay(scan.rest_ratio)
         if self._made != (self._wanted, self.rest):
@@ -287,8 +291,11 @@ class CalibratedSkin(Closing):
 
         :raises TareRefused: something touches the skin.
         :raises DeviceLost: as `Device.mean_ratio`.
+        :raises ValueError: the board scans in another mode than was calibrated.
         """
-        return self._reader.tare(self.device.mean_ratio(seconds), force=force)
+        rest_ratio = self.device.mean_ratio(seconds)
+        self._reader.check_mode(self.info.mode)
+        return self._reader.tare(rest_ratio, force=force)
 
     def undo_tare(self) -> Tare:
         """Return to the rest before the last tare. Returns that, for a `Recorder`.

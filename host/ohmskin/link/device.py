@@ -124,7 +124,7 @@ class Device(Closing):
         """
         scans: list[Scan] = []
         for scan in self:
-            if scans and scan.codes.shape != scans[0].codes.shape:
+            if scans and scan.kind != scans[0].kind:
                 scans.clear()  # somebody has configured the board
             scans.append(scan)
             if scan.time_us - scans[0].time_us >= 1e6 * seconds:

@@ -144,6 +144,11 @@ class Scan:
         return protocol.MODES[self.mode]
 
     @property
+    def kind(self) -> tuple[tuple[int, ...], str]:
+        """Shape of the codes and mode: scans that differ in it cannot be averaged."""
+        return self.codes.shape, self.mode
+
+    @property
     def rows(self) -> int:
         """Rows of the skin."""
         return int(self.codes.shape[0])

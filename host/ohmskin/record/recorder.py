@@ -219,7 +219,7 @@ def record(
                 recorder.add(skin.info)
             recorder.add(scan)
             if tare_s and elapsed_s <= tare_s:
-                if untouched and not _mean(untouched[:1]).is_of(scan):
+                if untouched and scan.kind != untouched[0].kind:
                     untouched.clear()  # somebody has configured the board
                 untouched.append(scan)
             elif untouched:

@@ -82,7 +82,7 @@ class Tare:
 
     def is_of(self, scan: Scan) -> bool:
         """Whether it is the rest of such scans: of the same cells and mode."""
-        return (self.rest_ratio.shape, self.mode) == (scan.codes.shape, scan.mode)
+        return (self.rest_ratio.shape, self.mode) == scan.kind
 
 
 @dataclass(frozen=True)
@@ -342,9 +342,8 @@ def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
     scans = [scan for scan in scans if first_s + begin_s <= scan.host_time_s <= last_s]
     if not scans:
         raise RecordingError("no scans: neither in the recording nor in this part of it")
-    first = scans[0]
     for scan in scans:
-        if (scan.codes.shape, scan.mode) != (first.codes.shape, first.mode):
+        if scan.kind != scans[0].kind:
             change = f"cells or mode change after {scan.host_time_s - first_s:.3f} s"
             raise RecordingError(f"{change}: export each part by itself, --begin and --end")
     return scans
