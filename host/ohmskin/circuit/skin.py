@@ -113,10 +113,9 @@ _triangle = lru_cache(maxsize=8)(np.tri)  # ones: which cells are behind a segme
 @lru_cache(maxsize=8)
 def _unit_coupling(rows: int, columns: int) -> tuple[Float, Float]:
     """K of top wires, and of bottom wires, of 1 ohm a segment."""
-    in_row, in_column = (
-        np.minimum.outer(n, n) + 1.0 for n in (np.arange(columns), np.arange(rows))
-    )
-    return np.kron(np.eye(rows), in_row), np.kron(in_column, np.eye(columns))  # type: ignore[return-value]
+    shape = rows, columns
+    ones, zeros = np.ones(shape), np.zeros(shape)
+    return wire_coupling_ohm(ones, zeros, shape), wire_coupling_ohm(zeros, ones, shape)
 
 
 def wire_coupling_ohm(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
