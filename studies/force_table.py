@@ -30,16 +30,10 @@ def surface_tables(rows: Sequence[Row]) -> list[Table]:
         ]
         first = of_table[0]
         groups = list(dict.fromkeys(row.group for row in of_table))
-        table = Table(
-            box=None,
-            title=f"{first.surface} {places[0]}x{places[1]}, {places[3]}, simulated: RMSE [N], "
-            f"{first.skins} skins, {first.frames} frames each",
-            title_justify="left",
-        )
-        for heading in ("cells", "method"):
-            table.add_column(heading, no_wrap=True)
-        for heading in ("calibr.", *groups, "below", "best", "every cell", "below", "best"):
-            table.add_column(heading, justify="right", no_wrap=True)
+        skin = f"{first.surface} {places[0]}x{places[1]}, {places[3]}, simulated"
+        title = f"{skin}: RMSE [N], {first.skins} skins, {first.frames} frames each"
+        numbers = ("calibr.", *groups, "below", "best", "every cell", "below", "best")
+        table = _table(title, ("cells", "method"), numbers)
         before = ""
         for cells, method in dict.fromkeys((row.cells, row.method) for row in of_table):
             by_group = {
@@ -62,6 +56,16 @@ def surface_tables(rows: Sequence[Row]) -> list[Table]:
             _add_published(table, first.surface)
         tables.append(table)
     return tables
+
+
+def _table(title: str, words: Iterable[str], numbers: Iterable[str]) -> Table:
+    """An empty table with columns of words, then of numbers."""
+    table = Table(box=None, title=title, title_justify="left")
+    for heading in words:
+        table.add_column(heading, no_wrap=True)
+    for heading in numbers:
+        table.add_column(heading, justify="right", no_wrap=True)
+    return table
 
 
 def _add_published(table: Table, surface: str) -> None:
@@ -94,15 +98,8 @@ def best_of_ours(rows: Iterable[Row]) -> list[dict[str, Any]]:
 
 def talk_table(rows: Iterable[CrossTalk]) -> Table:
     """Cross-talk by method."""
-    table = Table(
-        box=None,
-        title="largest false force on an unpressed cell over the largest on the pressed, simulated",
-        title_justify="left",
-    )
-    for heading in ("regression", "method"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("skins", "mean %", "worst %"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    title = "largest false force on an unpressed cell over the largest on the pressed, simulated"
+    table = _table(title, ("regression", "method"), ("skins", "mean %", "worst %"))
     for row in rows:
         numbers = (f"{row.percent:.2f}", f"{row.worst_percent:.2f}")
         table.add_row(row.regression, row.method, str(row.skins), *numbers)
@@ -111,15 +108,9 @@ def talk_table(rows: Iterable[CrossTalk]) -> Table:
 
 def smallest_table(rows: Iterable[SmallestForce]) -> Table:
     """The smallest force told from none, by method and scene."""
-    table = Table(
-        box=None,
-        title="smallest force told from none by one frame [N], simulated",
-        title_justify="left",
-    )
-    for heading in ("scene", "method"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("median", "worst", "(1, 1)", "(1, 2)", "(2, 1)", "(2, 2)"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    title = "smallest force told from none by one frame [N], simulated"
+    cells = ("(1, 1)", "(1, 2)", "(2, 1)", "(2, 2)")
+    table = _table(title, ("scene", "method"), ("median", "worst", *cells))
     for row in sorted(rows, key=lambda row: row.scene):
         numbers = (row.median_n, row.worst_n, *row.by_cell_n)
         table.add_row(
