@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calibrations import of_scene
+from ohmskin import files
 from ohmskin.calibrate.tables import PRESS, save_press_table
 from ohmskin.record.readings import save_arrays
 from studies.commands import save_whole
@@ -65,11 +66,23 @@ def test_nothing_that_is_no_file_is_replaced(tmp_path: Path) -> None:
     assert pipe.is_fifo()
 
 
-def test_a_link_in_place_of_the_file_beside_is_not_followed(tmp_path: Path) -> None:
-    (tmp_path / f".file.{os.getpid()}.part").symlink_to(tmp_path / "other")
+def test_a_link_in_place_of_the_file_beside_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "token_hex", lambda _: "0")
+    (tmp_path / ".file.0.part").symlink_to(tmp_path / "other")
     with pytest.raises(ValueError, match="file: cannot be written: File exists"):
         save_whole({tmp_path / "file": b"new"})
     assert not (tmp_path / "other").exists()
+
+
+def test_what_a_killed_program_left_hinders_no_other(tmp_path: Path) -> None:
+    """In a container, programs have the same number again and again."""
+    left = tmp_path / f".file.{os.getpid()}.part"
+    left.write_bytes(b"begun")
+    save_whole({tmp_path / "file": b"new"})
+    assert (tmp_path / "file").read_bytes() == b"new"
+    assert left.read_bytes() == b"begun"
 
 
 @pytest.mark.parametrize("what", SAVERS)

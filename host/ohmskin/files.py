@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
+from secrets import token_hex
 from typing import BinaryIO, Self
 
 PathName = str | os.PathLike[str]
@@ -44,7 +45,7 @@ def whole_file(path: PathName) -> Iterator[BinaryIO]:
     ValueError, which names the path, if it cannot be written, or is there and no file.
     """
     target = Path(os.path.realpath(path))
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
+    partial = target.with_name(f".{target.name}.{token_hex(8)}.part")
     try:
         if target.exists() and not target.is_file():
             raise OSError("it is no file")
