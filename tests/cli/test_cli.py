@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import serial
+from rich.console import Console
 
 import ohmskin
 from calibrations import of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python, well
 from ohmskin.cli.main import app
+from ohmskin.cli.stream import cell_table
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
@@ -142,6 +144,21 @@ def test_stream_shows_a_table(run: Run, method: str) -> None:
     rows = [line.split() for line in done.out.splitlines()]
     for row in range(4):
         assert any(len(cells) == 7 and cells[0] == str(row) for cells in rows)
+
+
+@pytest.mark.parametrize("place", ["pipe", "terminal"])
+def test_a_table_of_16_columns_is_whole_on_80(place: str) -> None:
+    arguments = ("stream", "emulator://1x16", "--scans", "1", "--method", "none")
+    forced = {"FORCE_COLOR": "1", "TERM": "dumb"} if place == "terminal" else {}
+    done = well(python("-m", "ohmskin", *arguments, COLUMNS="80", **forced))
+    rows = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line).split() for line in done.out.splitlines()]
+    assert [str(column) for column in range(16)] in rows
+    assert [len(row) for row in rows if row and row[0] == "0" and row[1:2] != ["1"]] == [17]
+
+
+def test_a_wide_text_keeps_its_column_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    Console(width=80, soft_wrap=True).print(cell_table([["0.12 (12)"] * 16], ""))
+    assert capsys.readouterr().out.count("0.12 (12)") == 16
 
 
 def test_stream_says_what_was_lost(run: Run) -> None:

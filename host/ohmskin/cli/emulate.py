@@ -15,7 +15,7 @@ import ohmskin
 from ohmskin.arrays import Bool, Float
 from ohmskin.cli.demo import URL
 from ohmskin.cli.record import progress
-from ohmskin.cli.stream import FULL_SCALE_US, coloured, limited
+from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured, limited
 from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
@@ -71,7 +71,7 @@ def compare(port: str, seconds: float, picture: Path) -> None:
         for method, estimate in zip(_METHODS, found[-1], strict=True)
     ]
     title = f"scene '{scene.name}', simulated {board.rows}x{board.columns} skin"
-    out = _out if _out.is_terminal else Console(width=160)  # three tables side by side
+    out = _out if _out.is_terminal else WIDE
     out.print(f"{title}: cell conductance in microsiemens")
     tables = [coloured(1e6 * siemens, FULL_SCALE_US, name) for name, siemens, _ in views]
     out.print(Columns(tables))

@@ -30,6 +30,8 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
 _out = Console()
+# For tables in a file or pipe, which have no width: 16 columns, or three of 8 side by side.
+WIDE: Final = Console(width=160)
 # Conductance at which a table's colours end: a cell of 5 kOhm [microsiemens].
 FULL_SCALE_US: Final = 200.0
 # Force at which a table's colours end [N].
@@ -141,7 +143,7 @@ def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) 
                 if live:
                     live.update(picture, refresh=True)
                 else:
-                    _out.print(picture)
+                    WIDE.print(picture)
 
 
 def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
@@ -194,10 +196,11 @@ def _short(value: float) -> str:
 
 def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
     """A text for each cell, row by row, beside the numbers of rows and columns."""
-    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 0, 0, 1), pad_edge=False)
+    table = Table(title=title, box=SIMPLE_HEAD, padding=0)  # 16 columns fit into a terminal
     table.add_column("", justify="right", style="dim")
     for column in range(len(cells[0])):
-        table.add_column(str(column), justify="right", min_width=3, header_style="dim")
+        width = max(3, *(len(row[column]) for row in cells))
+        table.add_column(str(column), justify="right", min_width=width, header_style="dim")
     for row, texts in enumerate(cells):
         table.add_row(str(row), *texts)
     return table
