@@ -80,10 +80,10 @@ enum class Result : uint8_t {
     Ok = 0,  // done
     UnknownCommand = 1,  // this firmware has no such command
     BadLength = 2,  // the payload has the wrong length
-    BadRows = 3,  // rows outside 1..rows_max
-    BadColumns = 4,  // columns outside 1..columns_max
-    BadRate = 5,  // rate neither 0 nor within rate_mhz_min..rate_mhz_max
-    BadSettle = 6,  // settle time above settle_us_max
+    BadRows = 3,  // rows outside 1..16
+    BadColumns = 4,  // columns outside 1..16
+    BadRate = 5,  // rate neither 0 nor within 1000..2000000 mHz
+    BadSettle = 6,  // settle time above 3000 us
     BadPrescaler = 7,  // no such ADC prescaler
     BadBaud = 8,  // no such line speed
     TooFast = 9,  // the readings of a scan do not fit into its period: lower the rate, the settle time, the prescaler or the size

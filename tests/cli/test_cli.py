@@ -322,7 +322,16 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
         ["info", "emulator://4x4?foreign=257"],
         ["layout", f"0x{LAYOUT_CRC ^ 257:04X}", f"0x{LAYOUT_CRC:04X}", "ohmskin flash"],
     ),
-    "refused rows": (["configure", EMULATED, "--rows", "0"], ["bad_rows", "1..rows_max"]),
+    "refused rows": (["configure", EMULATED, "--rows", "0"], ["bad_rows", "1..16"]),
+    "rate out of range": (
+        ["configure", EMULATED, "--rate", "3000"],
+        ["bad_rate", "1000..2000000 mHz"],
+    ),
+    "negative rate": (["configure", EMULATED, "--rate", "-1"], ["no board scans -1.0 times"]),
+    "settle time out of range": (
+        ["configure", EMULATED, "--settle", "3001"],
+        ["bad_settle", "above 3000 us"],
+    ),
     "refused rate": (["configure", EMULATED, "--rate", "1900"], ["too_fast"]),
     "impossible rows": (["configure", EMULATED, "--rows", "-3"], ["rows is -3", "255"]),
     "unknown prescaler": (["configure", EMULATED, "--adc", "x"], ["clock_500khz"]),

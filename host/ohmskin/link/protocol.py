@@ -139,7 +139,7 @@ ENUMS: dict[str, Enum] = {
     name: Enum(
         name,
         {m["name"]: m["value"] for m in e["members"]},
-        {m["name"]: m["doc"] for m in e["members"]},
+        {m["name"]: m["doc"].format(**CONSTANTS) for m in e["members"]},
     )
     for name, e in DEFINITION["enums"].items()
 }
@@ -164,10 +164,10 @@ _BIT_VALUES = 1 << np.arange(ADC_BITS, dtype=np.uint16)
 def rate_mhz(rate_hz: float) -> int:
     """A scan rate in the unit of the link [mHz].
 
-    :raises ValueError: it is not finite, or so small that it would be rounded to 0, which means as
-        fast as possible.
+    :raises ValueError: it is negative or not finite, or so small that it would be rounded to 0,
+        which means as fast as possible.
     """
-    if not abs(rate_hz * 1000) < float("inf") or (rate_hz and not round(rate_hz * 1000)):
+    if not 0 <= rate_hz * 1000 < float("inf") or (rate_hz and not round(rate_hz * 1000)):
         raise ValueError(f"no board scans {rate_hz} times a second")
     return round(rate_hz * 1000)
 
