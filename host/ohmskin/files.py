@@ -37,6 +37,12 @@ def read_bounded(path: PathName, most_bytes: int) -> bytes:
     return octets
 
 
+def check_place(path: Path) -> None:
+    """Raise ValueError if no file can be written there: before it takes long to make it."""
+    if path.is_dir() or not path.parent.is_dir():
+        raise ValueError(f"{path}: cannot be written: say a file in a directory there is")
+
+
 @contextmanager
 def whole_file(path: PathName) -> Iterator[BinaryIO]:
     """A file to write beside `path`, which takes its place at the end if nothing was raised.

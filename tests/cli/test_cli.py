@@ -291,6 +291,15 @@ def test_demo_shows_a_ghost_and_how_it_goes(run: Run, tmp_path: Path) -> None:
     assert picture.stat().st_size > 10_000
 
 
+def test_the_demo_writes_the_picture_that_it_names(run: Run, tmp_path: Path) -> None:
+    done = run("demo", "--seconds", "0.1", "--picture", str(tmp_path / "demo"))
+    assert f"picture: {tmp_path / 'demo'}" in done.out
+    assert (tmp_path / "demo").read_bytes().startswith(b"\x89PNG")
+    done = run("demo", "--seconds", "0.1", "--picture", str(tmp_path / "no" / "demo.png"))
+    assert done.code == 2
+    assert "demo.png: cannot be written: say a file in a directory there is" in done.err
+
+
 def test_nothing_listens_on_the_network(command: Command) -> None:
     if not Path("/proc/net/tcp").exists():
         pytest.skip("needs /proc")

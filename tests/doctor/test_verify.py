@@ -200,6 +200,34 @@ def test_the_page_the_file_and_the_picture(run: Run, write: Write, tmp_path: Pat
     assert told["hello"]["board"] == "emulated"
 
 
+@pytest.mark.usefixtures("benches")
+@pytest.mark.parametrize("option", ["--picture", "--json"])
+def test_a_file_that_cannot_be_is_refused_before_the_board_is_read(
+    run: Run, write: Write, tmp_path: Path, option: str
+) -> None:
+    for path in ("/no/such/place.png", str(tmp_path)):
+        done = run("verify", "emulator://8x8", write(PLATE), "--seconds", "1", option, path)
+        assert_one_line(done, f"{path}: cannot be written")
+
+
+@pytest.mark.usefixtures("benches")
+def test_no_half_picture_stays(run: Run, write: Write, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    picture, limits = tmp_path / "plate.png", resource.getrlimit(resource.RLIMIT_FSIZE)
+    picture.write_text("of yesterday")
+    more = ("--seconds", "1", "--picture", str(picture))
+    plate = write(PLATE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # as a disk that is full
+    try:
+        done = run("verify", f"emulator://8x8?plate={plate}", plate, *more)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert done.code == 2
+    assert f"{picture}: cannot be written" in done.err
+    assert picture.read_text() == "of yesterday"
+    assert {path.name for path in tmp_path.iterdir()} == {"plate.csv", "plate.png"}
+
+
 @pytest.mark.parametrize("end", [None, KeyboardInterrupt])
 @pytest.mark.parametrize("look", [1, 2, 3, 5])
 def test_the_board_is_put_back(

@@ -30,7 +30,7 @@ from ohmskin.cli.record import progress, until_stopped
 from ohmskin.cli.stream import cell_table
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
-from ohmskin.files import naming
+from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.force.regression import MIN_PRESSES
 from ohmskin.link.device import Device
@@ -213,8 +213,7 @@ def _options(
         raise ValueError(f"a table has conductances, which '{VOLTAGE}' knows nothing of")
     if not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
-    if out.is_dir() or not out.parent.is_dir():
-        raise ValueError(f"{out}: cannot be written: say a file in a directory there is")
+    check_place(out)
     return lambda board, rest: Calibrator(board, rest, method, 1e-6 * indenter_mm2, nominal)
 
 

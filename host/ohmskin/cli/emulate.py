@@ -21,6 +21,7 @@ from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
 from ohmskin.estimate.base import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.files import check_place, whole_file
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.opening import emulated
 
@@ -53,6 +54,7 @@ def emulate(
 
 def compare(port: str, seconds: float, picture: Path) -> None:
     """Scan `port`, an emulated board, print truth and estimates, and write them as a PNG."""
+    check_place(picture)
     _, scene, _ = emulated(port)
     with ohmskin.open(port) as skin:
         board = skin.info
@@ -113,4 +115,5 @@ def _save_picture(path: Path, views: Sequence[tuple[str, Float, Bool]], title: s
         rows, columns = map(range, cell_siemens.shape)
         axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
     figure.colorbar(all_axes[0].images[0], ax=all_axes, label="cell conductance [µS]", shrink=0.9)
-    figure.savefig(path, dpi=120)
+    with whole_file(path) as file:
+        figure.savefig(file, format=path.suffix[1:] or "png", dpi=120)

@@ -19,7 +19,7 @@ from ohmskin.cli.doctor_words import line_in_words
 from ohmskin.cli.stream import numbers
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.plate import PlateExam, Tolerance
-from ohmskin.files import whole_file
+from ohmskin.files import check_place, whole_file
 
 _MOST: Final = Tolerance()
 _out = Console(soft_wrap=True, markup=False, highlight=False)
@@ -53,6 +53,8 @@ def verify(
     settled, noise by ADC clock, and lost scans. Leaves the board as it was. Exit code 0: all is
     within the tolerances; 1: something is not.
     """
+    for path in filter(None, (str(picture or ""), json_file.removeprefix("-"))):
+        check_place(Path(path))
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
     with terminal() as tell, ohmskin.open(port, start=False) as device, put_back(device):
@@ -128,4 +130,5 @@ def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
         of_lines.plot(x, y - x, "o+x."[k], label=name, markersize=6, fillstyle="none")
     of_lines.set(title="reading less prediction [LSB]", xlabel="current by the circuit [LSB]")
     of_lines.legend(title="reading")
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as file:
+        figure.savefig(file, format=path.suffix[1:] or "png", dpi=110)
