@@ -368,6 +368,29 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
 }
 
 
+NO_TIMES = {
+    ("stream", EMULATED): ("--seconds", "--scans", "--tare"),
+    ("record", EMULATED, "/no/such/place.mcap"): ("--seconds", "--scans", "--tare"),
+    ("tare", EMULATED, "/no/such/skin.json"): ("--seconds",),
+    ("calibrate", "table", EMULATED, READINGS, "/no/such.json", "--indenter-mm2", "1"): ("--rest",),
+    ("calibrate", "recording", READINGS, "/no/such.json", "--indenter-mm2", "1"): ("--rest",),
+    ("export", READINGS, "/no/such/place.csv"): ("--begin", "--end"),
+    ("emulate", EMULATED): ("--seconds",),
+    ("demo",): ("--seconds",),
+}
+
+
+@pytest.mark.parametrize("arguments", NO_TIMES, ids=" ".join)
+def test_a_time_below_0_is_refused(run: Run, arguments: tuple[str, ...]) -> None:
+    for option in NO_TIMES[arguments]:
+        for value in ("-1", "nan"):
+            assert_one_line(run(*arguments, option, value), option)
+
+
+def test_a_demo_ends(run: Run) -> None:
+    assert_one_line(run("demo", "--seconds", "0"), "--seconds")
+
+
 @pytest.mark.parametrize("what", WRONG)
 def test_an_error_is_one_line(what: str, run: Run, attach: Attach) -> None:
     attach()

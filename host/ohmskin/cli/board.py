@@ -39,6 +39,9 @@ _out = Console(soft_wrap=True)
 Port = Annotated[str, Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
 Wires = Annotated[str, Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
 
+Scans = Annotated[int, Option(min=0, help="stop after so many; 0: never")]
+Seconds = Annotated[float, Option(min=0, help="stop after so long; 0: never")]
+
 
 def wires_of(text: str) -> WireOhm:
     """What `--wires` says; nothing: they are not known."""

@@ -113,7 +113,7 @@ def recording(
         Option(help="force sensor's log (.csv: time_s, force_n); default: the forces in it"),
     ] = None,
     rest_s: Annotated[
-        float, Option("--rest", help="so long nothing touched the skin at first, in s; 0: its tare")
+        float, Option("--rest", min=0, help="seconds before the first touch; 0: its tare")
     ] = 0.0,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
@@ -156,7 +156,7 @@ def table(
     out: Out,
     indenter_mm2: Indenter,
     rest_s: Annotated[
-        float, Option("--rest", help="so long the untouched skin is measured, in s")
+        float, Option("--rest", min=0, help="so long the untouched skin is measured, in s")
     ] = TARE_S,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
@@ -174,7 +174,7 @@ def tare(
     calibration: Annotated[
         Path, Argument(envvar="OHMSKIN_CALIBRATION", help="file (.json) to be changed")
     ],
-    seconds: Annotated[float, Option(help="so long nothing touches the skin, in s")] = TARE_S,
+    seconds: Annotated[float, Option(min=0, help="touch nothing for so long, in s")] = TARE_S,
     undo: Annotated[bool, Option("--undo", help="return to the rest of the calibration")] = False,
     force: Annotated[bool, Option("--force", help="even if cells seem to be touched")] = False,
 ) -> None:

@@ -10,7 +10,7 @@ URL: Final = "emulator://8x8?scene=ghost&seed=1"
 
 
 def demo(
-    seconds: Annotated[float, Option(help="how long to scan")] = 3.0,
+    seconds: Annotated[float, Option(min=0.01, help="how long to scan, in s")] = 3.0,
     port: Annotated[str, Option(help="an emulator:// URL")] = f"{URL}&begin=0",
     picture: Annotated[Path, Option(help="PNG to write")] = Path("ohmskin-demo.png"),
 ) -> None:

@@ -9,10 +9,11 @@ from typing import Annotated, Final
 import numpy as np
 from rich.columns import Columns
 from rich.console import Console
-from typer import Argument, Option
+from typer import Argument
 
 import ohmskin
 from ohmskin.arrays import Bool, Float
+from ohmskin.cli.board import Seconds
 from ohmskin.cli.demo import URL
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured, limited
@@ -43,7 +44,7 @@ EPILOGS: Final = {
 
 def emulate(
     url: Annotated[str, Argument(help="an emulator:// URL")] = URL,
-    seconds: Annotated[float, Option(help="stop after so long; 0: never")] = 0.0,
+    seconds: Seconds = 0.0,
 ) -> None:
     """Serve an emulated board at a pseudo-terminal. Ctrl-C ends it."""
     board, _, faults = emulated(url)

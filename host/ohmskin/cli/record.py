@@ -22,7 +22,7 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli.board import Port
+from ohmskin.cli.board import Port, Scans, Seconds
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.methods import METHODS
@@ -45,10 +45,10 @@ _T = TypeVar("_T")
 def record(
     port: Port,
     file: Annotated[Path, Argument(help="file to write (.mcap), a new one")],
-    scans: Annotated[int, Option(help="stop after so many; 0: never")] = 0,
-    seconds: Annotated[float, Option(help="stop after so long; 0: never")] = 0.0,
+    scans: Scans = 0,
+    seconds: Seconds = 0.0,
     tare_s: Annotated[
-        float | None, Option("--tare", help="so long nothing touches the skin at first, in s")
+        float | None, Option("--tare", min=0, help="touch nothing for so long at first, in s")
     ] = None,
     mark: Annotated[list[str] | None, Option(help="a mark at the beginning")] = None,
     force_port: Annotated[str, Option(help="a force sensor's serial port: a number a line")] = "",
@@ -187,9 +187,9 @@ def export(
     recording: Annotated[Path, Argument(help="recording (.mcap)")],
     out: Annotated[Path, Argument(help=f"file to write: {' or '.join(FORMATS)}")],
     begin_s: Annotated[
-        float, Option("--begin", help="from so long after the first scan, in s")
+        float, Option("--begin", min=0, help="from so long after the first scan, in s")
     ] = 0.0,
-    end_s: Annotated[float, Option("--end", help="until then, in s; 0: to the last")] = 0.0,
+    end_s: Annotated[float, Option("--end", min=0, help="until then, in s; 0: to the last")] = 0.0,
 ) -> None:
     """Write a recording's scans as readings (.npz) or as a table (.csv)."""
     given = load_recording(recording)

@@ -21,7 +21,7 @@ from typer import Option
 
 import ohmskin
 from ohmskin.arrays import Float
-from ohmskin.cli.board import Port
+from ohmskin.cli.board import Port, Scans, Seconds
 from ohmskin.errors import ctrl_c_kept
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
@@ -53,10 +53,10 @@ def stream(
         Path | None, Option(envvar="OHMSKIN_CALIBRATION", help="file (.json): show forces")
     ] = None,
     force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
-    tare_s: Annotated[float, Option("--tare", help="so long nothing touches the skin, in s")] = 0.0,
+    tare_s: Annotated[float, Option("--tare", min=0, help="touch nothing for so long, in s")] = 0.0,
     as_json: Annotated[bool, Option("--json", help="one JSON object a scan")] = False,
-    scans: Annotated[int, Option(help="stop after so many; 0: never")] = 0,
-    seconds: Annotated[float, Option(help="stop after so long; 0: never")] = 0.0,
+    scans: Scans = 0,
+    seconds: Seconds = 0.0,
 ) -> None:
     """Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it."""
     if method not in ("", "none", *METHODS):
