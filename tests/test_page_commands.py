@@ -37,6 +37,7 @@ import ohmskin
 from bench_board import Bench
 from calibrations import of_scene
 from command_line import ENVIRONMENT, Command, Run, finish
+from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.record.recording import ForceSample, Tare, load_recording
 from places import ROOT
 from ports import Attach, Serve
@@ -151,7 +152,8 @@ def missing(lines: tuple[str, ...], printed: str) -> str | None:
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the pages' commands read: presses with forces, a recording, a calibration, a table."""
     folder = tmp_path_factory.mktemp("files")
-    with ohmskin.open("emulator://8x8", calibration=of_scene("rest")) as skin:
+    learned = of_scene("rest", method=DEFAULT_METHOD)  # as the pages' `calibrate` learns it
+    with ohmskin.open("emulator://8x8", calibration=learned) as skin:
         skin.tare(0.2)
         skin.calibration.save(folder / "skin.json")
     shutil.copy(ROOT / "examples/presses.csv", folder)
