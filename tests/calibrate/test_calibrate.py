@@ -224,6 +224,10 @@ def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Pa
     assert_one_line(
         calibrate(run, presses, "--method", "joint"), "presses.mcap: no tare in it: say --rest 2"
     )
+    assert_one_line(
+        calibrate(run, presses, "--rest", "100"),
+        "presses.mcap: nothing touched the skin for 100 s? all of it is not longer",
+    )
     given = load_recording(recording)
     tare = Tare(given.scans[0].ratio, 0.0, "far")
     write_recording(tmp_path / "far.mcap", given.hellos[0], [tare, *given.scans[:2]])

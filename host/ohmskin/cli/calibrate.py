@@ -222,6 +222,8 @@ def _rest_ratio(given: Recording, rest_s: float) -> Float:
     if rest_s:
         first_s = given.scans[0].host_time_s
         untouched = [scan.ratio for scan in given.scans if scan.host_time_s - first_s <= rest_s]
+        if len(untouched) == len(given.scans):
+            raise ValueError(f"nothing touched the skin for {rest_s:g} s? all of it is not longer")
         return np.asarray(np.mean(untouched, axis=0))
     tares = [tare for tare in given.tares if tare.is_of(given.scans[-1])]
     if not tares:
