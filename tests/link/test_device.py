@@ -462,6 +462,15 @@ def test_close_while_another_thread_waits() -> None:
     assert [str(failure) for failure in failures] == ["emulator://1x1?rate=1 was closed"] * 2
 
 
+def test_what_is_asked_of_a_closed_skin_says_that_it_was_closed(url: str) -> None:
+    with ohmskin.open(url) as skin:
+        skin.latest()
+    for use in (skin.latest, lambda: iter(skin), lambda: skin.configure(rows=3), skin.self_test):
+        with pytest.raises(DeviceLost) as lost:
+            use()
+        assert str(lost.value) == f"{skin.name} was closed"
+
+
 def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """While one is being sent and answered, the other is not written."""
     link = SteppedLink("emulator://1x1")

@@ -119,11 +119,11 @@ class Session(Device):
     def _send(self, name: str, **values: protocol.Value) -> int:
         """Send a command and return its sequence number; nothing waits for the answer."""
         frame = protocol.FRAMES[name]
-        payload = frame.pack(**values)
         with self._changed:
+            self._wait(lambda: False, 0.0)  # raises what has ended it, such as close()
             sequence = self._sequence = (self._sequence + 1) & 0xFF
             self._acks.pop(sequence, None)
-        self._link.write(framing.encode(frame.id, sequence, payload))
+        self._link.write(framing.encode(frame.id, sequence, frame.pack(**values)))
         return sequence
 
     def _command(self, name: str, **values: protocol.Value) -> None:
