@@ -37,10 +37,12 @@ def read_bounded(path: PathName, most_bytes: int) -> bytes:
     return octets
 
 
-def check_place(path: Path) -> None:
-    """Raise ValueError if no file can be written there: before it takes long to make it."""
+def check_place(path: Path, *inputs: Path | None) -> None:
+    """Raise ValueError if no file can be written there, or an input is, before it is made."""
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"{path}: cannot be written: say a file in a directory there is")
+    if path.exists() and any(each and each.exists() and each.samefile(path) for each in inputs):
+        raise ValueError(f"{path}: is what is read: say another file to write")
 
 
 @contextmanager

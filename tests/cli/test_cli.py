@@ -491,3 +491,21 @@ def test_help_names_every_command(run: Run) -> None:
     for name in OPTIONS:
         assert f" {name} " in done.out
     assert sorted(OPTIONS) == sorted(app.commands)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("calibrate", "table", EMULATED, "{}", "{}", "--indenter-mm2", "80"),
+        ("calibrate", "recording", "{}", "{}", "--indenter-mm2", "80"),
+        ("estimate", "{}", "--method", "joint", "--out", "{}"),
+        ("verify", EMULATED, "{}", "--json", "{}"),
+    ],
+)
+def test_what_is_read_is_not_written_over(run: Run, tmp_path: Path, words: tuple[str, ...]) -> None:
+    (there := tmp_path / "there").write_text("an hour's work")
+    (tmp_path / "link").symlink_to(there)
+    names = iter((there, tmp_path / "link"))
+    done = run(*(str(next(names)) if word == "{}" else word for word in words))
+    assert_one_line(done, "link: is what is read: say another file to write")
+    assert there.read_text() == "an hour's work"

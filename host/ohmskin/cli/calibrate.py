@@ -122,7 +122,7 @@ def recording(
 
     The two clocks may differ: they are aligned by what both saw.
     """
-    calibrator_of = _options(out, method, indenter_mm2, wires)
+    calibrator_of = _options(out, method, indenter_mm2, wires, recording, forces)
     given = load_recording(recording)
     if not given.scans:
         raise RecordingError(f"{recording}: no scan in it")
@@ -162,7 +162,7 @@ def table(
     wires: Wires = "",
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
-    calibrator_of = _options(out, method, indenter_mm2, wires, table=True)
+    calibrator_of = _options(out, method, indenter_mm2, wires, table, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
         calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s))
@@ -199,7 +199,12 @@ def tare(
 
 
 def _options(
-    out: Path, method: str, indenter_mm2: float, wires: str, *, table: bool = False
+    out: Path,
+    method: str,
+    indenter_mm2: float,
+    wires: str,
+    *inputs: Path | None,
+    table: bool = False,
 ) -> Callable[[Hello, Float], Calibrator]:
     """Check what all commands are told, before anybody presses cells for an hour.
 
@@ -213,7 +218,7 @@ def _options(
         raise ValueError(f"a table has conductances, which '{VOLTAGE}' knows nothing of")
     if not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
-    check_place(out)
+    check_place(out, *inputs)
     return lambda board, rest: Calibrator(board, rest, method, 1e-6 * indenter_mm2, nominal)
 
 

@@ -26,6 +26,7 @@ from ohmskin.cli.board import Port, Scans, Seconds
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.methods import METHODS
+from ohmskin.files import check_place
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
@@ -209,6 +210,7 @@ def estimate(
     cold: Annotated[bool, Option(help="start every frame afresh")] = False,
 ) -> None:
     """Estimate every cell of every frame of a readings file."""
+    check_place(out, readings)
     answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))
     save_arrays(out, answers)
     frames = len(answers["converged"])

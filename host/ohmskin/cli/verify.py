@@ -54,7 +54,7 @@ def verify(
     within the tolerances; 1: something is not.
     """
     for path in filter(None, (str(picture or ""), json_file.removeprefix("-"))):
-        check_place(Path(path))
+        check_place(Path(path), plate)
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
     with terminal() as tell, ohmskin.open(port, start=False) as device, put_back(device):
