@@ -14,11 +14,12 @@ What only one kind needs is imported when that kind is opened.
 from __future__ import annotations
 
 import heapq
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 from urllib.parse import parse_qsl
 
 from ohmskin.errors import DeviceSilent, PortError
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from ohmskin.emulate.scenes import Scene
 
 CalibrationLike = Calibration | PathName
+_Number = TypeVar("_Number", int, float)
 
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
@@ -47,17 +49,21 @@ _NOT_OF_SIMULATOR = ("scene", "begin", "plate", "baud")
 
 
 @overload
-def open(url: str, *, start: bool = True) -> Device: ...
+def open(url: PathName, *, start: bool = True) -> Device: ...
 
 
 @overload
 def open(
-    url: str, *, start: bool = True, calibration: CalibrationLike, force: bool = False
+    url: PathName, *, start: bool = True, calibration: CalibrationLike, force: bool = False
 ) -> CalibratedSkin: ...
 
 
 def open(
-    url: str, *, start: bool = True, calibration: CalibrationLike | None = None, force: bool = False
+    url: PathName,
+    *,
+    start: bool = True,
+    calibration: CalibrationLike | None = None,
+    force: bool = False,
 ) -> Device | CalibratedSkin:
     """Connect to a board, and start scanning unless told otherwise.
 
@@ -77,7 +83,7 @@ def open(
     """
     told = None if calibration is None else _loaded(calibration)
     with ExitStack() as opened:
-        device = opened.enter_context(_device(url))
+        device = opened.enter_context(_device(os.fspath(url)))
         skin = device if told is None else CalibratedSkin(device, told, force=force)
         if start:
             device.start()
@@ -114,7 +120,7 @@ def _device(url: str) -> Device:
 
         options = _options(url, query, "speed")
         with _wrong(url):
-            return Replay(place, float(options.get("speed", "1")), url)
+            return Replay(place, _number(options, "speed", 1.0), url)
     known = "serial ports by name, emulator://, simavr:// and replay://"
     raise PortError(f"no kind of port '{scheme}://': there are {known}")
 
@@ -132,6 +138,15 @@ def _options(url: str, query: str, *known: str) -> dict[str, str]:
         if key not in known:
             raise PortError(f"{url}: no option '{key}': there are {', '.join(known)}")
     return options
+
+
+def _number(options: dict[str, str], name: str, default: _Number) -> _Number:
+    text = options.get(name, default)
+    try:
+        return type(default)(text)
+    except ValueError:
+        kind = {int: "a whole number", float: "a number"}[type(default)]
+        raise ValueError(f"{name} must be {kind}, not '{text}'") from None
 
 
 def _baud(options: dict[str, str]) -> int | None:
@@ -170,17 +185,17 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
     known = (*_OF_BOARD, *SKIN_FAULTS, *LINE_FAULTS)
     options = _options(url, query, *known)
     with _wrong(url):
-        seed = int(options.get("seed", 0))
+        seed = _number(options, "seed", 0)
         faults = faults_of(SkinFaults, options)
         scene = _scene(place, options, faults)
         board = EmulatedBoard(
             *(scene.ratio, scene.rows, scene.columns),
-            rate_hz=float(options["rate"]) if "rate" in options else None,
-            noise_lsb=float(options.get("noise", _DEFAULT_NOISE_LSB)),
+            rate_hz=_number(options, "rate", 0.0) if "rate" in options else None,
+            noise_lsb=_number(options, "noise", _DEFAULT_NOISE_LSB),
             seed=seed,
-            unit_id=int(options.get("unit", 0)),
+            unit_id=_number(options, "unit", 0),
             mode=options.get("mode", "near"),
-            layout_crc=protocol.LAYOUT_CRC ^ int(options.get("foreign", 0)),
+            layout_crc=protocol.LAYOUT_CRC ^ _number(options, "foreign", 0),
             sampled=faults.sampled,
         )
         return board, scene, faults_of(LineFaults, options, seed=seed)
@@ -195,9 +210,9 @@ def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None)
     most = (protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
     if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
         raise ValueError(f"a size is as 8x8, from 1x1 to {most[0]}x{most[1]}, not '{size}'")
-    seed = int(options.get("seed", 0))
+    seed = _number(options, "seed", 0)
     plate = load_plate(options["plate"]) if "plate" in options else None
-    begin_s = float(options["begin"]) if "begin" in options else None
+    begin_s = _number(options, "begin", 0.0) if "begin" in options else None
     name = options.get("scene", "rest")
     return Scene(name, rows, columns, seed=seed, faults=faults, plate=plate, begin_s=begin_s)
 

@@ -200,6 +200,8 @@ IMPOSSIBLE: list[dict[str, Any]] = [
     *({"rate_hz": rate_hz} for rate_hz in (-1.0, 1e7, 0.0001, float("inf"), float("nan"))),
     {"adc_prescaler": "fast"},
     {"mode": "middle"},
+    {"rows": 8.5},  # was taken for 8
+    {"rows": "8"},
 ]
 
 

@@ -191,7 +191,7 @@ def test_one_that_cannot_be_opened_closes_all(pty_board: Serve) -> None:
     path = pty_board("emulator://8x8?unit=1").path
     with pytest.raises(PortError, match="no port /dev/ttyACM99"):
         ohmskin.open_all([path, "/dev/ttyACM99", *units(2)])
-    with ohmskin.open(path) as skin:  # it is free again
+    with ohmskin.open(Path(path)) as skin:  # it is free again
         assert skin.info.scanning == 0
 
 

@@ -55,12 +55,12 @@ class Field:
             value = members[value]
         elif self.flags and isinstance(value, tuple):
             value = sum(ENUMS[self.flags].values[str(name)] for name in value)
-        integers = tuple(map(int, value if isinstance(value, tuple) else (value,)))
-        most = (1 << int(self.type[1:])) - 1
-        if len(integers) != self.count or not all(0 <= each <= most for each in integers):
-            many = f"{self.count} numbers " if self.count > 1 else ""
-            raise ValueError(f"{self.name} is {value}: must be {many}from 0 to {most}")
-        return integers
+        given, most = value if isinstance(value, tuple) else (value,), (1 << int(self.type[1:])) - 1
+        integers = tuple(int(each) for each in given if isinstance(each, int | np.integer))
+        if self.count == len(given) == sum(0 <= each <= most for each in integers):
+            return integers
+        what = f"{self.count} whole numbers" if self.count > 1 else "a whole number"
+        raise ValueError(f"{self.name} is {value!r}: must be {what} from 0 to {most}")
 
     def value(self, integers: tuple[int, ...]) -> Value:
         """The value that integers of a payload stand for.
