@@ -62,9 +62,9 @@ class CheapBoard(EmulatedBoard):
 
     def __init__(self, codes: NDArray[np.uint16], unit_id: int) -> None:
         self.made = codes
-        super().__init__(lambda _: codes[0] / 1024, 8, 8, rate_hz=RATE_HZ, unit_id=unit_id)
+        super().__init__(lambda *_: codes[0] / 1024, 8, 8, rate_hz=RATE_HZ, unit_id=unit_id)
 
-    def codes_at(self, time_s: float) -> NDArray[np.uint16]:
+    def codes_at(self, time_s: float, mode: str = "near") -> NDArray[np.uint16]:
         return self.made[round(time_s * RATE_HZ) % len(self.made)]
 
 

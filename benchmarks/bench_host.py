@@ -67,7 +67,7 @@ SERVE_SECONDS = "60"  # at most: this process ends it sooner
 def serve(seconds: float) -> None:
     """Serve an emulated board: print its port, then, when stdin closes, when it wrote each scan."""
     ratio = np.random.default_rng(0).random((8, 8, 4))
-    board = EmulatedBoard(lambda _: ratio, 8, 8, rate_hz=RATE_HZ)
+    board = EmulatedBoard(lambda *_: ratio, 8, 8, rate_hz=RATE_HZ)
     master, slave = os.openpty()
     tty.setraw(slave)
     print(os.ttyname(slave), flush=True)
