@@ -38,7 +38,7 @@ def read_bounded(path: PathName, most_bytes: int) -> bytes:
 
 
 def check_place(path: Path, *inputs: Path | None) -> None:
-    """Raise ValueError if no file can be written there, or an input is, before it is made."""
+    """Raise ValueError if `path` is no place for a file, or is one of the inputs."""
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"{path}: cannot be written: say a file in a directory there is")
     if path.exists() and any(each and each.exists() and each.samefile(path) for each in inputs):

@@ -111,8 +111,9 @@ def test_wires_of_the_simulated_desk_are_measured(run: Run) -> None:
     url = "simavr://uno?scene=corners&desk=1&seed=1"
     answer = json.loads(run("doctor", url, "--press", "--wires", "100,200", "--json").out)
     assert [each["id"] for each in answer["findings"]] == ["settling"]  # 100 pF a line
-    # 0.98 +- 0.05; on a busy machine, which has other scans of each touch, 1.03 +- 0.05.
-    assert float(answer["measured"]["wires"].split()[0]) == pytest.approx(1, abs=0.1)
+    share, _, std = answer["measured"]["wires"].split()[:3]
+    assert float(std) <= 0.06  # on an untouched skin, or one not held, there is none
+    assert abs(float(share) - 1) < 3 * float(std)
 
 
 def test_drift_of_a_press_is_no_slow_node() -> None:
