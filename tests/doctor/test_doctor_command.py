@@ -112,7 +112,7 @@ def test_wires_of_the_simulated_desk_are_measured(run: Run) -> None:
     answer = json.loads(run("doctor", url, "--press", "--wires", "100,200", "--json").out)
     assert [each["id"] for each in answer["findings"]] == ["settling"]  # 100 pF a line
     share, _, std = answer["measured"]["wires"].split()[:3]
-    assert float(std) <= 0.06  # on an untouched skin, or one not held, there is none
+    assert float(std) <= 0.06
     assert abs(float(share) - 1) < 3 * float(std)
 
 
