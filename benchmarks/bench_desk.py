@@ -36,7 +36,7 @@ from bars import at_least, at_most, report  # beside this file
 
 from desk import DeskSkin, desk_skin, examined  # tests/helpers
 from ohmskin.circuit.skin import readings
-from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import MODES

@@ -56,7 +56,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import Readings, estimate_file, load_readings

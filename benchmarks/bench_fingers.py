@@ -45,7 +45,7 @@ from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.circuit.skin import readings
 from ohmskin.emulate.scenes import BEGIN_S, Scene
-from ohmskin.estimate.base import NO_WIRES, SkinKnowledge
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.codes import quantise, ratio_from_codes

@@ -40,7 +40,7 @@ import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.presses import Calibrator, Presses
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.estimate.base import WireOhm
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.codes import quantise, ratio_from_codes

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.matrix import MatrixEstimator
 from ohmskin.estimate.ohm import OhmEstimator
 from ohmskin.estimate.paper import LsqEstimator, PaperEstimator, RegularizedEstimator

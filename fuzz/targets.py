@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from calibrations import calibration
 from ohmskin.calibrate.tables import load_force_log, load_press_table
 from ohmskin.errors import PortError, RecordingError
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link import framing, protocol

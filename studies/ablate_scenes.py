@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import Readings, load_readings

@@ -27,7 +27,7 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.emulate.faults import OPEN_OHM, joined_readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
 from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, knowledge_of, skin_at_rest, touch

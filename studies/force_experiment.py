@@ -27,7 +27,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import NO_WIRES
+from ohmskin.estimate.knowledge import NO_WIRES
 from ohmskin.estimate.methods import METHODS, VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.force.regression import ForceRegression, fit_power

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.link import protocol
 from ohmskin.link.framing import encode
 from ohmskin.link.messages import BoardDecoder, Scan

@@ -25,7 +25,8 @@ from ohmskin.errors import (
 )
 
 if TYPE_CHECKING:
-    from ohmskin.estimate.base import Estimate, Estimator, SkinKnowledge, WireOhm
+    from ohmskin.estimate.base import Estimate, Estimator
+    from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
     from ohmskin.estimate.methods import METHODS, make_estimator
     from ohmskin.force.calibration import Calibration, load_calibration
     from ohmskin.force.contacts import Contact
@@ -72,7 +73,8 @@ __version__ = "0.1.0"
 
 # Where a name is from. Its module is imported when the name is first asked for.
 _MODULES = {
-    "estimate.base": ("Estimate", "Estimator", "SkinKnowledge", "WireOhm"),
+    "estimate.base": ("Estimate", "Estimator"),
+    "estimate.knowledge": ("SkinKnowledge", "WireOhm"),
     "estimate.methods": ("METHODS", "make_estimator"),
     "force.calibration": ("Calibration", "load_calibration"),
     "force.contacts": ("Contact",),

@@ -25,7 +25,7 @@ from ohmskin.cli.doctor import gather
 from ohmskin.doctor.examine import examine
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
-from ohmskin.estimate.base import WireOhm
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link import session
 from ports import Serve

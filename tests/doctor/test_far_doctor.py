@@ -28,7 +28,7 @@ from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
 from ohmskin.doctor.signal import Rest
 from ohmskin.emulate.simavr import PROGRAM
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.calibration import Rest as CalibratedRest
 from ohmskin.link.codes import quantise

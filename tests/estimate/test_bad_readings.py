@@ -8,7 +8,8 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import Estimator, SkinKnowledge, WireOhm
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from skins import told
 from studies.trials import skin_at_rest, touch

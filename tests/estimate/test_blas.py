@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 import numpy as np, scipy.linalg
 from threadpoolctl import threadpool_info
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.ohm import OhmEstimator
 
 def blas_threads():

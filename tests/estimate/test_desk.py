@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from desk import DeskSkin, desk_skin
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import MODES
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ohmskin.circuit.skin import Skin, ratio_from_current, readings
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import solve_ports, voltage_squared
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.estimate.ohm import voltage_level

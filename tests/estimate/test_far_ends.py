@@ -9,7 +9,8 @@ import pytest
 from network import laplacian_readings  # tests/helpers
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, Skin, all_readings, end_admittance
-from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.protocol import MODES

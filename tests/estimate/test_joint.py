@@ -15,6 +15,7 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, CellPrior, WireBelief
@@ -157,7 +158,7 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
         of_cells = np.where(square < 1, square, 1 + np.log(square))
         return float(np.sum(residual**2) + of_cells.sum() + off @ inverse @ off)
 
-    belief = WireBelief(3, 4, (100.0, 200.0, None))
+    belief = WireBelief(3, 4, WireOhm(100.0, 200.0))
     found = FullFit(prior, belief, 6e4, ports, prior.expected)
     assert not found.message
     best = np.concatenate([found.cell, found.wires])

@@ -6,7 +6,7 @@ import pytest
 
 from ohmskin.circuit.skin import Skin, current_from_ratio, ratio_from_current, readings
 from ohmskin.estimate import paper
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.matrix import MatrixEstimator
 from ohmskin.estimate.paper import (
     MAX_ITERATIONS,

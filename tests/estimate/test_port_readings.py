@@ -8,7 +8,7 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_readings import ALIKE_FRAMES, PortReader
 from skins import ten_bits, told
 from studies.conditions import shorted_readings

@@ -8,7 +8,7 @@ import pytest
 
 from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
-from ohmskin.estimate.base import NO_WIRES
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE, LAYER_STD, SEGMENT_STD, WireBelief
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
@@ -243,7 +243,7 @@ def test_told_wires_do_not_mislead_under_two_large_fingertips(seed: int) -> None
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     """Against the textbook's covariance form, two lessons, with what fades after each."""
     random = np.random.default_rng(8)
-    belief = WireBelief(2, 3, (100.0, 200.0, None))
+    belief = WireBelief(2, 3, WireOhm(100.0, 200.0))
     layers, own = np.kron(np.eye(2), np.ones((6, 1))), SEGMENT_STD**2 * np.eye(12)
     mean, covariance = np.log([100.0, 200.0]), LAYER_STD**2 * np.eye(2)
     for _ in range(2):
@@ -284,7 +284,7 @@ def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
         system = by_layers @ by_layers.T + noise
         belief.learn(by_layers, left, np.linalg.cholesky(system), instead=instead)
 
-    taught, never = (WireBelief(2, 3, (100.0, 200.0, None)) for _ in range(2))
+    taught, never = (WireBelief(2, 3, WireOhm(100.0, 200.0)) for _ in range(2))
     teach(taught, 0)
     teach(taught, 1)
     teach(taught, 2, instead=True)
@@ -295,7 +295,7 @@ def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
 
 
 def test_a_touch_alone_does_not_take_the_lesson_before_it_away() -> None:
-    belief = WireBelief(2, 3, (100.0, 200.0, None))
+    belief = WireBelief(2, 3, WireOhm(100.0, 200.0))
     lesson = belief.by_layers(np.ones((2, 2))), np.ones(2), 3.0 * np.eye(2)
     belief.learn(*lesson)
     taught = belief.log_layers

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
 from ohmskin.force.curve import POWER
 from ohmskin.force.regression import ForceRegression

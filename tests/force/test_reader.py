@@ -15,7 +15,7 @@ from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, calibration, of_scene
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
-from ohmskin.estimate.base import NO_WIRES
+from ohmskin.estimate.knowledge import NO_WIRES
 from ohmskin.estimate.methods import LEVEL_METHODS
 from ohmskin.estimate.prior import UNKNOWN_LAYER_STD
 from ohmskin.force.calibration import load_calibration

@@ -7,7 +7,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.regression import ForceRegression
 

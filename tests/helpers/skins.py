@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import Readings, load_readings
 from places import DATA

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.tables import ForceLog, PressTable
-from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest

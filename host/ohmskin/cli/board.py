@@ -17,7 +17,7 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
-from ohmskin.estimate.base import NO_WIRES, WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.link.serial_port import SerialPort, serial_ports

@@ -20,7 +20,7 @@ from ohmskin.doctor.far import segments_of
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, comparison
 from ohmskin.doctor.wires import CornerScans
-from ohmskin.estimate.base import WireOhm
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan

@@ -20,7 +20,7 @@ from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured, limited
 from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import check_place, whole_file
 from ohmskin.link.codes import quantise, ratio_from_codes

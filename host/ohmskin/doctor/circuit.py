@@ -35,7 +35,7 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.signal import Rest
-from ohmskin.estimate.base import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 
 WIRE_OHM: Final = (100.0, 200.0)  # [ohm] Top and bottom segments are so unless told otherwise.

@@ -33,7 +33,7 @@ from ohmskin.circuit import skin as circuit
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Place
 from ohmskin.doctor.signal import Rest
 from ohmskin.doctor.wires import KNOWN
-from ohmskin.estimate.base import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD
 from ohmskin.link.protocol import ADC_BITS

@@ -43,7 +43,8 @@ from ohmskin.circuit.skin import (
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.signal import NOISY_LSB, RestScans, examine_settling, examine_signal
-from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import ADC_BITS
 

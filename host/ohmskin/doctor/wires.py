@@ -46,7 +46,8 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit, current_std
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
 from ohmskin.doctor.signal import Rest, RestScans, rounding_std_lsb, settling
-from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD

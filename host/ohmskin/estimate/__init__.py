@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From readings to the conductance of every cell: the methods behind one interface.
 
-Takes readings (rows, columns, 4) and what is known of the skin (`base.SkinKnowledge`), gives a
+Takes readings (rows, columns, 4) and what is known of the skin (`knowledge.SkinKnowledge`), gives a
 `base.Estimate` with standard deviations, and the level that a force is read from. `methods` makes
 an estimator by its name. `port_readings` says which frames cannot be trusted.
 

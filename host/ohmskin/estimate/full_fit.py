@@ -34,7 +34,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
-from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE,

@@ -24,9 +24,10 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
-from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution, WireOhm
+from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_readings import PortReadings, cell_of
 from ohmskin.estimate.prior import (
@@ -71,7 +72,7 @@ class JointEstimator(Estimator):
 
     def wires(self) -> WireOhm:
         """As told, until a frame has taught more."""
-        return super().wires() if self._learned_from is None else WireOhm(*self._belief.learned())
+        return super().wires() if self._learned_from is None else self._belief.learned()
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""

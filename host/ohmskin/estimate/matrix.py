@@ -41,13 +41,8 @@ from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import impedance_of, port_difference
-from ohmskin.estimate.base import (
-    MAX_CELL_SIEMENS,
-    MIN_CELL_SIEMENS,
-    Estimator,
-    SkinKnowledge,
-    Solution,
-)
+from ohmskin.estimate.base import Estimator, Solution
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.ohm import conductance_from_current, port_current
 from ohmskin.estimate.port_readings import PortReadings
 

@@ -4,7 +4,8 @@
 from importlib import import_module
 from typing import Final
 
-from ohmskin.estimate.base import Estimator, SkinKnowledge
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge
 
 _WHERE: Final = {
     "ohm": ("ohm", "OhmEstimator"),

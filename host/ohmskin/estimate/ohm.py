@@ -16,7 +16,8 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
-from ohmskin.estimate.base import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, Estimator, Solution
+from ohmskin.estimate.base import Estimator, Solution
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings, cell_of
 
 # Beyond what any cell could draw by this many standard deviations, a reading is at fault.

@@ -54,7 +54,8 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.errors import ctrl_c_kept
-from ohmskin.estimate.base import Estimator, SkinKnowledge, Solution
+from ohmskin.estimate.base import Estimator, Solution
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.matrix import CellFit, solve_ports
 from ohmskin.estimate.port_readings import PortReadings, cell_of
 

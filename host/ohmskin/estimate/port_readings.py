@@ -49,10 +49,8 @@ A frame is at fault, and its answer not to be relied on, where
   line.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,10 +68,8 @@ from ohmskin.circuit.skin import (
     node_ratio,
     reference_ohm,
 )
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
-
-if TYPE_CHECKING:
-    from ohmskin.estimate.base import SkinKnowledge
 
 _MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}  # by degrees of freedom
 # Sign of a reading in what the other lines draw: more at the top node, less at the bottom one.

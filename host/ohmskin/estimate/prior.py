@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.small import solve, solve_lower
+from ohmskin.estimate.knowledge import WireOhm
 
 # Deviations (..._STD) are of the log of a resistance.
 UNTOUCHED_STD: Final = 1.0  # of a cell about all cells' level, before its rest is read
@@ -121,10 +122,8 @@ class CellPrior:
 class WireBelief:
     """Mean and covariance of the log wire resistances of a skin of rows x columns."""
 
-    def __init__(
-        self, rows: int, columns: int, wires: tuple[float | None, float | None, float | None]
-    ) -> None:
-        """wires: what is known of them, a `WireOhm`."""
+    def __init__(self, rows: int, columns: int, wires: WireOhm) -> None:
+        """wires: what is known of them before any frame."""
         self.shape = (rows, columns)
         *ohms, log_std = wires
         layer_std = UNKNOWN_LAYER_STD if None in ohms else LAYER_STD
@@ -176,10 +175,11 @@ class WireBelief:
         """Standard deviation of the log of the layer that is known less."""
         return float(np.hypot(*self._root.T).max())
 
-    def learned(self) -> tuple[float, float, float]:
-        """A `WireOhm`: mean segments of the layers [ohm], deviation of the log of both together."""
+    def learned(self) -> WireOhm:
+        """Mean segments of the layers, and the deviation of the log of both together."""
         top, bottom = np.exp(self.log_layers)
-        return float(top), float(bottom), float(np.linalg.norm(self._root.sum(axis=0)) / 2)
+        log_std = float(np.linalg.norm(self._root.sum(axis=0)) / 2)
+        return WireOhm(float(top), float(bottom), log_std)
 
     def layers(self, log_wires: Float) -> Float:
         """Top and bottom segments (2, R, C) [ohm] of these log resistances (2RC,)."""

@@ -45,7 +45,7 @@ from scipy.linalg import lapack
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, port_difference, wire_current
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
-from ohmskin.estimate.base import MAX_CELL_SIEMENS
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE,

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
-from ohmskin.estimate.base import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require

@@ -20,7 +20,8 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.errors import TareRefused
-from ohmskin.estimate.base import NO_WIRES, Estimate, SkinKnowledge
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest

@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR
-from ohmskin.estimate.base import Estimate, SkinKnowledge, WireOhm, check_ratio
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import PathName, naming, whole_file
 from ohmskin.link.protocol import ENUMS

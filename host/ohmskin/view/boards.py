@@ -22,7 +22,8 @@ from ohmskin import opening
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import as_near
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
-from ohmskin.estimate.base import Estimate, SkinKnowledge
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of a skin before a frame is read: its size, its references, its rest, its wires.
+
+Estimators, and the modules that prepare readings for them, are told a `SkinKnowledge`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR, check_references, current_std
+from ohmskin.link.codes import check_adc_bits, ratio_std
+from ohmskin.link.messages import Hello
+from ohmskin.link.protocol import MODES
+
+# No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
+MIN_CELL_SIEMENS: Final = 1e-9
+MAX_CELL_SIEMENS: Final = 1.0
+
+
+class WireOhm(NamedTuple):
+    """Nominal resistance of one wire segment of each layer [ohm]; None where it is not known.
+
+    log_std: standard deviation of the log of both together, where they were measured.
+    """
+
+    top: float | None = None
+    bottom: float | None = None
+    log_std: float | None = None
+
+    def check(self) -> Self:
+        """Itself. Raises ValueError, naming the field, for what is not finite or below 0."""
+        names = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
+        for name, number in zip(names, self, strict=True):
+            if number is not None and not (np.isfinite(number) and number >= 0):
+                raise ValueError(f"{name} is {number}, it must be finite and >= 0")
+        return self
+
+    @property
+    def both(self) -> tuple[float, float] | None:
+        """Top and bottom; None unless both are known."""
+        return None if self.top is None or self.bottom is None else (self.top, self.bottom)
+
+
+NO_WIRES: Final = WireOhm()
+
+
+@dataclass(frozen=True, eq=False)
+class SkinKnowledge:
+    """What is known of a skin before a frame is read.
+
+    rows, columns: its size. ref_top_ohm, ref_bottom_ohm [ohm]. adc_bits: resolution of the
+    readings, None when they are exact. rest_ratio: readings (R, C, 4) of the untouched skin.
+    nominal_wire_ohm: a wire segment of each layer [ohm], where known. reading_names: of each cell.
+    Raises ValueError for a value that cannot be.
+    """
+
+    rows: int
+    columns: int
+    ref_top_ohm: float = DEFAULT_REF_OHM
+    ref_bottom_ohm: float = DEFAULT_REF_OHM
+    adc_bits: int | None = None
+    rest_ratio: Float | None = None
+    nominal_wire_ohm: WireOhm = NO_WIRES
+    reading_names: tuple[str, ...] = NEAR
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError(f"a skin has at least 1x1 cells, not {self.rows}x{self.columns}")
+        check_references(self.ref_top_ohm, self.ref_bottom_ohm)
+        if self.adc_bits is not None:
+            check_adc_bits(self.adc_bits)
+        if self.rest_ratio is not None:
+            cells = self.rows, self.columns
+            rest = check_ratio(self.rest_ratio, *cells, "rest_ratio", self.reading_names).copy()
+            rest.setflags(write=False)
+            object.__setattr__(self, "rest_ratio", rest)
+        self.nominal_wire_ohm.check()
+
+    @classmethod
+    def of(
+        cls, board: Hello, rest_ratio: Float | None = None, nominal_wire_ohm: WireOhm = NO_WIRES
+    ) -> Self:
+        """What is known of the skin at this board."""
+        size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
+        names = MODES[board.mode]
+        return cls(*size, *references, board.adc_bits, rest_ratio, nominal_wire_ohm, names)
+
+    @property
+    def ratio_std(self) -> float:
+        """Standard deviation of one reading, as a ratio to Vdd."""
+        return ratio_std(self.adc_bits)
+
+    @property
+    def current_std(self) -> float:
+        """Standard deviation of a cell's port current per Vdd [S]."""
+        return current_std(self.ratio_std, self.ref_top_ohm, self.ref_bottom_ohm)
+
+    @property
+    def ref_ohm(self) -> float:
+        """Both reference resistors in series [ohm]: all that limits a shorted port's current."""
+        return self.ref_top_ohm + self.ref_bottom_ohm
+
+
+def check_ratio(
+    ratio: ArrayLike, rows: int, columns: int, name: str = "ratio", of: Sequence[str] = NEAR
+) -> Float:
+    """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell."""
+    readings = np.asarray(ratio, dtype=np.float64)
+    expected = (rows, columns, len(of))
+    if readings.shape != expected:
+        raise ValueError(f"{name} has shape {readings.shape}, this skin {expected}")
+    # Written so that NaN fails too.
+    good = (readings >= 0) & (readings <= 1)
+    if not good.all():
+        row, column, k = (int(index) for index in np.argwhere(~good)[0])
+        raise ValueError(
+            f"{name} of cell ({row}, {column}), reading {of[k].upper()}, is "
+            f"{readings[row, column, k]:g}, not in 0..1"
+        )
+    return readings
