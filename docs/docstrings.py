@@ -19,10 +19,10 @@ class Docstrings(griffe.Extension):
     def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
         """A docstring has been read."""
         if obj.docstring:
-            obj.docstring.value = _indented(obj.docstring.value)
+            obj.docstring.value = indented(obj.docstring.value)
 
 
-def _indented(text: str) -> str:
+def indented(text: str) -> str:
     """A table goes from its first border, a session from its first prompt, to a blank line."""
     out, inside = [], False
     for line in text.splitlines():

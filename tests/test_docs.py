@@ -211,7 +211,7 @@ def test_a_page_that_loads_from_another_host_is_refused() -> None:
 
 def test_tables_and_sessions_in_docstrings_stay_as_they_are() -> None:
     text = "Symbols\n\n=== ===\na   b\n=== ===\n\nx[i] [ohm]\n\n>>> f()\n1\n\nend"
-    shown = loaded("docstrings")._indented(text)
+    shown = loaded("docstrings").indented(text)
     assert "\n    === ===\n    a   b\n    === ===\n" in shown
     assert "\n    >>> f()\n    1\n" in shown
     assert "\nx[i] \\[ohm]\n" in shown
