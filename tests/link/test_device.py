@@ -432,9 +432,28 @@ def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_mean_is_not_of_scans_of_two_modes() -> None:
     """Where somebody configures the board meanwhile, the mean is of the scans after that."""
     near, far = (list(itertools.islice(Bench(f"{REST}&mode={mode}"), 9)) for mode in MODES)
-    mean = ohmskin.Device.mean_ratio([*near[:4], *far], 0.05)  # type: ignore[arg-type]
-    np.testing.assert_allclose(mean, np.mean([scan.ratio for scan in far[:6]], axis=0))
+    mean = device.mean_ratio([*near[:4], *far])
+    np.testing.assert_allclose(mean, np.mean([scan.ratio for scan in far], axis=0))
     assert np.abs(mean - near[0].ratio).max() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("seconds", "times_s", "taken"),
+    [
+        (1.0, (5.0, 5.4, 5.9, 6.1, 6.2), 4),  # the one that comes then is the last
+        (0.0, (5.0, 5.4), 1),
+        (float("inf"), (5.0, 5.4), 2),
+        (1.0, (5.0, 5.4, 0.1, 0.6, 0.8, 0.9), 5),  # the board was reset after 0.4 s
+    ],
+)
+def test_scans_for_so_long_by_the_board_s_clock(
+    seconds: float, times_s: tuple[float, ...], taken: int
+) -> None:
+    """The host reads all of them at once, as it does after it was busy for a while."""
+    codes = np.zeros((1, 1, 4), np.uint16)
+    scans = iter([Scan(codes, n, round(1e6 * time_s), 9.0, 0) for n, time_s in enumerate(times_s)])
+    assert len(list(device.scans_for(scans, seconds))) == taken
+    assert len(list(scans)) == len(times_s) - taken  # no scan is taken too many
 
 
 def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,7 @@ from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.force.regression import MIN_PRESSES
-from ohmskin.link.device import Device
+from ohmskin.link.device import Device, mean_ratio
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
 
@@ -226,10 +226,10 @@ def _rest_ratio(given: Recording, rest_s: float) -> Float:
     """Mean readings (R, C, 4) of so many first seconds; 0: the recorded tare."""
     if rest_s:
         first_s = given.scans[0].host_time_s
-        untouched = [scan.ratio for scan in given.scans if scan.host_time_s - first_s <= rest_s]
+        untouched = [scan for scan in given.scans if scan.host_time_s - first_s <= rest_s]
         if len(untouched) == len(given.scans):
             raise ValueError(f"nothing touched the skin for {rest_s:g} s? all of it is not longer")
-        return np.asarray(np.mean(untouched, axis=0))
+        return mean_ratio(untouched)
     tares = [tare for tare in given.tares if tare.is_of(given.scans[-1])]
     if not tares:
         what = f"no tare in mode {given.scans[-1].mode} in it" if given.tares else "no tare in it"

@@ -22,7 +22,7 @@ from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, compari
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
-from ohmskin.link.device import Device
+from ohmskin.link.device import Device, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import latency_timer
@@ -224,20 +224,17 @@ def _look(device: Device, seconds: float, **wanted: Any) -> tuple[Hello, list[Sc
 
 
 def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
-    for scan in device:
-        scans.append(scan)
-        elapsed_s = scan.host_time_s - scans[0].host_time_s
-        if elapsed_s >= seconds * (1 if len(scans) >= LEAST_SCANS else LONGEST):
-            return
+    # Slow scans are looked at for longer: few of them do not tell noise.
+    least_s = (LEAST_SCANS - 1) / device.info.rate_hz
+    for scan in scans_for(device, min(max(seconds, least_s), LONGEST * seconds)):
+        scans.append(scan)  # one by one, so that those before an error are kept
 
 
 def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
     """Until three corners and then three others were pressed, or it has taken too long."""
-    begin_s = None
-    for scan in device:
-        begin_s = scan.host_time_s if begin_s is None else begin_s
+    for scan in scans_for(device, WAIT_S):
         presses.take(scan)
-        if presses.done or scan.host_time_s - begin_s >= WAIT_S:
+        if presses.done:
             return
         tell(*words.guidance(presses))
 

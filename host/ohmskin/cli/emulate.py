@@ -16,7 +16,7 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.cli.board import Seconds
 from ohmskin.cli.demo import URL
 from ohmskin.cli.record import progress
-from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured, limited
+from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured
 from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
@@ -24,6 +24,7 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import check_place, whole_file
 from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.device import scans_for
 from ohmskin.opening import emulated
 
 _METHODS: Final = ("ohm", "joint")
@@ -63,7 +64,7 @@ def compare(port: str, seconds: float, picture: Path) -> None:
         knowledge = SkinKnowledge.of(board, rest_ratio)
         estimators = [make_estimator(method, knowledge) for method in _METHODS]
         found = []
-        for scan in progress("scanning")(limited(iter(skin), 0, seconds)):
+        for scan in progress("scanning")(scans_for(skin, seconds)):
             found.append([estimator.estimate(scan.ratio) for estimator in estimators])
         stats = skin.stats
     now_s = 1e-6 * scan.time_us

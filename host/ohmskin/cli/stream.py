@@ -2,11 +2,12 @@
 """``ohmskin stream``: the skin at a port, live in a terminal or as JSON."""
 
 import json
+import math
 import os
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -26,7 +27,7 @@ from ohmskin.errors import ctrl_c_kept
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
-from ohmskin.link.device import Device
+from ohmskin.link.device import Device, scans_for
 from ohmskin.link.messages import Scan
 
 _out = Console()
@@ -74,7 +75,7 @@ def stream(
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
         with suppress(KeyboardInterrupt), ctrl_c_kept():
-            given = limited(iter(skin), scans, seconds)
+            given = islice(scans_for(skin, seconds or math.inf), scans or None)
             if as_json:
                 _print_scans(reader, given)
             else:
@@ -84,15 +85,6 @@ def stream(
         text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
         text += f"{lost.line.damaged} damaged frames, {lost.restarts} restarts"
         print(text, file=sys.stderr)  # noqa: T201
-
-
-def limited(scans: Iterator[Scan], count: int, seconds: float) -> Iterator[Scan]:
-    """So many scans, or those of so long; 0: no limit."""
-    end_s = time.monotonic() + seconds if seconds else float("inf")
-    for number, scan in enumerate(scans, start=1):
-        yield scan
-        if number == count or time.monotonic() >= end_s:
-            return
 
 
 def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:

@@ -5,7 +5,7 @@ import logging
 import threading
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from weakref import WeakValueDictionary
@@ -122,16 +122,10 @@ class Device(Closing):
 
         :raises DeviceLost: the board went away, or there are no more scans.
         """
-        scans: list[Scan] = []
-        for scan in self:
-            if scans and scan.kind != scans[0].kind:
-                scans.clear()  # somebody has configured the board
-            scans.append(scan)
-            if scan.time_us - scans[0].time_us >= 1e6 * seconds:
-                break
-        if not scans:
+        untouched = list(scans_for(self, seconds))
+        if not untouched:
             raise DeviceLost(f"{self.name} gives no more scans")
-        return np.asarray(np.mean([scan.ratio for scan in scans], axis=0))
+        return mean_ratio(untouched)
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already."""
@@ -306,3 +300,34 @@ def configuration(board: Hello) -> dict[str, protocol.Value]:
     asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
     same = ("rows", "columns", "adc_prescaler", "mode")
     return asked | {name: getattr(board, name) for name in same}
+
+
+def scans_for(scans: Iterable[Scan], seconds: float) -> Iterator[Scan]:
+    """The first of these scans, up to the one that comes `seconds` after the first: at least one.
+
+    The board's clock counts, because it says when the skin was read. The host's clock says when a
+    scan arrived: late and in bunches where the host is busy, and at any pace where a recording is
+    played. A board that was reset begins its clock anew: the time of its reset is not counted.
+    """
+    passed_us, before_us = 0, None
+    for scan in scans:
+        if before_us is not None:
+            passed_us += max(scan.time_us - before_us, 0)
+        before_us = scan.time_us
+        yield scan
+        if passed_us >= 1e6 * seconds:
+            return
+
+
+def mean_ratio(scans: Iterable[Scan]) -> Float:
+    """Mean readings (R, C, 4) of scans, at least one: how a skin at rest is measured.
+
+    Somebody may configure the board meanwhile. Readings of two sizes or modes have no mean, so only
+    the scans after the last change count.
+    """
+    alike: list[Scan] = []
+    for scan in scans:
+        if alike and scan.kind != alike[0].kind:
+            alike.clear()
+        alike.append(scan)
+    return np.asarray(np.mean([scan.ratio for scan in alike], axis=0))

@@ -6,20 +6,21 @@ killed, or whose disk was full, can be read up to its last whole chunk.
 """
 
 import json
+import math
 import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 from mcap.writer import Writer
 
 from ohmskin.errors import RecordingError
 from ohmskin.files import Closing, PathName
-from ohmskin.link.device import Device
+from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.force_sensor import ForceSensor
 from ohmskin.record.recording import (
@@ -209,33 +210,24 @@ def record(
     :raises RecordingError: as `Recorder.add`.
     :raises DeviceLost: as `ForceSensor.take`.
     """
-    first_s: float | None = None
+
+    def keep(scan: Scan) -> None:
+        if skin.info is not recorder.board:
+            recorder.add(skin.info)
+        recorder.add(scan)
+        for sample in sensor.take() if sensor is not None else ():
+            recorder.add(sample)
+        if beside is not None:
+            beside(scan)
+
+    coming = islice(scans_for(scans, seconds or math.inf), count or None)
     untouched: list[Scan] = []
     try:
-        for scan in scans:
-            first_s = scan.host_time_s if first_s is None else first_s
-            elapsed_s = scan.host_time_s - first_s
-            if skin.info is not recorder.board:
-                recorder.add(skin.info)
-            recorder.add(scan)
-            if tare_s and elapsed_s <= tare_s:
-                if untouched and scan.kind != untouched[0].kind:
-                    untouched.clear()  # somebody has configured the board
-                untouched.append(scan)
-            elif untouched:
-                recorder.add(_mean(untouched))
-                untouched.clear()
-            for sample in sensor.take() if sensor is not None else ():
-                recorder.add(sample)
-            if beside is not None:
-                beside(scan)
-            if recorder.scans == count or (seconds and elapsed_s >= seconds):
-                return
+        for scan in scans_for(coming, tare_s) if tare_s else ():
+            keep(scan)
+            untouched.append(scan)
     finally:
         if untouched:
-            recorder.add(_mean(untouched))
-
-
-def _mean(scans: list[Scan]) -> Tare:
-    rest_ratio = np.mean([scan.ratio for scan in scans], axis=0)
-    return Tare(rest_ratio, time.monotonic(), scans[0].mode)
+            recorder.add(Tare(mean_ratio(untouched), time.monotonic(), untouched[-1].mode))
+    for scan in coming:
+        keep(scan)

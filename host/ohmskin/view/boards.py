@@ -117,6 +117,7 @@ class _Recording(Closing):
         trouble = ""
         try:
             with self.recorder as recorder:
+                # By the host's clock, which says what had come when somebody ended it.
                 in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, skin)
                 record(skin, recorder, in_time)
         except OhmskinError as exc:
