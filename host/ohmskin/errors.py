@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can go wrong between a program and a board, and Ctrl-C. Every text says what to do."""
-
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
+"""What can go wrong between a program and a board. Every text says what to do."""
 
 
 class OhmskinError(Exception):
@@ -63,27 +57,3 @@ class RecordingError(OhmskinError):
 
 class RecordingEnded(DeviceLost):
     """The recording at a ``replay://`` port has been played to its end. Iterators end by it."""
-
-
-@contextmanager
-def ctrl_c_kept() -> Iterator[None]:
-    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and imports may swallow it."""
-    before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
-    if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield  # nothing is raised here
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        try:
-            before(number, frame)
-        except BaseException as exc:
-            raised.append(exc)
-            raise  # this ends Ipopt
-
-    signal.signal(signal.SIGINT, handle)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if raised:
-            raise raised[0]

@@ -8,7 +8,7 @@ import pytest
 import ohmskin
 from command_line import python
 from ohmskin.cli.main import app, run
-from ohmskin.errors import ctrl_c_kept
+from ohmskin.ctrl_c import ctrl_c_kept
 
 # What takes long to load, and only some commands or methods need.
 HEAVY = {

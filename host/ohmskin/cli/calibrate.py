@@ -26,8 +26,9 @@ from ohmskin.calibrate.tables import (
     save_press_table,
 )
 from ohmskin.cli.board import Port, Wires, wires_of
-from ohmskin.cli.record import progress, until_stopped
+from ohmskin.cli.record import progress
 from ohmskin.cli.stream import cell_table
+from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import RecordingError
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
@@ -312,7 +313,7 @@ def _guided(
     bar = Progress(*columns, console=_out, transient=True, disable=not _out.is_terminal)
     task = bar.add_task("", total=total)
     with bar:
-        for scan in until_stopped(iter(skin.latest, None)):
+        for scan in until_ctrl_c(iter(skin.latest, None)):
             found = calibrator.estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
             if step.wanted is not None and step.rise is not None:

@@ -2,7 +2,6 @@
 """Without a board: ``ohmskin emulate``, and the comparison with the truth of ``ohmskin demo``."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -17,6 +16,7 @@ from ohmskin.cli.board import Seconds
 from ohmskin.cli.demo import URL
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured
+from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.emulate.board import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
@@ -49,7 +49,7 @@ def emulate(
 ) -> None:
     """Serve an emulated board at a pseudo-terminal. Ctrl-C ends it."""
     board, _, faults = emulated(url)
-    with PtyServer(board, faults) as server, suppress(KeyboardInterrupt):
+    with PtyServer(board, faults) as server, ends_by_ctrl_c():
         print(server.path, flush=True)  # noqa: T201
         server.serve(seconds or float("inf"))
 

@@ -5,7 +5,6 @@ A command's module is imported when the command is run, or asked for its help.
 """
 
 import sys
-from collections import namedtuple
 from collections.abc import Callable
 from importlib import import_module
 from typing import Annotated, Any, Final
@@ -14,6 +13,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import ohmskin
+from ohmskin.ctrl_c import forget_ctrl_c
 from ohmskin.errors import OhmskinError
 
 # Where each command is, and what the list of commands says of it: the first paragraph of its help.
@@ -86,9 +86,7 @@ def main() -> None:
     try:
         run(app, "ohmskin")
     finally:
-        # Ctrl-C that falls into a text that is executed, such as a dataclass's, ends Python as a
-        # signal does, handled or not, unless one more such text comes after it.
-        namedtuple("Cleared", "")
+        forget_ctrl_c()
 
 
 def run(commands: Callable[..., Any], program: str) -> None:

@@ -2,12 +2,11 @@
 """``ohmskin record``, ``export`` and ``estimate``: scans in files."""
 
 import os
-import signal
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -24,6 +23,7 @@ import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
 from ohmskin.cli.board import Port, Scans, Seconds
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
+from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.methods import METHODS
 from ohmskin.files import check_place
@@ -84,7 +84,7 @@ def record(
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
             recording.record(
-                *(skin, recorder, until_stopped(skin)),
+                *(skin, recorder, until_ctrl_c(skin)),
                 count=scans,
                 seconds=seconds,
                 tare_s=tare_s,
@@ -105,35 +105,6 @@ def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
     console = Console(stderr=True)
     hidden = not console.is_terminal
     return partial(track, description=what, console=console, transient=True, disable=hidden)
-
-
-def until_stopped(scans: Iterable[_T]) -> Iterator[_T]:
-    """Pass scans on until Ctrl-C or SIGTERM comes: they end between two, never amid a write.
-
-    The signal interrupts the wait for the next scan, and nothing else.
-    """
-    is_stopped = waits = False
-
-    def handle(*_: object) -> None:
-        nonlocal is_stopped
-        is_stopped = True
-        if waits:
-            raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with suppress(KeyboardInterrupt):
-            source = iter(scans)
-            while True:
-                waits = True
-                scan = None if is_stopped else next(source, None)
-                waits = False
-                if scan is None:
-                    return
-                yield scan
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class PressDisplay:

@@ -6,7 +6,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -23,7 +23,7 @@ from typer import Option
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.cli.board import Port, Scans, Seconds
-from ohmskin.errors import ctrl_c_kept
+from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
@@ -74,7 +74,7 @@ def stream(
         reader = None if method == "none" else SkinReader(board, told, method=method)
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
-        with suppress(KeyboardInterrupt), ctrl_c_kept():
+        with ends_by_ctrl_c():
             given = islice(scans_for(skin, seconds or math.inf), scans or None)
             if as_json:
                 _print_scans(reader, given)

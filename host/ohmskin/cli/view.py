@@ -5,12 +5,12 @@ import os
 import sys
 import threading
 import webbrowser
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 from typer import Argument, Option
 
+from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.errors import OhmskinError
 from ohmskin.force.calibration import load_calibration
 
@@ -54,7 +54,7 @@ def view(
             # Some browsers return only when they are closed.
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
-    with suppress(KeyboardInterrupt):
+    with ends_by_ctrl_c():
         server.serve(
             ViewedBoards(ports or (), calibrations, Path(), force=force), host, http_port, started
         )

@@ -53,7 +53,7 @@ from ohmskin.circuit.skin import (
     ratio_from_current,
     readings,
 )
-from ohmskin.errors import ctrl_c_kept
+from ohmskin.ctrl_c import ctrl_c_kept
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.matrix import CellFit, solve_ports

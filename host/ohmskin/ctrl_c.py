@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ctrl-C: what it ends, and when. Nothing else in the package handles it.
+
+==================================  ==============================================  ============
+what runs                           what Ctrl-C does                                exit code
+==================================  ==============================================  ============
+``stream``, ``view``, ``emulate``   ends the body of `ends_by_ctrl_c` at once       0
+``record``, ``calibrate weights``   ends `until_ctrl_c` between two scans           0, weights 130
+anything else                       raises KeyboardInterrupt up to `cli.main.run`   130
+==================================  ==============================================  ============
+
+Commands of the first two rows have no end of their own, so Ctrl-C is their usual end, and no error.
+Those of the second row write what they read, and Ctrl-C must not come amid a write. 130 is what
+shells say of a program that Ctrl-C has ended.
+"""
+
+import signal
+import threading
+from collections import namedtuple
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import TypeVar
+
+_T = TypeVar("_T")
+
+
+@contextmanager
+def ctrl_c_kept() -> Iterator[None]:
+    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and imports may swallow it."""
+    before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield  # nothing is raised here
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        try:
+            before(number, frame)
+        except BaseException as exc:
+            raised.append(exc)
+            raise  # this ends Ipopt
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if raised:
+            raise raised[0]
+
+
+@contextmanager
+def ends_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C ends the body at once, wherever it is, and the program goes on after it."""
+    with suppress(KeyboardInterrupt), ctrl_c_kept():
+        yield
+
+
+def until_ctrl_c(scans: Iterable[_T]) -> Iterator[_T]:
+    """Pass scans on until Ctrl-C or SIGTERM comes: they end between two, never amid a write.
+
+    The signal interrupts the wait for the next scan, and nothing else.
+    """
+    is_stopped = waits = False
+
+    def handle(*_: object) -> None:
+        nonlocal is_stopped
+        is_stopped = True
+        if waits:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with suppress(KeyboardInterrupt):
+            source = iter(scans)
+            while True:
+                waits = True
+                scan = None if is_stopped else next(source, None)
+                waits = False
+                if scan is None:
+                    return
+                yield scan
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def forget_ctrl_c() -> None:
+    """Let a program that has handled Ctrl-C end with its own exit code.
+
+    Python remembers a Ctrl-C that fell into a text that is executed, such as a dataclass's: it ends
+    the process as a signal does, handled or not, unless one more such text comes after it.
+    """
+    namedtuple("Executed", "")
