@@ -19,6 +19,10 @@ class PortError(OhmskinError):
     """A port that cannot be opened: unknown, busy, not permitted, a wrong URL."""
 
 
+class PortUnusable(PortError):
+    """The URL is right, but the system does not give its port: not there, busy, not permitted."""
+
+
 class DeviceLost(OhmskinError):
     """The board has gone, or no longer says anything."""
 

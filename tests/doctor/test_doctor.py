@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bench_board import Bench, evidence
-from ohmskin.cli.doctor import gather
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, Severity
-from ohmskin.doctor.signal import Rest, RestScans, comparison, examine_signal, find_hum
+from ohmskin.doctor.gather import gather
+from ohmskin.doctor.signal import Rest, RestScans, examine_signal, find_hum, second_look
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
@@ -235,7 +235,7 @@ def test_second_look_is_what_a_board_takes() -> None:
     for url in ("1x1", "1x1?rate=50", "2x2?rate=1", "16x16", "16x16?rate=1", "16x16?rate=0", "8x8"):
         bench = Bench(f"emulator://{url}")
         board = bench.info
-        other = comparison(board)
+        other = second_look(board)
         if other is None:
             assert board.settle_us * 1.2 >= 3000
             continue

@@ -20,9 +20,9 @@ from calibrations import calibration
 from command_line import Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import readings
-from ohmskin.cli import doctor as doctor_command
-from ohmskin.cli.doctor import gather
+from ohmskin.doctor import gather as gathering
 from ohmskin.doctor.examine import examine
+from ohmskin.doctor.gather import gather
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.knowledge import WireOhm
@@ -35,8 +35,7 @@ from recordings import write_recording
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """For boards in real time."""
-    monkeypatch.setattr(doctor_command, "REST_S", 0.2)
-    monkeypatch.setattr(doctor_command, "SETTLED_S", 0.05)
+    monkeypatch.setattr(gathering, "SETTLED_S", 0.05)
     monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
 
 
@@ -234,6 +233,18 @@ def test_ports_that_do_not_answer_are_findings(run: Run, pty_board: Serve) -> No
         assert word in answer["findings"][0]["measured"]
         assert answer["findings"][0]["what_to_do"]
         assert "not sound" in answer["verdict"]
+
+
+def test_a_wrong_url_is_no_finding(run: Run) -> None:
+    """Even where no board is: a person wrote it, and no cable mends it."""
+    for url, word in (
+        ("/dev/ttyACM99?speed=1", "no option 'speed'"),
+        ("/dev/ttyACM99?baud=9600", "a board knows"),
+        ("simavr://none", "no simulated board 'none'"),
+        ("replay:///no/such.mcap", "No such file"),
+        ("emulator://8x8?plate=/no/such.csv", "/no/such.csv"),
+    ):
+        assert_one_line(run("doctor", url), word)
 
 
 @pytest.mark.parametrize("speed", [0, 1])

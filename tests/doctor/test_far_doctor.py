@@ -20,12 +20,12 @@ from command_line import Run, assert_one_line, well
 from lockstep import Rig, elf_of
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance
-from ohmskin.cli.doctor import gather
 from ohmskin.cli.doctor_words import verdict, words_of
 from ohmskin.doctor.circuit import examine_circuit
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
+from ohmskin.doctor.gather import gather
 from ohmskin.doctor.signal import Rest
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm

@@ -16,7 +16,7 @@ import ohmskin
 from bench_board import Bench
 from command_line import Run, assert_one_line
 from ohmskin.circuit.plate import load_plate
-from ohmskin.cli import doctor as doctor_command
+from ohmskin.doctor import gather as gathering
 from ohmskin.doctor.plate import Tolerance
 
 # One resistor a line, as docs/hardware.md says; and a chain, two a line.
@@ -297,7 +297,7 @@ def test_empty_fields_are_open(tmp_path: Path) -> None:
 def test_the_firmware_in_the_simulator(
     run: Run, write: Write, monkeypatch: pytest.MonkeyPatch, desk: str
 ) -> None:
-    monkeypatch.setattr(doctor_command, "CLOCK_S", 0.3)
+    monkeypatch.setattr(gathering, "CLOCK_S", 0.3)
     plate, there = write(PLATE), write(other(PLATE, **{"4,5": 49.35e3}), "there")
     code, told = verified(run, f"simavr://uno?plate={plate}{desk}", plate)
     assert code == 0, told["findings"]

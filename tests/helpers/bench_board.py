@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 
-from ohmskin.cli.doctor import gather
 from ohmskin.doctor.examine import Evidence
+from ohmskin.doctor.gather import gather
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.files import Closing

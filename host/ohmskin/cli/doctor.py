@@ -2,8 +2,8 @@
 """``ohmskin doctor``: one page of findings about the skin board at a port."""
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -15,34 +15,20 @@ import ohmskin
 from ohmskin import errors
 from ohmskin.cli import doctor_words as words
 from ohmskin.cli.board import Port, Wires, wires_of
-from ohmskin.doctor.examine import Evidence, examine
-from ohmskin.doctor.far import segments_of
+from ohmskin.doctor.examine import examine, measured_wires
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
-from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, comparison
-from ohmskin.doctor.wires import CornerScans
-from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.doctor.gather import Report, Step, gather
 from ohmskin.force.calibration import load_calibration
-from ohmskin.link.device import Device, scans_for
-from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import ENUMS
-from ohmskin.link.serial_port import latency_timer
 
-WAIT_S: Final = 30.0  # [s] A person has this long to press where they are asked to.
-CLOCK_S: Final = 1.0  # [s] A look by another ADC clock takes this long: it tells noise alone.
-TURNS: Final = 5  # [looks] So often each settle time is had while corners are pressed.
-TURN_S: Final = 0.3  # [s] Such a look takes this long: a hand drifts in more.
-LONGEST: Final = 2.0  # [1] A look at slow scans takes up to this many times as long.
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
 _UNANSWERED: Final = {
     errors.DeviceLost: Kind.LOST,
     errors.DeviceSilent: Kind.NOTHING_ANSWERS,
-    errors.PortError: Kind.PORT_UNUSABLE,
+    errors.PortUnusable: Kind.PORT_UNUSABLE,
     errors.ProtocolMismatch: Kind.PROTOCOL_MISMATCH,
 }
 
 _out = Console(soft_wrap=True, markup=False, highlight=False)
-# Says what is being done, and before it what a person is asked to press, if anything.
-Tell = Callable[..., None]
 
 
 def doctor(
@@ -63,180 +49,78 @@ def doctor(
     is wrong.
     """
     calibration = calibration or into
-    told = None if calibration is None else load_calibration(calibration)
-    nominal = wires_of(wires)
-    wire_ohm = nominal.both or (None if told is None else told.nominal_wire_ohm.both)
-    with terminal() as tell:
+    of_board = None if calibration is None else load_calibration(calibration)
+    wire_ohm = wires_of(wires).both
+    if wire_ohm is None and of_board is not None:
+        wire_ohm = of_board.nominal_wire_ohm.both
+    with terminal() as report:
         try:
             device = ohmskin.open(port, start=False)
         except errors.OhmskinError as exc:
             diagnosis = Diagnosis([_unanswered(port, exc)])
         else:
             with device:
-                if told is not None:
-                    told.check(device.info)
+                if of_board is not None:
+                    of_board.check(device.info)
                 if device.info.mode == "far":
                     if press:
                         raise ValueError("mode far shows the wires untouched: leave out --press")
                 elif into is not None and not (press and wire_ohm):
                     raise ValueError("in mode near, --into needs --press and nominal --wires")
-                evidence = gather(device, tell, wire_ohm, press=press)
-            diagnosis = examine(evidence)
+                evidence = gather(device, report, wire_ohm, press=press)
+            diagnosis = examine(replace(evidence, host_version=ohmskin.__version__))
     page = as_object(port, diagnosis)
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201
     else:
         print_page(page)
     if into is not None:
-        _keep_wires(diagnosis, wire_ohm, into)
+        _keep_wires(diagnosis, into)
     if diagnosis.worse:
         raise SystemExit(1)
 
 
-def _keep_wires(diagnosis: Diagnosis, wire_ohm: tuple[float, float] | None, into: Path) -> None:
+def _keep_wires(diagnosis: Diagnosis, into: Path) -> None:
     """Write the wires that presses or far ends showed into a calibration, with their deviation."""
-    measured = segments_of(diagnosis.lines)
-    if wire_ohm and diagnosis.pressed and diagnosis.pressed[0].known:
-        whole = diagnosis.pressed[0]
-        top, bottom = (whole.share * ohm for ohm in wire_ohm)
-        measured = WireOhm(top, bottom, whole.std / whole.share)
-    if measured is None:
+    wires = measured_wires(diagnosis)
+    if wires is None:
         raise ValueError(f"{into} is as it was: neither presses nor far ends have told the wires")
-    replace(load_calibration(into), nominal_wire_ohm=measured).save(into)
+    replace(load_calibration(into), nominal_wire_ohm=wires).save(into)
 
 
 def _unanswered(port: str, error: errors.OhmskinError) -> Finding:
-    """Why there is nothing to examine. Raises what is a wrong use instead."""
+    """Why there is nothing to examine. Raises what is a wrong use instead, as a wrong URL is."""
     kind = _UNANSWERED.get(type(error))
-    wrong_url = kind is Kind.PORT_UNUSABLE and ("://" in port or error.__cause__ is None)
-    if kind is None or wrong_url:
+    if kind is None:
         raise error
     remedy = error.remedy or "check the port's name and its cable"
-    told = {"port": port, "problem": error.problem, "remedy": remedy}
-    return Finding(kind, WHOLE_SKIN, {name: told[name] for name in kind.names})
+    values = {"port": port, "problem": error.problem, "remedy": remedy}
+    return Finding(kind, WHOLE_SKIN, {name: values[name] for name in kind.names})
 
 
 @contextmanager
-def terminal() -> Iterator[Tell]:
-    """On a terminal, one line changes. Elsewhere each request is printed once, and no progress."""
+def terminal() -> Iterator[Report]:
+    """Says each step of `gather` on a line of the terminal, which changes.
+
+    Elsewhere progress is of no use: each request to a person is printed, once.
+    """
     console, said = Console(stderr=True, markup=False, highlight=False), {""}
 
-    def print_once(doing: str, request: str = "") -> None:
+    def print_once(step: Step, detail: Any) -> None:
+        _, request = words.step_in_words(step, detail)
         if request not in said:
             said.add(request)
             console.print(request)
+
+    def update(step: Step, detail: Any) -> None:
+        doing, request = words.step_in_words(step, detail)
+        status.update(f"{request}; {doing}" if request else doing)
 
     if not console.is_terminal:
         yield print_once
         return
     with console.status("connecting") as status:
-        yield lambda doing, request="": status.update(f"{request}; {doing}" if request else doing)
-
-
-# ------------------------------------------------------------------------------- the examination
-
-
-def gather(
-    device: Device,
-    tell: Tell = lambda *told: None,
-    wire_ohm: tuple[float, float] | None = None,
-    *,
-    press: bool = False,
-    seconds: float = REST_S,
-    clocks: bool = False,
-) -> Evidence:
-    """What `examine` goes by, as far as the board lets. Leaves the board as it was.
-
-    seconds: how long the first look takes. clocks: whether to scan by each ADC clock, too.
-
-    :raises ValueError: somebody would be asked to press a skin of one row or column.
-    """
-    board, path = device.info, device.name.partition("?")[0]
-    evidence = Evidence(board, host_version=ohmskin.__version__)
-    # Wires of no resistance are none that could have changed.
-    evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
-    evidence.latency = None if "://" in path else latency_timer(path)
-    presses = CornerScans(board) if press else None
-    try:
-        tell("self-test")
-        with suppress(errors.CommandRefused):  # a recording has none
-            evidence.report = device.self_test()
-        tell(f"scanning {'the plate' if clocks else 'the untouched skin'} for {seconds:g} s")
-        _scan(device, evidence.scans, seconds)
-        evidence.board = device.info
-        other = comparison(evidence.board)
-        with suppress(errors.CommandRefused), put_back(device):
-            if other is not None:
-                tell("scanning with a longer settle time")
-                far = evidence.board.mode == "far"
-                evidence.settled = _look(device, FAR_S if far else SETTLED_S, **other)
-            for clock in ENUMS["adc_prescaler"].values if clocks else ():
-                tell(f"scanning by {clock}")
-                # As fast as it can: a slow clock does not reach the rate of the board.
-                by_clock = _look(device, CLOCK_S, adc_prescaler=clock, rate_hz=0)
-                evidence.clocks.append(by_clock)
-        if presses is not None:
-            evidence.presses = presses
-            _scan_presses(device, presses, tell)
-        if presses is not None and presses.done and other is not None:
-            tell("comparing settle times", "keep pressing")
-            usual = {"settle_us": board.settle_asked_us, "rate_hz": board.rate_asked_mhz / 1000}
-            with suppress(errors.CommandRefused), put_back(device):
-                for wanted in TURNS * (usual, other):
-                    evidence.pressed.append(_look(device, TURN_S, **wanted))
-    except errors.RecordingEnded:
-        pass  # all of the recording was read
-    except errors.DeviceLost as exc:
-        evidence.board, evidence.lost = device.info, str(exc)
-    evidence.stats = device.stats
-    return evidence
-
-
-@contextmanager
-def put_back(device: Device) -> Iterator[None]:
-    """Let the board stand still and then scan as before, however the body ends.
-
-    A board that is lost cannot be put back, and who reads it next is told.
-    """
-    board = device.info
-    device.stop()
-    try:
-        yield
-    finally:
-        with suppress(errors.DeviceLost):
-            device.stop()
-            device.configure(
-                rows=board.rows,
-                columns=board.columns,
-                rate_hz=board.rate_asked_mhz / 1000,
-                settle_us=board.settle_asked_us,
-                adc_prescaler=board.adc_prescaler,
-                mode=board.mode,
-            )
-
-
-def _look(device: Device, seconds: float, **wanted: Any) -> tuple[Hello, list[Scan]]:
-    """Scans of a board that is configured like this, and what it then says of itself."""
-    device.stop()
-    board, scans = device.configure(**wanted), list[Scan]()
-    _scan(device, scans, seconds)
-    return board, scans
-
-
-def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
-    # Slow scans are looked at for longer: few of them do not tell noise.
-    least_s = (LEAST_SCANS - 1) / device.info.rate_hz
-    for scan in scans_for(device, min(max(seconds, least_s), LONGEST * seconds)):
-        scans.append(scan)  # one by one, so that those before an error are kept
-
-
-def _scan_presses(device: Device, presses: CornerScans, tell: Tell) -> None:
-    """Until three corners and then three others were pressed, or it has taken too long."""
-    for scan in scans_for(device, WAIT_S):
-        presses.take(scan)
-        if presses.done:
-            return
-        tell(*words.guidance(presses))
+        yield update
 
 
 # ----------------------------------------------------------------------------------- the page

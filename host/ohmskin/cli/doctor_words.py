@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, LineWire, Place, WireShare
+from ohmskin.doctor.gather import Step
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.protocol import ENUMS
 
@@ -14,6 +15,14 @@ MOST_CELLS: Final = 6  # [cells] More are not named one by one.
 SEGMENT_KNOWN: Final = 0.15  # [1] A segment with a larger deviation is not told from the others.
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_STEPS: Final = {
+    Step.SELF_TEST: "self-test",
+    Step.SKIN: "scanning the untouched skin for {:g} s",
+    Step.PLATE: "scanning the plate for {:g} s",
+    Step.LONGER_SETTLING: "scanning with a longer settle time",
+    Step.ADC_CLOCK: "scanning by {}",
+    Step.PRESSED_SETTLING: "comparing settle times",
+}
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
 _WIDE: Final = "not known: press with something smaller than a cell, further apart"
@@ -141,6 +150,14 @@ def line_wire_in_words(line: LineWire) -> str:
     pairs = zip(line.segment_ohm, line.segment_std_ohm, strict=True)
     each = " ".join(f"{ohm:6.0f}" if std < SEGMENT_KNOWN * ohm else "     ?" for ohm, std in pairs)
     return f"{named(line.place):<18}{line.ohm:6.0f} +- {line.std_ohm:<4.0f}{each}"
+
+
+def step_in_words(step: Step, detail: Any) -> tuple[str, str]:
+    """What is being done, and what a person is asked to do meanwhile, if anything."""
+    if step is Step.PRESSES:
+        return guidance(detail)
+    request = "keep pressing" if step is Step.PRESSED_SETTLING else ""
+    return _STEPS[step].format(detail), request
 
 
 def guidance(presses: CornerScans) -> tuple[str, str]:

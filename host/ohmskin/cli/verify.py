@@ -2,7 +2,7 @@
 """``ohmskin verify``: a board against a reference plate, known resistors at its crossings."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,10 +14,11 @@ import ohmskin
 from ohmskin.circuit.plate import load_plate
 from ohmskin.circuit.skin import CONFIGURATIONS
 from ohmskin.cli.board import Port, Wires, wires_of
-from ohmskin.cli.doctor import as_object, gather, print_page, put_back, terminal
+from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
 from ohmskin.cli.stream import numbers
 from ohmskin.doctor.examine import examine
+from ohmskin.doctor.gather import gather, put_back
 from ohmskin.doctor.plate import PlateExam, Tolerance
 from ohmskin.files import check_place, whole_file
 
@@ -57,13 +58,13 @@ def verify(
         check_place(Path(path), plate)
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
-    with terminal() as tell, ohmskin.open(port, start=False) as device, put_back(device):
+    with terminal() as report, ohmskin.open(port, start=False) as device, put_back(device):
         rows, columns = exam.plate.shape
         rate_hz = device.info.rate_asked_mhz / 1000
         # Far ends add nothing: a plate has its lines' potential at both ends.
         device.configure(rows=rows, columns=columns, rate_hz=rate_hz, mode="near")
-        evidence = gather(device, tell, seconds=seconds, clocks=True)
-    evidence.loss = loss
+        evidence = gather(device, report, seconds=seconds, clocks=True)
+    evidence = replace(evidence, host_version=ohmskin.__version__, loss=loss)
     diagnosis = examine(evidence, exam.examine)
     page = as_object(port, diagnosis)
     figures = {

@@ -16,10 +16,11 @@ import numpy as np
 
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
-from ohmskin.doctor.far import examine_far, near_ends
+from ohmskin.doctor.far import examine_far, near_ends, segments_of
 from ohmskin.doctor.findings import Diagnosis, Kind, Place
 from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
 LEAST_TIMER_MS: Final = 1  # [ms] The timer of a USB bridge cannot be set to less.
@@ -111,6 +112,15 @@ def examine(
     order = list(Kind)
     diagnosis.findings.sort(key=lambda finding: order.index(finding.kind))
     return diagnosis
+
+
+def measured_wires(diagnosis: Diagnosis) -> WireOhm | None:
+    """A segment of each layer, as presses or far ends showed it; None if neither did."""
+    if diagnosis.nominal_ohm and diagnosis.pressed and diagnosis.pressed[0].known:
+        whole = diagnosis.pressed[0]
+        top, bottom = (whole.share * ohm for ohm in diagnosis.nominal_ohm)
+        return WireOhm(top, bottom, whole.std / whole.share)
+    return segments_of(diagnosis.lines)
 
 
 def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:

@@ -307,7 +307,7 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
 # ------------------------------------------------------------------------------------ settling
 
 
-def comparison(board: Hello) -> dict[str, Any] | None:
+def second_look(board: Hello) -> dict[str, Any] | None:
     """`settle_us` and `rate_hz` of a second look; None if it could show nothing new.
 
     The settle time is longer, where it can be; the rate is one at which no mains stands still.

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 import serial
 from serial.tools import list_ports
 
-from ohmskin.errors import DeviceLost, PortError
+from ohmskin.errors import DeviceLost, PortUnusable
 from ohmskin.link import protocol
 
 # A read waits so long when nothing comes [s]. Closing a device takes at most this long.
@@ -49,7 +49,7 @@ class Link(Protocol):
 class SerialLink:
     """A serial port, opened for this program alone.
 
-    :raises PortError: it does not exist, is in use, or may not be opened.
+    :raises PortUnusable: it does not exist, is in use, or may not be opened.
     """
 
     def __init__(self, path: str, baud: int = protocol.CONSTANTS["baud_default"]) -> None:
@@ -59,7 +59,7 @@ class SerialLink:
                 path, baud, timeout=READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as exc:
-            raise PortError(*_explain(path, exc)) from exc
+            raise PortUnusable(*_explain(path, exc)) from exc
         # Its line DTR does that; a pseudo-terminal has no such lines.
         self.resets_board = not os.path.realpath(path).startswith("/dev/pts/")
 
@@ -84,7 +84,7 @@ class SerialLink:
         try:
             self._port.baudrate = baud
         except (serial.SerialException, OSError, ValueError) as exc:
-            raise PortError(f"{self.name} cannot do {baud} baud: {exc}") from exc
+            raise PortUnusable(f"{self.name} cannot do {baud} baud: {exc}") from exc
 
     def close(self) -> None:
         """See `Link.close`."""

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measures a board for `examine`: which scans are taken, by which settings, for how long.
+
+A look is a number of scans by one configuration, with what the board said of itself then. The first
+look is as the board is configured. The others differ in one thing each (settle time, ADC clock), so
+that what they show otherwise is the fault of this thing.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from enum import Enum, auto
+from typing import Any, Final
+
+from ohmskin.doctor.examine import Evidence
+from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, second_look
+from ohmskin.doctor.wires import CornerScans
+from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
+from ohmskin.link.device import Device, scans_for
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import ENUMS
+from ohmskin.link.serial_port import latency_timer
+
+# [s] A person has this long to press all corners. Chosen: three times what it takes.
+WAIT_S: Final = 30.0
+# [s] A look by another ADC clock takes this long. Chosen: it shows noise alone, which needs little.
+CLOCK_S: Final = 1.0
+# [looks] While corners are pressed, each settle time gets this many looks. Chosen: their scatter
+# shows how much the hand drifts.
+TURNS: Final = 5
+# [s] Such a look takes this long. Chosen: in longer ones, a hand drifts more.
+TURN_S: Final = 0.3
+# [1] A look at slow scans takes up to this many times as long. Chosen: all looks within 10 s.
+LONGEST: Final = 2.0
+
+
+class Step(Enum):
+    """What `gather` does next. It is reported with a detail, which is named here."""
+
+    SELF_TEST = auto()  # None
+    SKIN = auto()  # seconds for which the untouched skin is scanned
+    PLATE = auto()  # seconds for which the plate is scanned
+    LONGER_SETTLING = auto()  # None
+    ADC_CLOCK = auto()  # name of the clock
+    PRESSES = auto()  # a CornerScans: what is pressed, and where to press next
+    PRESSED_SETTLING = auto()  # None: the corners must stay pressed
+
+
+Report = Callable[[Step, Any], None]
+
+
+def gather(
+    device: Device,
+    report: Report = lambda step, detail: None,
+    wire_ohm: tuple[float, float] | None = None,
+    *,
+    press: bool = False,
+    seconds: float = REST_S,
+    clocks: bool = False,
+) -> Evidence:
+    """What `examine` goes by, as far as the board lets. Leaves the board as it was.
+
+    report: is told each step before it is done, and each scan while somebody presses.
+    wire_ohm: nominal wires of a segment, top and bottom.
+    press: whether somebody is asked to press corners.
+    seconds: how long the first look takes.
+    clocks: whether to scan by each ADC clock, too. Only plates have this done.
+
+    :raises ValueError: somebody would be asked to press a skin of one row or column.
+    """
+    board, path = device.info, device.name.partition("?")[0]
+    evidence = Evidence(board)
+    # Wires without resistance cannot have changed: there is nothing to compare with.
+    evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
+    evidence.latency = None if "://" in path else latency_timer(path)
+    presses = CornerScans(board) if press else None
+    try:
+        report(Step.SELF_TEST, None)
+        with suppress(CommandRefused):  # a recording has none
+            evidence.report = device.self_test()
+        report(Step.PLATE if clocks else Step.SKIN, seconds)
+        _scan(device, evidence.scans, seconds)
+        evidence.board = device.info
+        settling = second_look(evidence.board)
+        with suppress(CommandRefused), put_back(device):
+            if settling is not None:
+                report(Step.LONGER_SETTLING, None)
+                far = evidence.board.mode == "far"
+                evidence.settled = _look(device, FAR_S if far else SETTLED_S, settling)
+            for clock in ENUMS["adc_prescaler"].values if clocks else ():
+                report(Step.ADC_CLOCK, clock)
+                # As fast as it can: a slow clock does not reach the rate of the board.
+                settings = {"adc_prescaler": clock, "rate_hz": 0}
+                evidence.clocks.append(_look(device, CLOCK_S, settings))
+        if presses is not None:
+            evidence.presses = presses
+            _scan_presses(device, presses, report)
+            if presses.done and settling is not None:
+                report(Step.PRESSED_SETTLING, None)
+                with suppress(CommandRefused), put_back(device):
+                    for settings in TURNS * (_settings(board), settling):
+                        evidence.pressed.append(_look(device, TURN_S, settings))
+    except RecordingEnded:
+        pass  # all of the recording was read
+    except DeviceLost as exc:
+        evidence.board, evidence.lost = device.info, str(exc)
+    evidence.stats = device.stats
+    return evidence
+
+
+@contextmanager
+def put_back(device: Device) -> Iterator[None]:
+    """Let the board stand still, and configure it as before, however the body ends.
+
+    A board that is lost cannot be put back. This raises nothing: who reads it next gets an error.
+    """
+    settings = _settings(device.info)
+    device.stop()
+    try:
+        yield
+    finally:
+        with suppress(DeviceLost):
+            device.stop()
+            device.configure(**settings)
+
+
+def _settings(board: Hello) -> dict[str, Any]:
+    """What `Device.configure` must be given for a board to scan as this one does."""
+    return {
+        "rows": board.rows,
+        "columns": board.columns,
+        "rate_hz": board.rate_asked_mhz / 1000,
+        "settle_us": board.settle_asked_us,
+        "adc_prescaler": board.adc_prescaler,
+        "mode": board.mode,
+    }
+
+
+def _look(device: Device, seconds: float, settings: dict[str, Any]) -> tuple[Hello, list[Scan]]:
+    """What a board with these settings says of itself, and its scans."""
+    device.stop()
+    board, scans = device.configure(**settings), list[Scan]()
+    _scan(device, scans, seconds)
+    return board, scans
+
+
+def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
+    """Append scans for so long, one by one: they stay if the board goes away meanwhile.
+
+    A board that scans slowly gets more time, since a few scans do not show noise.
+    """
+    least_s = (LEAST_SCANS - 1) / device.info.rate_hz
+    for scan in scans_for(device, min(max(seconds, least_s), LONGEST * seconds)):
+        scans.append(scan)
+
+
+def _scan_presses(device: Device, presses: CornerScans, report: Report) -> None:
+    """Scan until three corners and then three others were pressed, or it has taken too long."""
+    for scan in scans_for(device, WAIT_S):
+        presses.take(scan)
+        if presses.done:
+            return
+        report(Step.PRESSES, presses)
