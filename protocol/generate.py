@@ -148,7 +148,7 @@ def _rows(frame: Frame) -> list[str]:
         kind = f.type + (f"[{f.count}]" if f.count > 1 else "")
         link = f" (`{f.enum or f.flags}`)" if f.enum or f.flags else ""
         rows.append(f"| {offset} | `{f.name}` | {kind} | {f.unit or ''} | {f.doc}{link} |")
-        offset += int(f.type[1:]) // 8 * f.count
+        offset += f.size
     if frame.tail:
         rows.append(f"| {offset} | `{frame.tail['name']}` | packed | | {frame.tail['doc']} |")
     return rows

@@ -408,7 +408,7 @@ def test_an_error_of_a_process_is_one_line(what: str, command: Command) -> None:
 
 
 def test_a_silent_port(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
+    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
     assert_one_line(run("info", "emulator://4x4?silent=1"), "silent", "ohmskin flash")
 
 

@@ -198,7 +198,7 @@ def test_a_failed_upload_is_said(run: Run, writer: Writer, attach: Attach) -> No
 def test_a_board_that_stays_silent_is_said(
     run: Run, attach: Attach, pty_board: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
+    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
     attach((pty_board(board(), silent_s=30.0).path, "uno"))
     assert "is silent" in failed(run)
 

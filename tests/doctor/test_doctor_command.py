@@ -36,7 +36,7 @@ from recordings import write_recording
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """For boards in real time."""
     monkeypatch.setattr(gathering, "SETTLED_S", 0.05)
-    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
+    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
 
 
 def test_a_sound_board_takes_less_than_ten_seconds(run: Run, benches: list[Bench]) -> None:

@@ -194,7 +194,7 @@ def test_a_serial_port_that_goes_away(use: str, pty_board: Serve) -> None:
 
 def test_a_board_that_stops_talking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.3)
-    monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(session, "COMMAND_TIMEOUT_S", 0.1)
     link = SteppedLink("emulator://2x2?stall=600")
     with Session(link) as skin:
         skin.start()
@@ -211,7 +211,7 @@ def test_a_port_with_other_things_to_say(
     monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
 ) -> None:
     """As of a board with another sketch, which prints lines for ever."""
-    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
+    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
     master, path = silent_port
     done = threading.Event()
 
@@ -242,8 +242,8 @@ def test_a_board_on_a_desk(board: str) -> None:
 
 
 def test_a_lost_answer_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "_COMMAND_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(session, "_OFTEN", 80 * [("baud_default", True, 0.05)])
+    monkeypatch.setattr(session, "COMMAND_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(session, "ATTEMPTS", 80 * [("baud_default", True, 0.05)])
     for seed in range(5):
         with ohmskin.open(f"emulator://2x2?rate=200&drop=0.15&seed={seed}", start=False) as skin:
             for unit_id in range(10):
@@ -267,7 +267,7 @@ def test_refusals_on_a_bad_line_stay_refusals() -> None:
 def test_no_thread_or_file_is_left_when_opening_fails(
     monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
 ) -> None:
-    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
+    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
     for fault in ("silent=1", "foreign=1", "vanish=1e-6", ""):
         with pytest.raises(OhmskinError):
             ohmskin.open(f"emulator://2x2?{fault}" if fault else silent_port[1])

@@ -232,7 +232,7 @@ def test_a_mega_s_boot_loader_is_done_before_the_host_asks_again(simulate: Simul
     program = "int main(void) { transmitter(); send('!'); send('O'); for (;;) {} }"
     sim = simulate(program, "megaatmega2560", bootloader="board")
     question = bytes.fromhex("00058101872500")  # get_hello
-    (_, _, first_s), (_, _, second_s), (_, _, third_s), *_ = session._SELDOM[1:]
+    (_, _, first_s), (_, _, second_s), (_, _, third_s), *_ = session.ATTEMPTS_AFTER_RESET[1:]
     sim.reset()
     sim.run(0.7)  # shortly before it starts the program
     for baud, listen_s in ((500_000, first_s), (1_000_000, second_s)):

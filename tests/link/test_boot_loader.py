@@ -5,6 +5,7 @@ The numbers are those of the Mega's loader (firmware/sim/README.md): left alone,
 program after 0.83 s; a byte that it hears keeps it for 5 s more.
 """
 
+import threading
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -45,11 +46,11 @@ class SilentLink:
 def link(monkeypatch: pytest.MonkeyPatch) -> SilentLink:
     silent = SilentLink()
 
-    def wait(_: Session, ready: Callable[[], bool], limit_s: float) -> bool:
+    def wait_for(_: object, ready: Callable[[], bool], limit_s: float) -> bool:
         silent.now_s += limit_s
         return ready()
 
-    monkeypatch.setattr(Session, "_wait", wait)
+    monkeypatch.setattr(threading.Condition, "wait_for", wait_for)
     return silent
 
 

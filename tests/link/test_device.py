@@ -414,16 +414,16 @@ def test_latest_waits_as_long_as_told() -> None:
 
 
 def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    skin = ohmskin.open("emulator://1x1")
-    assert isinstance(skin, Session)
-    both, closed = threading.Barrier(2), list[str]()
-    monkeypatch.setattr(skin._link, "close", lambda: closed.append("once"))
+    link = SteppedLink("emulator://1x1")
+    skin, both, closed = Session(link), threading.Barrier(2), list[str]()
+    skin.start()
+    monkeypatch.setattr(link, "close", lambda: closed.append("once"))
 
-    def send(_: str) -> None:
+    def write(_: bytes) -> None:
         with suppress(threading.BrokenBarrierError):
             both.wait(0.3)
 
-    monkeypatch.setattr(skin, "_send", send)
+    monkeypatch.setattr(link, "write", write)
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda _: skin.close(), range(2)))
     assert closed == ["once"]

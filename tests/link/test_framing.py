@@ -16,7 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ohmskin.link import framing, protocol
-from ohmskin.link.framing import LARGEST_FRAME, Decoder, RawFrame
+from ohmskin.link.framing import MAX_FRAME_BYTES, Decoder, RawFrame
 from ohmskin.link.messages import BoardDecoder, Scan
 
 
@@ -83,7 +83,7 @@ pieces = st.lists(
     st.one_of(
         frames.map(wire),
         st.binary(max_size=60),
-        st.integers(1, 2 * LARGEST_FRAME).map(lambda size: b"\x11" * size),
+        st.integers(1, 2 * MAX_FRAME_BYTES).map(lambda size: b"\x11" * size),
     ),
     max_size=8,
 )
@@ -91,8 +91,8 @@ pieces = st.lists(
 
 @settings(max_examples=200)
 @given(pieces, st.lists(st.integers(0, 1 << 16), max_size=30))
-@example([b"\x11" * LARGEST_FRAME, b"\0"], [LARGEST_FRAME - 1])
-@example([b"\x11" * (LARGEST_FRAME + 1), b"\0"], [LARGEST_FRAME, LARGEST_FRAME + 1])
+@example([b"\x11" * MAX_FRAME_BYTES, b"\0"], [MAX_FRAME_BYTES - 1])
+@example([b"\x11" * (MAX_FRAME_BYTES + 1), b"\0"], [MAX_FRAME_BYTES, MAX_FRAME_BYTES + 1])
 def test_how_the_stream_is_cut_changes_nothing(pieces: list[bytes], cuts: list[int]) -> None:
     stream = b"".join(pieces)
     whole, parts = Decoder(), Decoder()
@@ -142,7 +142,7 @@ def test_damage_to_one_frame_takes_no_other_along(
     assert [f for f in found[1:-1] if f != middle] == []
 
 
-@pytest.mark.parametrize(("size", "count"), [(4096, 2500), (1, 20 * LARGEST_FRAME)])
+@pytest.mark.parametrize(("size", "count"), [(4096, 2500), (1, 20 * MAX_FRAME_BYTES)])
 def test_an_endless_stretch_does_not_fill_the_memory(size: int, count: int) -> None:
     """10 MB without a delimiter, or fewer bytes one by one."""
     decoder, chunk = Decoder(), b"\x11" * size

@@ -156,7 +156,7 @@ def test_the_boards_of_this_machine(pty_board: Serve, attach: Attach) -> None:
 def test_what_is_no_skin_is_skipped_in_a_search(
     pty_board: Serve, attach: Attach, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "_OFTEN", session._OFTEN[:1])
+    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
     other, skin = (pty_board(f"emulator://8x8?{what}").path for what in ("silent=1", "unit=5"))
     attach((other, "uno"), (skin, "uno"))
     with ohmskin.open_all() as skins:

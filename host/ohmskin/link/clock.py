@@ -16,12 +16,18 @@ h(u)   host time of u: h(u) = t_0 + q (u - u_0)                                 
 ====== ===================================================================================== ====
 
 A USB bridge's latency timer, buffers and a busy machine can only delay what a board sends, so that
-t >= h(u). Therefore h is the line below all points (u, t) whose distances to the points have the
-least sum [Moon1999]. This line is the edge of the points' lower convex hull at the mean of u
-[Zhang2002]. Late points change nothing, however many and however late they are, as long as some
-points are on time. A line of least squares would move with the load of the machine.
+t >= h(u). Therefore h is a line below all points (u, t): of all such lines, the one whose distances
+to the points have the least sum [Moon1999]. It is found without a search. The lower convex hull of
+the points is the chain of lines that a rubber band would make, stretched below them, and h is the
+line of that chain at the mean of u [Zhang2002]. Late points change nothing, however many they are
+and however late, as long as some points are on time. A line of least squares would move with the
+load of the machine.
 
 A delay that all scans have in common cannot be seen and is part of h.
+
+The line is fitted to the last `WINDOW_S`, because a resonator drifts while it warms. A new line
+would make times jump, and perhaps go back. Therefore the difference to the old line is added at
+first, and fades within a second.
 
 [Moon1999]: Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
 measurements". [Zhang2002]: Zhang, Liu, Xia, "Clock synchronization algorithms for network
@@ -38,27 +44,29 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.link import protocol
-from ohmskin.link.framing import MAX_BLOCK, cobs_encode
-from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.framing import MAX_BLOCK_BYTES, cobs_encode
+from ohmskin.link.messages import MAX_RATE_ERROR, Hello, Scan
 
-# Board time of the points that a line is fitted to [s]. A ceramic resonator that warms drifts by up
-# to 10 ppm a second, which bends the line by 1 ms in this time.
+# Board time of the points that a line is fitted to. A ceramic resonator that warms drifts by up to
+# 10 ppm a second, which bends the line by 1 ms in this time.
 WINDOW_S: Final = 30.0
-# Largest |q - 1|: a ceramic resonator is up to 0.5 % off, a crystal 0.01 %.
-MAX_RATE_ERROR: Final = 0.006
-# A scan that comes this much before h shows that a clock has stepped [s].
+# A scan that comes this much before h shows that a clock has stepped. Chosen: no sound line is off
+# by as much, and a host that slept for a shorter time can be followed by the slow way.
 STEP_S: Final = 0.05
-# Of each block of so much board time only the earliest point is kept [s].
+# Of each block of so much board time only the point that came earliest is kept: the others do not
+# change the line, and 120 points are fitted in no time. Chosen.
 _BLOCK_S: Final = 0.25
-# A better line takes effect within this time [s], so that times never jump or go back.
+# The difference between the old line and a better one fades within this time. Chosen: its largest
+# value, `STEP_S`, is then 5 % of the time that passes, so times go on rising.
 _SLEW_S: Final = 1.0
-# A byte takes ten bits on a line of 8N1: a start bit, eight data bits and a stop bit.
+# A byte takes ten bits on a line of 8N1, as frames.toml says of `baud_default`: a start bit, eight
+# data bits and a stop bit.
 _BITS_PER_BYTE: Final = 10
-# The last conversion and the pass of the main loop that packs its cell [s]: 0.1 ms fits the built
-# firmware in the simulator (tests/link/test_timing.py).
+# Time for the last conversion and for the pass of the main loop that packs its cell: 0.1 ms fits
+# the built firmware in the simulator (tests/link/test_timing.py).
 _FIRMWARE_S: Final = 0.1e-3
 
-_Point = tuple[float, float]
+_Point = tuple[float, float]  # (u, t)
 
 
 def slot_s(board: Hello) -> float:
@@ -80,48 +88,62 @@ def reading_offsets_s(board: Hello) -> Float:
 def line_delay_s(scan: Scan, board: Hello) -> float:
     """Time from a scan's end to its last byte at the end of a serial line [s], without USB.
 
-    A COBS block begins with its length, so up to 254 bytes (5 ms at 500 kbaud) wait for the next
-    zero in the codes: what a skin shows moves the arrival of its scans. The delay is the maximum
-    over all blocks of (time from the scan's end until the block is known + time that the line takes
-    from this block on). It leaves out that frames may wait for those before them.
+    The board sends while it scans. But a COBS block begins with its length, so the board can send
+    none of its bytes, up to 254 (5 ms at 500 kbaud), before it knows where the next zero is. So
+    what a skin shows moves the arrival of its scans, and whoever knows when scans came can take
+    this delay off. The last byte can leave no earlier than any block allows. Therefore the delay is
+    the maximum, over all blocks, of
+
+        time from the scan's end until the block is known, negative if that is before the end
+        + time that the line takes for this block and all after it
+
+    It leaves out that frames may wait for those before them.
     """
     if board.board == "emulated":
         # An emulated board sends a whole scan at the end of its period.
         return 1 / board.rate_hz - scan_s(board)
     kind = protocol.FRAMES["scan"]
-    # With numbers of any scan, because zeros among them end blocks that are early anyway.
+    # Any counters will do: zeros among them end blocks that are known before the scan ends.
     counters = {"scan": 1, "time_us": 1, "dropped": 0, "rx_errors": 0}
     payload = kind.pack(**counters, rows=scan.rows, columns=scan.columns, mode=scan.mode)
     header = bytes([kind.id, 1]) + payload
     codes = protocol.pack_codes(scan.codes)
     # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
     wire = cobs_encode(header + codes + b"\x01\x01")
-    byte_s = _BITS_PER_BYTE / board.baud
-    known_byte_s = scan_s(board) / len(codes)
-    delay_s, at, unknown = 0.0, 0, len(header) + len(codes)
-    while at < len(wire):
-        unknown -= wire[at] - (wire[at] == MAX_BLOCK)  # no zero stands for the end of a full block
-        line_s = (len(wire) + 1 - at) * byte_s
-        delay_s = max(delay_s, line_s - max(unknown, 0) * known_byte_s)
-        at += wire[at]
+    byte_on_line_s = _BITS_PER_BYTE / board.baud
+    byte_of_scan_s = scan_s(board) / len(codes)
+    delay_s, begin, unknown = 0.0, 0, len(header) + len(codes)  # bytes of content not known yet
+    while begin < len(wire):
+        # A block has as many bytes as it stands for: it has its length, and lacks the zero at its
+        # end. A full block stands for one byte less, because no zero comes after it.
+        unknown -= wire[begin] - (wire[begin] == MAX_BLOCK_BYTES)
+        on_line_s = (len(wire) + 1 - begin) * byte_on_line_s  # and the delimiter
+        delay_s = max(delay_s, on_line_s - max(unknown, 0) * byte_of_scan_s)
+        begin += wire[begin]
     return delay_s + _FIRMWARE_S
 
 
 class _Line(NamedTuple):
-    """h: its rate q, and a point (u, t) [s] of it."""
+    """h, by its rate q and one point (u, t) [s] of it."""
 
     rate: float
     u_s: float
     t_s: float
 
     def at(self, u_s: float) -> float:
+        """h(u) [s]."""
         return self.t_s + self.rate * (u_s - self.u_s)
 
 
-def _below(points: Collection[_Point], rate: float) -> _Line:
-    """The line below points (u, t) with rising u [Zhang2002]. rate: that of a single point."""
+def _line_below(points: Collection[_Point], rate: float) -> _Line:
+    """The line below points whose u rise [Zhang2002]. rate: the one to take if there is one point.
+
+    The rate is kept within what a resonator can have. Where that changes it, the line is moved to
+    touch the points from below again.
+    """
     hull: list[_Point] = []
     for u_s, t_s in points:
+        # A point above the line from the one before it to the new one is not part of the hull.
         while len(hull) > 1 and _slope(hull[-2], hull[-1]) >= _slope(hull[-2], (u_s, t_s)):
             hull.pop()
         hull.append((u_s, t_s))
@@ -149,9 +171,11 @@ class BoardClock:
 
     def __init__(self) -> None:
         self._line: _Line | None = None
-        self._points: deque[_Point] = deque()  # the earliest of each block
-        self._block_u_s = self._last_u_s = 0.0  # begin of the last block; the last time
-        self._slew_s, self._slew_from_s = 0.0, 0.0
+        self._points: deque[_Point] = deque()  # of each block, the one that came earliest
+        self._block_u_s = 0.0  # where the newest block begins
+        self._last_u_s = 0.0  # of the newest point
+        # What the line before the present one gave more at this time u; see the module.
+        self._slew_s, self._slew_from_u_s = 0.0, 0.0
 
     def add(self, time_us: float, host_time_s: float) -> None:
         """Learn that something at `time_us` of the board's clock was known here at `host_time_s`.
@@ -159,8 +183,9 @@ class BoardClock:
         Calls come in the order of the board's clock. A time that goes back is a restart.
         """
         u_s, t_s = 1e-6 * time_us, host_time_s
-        late_s = 0.0 if self._line is None else t_s - self._line.at(u_s)
-        if self._line is None or u_s <= self._last_u_s or late_s < -STEP_S:
+        line = self._line
+        late_s = 0.0 if line is None else t_s - line.at(u_s)
+        if line is None or u_s <= self._last_u_s or late_s < -STEP_S:
             self._restart(u_s, t_s)
             return
         self._last_u_s = u_s
@@ -170,10 +195,10 @@ class BoardClock:
                 self._points.popleft()
             self._points.append((u_s, t_s))
             self._block_u_s = u_s
-        elif late_s < self._points[-1][1] - self._line.at(self._points[-1][0]):
-            self._points[-1] = (u_s, t_s)
+        elif late_s < self._points[-1][1] - line.at(self._points[-1][0]):
+            self._points[-1] = (u_s, t_s)  # less late than the earliest of this block so far
         if ends_block or late_s < 0:
-            self._learn(u_s)
+            self._fit(u_s)
 
     def host_s(self, time_us: float) -> float:
         """Host time at which the board's clock showed `time_us`, on `time.monotonic()` [s].
@@ -183,8 +208,8 @@ class BoardClock:
         if self._line is None:
             raise ValueError("no scan has been added: its arrival tells the time")
         u_s = 1e-6 * time_us
-        left = 1 - max(u_s - self._slew_from_s, 0.0) / _SLEW_S
-        return self._line.at(u_s) + self._slew_s * max(left, 0.0)
+        slew_share = 1 - max(u_s - self._slew_from_u_s, 0.0) / _SLEW_S
+        return self._line.at(u_s) + self._slew_s * max(slew_share, 0.0)
 
     def _restart(self, u_s: float, t_s: float) -> None:
         rate = self._line.rate if self._line else 1.0  # a restart does not change the resonator
@@ -193,20 +218,22 @@ class BoardClock:
         self._last_u_s = self._block_u_s = u_s
         self._slew_s = 0.0
 
-    def _learn(self, u_s: float) -> None:
+    def _fit(self, u_s: float) -> None:
+        """Fit the line to the points anew, which changes h from the time `u_s` on."""
         assert self._line is not None
         before_s = self.host_s(1e6 * u_s)
-        self._line = _below(self._points, self._line.rate)
-        # So little that times go on rising while it fades.
+        self._line = _line_below(self._points, self._line.rate)
         self._slew_s = min(max(before_s - self._line.at(u_s), -STEP_S), STEP_S)
-        self._slew_from_s = u_s
+        self._slew_from_u_s = u_s
 
 
 def scan_times_s(scans: list[Scan]) -> Float:
     """Times of recorded scans on the host's clock [s], (n,), without the jitter of their arrival.
 
-    All are late by about a scan. Every 15 s of each run of the board's clock there is a knot with
-    the h of the 30 s around it; between knots, times are interpolated.
+    All are late by about a scan. Nothing has to wait for what comes later here, as it does in
+    `BoardClock`: at every half `WINDOW_S` of the board's clock there is a knot, whose time is by
+    the line that fits the window around it. Between knots, times are interpolated. A board that is
+    reset begins its clock anew, so the scans before and after a reset are taken separately.
     """
     host_s = np.array([scan.host_time_s for scan in scans])
     board_s = 1e-6 * np.array([scan.time_us for scan in scans])
@@ -220,6 +247,6 @@ def scan_times_s(scans: list[Scan]) -> Float:
             first, last = np.searchsorted(u_s, [knot_s - WINDOW_S / 2, knot_s + WINDOW_S / 2])
             points = list(zip(u_s[first:last].tolist(), t_s[first:last].tolist(), strict=True))
             if points:
-                knots.append((knot_s, _below(points, 1.0).at(knot_s)))
+                knots.append((knot_s, _line_below(points, 1.0).at(knot_s)))
         times_s[part] = np.interp(u_s, *np.array(knots).T)
     return times_s

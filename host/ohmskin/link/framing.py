@@ -3,6 +3,12 @@
 
 encode   type, sequence, payload  ->  0x00 COBS(type sequence payload crc16) 0x00
 Decoder  bytes as they come       ->  whole, valid frames, and counts of what was not
+
+COBS takes the zero bytes out of a frame's content, so that a zero byte on the line always ends a
+frame. A decoder that has lost its place, by damage or because it came late, waits for the next zero
+and is right again. On the line, the content is a row of blocks: a byte that says how long the block
+is, this byte included, and bytes other than zero. In the content a zero follows each block, but not
+the last one, nor a block of the largest length.
 """
 
 import struct
@@ -10,23 +16,34 @@ from dataclasses import dataclass
 
 from ohmskin.link import protocol
 
-# The longest COBS block [bytes]: its length byte and 254 others.
-MAX_BLOCK = 0xFF
-_HEADER_SIZE = 2
+# The longest COBS block: its length is a byte, which counts itself [Cheshire1999].
+MAX_BLOCK_BYTES = 0xFF
+# Type and sequence number, and the CRC. frames.toml says so in the sentence of `framing`; a key of
+# its own would change the layout CRC, and boards of before would have to be flashed.
+_HEADER = struct.Struct("<BB")
 _CRC = struct.Struct("<H")
-_LARGEST_CONTENT = (
-    _HEADER_SIZE
+# Sequence numbers go on with 0 after so many. An `ack` repeats that of its command, in this field.
+SEQUENCE_SPAN = protocol.FRAMES["ack"].span("command_sequence")
+# Type, sequence, payload and CRC of the largest scan: no frame has more.
+_MAX_CONTENT_BYTES = (
+    _HEADER.size
     + protocol.FRAMES["scan"].struct.size
     + protocol.codes_size(protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
     + _CRC.size
 )
-# The longest stretch between two delimiters that can be a frame [bytes].
-LARGEST_FRAME = _LARGEST_CONTENT + 1 + _LARGEST_CONTENT // (MAX_BLOCK - 1)
+# The longest stretch between two delimiters that can be a frame: COBS adds a byte, and one for each
+# block that is full.
+MAX_FRAME_BYTES = _MAX_CONTENT_BYTES + 1 + _MAX_CONTENT_BYTES // (MAX_BLOCK_BYTES - 1)
 
 
 @dataclass(frozen=True)
 class RawFrame:
-    """A frame whose CRC is right. This host may still not know its `type`."""
+    """A frame whose CRC is right. This host may still not know its `type`.
+
+    type: id of the kind of frame.
+    sequence: the sender's count of frames, modulo `SEQUENCE_SPAN`.
+    payload: all between these two and the CRC.
+    """
 
     type: int
     sequence: int
@@ -35,10 +52,13 @@ class RawFrame:
 
 @dataclass
 class DecoderStats:
-    """What a `Decoder` has seen: bytes (octets), valid frames, and damaged stretches.
+    """What a `Decoder` has been fed. A stretch is what stands between two delimiters.
 
-    crc_errors: COBS with a wrong CRC. cobs_errors: not COBS, or too short for a frame. overlong:
-    longer than any frame.
+    octets: bytes.
+    frames: valid frames.
+    crc_errors: stretches that are COBS, but whose CRC is wrong.
+    cobs_errors: stretches that are not COBS, or too short for a frame.
+    overlong: stretches longer than any frame.
     """
 
     octets: int = 0
@@ -54,39 +74,46 @@ class DecoderStats:
 
 
 def cobs_encode(content: bytes) -> bytes:
-    """`content` without zero bytes (consistent overhead byte stuffing, Cheshire & Baker 1999)."""
+    """`content` without zero bytes: consistent overhead byte stuffing [Cheshire1999].
+
+    [Cheshire1999]: Cheshire, Baker, "Consistent overhead byte stuffing", IEEE/ACM Transactions on
+    Networking 7(2).
+    """
     out = bytearray()
-    for stretch in content.split(protocol.DELIMITER):
-        *full, rest = (
-            stretch[at : at + MAX_BLOCK - 1] for at in range(0, len(stretch) + 1, MAX_BLOCK - 1)
-        )
+    step = MAX_BLOCK_BYTES - 1
+    for run in content.split(protocol.DELIMITER):
+        *full, last = (run[at : at + step] for at in range(0, len(run) + 1, step))
         for block in full:
-            out += bytes([MAX_BLOCK]) + block
-        out += bytes([len(rest) + 1]) + rest
-    if full and not rest:
-        out.pop()  # nothing follows a full block at the end
+            out += bytes([MAX_BLOCK_BYTES]) + block
+        out += bytes([len(last) + 1]) + last
+    if full and not last:
+        out.pop()  # an empty block is written only where a zero stood, and none stands at the end
     return bytes(out)
 
 
 def cobs_decode(stuffed: bytes) -> bytes | None:
     """The content, or None where `stuffed`, which has no zero byte, is not COBS."""
     out = bytearray()
-    at, size = 0, len(stuffed)
-    while at < size:
-        block = stuffed[at]
-        end = at + block
+    begin, size = 0, len(stuffed)
+    while begin < size:
+        block_size = stuffed[begin]
+        end = begin + block_size
         if end > size:
             return None
-        out += stuffed[at + 1 : end]
-        if block != MAX_BLOCK and end < size:
+        out += stuffed[begin + 1 : end]
+        if block_size != MAX_BLOCK_BYTES and end < size:
             out.append(0)
-        at = end
+        begin = end
     return bytes(out)
 
 
 def encode(frame_type: int, sequence: int, payload: bytes) -> bytes:
-    """The bytes on the line of one frame, its two delimiters included."""
-    content = bytes((frame_type, sequence & 0xFF)) + payload
+    """The bytes on the line of one frame, its two delimiters included.
+
+    The delimiter before it ends what noise may have left in the receiver. Without it, the first
+    frame after a pause could be taken for the end of a damaged one, and be lost.
+    """
+    content = _HEADER.pack(frame_type, sequence % SEQUENCE_SPAN) + payload
     content += _CRC.pack(protocol.crc16(content))
     return protocol.DELIMITER + cobs_encode(content) + protocol.DELIMITER
 
@@ -103,15 +130,17 @@ class Decoder:
 
     def __init__(self) -> None:
         self.stats = DecoderStats()
-        self._partial = b""
-        self._skipping = False  # inside a stretch that is too long already
+        self._partial = b""  # of a stretch whose delimiter has not come yet
+        # Whether this stretch is too long already, and counted. Its bytes are dropped as they come,
+        # so that a line that never sends a delimiter does not fill the memory.
+        self._skipping = False
 
     def feed(self, chunk: bytes) -> list[RawFrame]:
         """The frames that `chunk` completes, in order."""
         self.stats.octets += len(chunk)
         *stretches, self._partial = (self._partial + chunk).split(protocol.DELIMITER)
-        frames = [frame for each in stretches if (frame := self._decode(each)) is not None]
-        if len(self._partial) > LARGEST_FRAME:
+        frames = [frame for frame in map(self._decode, stretches) if frame is not None]
+        if len(self._partial) > MAX_FRAME_BYTES:
             self._partial = b""
             self.stats.overlong += not self._skipping
             self._skipping = True
@@ -119,13 +148,13 @@ class Decoder:
 
     def _decode(self, stretch: bytes) -> RawFrame | None:
         if self._skipping or not stretch:
-            self._skipping = False  # the rest of a stretch that was counted when it became too long
+            self._skipping = False  # this delimiter ends what was too long
             return None
-        if len(stretch) > LARGEST_FRAME:
+        if len(stretch) > MAX_FRAME_BYTES:
             self.stats.overlong += 1
             return None
         content = cobs_decode(stretch)
-        if content is None or len(content) < _HEADER_SIZE + _CRC.size:
+        if content is None or len(content) < _HEADER.size + _CRC.size:
             self.stats.cobs_errors += 1
             return None
         body = content[: -_CRC.size]
@@ -133,4 +162,5 @@ class Decoder:
             self.stats.crc_errors += 1
             return None
         self.stats.frames += 1
-        return RawFrame(body[0], body[1], body[_HEADER_SIZE:])
+        kind, sequence = _HEADER.unpack_from(body)
+        return RawFrame(kind, sequence, body[_HEADER.size :])

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a board says, as Python objects. They are decoded from bytes, without port or thread."""
+"""What a board says, as Python objects. They are decoded from bytes, without port or thread.
+
+`BoardDecoder` makes them. What makes a message of a payload alone is in the frames' definition
+(`protocol`). The decoder adds what only a row of scans tells: how many are missing before each, and
+a board time that does not wrap.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,17 +16,22 @@ from ohmskin.link import protocol
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.framing import Decoder, DecoderStats, RawFrame
 
-# Scan numbers and board times wrap at 2^32, the counter of dropped scans at 2^16 (frames.toml).
-_COUNTER_SPAN = 1 << 32
-_DROPPED_SPAN = 1 << 16
-# The first field of `hello` is the same in every definition [bytes].
-_LAYOUT_CRC_SIZE = 2
-# The slowest scan, of the largest skin at the longest settle time, takes 3.2 s.
-_LONGEST_SCAN_S = 10
-# Through a larger one the converter's input would leak [ohm]; the wiring has 30 kOhm.
-_MOST_REF_OHM = 10_000_000
-# A ceramic resonator is up to 0.5 % off.
-_RATE_ERROR = 0.005
+_SCAN = protocol.FRAMES["scan"]
+# Counters of a board go on with 0 after so many: the scan's number, its time [us], and how many
+# scans the board has dropped.
+_NUMBER_SPAN = _SCAN.span("scan")
+_TIME_SPAN_US = _SCAN.span("time_us")
+_DROPPED_SPAN = _SCAN.span("dropped")
+# A board's second is at most this share longer or shorter than the host's: its ceramic resonator is
+# up to 0.5 % off (data sheet of Murata's CSTCE16M0V53, which an Arduino Uno has), a crystal 0.01 %;
+# a fifth more is left for delays.
+MAX_RATE_ERROR = 0.006
+# No sound board says that a scan takes longer: the largest skin at the longest settle time takes
+# 3.2 s. Chosen, not a number of the protocol, as is the next one.
+_MAX_SCAN_S = 10
+# No sound board says that it has a larger reference resistor: through one, the leakage of the
+# converter's input, 1 uA at most by the ATmega328P's data sheet, would be all that is read.
+_MAX_REF_OHM = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -64,18 +74,22 @@ class Hello:
         return self.clock_hz / self.scan_cycles
 
     def impossible(self) -> str:
-        """A field and what no board of this protocol says in it, ``"rows 0"``; ``""`` for none."""
+        """A field and what no board of this protocol says in it, ``"rows 0"``; ``""`` for none.
+
+        Whoever gets a hello asks this first. The rest of the host divides by these numbers and
+        makes arrays of these sizes, whatever a broken board or a hostile file says.
+        """
         limits, slots = protocol.CONSTANTS, self.rows * self.columns * self.readings_per_cell
         can_be = {
             "rows": 1 <= self.rows <= limits["rows_max"],
             "columns": 1 <= self.columns <= limits["columns_max"],
             "readings_per_cell": self.readings_per_cell == protocol.READINGS_PER_CELL,
             "adc_bits": self.adc_bits == protocol.ADC_BITS,
-            "ref_top_ohm": 0 < self.ref_top_ohm <= _MOST_REF_OHM,
-            "ref_bottom_ohm": 0 < self.ref_bottom_ohm <= _MOST_REF_OHM,
+            "ref_top_ohm": 0 < self.ref_top_ohm <= _MAX_REF_OHM,
+            "ref_bottom_ohm": 0 < self.ref_bottom_ohm <= _MAX_REF_OHM,
             "baud": self.baud > 0,
             "clock_hz": self.clock_hz > 0,
-            "scan_cycles": 0 < self.scan_cycles <= _LONGEST_SCAN_S * self.clock_hz,
+            "scan_cycles": 0 < self.scan_cycles <= _MAX_SCAN_S * self.clock_hz,
             "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,
             "adc_prescaler": self.adc_prescaler in protocol.ENUMS["adc_prescaler"].values,
             "mode": self.mode in protocol.MODES,
@@ -93,7 +107,12 @@ class ForeignHello:
 
 @dataclass(frozen=True)
 class Ack:
-    """A board's answer to a command. `result`: name of a member of the enum `result`."""
+    """A board's answer to a command.
+
+    command: id of the command's frame.
+    command_sequence: sequence number of the command's frame.
+    result: name of a member of the enum `result`.
+    """
 
     command: int
     command_sequence: int
@@ -104,8 +123,9 @@ class Ack:
 class SelfTestReport:
     """What the sense nodes read over all multiplexer inputs.
 
-    findings: names of the members of the enum `finding`; empty on a sound board. code_min,
-    code_max: smallest and largest code of the readings a to h; 1023 and 0 for those not taken.
+    findings: names of the members of the enum `finding`; empty on a sound board.
+    code_min: smallest code of each of the readings a to h; the largest there is, if not taken.
+    code_max: largest code of each of the readings a to h; 0, if not taken.
     """
 
     findings: tuple[str, ...]
@@ -117,11 +137,13 @@ class SelfTestReport:
 class Scan:
     """All readings of a skin at one time.
 
-    codes: shape (rows, columns, 4), ADC codes of `reading_names`. number: of the scan since the
-    board was started. time_us: board time at the scan's start [us], without wraps, from
-    the board's start. host_time_s: `time.monotonic()` when its last byte was read [s]. missed:
-    scans made since the one before this that never came, dropped there or damaged on the way. mode:
-    which readings these are, a name of the enum `mode`.
+    codes: ADC codes of `reading_names`, shape (rows, columns, 4).
+    number: of the scan since the board was started.
+    time_us: board time at the scan's start [us], from the board's start, without wraps.
+    host_time_s: `time.monotonic()` when the scan's last byte was read [s].
+    missed: scans made since the one before this that never came: the board dropped them, or they
+        were damaged on the way.
+    mode: which readings these are, a name of the enum `mode`.
     rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
     """
 
@@ -145,7 +167,7 @@ class Scan:
 
     @property
     def kind(self) -> tuple[tuple[int, ...], str]:
-        """Shape of the codes and mode: scans that differ in it cannot be averaged."""
+        """Shape of the codes, and mode: scans that differ in it cannot be averaged."""
         return self.codes.shape, self.mode
 
     @property
@@ -166,11 +188,15 @@ Message = Hello | ForeignHello | Ack | SelfTestReport | Scan
 class BoardStats:
     """Counts since the connection was made. All that went missing is counted here.
 
-    line: bytes, frames and damaged frames. scans: that arrived whole. missed: that the board made
-    and that never came. dropped_by_board: those of them that the board dropped because the line was
-    full; the others were damaged on the line. board_rx_errors: damaged commands that the board
-    reports. unknown: valid frames whose type or size this host does not know. restarts: times that
-    the board restarted or was reset. overflowed: scans lost to iterators slower than the board.
+    line: bytes, frames and damaged frames.
+    scans: scans that arrived whole.
+    missed: scans that the board made and that never came.
+    dropped_by_board: those of `missed` that the board dropped because the line was full. The others
+        were damaged on the line.
+    board_rx_errors: damaged commands, as the board reports.
+    unknown: valid frames whose type or size this host does not know.
+    restarts: times that the board restarted or was reset.
+    overflowed: scans lost to iterators slower than the board.
     """
 
     line: DecoderStats = field(default_factory=DecoderStats)
@@ -192,20 +218,22 @@ class BoardDecoder:
     def __init__(self) -> None:
         self._frames = Decoder()
         self.stats = BoardStats(line=self._frames.stats)
-        # Of the last scan. -1: none since the board was started; None: not known.
+        # Number of the last scan. -1: none since the board was started; None: not known.
         self._number: int | None = None
-        self._time_us = 0
-        self._host_time_s: float | None = None
-        self._dropped = 0
+        self._time_us = 0  # `Scan.time_us` of the last scan
+        self._host_time_s: float | None = None  # and its `Scan.host_time_s`
+        self._dropped = 0  # how many the board had dropped then
 
     def feed(self, chunk: bytes, host_time_s: float) -> list[Message]:
         """The messages that `chunk`, read at `host_time_s`, completes."""
-        found = [self._message(frame, host_time_s) for frame in self._frames.feed(chunk)]
-        messages = [message for message in found if message is not None]
-        self.stats.unknown += len(found) - len(messages)
+        frames = self._frames.feed(chunk)
+        decoded = (self._message(frame, host_time_s) for frame in frames)
+        messages = [message for message in decoded if message is not None]
+        self.stats.unknown += len(frames) - len(messages)
         return messages
 
     def _message(self, raw: RawFrame, host_time_s: float) -> Message | None:
+        """The message of a frame; None if this host does not know it."""
         frame = protocol.FRAMES_BY_ID.get(raw.type)
         if frame is None or frame.sender != "board":
             return None
@@ -220,14 +248,17 @@ class BoardDecoder:
         return Ack(**values) if frame.name == "ack" else SelfTestReport(**values)
 
     def _hello(self, frame: protocol.Frame, payload: bytes) -> Message | None:
-        if len(payload) < _LAYOUT_CRC_SIZE:
+        # The first field stays what it is in every definition, so that this host can say which one
+        # a board has whose other fields it cannot read.
+        size = frame.fields[0].size
+        if len(payload) < size:
             return None
-        layout_crc = int.from_bytes(payload[:_LAYOUT_CRC_SIZE], "little")
+        layout_crc = int.from_bytes(payload[:size], "little")
         if layout_crc != protocol.LAYOUT_CRC or len(payload) != frame.struct.size:
             return ForeignHello(layout_crc)
         hello = Hello(**frame.unpack(payload))
         if not hello.scanning:
-            self._number = -1
+            self._number = -1  # the next scan is the first since a start, with the number 0
         return hello
 
     def _scan(self, values: dict[str, Any], packed: bytes, host_time_s: float) -> Scan:
@@ -235,15 +266,16 @@ class BoardDecoder:
             raise ValueError(f"no mode {values['mode']}")
         codes = protocol.unpack_codes(packed, values["rows"], values["columns"])
         number, dropped = values["scan"], values["dropped"]
-        step = 1 if self._number is None else (number - self._number) % _COUNTER_SPAN
-        if self._number is None or self._number < 0 or not 0 < step < _COUNTER_SPAN // 2:
-            # The first scan since a start: numbers that go back show a start that was not seen.
+        step = 1 if self._number is None else (number - self._number) % _NUMBER_SPAN
+        # A step above half of the span is one back: the board was started anew, and nobody saw it.
+        if self._number is None or self._number < 0 or not 0 < step < _NUMBER_SPAN // 2:
+            # The first scan since a start. All before it are missed, unless the host came late.
             missed = 0 if self._number is None else number
             self._dropped = dropped if self._number is None else 0
             self._time_us = self._time_at_start(values["time_us"], host_time_s)
         else:
             missed = step - 1
-            self._time_us += (values["time_us"] - self._time_us) % _COUNTER_SPAN
+            self._time_us += (values["time_us"] - self._time_us) % _TIME_SPAN_US
         stats = self.stats
         stats.scans += 1
         stats.missed += missed
@@ -256,12 +288,17 @@ class BoardDecoder:
     def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
         """Board time of the first scan since a start [us].
 
-        It goes on where the board was only stopped, with all wraps, and is small after a reset.
+        A board that was only stopped has the same clock as before, which may have wrapped several
+        times meanwhile: of the times with this counter, the nearest to the one expected is taken.
+        A board that was reset began at 0, so the counter is far from what is expected: it is the
+        time.
         """
         if self._host_time_s is None:
             return counter_us
         elapsed_us = (host_time_s - self._host_time_s) * 1e6
         expected_us = self._time_us + elapsed_us
-        time_us = counter_us + _COUNTER_SPAN * round((expected_us - counter_us) / _COUNTER_SPAN)
-        near = time_us >= 0 and abs(time_us - expected_us) < 1e6 + _RATE_ERROR * elapsed_us
-        return time_us if near else counter_us
+        wraps = round((expected_us - counter_us) / _TIME_SPAN_US)
+        time_us = counter_us + _TIME_SPAN_US * wraps
+        # A second covers what delays the arrival of either scan.
+        is_near = abs(time_us - expected_us) < 1e6 + MAX_RATE_ERROR * elapsed_us
+        return time_us if time_us >= 0 and is_near else counter_us

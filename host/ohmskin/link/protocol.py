@@ -2,7 +2,10 @@
 """The link's definition, read from ``protocol/frames.toml``: the only source of its numbers.
 
 ``FRAMES`` maps names to `Frame`. A `Frame` packs and unpacks payloads as dictionaries, in which the
-value of an enum field is a name. Framing and ports are not known here.
+value of an enum field is a name. How a frame is put into bytes is in `framing`, above this module.
+
+The definition is read when the module is imported. No number of it is written in Python, so board
+and host cannot drift apart: a host of another definition sees that at the board's `hello`.
 """
 
 import binascii
@@ -29,10 +32,16 @@ Value = int | str | tuple[str, ...] | tuple[int, ...]
 
 @dataclass(frozen=True)
 class Field:
-    """One integer, or `count` of them, in a payload.
+    """One integer, or `count` of them, in a payload. All but `count` as in ``frames.toml``.
 
-    ``enum``: the value is the name of one member. ``flags``: the value is a tuple of the names of
-    all members whose bit is set.
+    name: of the field.
+    type: of an integer: "u8", "u16" or "u32".
+    doc: what the field means, a sentence.
+    count: integers in the field.
+    enum: the `Enum` one of whose members the integer is; the field's value is that member's name.
+    flags: the `Enum` whose members are bits of the integer; the value is a tuple of the names of
+        all members whose bit is set.
+    unit: of the integer.
     """
 
     name: str
@@ -42,6 +51,16 @@ class Field:
     enum: str | None = None
     flags: str | None = None
     unit: str | None = None
+
+    @property
+    def span(self) -> int:
+        """How many values an integer of this type has: a counter goes on with 0 after them."""
+        return 1 << int(self.type.removeprefix("u"))
+
+    @property
+    def size(self) -> int:
+        """Bytes of the whole field."""
+        return self.count * struct.calcsize(_STRUCT_CODES[self.type])
 
     def integers(self, value: Value) -> tuple[int, ...]:
         """The integers that stand for a value.
@@ -55,17 +74,18 @@ class Field:
             value = members[value]
         elif self.flags and isinstance(value, tuple):
             value = sum(ENUMS[self.flags].values[str(name)] for name in value)
-        given, most = value if isinstance(value, tuple) else (value,), (1 << int(self.type[1:])) - 1
-        integers = tuple(int(each) for each in given if isinstance(each, int | np.integer))
-        if self.count == len(given) == sum(0 <= each <= most for each in integers):
+        given = value if isinstance(value, tuple) else (value,)
+        integers = tuple(int(number) for number in given if isinstance(number, int | np.integer))
+        if self.count == len(given) == sum(0 <= number < self.span for number in integers):
             return integers
         what = f"{self.count} whole numbers" if self.count > 1 else "a whole number"
-        raise ValueError(f"{self.name} is {value!r}: must be {what} from 0 to {most}")
+        raise ValueError(f"{self.name} is {value!r}: must be {what} from 0 to {self.span - 1}")
 
     def value(self, integers: tuple[int, ...]) -> Value:
         """The value that integers of a payload stand for.
 
-        A member of a newer definition is ``"unknown_<integer>"``.
+        An integer that is no member of the enum is ``"unknown_<integer>"``, because a damaged or
+        odd board must not raise here: who uses the value decides what to do.
         """
         if self.enum:
             names = {value: name for name, value in ENUMS[self.enum].values.items()}
@@ -79,7 +99,12 @@ class Field:
 
 @dataclass(frozen=True)
 class Enum:
-    """Names for the values of a field."""
+    """Names for the values of a field.
+
+    name: of the enum.
+    values: the integer of each member, by its name.
+    docs: what each member means, by its name.
+    """
 
     name: str
     values: dict[str, int]
@@ -87,7 +112,14 @@ class Enum:
 
 
 class Frame:
-    """A frame type: its id, direction and payload fields."""
+    """A kind of frame: what ``frames.toml`` says of it.
+
+    name, id, doc: of this kind.
+    sender: "board" or "host".
+    fields: of the payload, in order.
+    tail: what follows the fields, of any length; None for most kinds.
+    struct: packs the integers of the fields.
+    """
 
     def __init__(self, entry: Mapping[str, Any]) -> None:
         self.name: str = entry["name"]
@@ -101,6 +133,10 @@ class Frame:
         )
         codes = (f"{f.count if f.count > 1 else ''}{_STRUCT_CODES[f.type]}" for f in self.fields)
         self.struct = struct.Struct("<" + "".join(codes))
+
+    def span(self, name: str) -> int:
+        """`Field.span` of the field with this name."""
+        return next(field.span for field in self.fields if field.name == name)
 
     def pack(self, **values: Value) -> bytes:
         """The payload (without tail) of this frame; every field must be given.
@@ -126,7 +162,10 @@ class Frame:
 
 
 def crc16(octets: bytes) -> int:
-    """CRC-16/IBM-3740 (polynomial 0x1021, start 0xFFFF, not reflected) of `octets`."""
+    """CRC-16/IBM-3740 of `octets`, as ``framing`` in ``frames.toml`` defines it.
+
+    The library's function is fixed to this polynomial: tests fail if the definition says another.
+    """
     return binascii.crc_hqx(octets, _CRC_INITIAL)
 
 
@@ -147,7 +186,7 @@ ENUMS: dict[str, Enum] = {
 MODES = {m["name"]: tuple(m["readings"]) for m in DEFINITION["enums"]["mode"]["members"]}
 FRAMES: dict[str, Frame] = {e["name"]: Frame(e) for e in DEFINITION["frames"]}
 FRAMES_BY_ID: dict[int, Frame] = {f.id: f for f in FRAMES.values()}
-# The definition as far as it decides what bytes mean.
+# The definition as far as it decides what bytes mean: its CRC may stay when a text is improved.
 _LAYOUT = json.loads(
     json.dumps(DEFINITION),
     object_hook=lambda node: {k: v for k, v in node.items() if k not in ("doc", "unit")},
@@ -155,9 +194,11 @@ _LAYOUT = json.loads(
 LAYOUT_CRC = crc16(json.dumps(_LAYOUT, sort_keys=True, separators=(",", ":")).encode())
 
 READINGS_PER_CELL = CONSTANTS["readings_per_cell"]
+# A scan passes over all cells so often, and takes `readings_per_pass` of each cell every time.
 _PASSES = READINGS_PER_CELL // CONSTANTS["readings_per_pass"]
 ADC_BITS = CONSTANTS["adc_bits"]
-_LARGEST_CODE = (1 << ADC_BITS) - 1
+LARGEST_CODE = (1 << ADC_BITS) - 1  # of the converter, for a voltage of Vdd
+# What each bit of a code counts, the least significant one first.
 _BIT_VALUES = 1 << np.arange(ADC_BITS, dtype=np.uint16)
 
 
@@ -194,7 +235,10 @@ def unpack_codes(packed: bytes, rows: int, columns: int) -> NDArray[np.uint16]:
 
 
 def in_scan_order(readings: NDArray[Any]) -> NDArray[Any]:
-    """Readings (rows, columns, readings) one after the other, as a board takes and sends them."""
+    """Readings (rows, columns, readings) one after the other, as a board takes and sends them.
+
+    Two readings of each cell, rows running fastest, then the other two of each cell.
+    """
     passes = readings.reshape(*readings.shape[:2], _PASSES, -1)
     return passes.transpose(2, 1, 0, 3).ravel()
 
@@ -210,8 +254,8 @@ def pack_codes(codes: NDArray[np.uint16]) -> bytes:
 
     :raises ValueError: a code does not fit adc_bits.
     """
-    if codes.size and int(codes.max()) > _LARGEST_CODE:
-        raise ValueError(f"code above {_LARGEST_CODE}")
+    if codes.size and int(codes.max()) > LARGEST_CODE:
+        raise ValueError(f"code above {LARGEST_CODE}")
     in_order = in_scan_order(codes).astype("<u2").reshape(-1, 1)
     bits = np.unpackbits(in_order.view(np.uint8), axis=1, count=ADC_BITS, bitorder="little")
     return np.packbits(bits, bitorder="little").tobytes()

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways for bytes to and from a board: `Link`, and the serial ports of this machine."""
+"""Ways for bytes to and from a board: `Link`, and the serial ports of this machine.
+
+`Link` is all that a session knows of its port. An emulated board is a `Link` too.
+"""
 
 import errno
 import os
@@ -13,13 +16,16 @@ from serial.tools import list_ports
 from ohmskin.errors import DeviceLost, PortUnusable
 from ohmskin.link import protocol
 
-# A read waits so long when nothing comes [s]. Closing a device takes at most this long.
+# A read waits so long when nothing comes. Chosen: closing a device takes at most this long, and an
+# idle thread wakes no more than five times a second.
 READ_TIMEOUT_S: Final = 0.2
-# A write waits at most so long for the system's buffer [s], which empties in a tenth of this.
+# A write waits at most so long for the system's buffer. Chosen: on a line that works, the buffer
+# empties in a tenth of this.
 _WRITE_TIMEOUT_S: Final = 2.0
-# Linux shows the settings of USB serial bridges there.
+# Linux shows the settings of USB serial bridges here.
 USB_SERIAL: Final = Path("/sys/bus/usb-serial/devices")
-# Arduino's USB vendor ids, and what its product ids stand for (boards.txt of its AVR core).
+# Boards by the USB ids of Arduino's product, under both of its vendor ids (boards.txt of its AVR
+# core). Other makers' boards have ids of USB bridges, which do not tell what is behind them.
 _ARDUINO: Final = (0x2341, 0x2A03)
 _BOARDS: Final = {0x0001: "uno", 0x0043: "uno", 0x0010: "megaatmega2560", 0x0042: "megaatmega2560"}
 
@@ -92,7 +98,7 @@ class SerialLink:
 
 
 def _explain(path: str, exc: Exception) -> tuple[str, str]:
-    """Problem and remedy."""
+    """Problem and remedy: what systems call them differs, and what pyserial keeps of that too."""
     number = getattr(exc, "errno", None)
     text = str(exc)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFound" in text:
@@ -112,7 +118,12 @@ def _explain(path: str, exc: Exception) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class SerialPort:
-    """A serial port of this machine. `board`: what is probably behind it, or ``""``."""
+    """A serial port of this machine.
+
+    path: what opens it.
+    description: what the system calls it, ``""`` if nothing.
+    board: what is probably behind it, a name of the enum `board`; ``""`` if nothing tells.
+    """
 
     path: str
     description: str
@@ -134,8 +145,8 @@ def serial_ports() -> list[SerialPort]:
 def latency_timer(port: str) -> tuple[int, str] | None:
     """The latency timer of a USB serial bridge [ms], and the file in which Linux sets it.
 
-    A bridge holds back a few bytes until this timer ends. `port` may be a link. None: it has no
-    such timer, as ports of other systems.
+    A bridge waits for more bytes until this timer ends, before it passes a few of them on. `port`
+    may be a symbolic link. None: the port has no such timer, or the system does not show it.
     """
     file = USB_SERIAL / Path(os.path.realpath(port)).name / "latency_timer"
     try:

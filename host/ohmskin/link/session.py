@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The conversation with a board: one thread reads, and commands wait for their answers."""
+"""The conversation with a board: one thread reads, and commands wait for their answers.
+
+port -> `_read`, in a thread of its own -> `BoardDecoder` -> `_keep` -> who waits for it
+
+A scan goes to the queues of `Device`, an answer to the thread that waits for it in `_command`. The
+thread also looks after the board: one that was reset while it scanned is made to scan again.
+"""
 
 import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 from ohmskin.errors import (
     CommandRefused,
@@ -28,23 +34,42 @@ from ohmskin.link.messages import (
 )
 from ohmskin.link.serial_port import Link
 
-# Until hello: speed of the line, whether to ask for it, time to listen [s]. A board that opening
-# does not reset is asked often. One that it resets says hello by itself: its boot loader takes a
-# byte for the start of an upload, and the Mega's then waits for 5 s after the last one. So the
-# questions at both speeds are close to each other, and the silence after them is longer than 5 s:
-# a board that was reset late and heard both says hello 5.0 s after the second.
-_OFTEN = 3 * (4 * [("baud_default", True, 0.3)] + [("baud_fast", True, 0.3)])
-_SELDOM: Final = (
-    ("baud_default", False, 2.0),
-    ("baud_default", True, 0.5),
-    ("baud_fast", True, 0.5),
-    ("baud_default", False, 5.5),
-    ("baud_default", True, 1.0),
+
+class Attempt(NamedTuple):
+    """One step of the way to a board's hello.
+
+    speed: of the line, by the name of a constant in ``frames.toml``.
+    asks: whether the host asks for hello first, or only listens.
+    listen_s: how long it listens [s].
+    """
+
+    speed: str
+    asks: bool
+    listen_s: float
+
+
+# How a board is made to say hello where opening the port does not reset it, so that it may be
+# asked at once: often, because answers get lost. The times are chosen.
+ATTEMPTS = 3 * (4 * [Attempt("baud_default", True, 0.3)] + [Attempt("baud_fast", True, 0.3)])
+# How it is made to where opening the port resets it. Then it says hello by itself, and its boot
+# loader must be left alone: it takes a byte for the start of an upload, and the Mega's then waits
+# for 5 s after the last byte (firmware/sim/README.md). So the questions at both speeds are close to
+# each other, and the silence after them is longer than 5 s: a board that was reset late and heard
+# both says hello 5.0 s after the second.
+ATTEMPTS_AFTER_RESET: Final = (
+    Attempt("baud_default", False, 2.0),
+    Attempt("baud_default", True, 0.5),
+    Attempt("baud_fast", True, 0.5),
+    Attempt("baud_default", False, 5.5),
+    Attempt("baud_default", True, 1.0),
 )
-# Time that a board has for its answer, besides the rest of a scan [s].
-_COMMAND_TIMEOUT_S = 1.0
-# A scanning board that sends no valid frame for so long is asked who it is, and again later [s].
+# Time that a board has for its answer, besides the time for the scan that it ends first. Chosen:
+# far above what a USB bridge and the slowest command, `save`, take.
+COMMAND_TIMEOUT_S = 1.0
+# A scanning board that sends no valid frame for so long is asked who it is. Chosen: a board that is
+# reset and left alone says hello within 2 s, and only what stays silent has to be asked.
 _SPEED_LOST_S = 2.5
+# It is asked again after so long: a boot loader that took the question for an upload is done then.
 _ASK_AGAIN_S = 6.5
 _BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
 
@@ -68,9 +93,9 @@ class Session(Device):
         self._link = link
         self._decoder = BoardDecoder()
         super().__init__(link.name, self._decoder.stats)
-        self._acks: dict[int, Ack] = {}
+        self._acks: dict[int, Ack] = {}  # by the sequence numbers of their commands
         self._closing, self._ends = False, threading.Lock()
-        self._sequence = 0
+        self._sequence = 0  # number of the last command
         work, name = (self._read,), f"read {link.name}"
         self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
         self._thread.start()
@@ -88,7 +113,8 @@ class Session(Device):
             raise
 
     def _connect(self) -> None:
-        for speed, asks, listen_s in _SELDOM if self._link.resets_board else _OFTEN:
+        """Wait for hello, by whichever attempt it comes."""
+        for speed, asks, listen_s in ATTEMPTS_AFTER_RESET if self._link.resets_board else ATTEMPTS:
             if self._hello is not None:
                 return
             self._link.set_baud(protocol.CONSTANTS[speed])
@@ -121,7 +147,7 @@ class Session(Device):
         frame = protocol.FRAMES[name]
         with self._changed:
             self._wait(lambda: False, 0.0)  # raises what has ended it, such as close()
-            sequence = self._sequence = (self._sequence + 1) & 0xFF
+            sequence = self._sequence = (self._sequence + 1) % framing.SEQUENCE_SPAN
             self._acks.pop(sequence, None)
         self._link.write(framing.encode(frame.id, sequence, frame.pack(**values)))
         return sequence
@@ -133,7 +159,7 @@ class Session(Device):
         :raises DeviceLost: there is none.
         """
         with self._commands:
-            limit_s = _COMMAND_TIMEOUT_S + 1 / self.info.rate_hz  # it waits for the scan's end
+            limit_s = COMMAND_TIMEOUT_S + 1 / self.info.rate_hz
             for _ in range(COMMAND_TRIES):
                 sequence = self._send(name, **values)
                 with self._changed:
@@ -147,6 +173,7 @@ class Session(Device):
             raise CommandRefused(name, ack.result, reason)
 
     def _read(self) -> None:
+        """The work of the reading thread, until the session is closed."""
         heard_s = time.monotonic()
         while not self._closing:
             chunk = self._link.read()
@@ -159,12 +186,14 @@ class Session(Device):
                     heard_s = now_s
                     self._changed.notify_all()
             if self._want_scans and now_s - heard_s > _SPEED_LOST_S:
-                # A board that was reset is back at its default speed.
+                # A board that was reset is back at its default speed, at which its hello was not
+                # understood.
                 heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
                 self._link.set_baud(protocol.CONSTANTS["baud_default"])
                 self._send("get_hello")
 
     def _keep(self, message: Message) -> None:
+        """Give a message to who waits for it. Raises ProtocolError for what no board can say."""
         match message:
             case Hello() if odd := message.impossible():
                 raise ProtocolError(f"{self.name}: hello says {odd}, which cannot be", _BROKEN)
@@ -178,7 +207,8 @@ class Session(Device):
             case SelfTestReport():
                 self._report = message
             case Hello() if self._want_scans and not message.scanning:
-                # It was reset: bring it back to where it was.
+                # It was reset: bring it back to where it was. Nothing waits for answers, because
+                # this is the thread that reads them.
                 self._stats.restarts += 1
                 LOG.warning("%s: was reset (%s)", self.name, ", ".join(message.reset_cause))
                 self._send("configure", **configuration(self.info))
