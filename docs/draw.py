@@ -59,7 +59,8 @@ def relative_std(cell_ohm: np.ndarray | float, ref_ohm: np.ndarray | float) -> A
 def slot() -> dict[str, float]:
     """A slot at the default setting (8x8, 90 Hz), clock cycles from the timer's zero."""
     trigger = _constant("board_avr.cpp", r"TRIGGER_AT = (\d+);")
-    early = _constant("board_avr.cpp", r"TRIGGER_AT \+ 3u \* prescaler \+ 3 - (\d+)\)")
+    entry = _constant("board_avr.cpp", r"PINS_AFTER_INTERRUPT = (\d+);")
+    spare = _constant("board_avr.cpp", r"PINS_SPARE = (\d+);")
     prescaler = 32
     hold = trigger + 2 * prescaler + 3
     readings, period = 256, round(CLOCK_HZ / 90)
@@ -69,7 +70,7 @@ def slot() -> dict[str, float]:
     return {
         "trigger": trigger,
         "hold": hold,
-        "interrupt": hold + prescaler - early,
+        "interrupt": hold + prescaler + spare - entry,
         "pins_set": hold + PINS_CYCLES,
         "conversion_done": trigger + 13 * prescaler + prescaler // 2 + 3,
         "cycles": cycles,

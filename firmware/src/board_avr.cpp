@@ -21,13 +21,16 @@ namespace board {
 // the transmitter is off. Unused pins of the ports that each slot writes as a whole are outputs at
 // 0: connect nothing to them. All other unused pins are inputs with pull-ups.
 const uint32_t CLOCK_HZ = F_CPU;
+// The reference resistors of README.md's wiring; docs/build.md says why they are 30 kOhm. Boards
+// with others need other numbers here: the host computes with what `hello` says.
 const uint32_t REF_TOP_OHM = 30000;
 const uint32_t REF_BOTTOM_OHM = 30000;
 
 namespace {
-// By Sense.
+// Channels of the converter, by Sense.
 constexpr uint8_t CHANNELS[] = {0, 1, 2, 3};
-constexpr uint8_t CHANNEL_PINS = 0x0F;  // of port C (Uno) or F (Mega)
+// Their pins, as bits of port C (Uno) or F (Mega).
+constexpr uint8_t CHANNEL_PINS = 0x0F;
 }  // namespace
 
 #if defined(__AVR_ATmega328P__)
@@ -85,19 +88,20 @@ Scanner scanner;
 
 namespace {
 
-// Readings as register values, by Selection::reading.
+// What the registers hold for each reading, by Selection::pattern_entry.
 struct Registers {
     uint8_t drive;
     uint8_t admux;
 };
-constexpr Registers registers_of(Configuration c) {
-    return Registers{c.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
-                     static_cast<uint8_t>(_BV(REFS0) | CHANNELS[static_cast<uint8_t>(c.sense)])};
+constexpr Registers registers_of(ReadingDefinition reading) {
+    return Registers{
+        reading.drive == Drive::Top ? DRIVE_TOP : DRIVE_BOTTOM,
+        static_cast<uint8_t>(_BV(REFS0) | CHANNELS[static_cast<uint8_t>(reading.sense)])};
 }
-constexpr Registers registers_of(uint8_t order, uint8_t n) {
-    return registers_of(CONFIGURATIONS[static_cast<uint8_t>(reading_of(order, n))]);
+constexpr Registers registers_of(uint8_t pattern, uint8_t n) {
+    return registers_of(READING_DEFINITIONS[static_cast<uint8_t>(reading_of(pattern, n))]);
 }
-static_assert(frames::READINGS_PER_CELL == 4 && ORDERS == 4, "one entry a reading below");
+static_assert(frames::READINGS_PER_CELL == 4 && PATTERNS == 4, "one entry a reading below");
 constexpr Registers REGISTERS[] = {
     registers_of(0, 0), registers_of(0, 1), registers_of(0, 2), registers_of(0, 3),
     registers_of(1, 0), registers_of(1, 1), registers_of(1, 2), registers_of(1, 3),
@@ -105,14 +109,43 @@ constexpr Registers REGISTERS[] = {
     registers_of(3, 0), registers_of(3, 1), registers_of(3, 2), registers_of(3, 3),
 };
 
-// Timer 1 counts a slot. Compare B triggers the conversion, whose sample is held 2 ADC clocks and 3
-// cycles of synchronisation later. Compare A interrupts so that the pins, which change 59 cycles or
-// more into the interrupt, do so an ADC clock and some cycles after the hold: the data sheet leaves
-// some of that clock open.
+// Timer 1 counts a slot. Its compare B triggers the converter. Its compare A makes the interrupt,
+// which sets the pins for the next slot as soon as the sample is held. Pins that change earlier
+// change the reading; pins that change later have less time to settle. Entering the interrupt takes
+// so long that it has to begin before the hold:
+//
+//     clock cycle of the slot       what happens
+//     TRIGGER_AT                    compare B: the converter is triggered
+//     interrupt_at()                compare A: the interrupt begins
+//     hold = TRIGGER_AT + HOLD_SYNC_CYCLES + HOLD_ADC_CLOCKS
+//                                   the sample is held
+//     hold + OPEN_ADC_CLOCKS        the sample is held by now, whatever the data sheet leaves open
+//     ... + PINS_SPARE              the first pin changes, PINS_AFTER_INTERRUPT after compare A
+
+// Any cycle but the slot's first ones would serve. start_slots() writes the counter, and the data
+// sheets ("16-bit Timer/Counter1", "Using the Output Compare Unit") say that no match is
+// seen in the cycle after that.
 constexpr uint16_t TRIGGER_AT = 8;
+// Clock cycles and ADC clocks from the trigger to the hold, and ADC clocks that are left open
+// because the data sheets give the hold in whole ones ("Prescaling and Conversion Timing", auto
+// triggered).
+constexpr uint16_t HOLD_SYNC_CYCLES = 3;
+constexpr uint16_t HOLD_ADC_CLOCKS = 2, OPEN_ADC_CLOCKS = 1;
+// Clock cycles from compare A to the first change of a pin, at the least: the chip enters the
+// interrupt, the compiler's code saves registers, and select() looks the pins up. This number is
+// the compiler's: with avr-gcc 5.4 it is 56 on the Uno and 55 on the Mega, with 7.3 it is 55 on
+// both. A test measures it in the simulator, and fails where pins change too early: tests/firmware,
+// test_pins_change_after_the_hold_and_not_before.
+constexpr uint16_t PINS_AFTER_INTERRUPT = 55;
+// Clock cycles to spare, for a compiler whose code is a little faster. Chosen.
+constexpr uint16_t PINS_SPARE = 3;
 constexpr uint16_t interrupt_at(uint8_t prescaler) {
-    return static_cast<uint16_t>(TRIGGER_AT + 3u * prescaler + 3 - 52);
+    return static_cast<uint16_t>(TRIGGER_AT + HOLD_SYNC_CYCLES +
+                                 (HOLD_ADC_CLOCKS + OPEN_ADC_CLOCKS) * prescaler + PINS_SPARE -
+                                 PINS_AFTER_INTERRUPT);
 }
+
+// A prescaler as the converter's register has it: its logarithm to the base 2.
 uint8_t prescaler_bits(uint8_t prescaler) {
     uint8_t bits = 0;
     while (prescaler >>= 1)
@@ -120,45 +153,55 @@ uint8_t prescaler_bits(uint8_t prescaler) {
     return bits;
 }
 
+// Sets pins and multiplexers, and the converter's channel for its next sample.
 inline void select(const Selection &selection) {
-    const Registers &registers = REGISTERS[selection.reading];
+    const Registers &registers = REGISTERS[selection.pattern_entry];
     pins_set(selection.row, selection.column, registers.drive);
     ADMUX = registers.admux;
 }
 
 }  // namespace
 
+// Once a slot: core/scanner.h says what is in which slot. The converter's own interrupt is not
+// used, because two interrupts could make each other late.
 ISR(TIMER1_COMPA_vect) {
-    TIFR1 = _BV(OCF1B);  // the next trigger is the flag's next rising edge
+    // The converter is triggered by a rising edge of this flag, so the flag must be 0 before that.
+    TIFR1 = _BV(OCF1B);
     select(scanner.selection());
+    // ADIF says whether a conversion has ended since the interrupt before. Writing 1 to it clears
+    // it, so writing back what was read does. ADSC must not be written as 1: it reads as 1 during
+    // a conversion, and a conversion that ends just now would be followed by another one.
     const uint8_t status = ADCSRA;
-    ADCSRA = static_cast<uint8_t>(status & ~_BV(ADSC));  // clears ADIF if it is set
+    ADCSRA = static_cast<uint8_t>(status & ~_BV(ADSC));
     scanner.step(ADC, status & _BV(ADIF));
 }
 
 void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
     const uint8_t bits = prescaler_bits(adc_prescaler);
     select(scanner.selection());
-    // A trigger flag from before must not start a conversion: the timer stands still first.
+    // The timer stands still until all is set, and its flags are cleared: a flag from before would
+    // start a conversion at once.
     TCCR1B = 0;
     TIFR1 = _BV(OCF1A) | _BV(OCF1B);
     ADCSRB = _BV(ADTS2) | _BV(ADTS0);  // auto trigger by timer 1, compare B
     ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | bits);
     TCCR1A = 0;
-    TCCR1B = _BV(WGM13) | _BV(WGM12);  // clear at ICR1, which can be written in such a mode only
+    // The mode in which the counter starts again after ICR1, which can be written in this mode
+    // only.
+    TCCR1B = _BV(WGM13) | _BV(WGM12);
     ICR1 = plan.slot_cycles - 1;
     OCR1B = TRIGGER_AT;
     OCR1A = interrupt_at(adc_prescaler);
     TCNT1 = 0;
     TIMSK1 = _BV(OCIE1A);
-    TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);
+    TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);  // from here on it counts every clock cycle
 }
 
 void stop_slots() {
     TCCR1B = 0;
     TIMSK1 = 0;
-    // The converter stays on, because its first conversion after that takes twice as long. ADSC
-    // would start one more, if one ends just now.
+    // The converter stays on, because the first conversion after it is switched on takes twice as
+    // long. ADSC is written as 0 for the reason that the interrupt has.
     ADCSRA = static_cast<uint8_t>((ADCSRA & ~(_BV(ADATE) | _BV(ADSC))) | _BV(ADIF));
     pins_set(0, 0, 0);  // no current through the skin
 }
@@ -166,13 +209,19 @@ void stop_slots() {
 // ------------------------------------------------------------------- reset, clock, watchdog
 namespace {
 uint8_t reset_cause_bits;
-uint32_t overflows_us;
 
-// The C runtime does not clear these.
+// Timer 0 is the clock: a count takes 64 clock cycles, and the counter turns over after 256 counts.
+constexpr uint8_t COUNT_US = 4;
+constexpr uint16_t TURN_US = 1024;
+uint32_t turns_us;  // time of all turns so far
+
+// What the firmware before this start left (core/reset_cause.h), and what the boot loader passes
+// on. The C runtime does not clear these.
 __attribute__((section(".noinit"))) Mark mark;
 __attribute__((section(".noinit"))) uint8_t loader_status;
 
-// Runs before the C runtime's own code for memory. No other code uses r2: -ffixed-r2.
+// Keeps r2, in which a boot loader passes on the reset flags. It runs before the C runtime's own
+// code for memory. No other code uses r2: -ffixed-r2 (firmware/reserve_r2.py).
 __attribute__((naked, used, section(".init3"))) void take_loader_status() {
     asm volatile("sts %0, r2\n\tclr r2" ::"i"(&loader_status));
 }
@@ -180,7 +229,7 @@ __attribute__((naked, used, section(".init3"))) void take_loader_status() {
 void clock_begin() {
     TIMSK0 = 0;  // the Arduino core counts milliseconds in this interrupt
     TCCR0A = 0;
-    TCCR0B = _BV(CS01) | _BV(CS00);  // clock / 64: 4 us a count, 1024 us a turn
+    TCCR0B = _BV(CS01) | _BV(CS00);  // clock / 64
     TCNT0 = 0;
     TIFR0 = _BV(TOV0);
 }
@@ -188,8 +237,10 @@ void clock_begin() {
 void converter_begin() {
     DIDR0 = CHANNEL_PINS;
     ADMUX = REGISTERS[0].admux;
-    // A conversion nobody reads: the first one after switching on takes 25 ADC clocks.
-    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(32));
+    // The first conversion after switching on takes 25 ADC clocks, for which a slot has no room. So
+    // it is made now, and nobody reads it.
+    constexpr uint8_t PRESCALER = static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz);
+    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(PRESCALER));
     while (ADCSRA & _BV(ADSC)) {
     }
 }
@@ -227,17 +278,17 @@ void keep_alive() {
     wdt_reset();
     if (TIFR0 & _BV(TOV0)) {
         TIFR0 = _BV(TOV0);
-        overflows_us += 1024;
+        turns_us += TURN_US;
     }
 }
 
 uint32_t now_us() {
     uint8_t count = TCNT0;
-    if (TIFR0 & _BV(TOV0)) {  // it may have turned just before the count was read
+    if (TIFR0 & _BV(TOV0)) {  // it may have turned over before or after the count was read
         keep_alive();
         count = TCNT0;
     }
-    return overflows_us + count * 4u;
+    return turns_us + count * uint16_t{COUNT_US};
 }
 
 void mark_pass(bool worked) { GPIOR0 = worked; }
@@ -249,16 +300,16 @@ bool serial_speed_known(uint32_t baud) {
 
 void serial_speed(uint32_t baud) {
     UCSR0B = 0;
-    UCSR0A = _BV(U2X0);
+    UCSR0A = _BV(U2X0);  // the clock is divided by 8, not 16
     UBRR0 = static_cast<uint16_t>(CLOCK_HZ / 8 / baud - 1);
-    UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
+    UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);  // 8N1
     UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
 }
 
 bool serial_can_write() { return UCSR0A & _BV(UDRE0); }
 
 void serial_write(uint8_t octet) {
-    UCSR0A = _BV(U2X0) | _BV(TXC0);  // writing the flag clears it
+    UCSR0A = _BV(U2X0) | _BV(TXC0);  // writing 1 to TXC0 clears it: serial_idle() waits for it
     UDR0 = octet;
 }
 
@@ -268,10 +319,11 @@ bool serial_idle() { return UCSR0A & _BV(TXC0); }
 // It takes 5 us, once a byte of a command, by which a slot interrupt may come late: pins then
 // settle that much shorter, and no reading is lost.
 namespace {
-constexpr uint8_t RECEIVED_SIZE = 32;  // more than the longest command
+// Bytes: a power of two, and more than the longest command takes.
+constexpr uint8_t RECEIVED_SIZE = 32;
 uint8_t received[RECEIVED_SIZE];
-volatile uint8_t received_write, received_read;
-volatile bool received_damage;
+volatile uint8_t received_write, received_read;  // moved by the interrupt, by the main loop
+volatile bool received_damage;                   // a byte was damaged or lost
 }  // namespace
 
 #if defined(USART0_RX_vect)

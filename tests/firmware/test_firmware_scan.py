@@ -228,11 +228,13 @@ def test_settle_time_before_each_hold(rig: Rig, mode: str) -> None:
 def test_pins_change_after_the_hold_and_not_before(
     rig: Rig, clock_khz: int, adc_clock: int
 ) -> None:
-    """The data sheet leaves some of an ADC clock open."""
+    """The data sheet leaves some of an ADC clock open, and the compiler decides how soon it is."""
     rig.start_scan(rate_mhz=0, adc_prescaler=f"clock_{clock_khz}khz")
     rig.sim.reset_stats()
     rig.run(0.1)
-    assert rig.sim.stats()["change_after_hold_cycles_min"] >= adc_clock
+    spare = rig.sim.stats()["change_after_hold_cycles_min"] - adc_clock
+    print(f"{rig.board}, {clock_khz} kHz: {spare} cycles to spare (PINS_SPARE in board_avr.cpp)")
+    assert spare >= 0
 
 
 @pytest.mark.parametrize("cells", [(1, 1), (2, 1), (3, 1), (4, 3)])

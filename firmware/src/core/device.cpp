@@ -28,25 +28,25 @@ bool Device::poll() {
         take_group();
         return true;
     }
-    // Cells cannot wait, the rest can.
+    // Codes cannot wait, because the queue is short. Everything else can.
     if (attention_ || board::scanner.parked())
         worked |= attend();
     return worked;
 }
 
-// What is not there most of the time.
+// The work of few passes: see attention_. True when there was some.
 bool Device::attend() {
     bool worked = false;
     if (!settings_writer_.idle())
         worked = poll_save();
-    if (mode_ != Mode::Idle && board::scanner.parked() && !board::scanner.has_group())
+    if (activity_ != Activity::Idle && board::scanner.parked() && !board::scanner.has_group())
         finish_slots();
     if (groups_left_ == 0)
         send_pending();
     watch_baud();
-    // Answers that wait for the end of a frame are sent there, by begin_scan().
-    const bool answers = hello_pending_ || report_pending_ || ack_count_ != 0;
-    attention_ = (answers && groups_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
+    // Answers that wait for the end of a scan frame need no pass before it: take_group() sets
+    // attention_ there, and begin_scan() sends them if the next scan comes first.
+    attention_ = (answers_wait() && groups_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
                  !settings_writer_.idle();
     return worked;
 }
@@ -64,6 +64,7 @@ bool Device::transmit() {
 
 void Device::receive() {
     uint8_t octet;
+    // A byte comes even then, and may be a delimiter, after which the reader is in step again.
     if (!board::serial_read(&octet))
         reader_.line_error();
     if (reader_.feed(octet)) {
@@ -72,6 +73,8 @@ void Device::receive() {
     }
 }
 
+// Sends the answers that wait, as far as the ring has room; those that have none wait on. Not while
+// a scan frame is open, because the ring takes one frame after the other.
 void Device::send_pending() {
     if (hello_pending_ && writer_.space() >= FrameWriter::line_bytes(sizeof(frames::Hello))) {
         hello_pending_ = false;
@@ -85,13 +88,13 @@ void Device::send_pending() {
         writer_.put(&report, sizeof report);
         writer_.end();
     }
-    uint8_t waiting = 0;
+    uint8_t still_waiting = 0;
     for (uint8_t i = 0; i < ack_count_; i++) {
         const Ack ack = acks_[i];
-        // An ack comes after the frame it stands for.
+        // An ack comes after the frame that the command asked for.
         if (!ack.ready || hello_pending_ || report_pending_ ||
             writer_.space() < FrameWriter::line_bytes(sizeof(frames::Ack))) {
-            acks_[waiting++] = ack;
+            acks_[still_waiting++] = ack;
             continue;
         }
         const frames::Ack frame = {ack.command, ack.sequence, static_cast<uint8_t>(ack.result)};
@@ -99,13 +102,15 @@ void Device::send_pending() {
         writer_.put(&frame, sizeof frame);
         writer_.end();
     }
-    ack_count_ = waiting;
+    ack_count_ = still_waiting;
 }
 
+// Changes the line's speed, and changes it back if the host is not heard at the new one: the host
+// or its USB bridge may not know that speed, and could never reach the board again.
 void Device::watch_baud() {
     if (baud_next_ != 0) {
         if (ack_count_ != 0 || writer_.has_byte() || !board::serial_idle())
-            return;
+            return;  // the ack of set_baud still leaves at the old speed
         baud_ = baud_next_;
         baud_next_ = 0;
         board::serial_speed(baud_);
@@ -121,86 +126,98 @@ void Device::watch_baud() {
 
 // ---------------------------------------------------------------------------------- commands
 
+namespace {
+
+struct Command {
+    Type type;
+    uint8_t payload_size;
+    bool while_scanning;  // false: refused then, because it would tear a scan
+};
+
+constexpr Command COMMANDS[] = {
+    {Type::GetHello, 0, true},
+    {Type::Configure, sizeof(frames::Configure), false},
+    {Type::Start, 0, true},
+    {Type::Stop, 0, true},
+    {Type::SetUnitId, sizeof(frames::SetUnitId), true},
+    {Type::Save, 0, true},
+    {Type::LoadDefaults, 0, false},
+    {Type::SelfTest, 0, false},
+    {Type::SetBaud, sizeof(frames::SetBaud), false},
+};
+
+// The fields of a payload, whose size refusal() has checked. It is copied, because the reader's
+// bytes need not lie where a field of several bytes may.
+template <class Fields> Fields fields_of(const uint8_t *payload) {
+    Fields fields;
+    memcpy(&fields, payload, sizeof fields);
+    return fields;
+}
+
+}  // namespace
+
+// Every command that arrives whole is answered once: refused at once, or when it is carried out.
 void Device::execute() {
-    struct Command {
-        Type type;
-        uint8_t size;
-        bool while_scanning;
-    };
-    static const Command COMMANDS[] = {
-        {Type::GetHello, 0, true},
-        {Type::Configure, sizeof(frames::Configure), false},
-        {Type::Start, 0, true},
-        {Type::Stop, 0, true},
-        {Type::SetUnitId, sizeof(frames::SetUnitId), true},
-        {Type::Save, 0, true},
-        {Type::LoadDefaults, 0, false},
-        {Type::SelfTest, 0, false},
-        {Type::SetBaud, sizeof(frames::SetBaud), false},
-    };
-    baud_confirmed_ = true;
+    baud_confirmed_ = true;  // the host is heard at this speed
     if (ack_count_ == ACKS_MAX) {
         // A host that does not wait for its answers: what cannot be answered is not carried out.
         reader_.count_error();
         return;
     }
+    const Result refused = refusal();
+    if (refused != Result::Ok)
+        return answer(refused);
+    carry_out();
+}
+
+// Why the command that has arrived cannot be carried out now; Ok if it can.
+Result Device::refusal() const {
     const Command *command = nullptr;
     for (const Command &candidate : COMMANDS)
         if (static_cast<uint8_t>(candidate.type) == reader_.type())
             command = &candidate;
     if (command == nullptr)
-        return answer(Result::UnknownCommand);
-    if (reader_.payload_size() != command->size)
-        return answer(Result::BadLength);
-    if (mode_ == Mode::SelfTesting && command->type != Type::GetHello)
-        return answer(Result::Busy);
-    if ((mode_ == Mode::Scanning || mode_ == Mode::Stopping) && !command->while_scanning)
-        return answer(Result::Scanning);
+        return Result::UnknownCommand;
+    if (reader_.payload_size() != command->payload_size)
+        return Result::BadLength;
+    if (activity_ == Activity::SelfTesting && command->type != Type::GetHello)
+        return Result::Busy;
+    const bool scanning = activity_ == Activity::Scanning || activity_ == Activity::Stopping;
+    if (scanning && !command->while_scanning)
+        return Result::Scanning;
+    return Result::Ok;
+}
 
-    switch (command->type) {
+// Carries out the command that has arrived, and answers it or leaves that to resolve().
+void Device::carry_out() {
+    const uint8_t *payload = reader_.payload();
+    switch (static_cast<Type>(reader_.type())) {
     case Type::GetHello:
         hello_pending_ = true;
         return answer(Result::Ok);
-    case Type::Configure: {
-        ScanRequest request;
-        memcpy(&request, reader_.payload(), sizeof request);
-        return answer(configure(request));
-    }
+    case Type::Configure:
+        return answer(configure(fields_of<frames::Configure>(payload)));
     case Type::Start:
-        if (mode_ == Mode::Stopping)
-            return answer(Result::Busy);
         return answer(start());
     case Type::Stop:
-        if (mode_ == Mode::Idle)
-            return answer(Result::Ok);
-        board::scanner.stop_after_scan();
-        mode_ = Mode::Stopping;
-        return defer();
+        return stop();
     case Type::SetUnitId:
-        memcpy(&settings_.unit_id, reader_.payload(), sizeof settings_.unit_id);
+        settings_.unit_id = fields_of<frames::SetUnitId>(payload).unit_id;
         return answer(Result::Ok);
     case Type::Save:
-        if (!settings_writer_.idle())
-            return answer(Result::Busy);
-        settings_writer_.begin(settings_);
-        return defer();
+        return save();
     case Type::LoadDefaults:
-        if (configure(DEFAULT_SETTINGS.request) != Result::Ok)
-            return answer(Result::LineTooSlow);
-        settings_ = DEFAULT_SETTINGS;
-        return answer(Result::Ok);
+        return answer(load_defaults());
     case Type::SelfTest:
-        self_test_.begin(settings_.request);
-        begin_self_test_scan();
-        mode_ = Mode::SelfTesting;
-        return defer();
+        return begin_self_test();
     case Type::SetBaud:
-        return answer(set_baud(reader_.payload()));
+        return answer(set_baud(fields_of<frames::SetBaud>(payload).baud));
     default:
         return answer(Result::UnknownCommand);
     }
 }
 
+// Takes all of the request or nothing.
 Result Device::configure(const ScanRequest &request) {
     ScanPlan plan;
     const Result result = plan_scan(request, board::CLOCK_HZ, &plan);
@@ -213,54 +230,91 @@ Result Device::configure(const ScanRequest &request) {
     return Result::Ok;
 }
 
-Result Device::set_baud(const uint8_t *payload) {
-    frames::SetBaud wanted;
-    memcpy(&wanted, payload, sizeof wanted);
-    if (!board::serial_speed_known(wanted.baud))
-        return Result::BadBaud;
-    if (ring_limit(settings_.request, plan_, wanted.baud) == 0)
-        return Result::LineTooSlow;
-    baud_next_ = wanted.baud;
-    return Result::Ok;
-}
-
 Result Device::start() {
-    if (mode_ == Mode::Scanning)
+    if (activity_ == Activity::Scanning)
         return Result::Ok;
+    if (activity_ == Activity::Stopping)
+        return Result::Busy;
     // Settings may have been made and saved at a faster line.
     ring_limit_ = ring_limit(settings_.request, plan_, baud_);
     if (ring_limit_ == 0)
         return Result::LineTooSlow;
     scan_number_ = 0;
     dropped_ = 0;
-    begin_slots(settings_.request, plan_);
-    mode_ = Mode::Scanning;
+    begin_slots(settings_.request, settings_.request.mode, plan_);
+    activity_ = Activity::Scanning;
     return Result::Ok;
 }
 
-void Device::begin_slots(const ScanRequest &request, const ScanPlan &plan) {
+// Answered by finish_slots(), after the last scan.
+void Device::stop() {
+    if (activity_ == Activity::Idle)
+        return answer(Result::Ok);
+    board::scanner.stop_after_scan();
+    activity_ = Activity::Stopping;
+    defer();
+}
+
+// Answered by poll_save(), when the EEPROM has been read back.
+void Device::save() {
+    if (!settings_writer_.idle())
+        return answer(Result::Busy);
+    settings_writer_.begin(settings_);
+    defer();
+}
+
+Result Device::load_defaults() {
+    if (configure(DEFAULT_SETTINGS.request) != Result::Ok)
+        return Result::LineTooSlow;
+    settings_ = DEFAULT_SETTINGS;
+    return Result::Ok;
+}
+
+// Answered by finish_slots(), after the last of its scans.
+void Device::begin_self_test() {
+    self_test_.begin(settings_.request);
+    begin_self_test_scan();
+    activity_ = Activity::SelfTesting;
+    defer();
+}
+
+// The line changes its speed when the answer has left: see watch_baud().
+Result Device::set_baud(uint32_t baud) {
+    if (!board::serial_speed_known(baud))
+        return Result::BadBaud;
+    if (ring_limit(settings_.request, plan_, baud) == 0)
+        return Result::LineTooSlow;
+    baud_next_ = baud;
+    return Result::Ok;
+}
+
+// --------------------------------------------------------------------- what commands begin
+
+// pattern: which readings the scans take (scan_sequence.h).
+void Device::begin_slots(const ScanRequest &request, uint8_t pattern, const ScanPlan &plan) {
     groups_left_ = 0;
-    board::scanner.begin(request.rows, request.columns, request.mode, plan.idle_slots);
+    board::scanner.begin(request.rows, request.columns, pattern, plan.idle_slots);
     const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
-    const uint32_t ahead = uint32_t{plan.slot_cycles} * Scanner::FIRST_SLOT;  // beyond 16 bits
+    // Cycles from now to the first reading. Small slow scans have slots for which 16 bits are few.
+    const uint32_t ahead = uint32_t{plan.slot_cycles} * Scanner::FIRST_SLOT;
     scan_time_us_ = board::now_us() + ahead / cycles_per_us;
     scan_time_rest_ = static_cast<uint8_t>(ahead % cycles_per_us);
     board::start_slots(plan, request.adc_prescaler);
 }
 
 void Device::begin_self_test_scan() {
-    ScanRequest request = SelfTest::request();
+    const ScanRequest request = SelfTest::request();
     ScanPlan plan;
     plan_scan(request, board::CLOCK_HZ, &plan);
-    request.mode = self_test_.order();
-    begin_slots(request, plan);
+    begin_slots(request, self_test_.pattern(), plan);
 }
 
+// The slots' last scan is over, and all its codes are taken.
 void Device::finish_slots() {
     board::stop_slots();
     if (groups_left_ != 0)
         drop_open_scan();
-    if (mode_ == Mode::SelfTesting) {
+    if (activity_ == Activity::SelfTesting) {
         if (self_test_.next())
             return begin_self_test_scan();
         report_pending_ = true;
@@ -268,7 +322,7 @@ void Device::finish_slots() {
     } else {
         resolve(Type::Stop, Result::Ok);
     }
-    mode_ = Mode::Idle;
+    activity_ = Activity::Idle;
 }
 
 bool Device::poll_save() {
@@ -312,7 +366,7 @@ void Device::send_hello() {
         baud_,
         static_cast<uint8_t>(settings_source_),
         board::reset_cause(),
-        static_cast<uint8_t>(mode_ == Mode::Scanning),
+        static_cast<uint8_t>(activity_ == Activity::Scanning),
     };
     writer_.begin(Type::Hello);
     writer_.put(&hello, sizeof hello);
@@ -321,15 +375,18 @@ void Device::send_hello() {
 
 // ----------------------------------------------------------------------------------- answers
 
+// Answers the command that has arrived.
 void Device::answer(Result result) {
     acks_[ack_count_++] = Ack{reader_.type(), reader_.sequence(), result, true};
 }
 
+// Leaves the answer to resolve(). Its place is taken now, because the reader forgets the command.
 void Device::defer() {
     answer(Result::Ok);
     acks_[ack_count_ - 1].ready = false;
 }
 
+// Answers every command of this type that was deferred: a host may have sent `stop` twice.
 void Device::resolve(Type command, Result result) {
     for (uint8_t i = 0; i < ack_count_; i++)
         if (acks_[i].command == static_cast<uint8_t>(command) && !acks_[i].ready) {

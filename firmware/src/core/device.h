@@ -21,9 +21,26 @@ class Device {
     bool poll();
 
   private:
-    OHMSKIN_RARE bool attend();
+    // What the slots run for.
+    enum class Activity : uint8_t {
+        Idle,        // no slots run
+        Scanning,    // scans are sent
+        Stopping,    // the same, until the scan at hand is over: `stop` is answered then
+        SelfTesting  // the self-test takes the scans; none is sent
+    };
 
-    enum class Mode : uint8_t { Idle, Scanning, Stopping, SelfTesting };
+    // The answer to a command, which waits until it may be sent: never inside a scan frame.
+    struct Ack {
+        uint8_t command;
+        uint8_t sequence;
+        frames::Result result;
+        bool ready;  // false: the command is still being carried out, resolve() comes later
+    };
+    // Answers that can wait. Four are chosen: hosts wait for each answer, and this is what a host
+    // may send at once that does not.
+    static constexpr uint8_t ACKS_MAX = 4;
+
+    OHMSKIN_RARE bool attend();
 
     // ---- serial line
     OHMSKIN_APART bool transmit();
@@ -33,10 +50,19 @@ class Device {
 
     // ---- commands
     OHMSKIN_RARE void execute();
+    frames::Result refusal() const;
+    void carry_out();
     OHMSKIN_RARE frames::Result configure(const ScanRequest &request);
-    OHMSKIN_RARE frames::Result set_baud(const uint8_t *payload);
     OHMSKIN_RARE frames::Result start();
-    OHMSKIN_RARE void begin_slots(const ScanRequest &request, const ScanPlan &plan);
+    void stop();
+    void save();
+    frames::Result load_defaults();
+    void begin_self_test();
+    OHMSKIN_RARE frames::Result set_baud(uint32_t baud);
+
+    // ---- what commands begin
+    OHMSKIN_RARE void begin_slots(const ScanRequest &request, uint8_t pattern,
+                                  const ScanPlan &plan);
     OHMSKIN_RARE void begin_self_test_scan();
     OHMSKIN_RARE void finish_slots();
     OHMSKIN_RARE bool poll_save();
@@ -52,31 +78,32 @@ class Device {
     OHMSKIN_RARE uint16_t ring_limit(const ScanRequest &request, const ScanPlan &plan,
                                      uint32_t baud) const;
 
-    // ---- answers, which wait until no scan frame is open
+    // ---- answers
     OHMSKIN_RARE void answer(frames::Result result);
     OHMSKIN_RARE void defer();
     OHMSKIN_RARE void resolve(frames::Type command, frames::Result result);
-
-    struct Ack {
-        uint8_t command;
-        uint8_t sequence;
-        frames::Result result;
-        bool ready;
-    };
-    static constexpr uint8_t ACKS_MAX = 4;
+    bool answers_wait() const { return hello_pending_ || report_pending_ || ack_count_ != 0; }
 
     FrameWriter writer_{};
     FrameReader reader_{};
     Settings settings_ = DEFAULT_SETTINGS;
     SettingsWriter settings_writer_{};
     SelfTest self_test_{};
-    ScanPlan plan_{};
-    Mode mode_ = Mode::Idle;
-    bool attention_ = true;  // something below is waiting
+    ScanPlan plan_{};  // for settings_.request
+    Activity activity_ = Activity::Idle;
+
+    // Whether attend() may find something to do. Most passes find nothing, so they skip it.
+    //
+    // It must be set wherever something begins that attend() has to go on with: at boot (hello),
+    // after each command, and at the end of a scan frame, for which answers have waited. Without
+    // it, that would wait until the next command. attend() itself keeps it set as long as work is
+    // left that no such event ends: a byte of the EEPROM, a new line speed. That the slots have
+    // stopped needs no flag, because poll() asks the scanner.
+    bool attention_ = true;
 
     frames::Settings settings_source_ = frames::Settings::DefaultsBlank;
     bool hello_pending_ = false;
-    bool report_pending_ = false;
+    bool report_pending_ = false;  // of the self-test
     Ack acks_[ACKS_MAX] = {};
     uint8_t ack_count_ = 0;
 
@@ -85,10 +112,10 @@ class Device {
     uint32_t scan_number_ = 0;
     uint32_t scan_time_us_ = 0;
     uint8_t scan_time_rest_ = 0;  // clock cycles beyond scan_time_us_
-    uint16_t dropped_ = 0;
-    uint16_t ring_limit_ = 0;  // ring use up to which a scan may begin and is sure to fit
+    uint16_t dropped_ = 0;        // scans since the start that were made and not sent
+    uint16_t ring_limit_ = 0;     // ring use up to which a scan may begin and is sure to fit
 
-    // The line's speed.
+    // The line's speed. A new one is given up again unless the host confirms it by a command.
     uint32_t baud_ = frames::BAUD_DEFAULT;
     uint32_t baud_next_ = 0;  // to be taken once the ack has left; 0: none
     bool baud_confirmed_ = true;

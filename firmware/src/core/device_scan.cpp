@@ -9,28 +9,44 @@ using frames::Type;
 
 namespace {
 
+// Start bit, eight data bits, stop bit.
 constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
-// What Hello, a report and the acks may take between two scans.
+
+// Bytes of a group: four codes of 10 bits.
+constexpr uint8_t GROUP_BYTES = 5;
+
+// Bytes of the ring that scans leave free, for a hello and its ack. Answers may be sent only
+// between two scans. If scans filled the ring to its end, an answer would find no room at that
+// moment, and might wait for ever. (A report of the self-test is sent while no scans are.)
 constexpr uint16_t ANSWERS_SPACE =
     FrameWriter::line_bytes(sizeof(frames::Hello)) + FrameWriter::line_bytes(sizeof(frames::Ack));
 
-// What the last group of a frame may take: its bytes, a block's length, CRC, delimiter.
-constexpr uint16_t GROUP_SPACE = 5 + 2 + 2 + 1;
+// Bytes that the last group of a frame may take: its own, the lengths of two blocks, CRC,
+// delimiter.
+constexpr uint16_t GROUP_SPACE = GROUP_BYTES + 2 + 2 + 1;
 
+// The main loop feeds the line somewhat slower than the line could go, at most by this part, an
+// eighth: with the shortest slots, interrupts leave it that little time. Chosen: with it, no load
+// of tests/firmware (test_no_load_damages_a_frame) tears a frame.
+constexpr uint8_t LINE_IDLE_PART = 8;
+
+// Bytes of a scan frame's payload.
 uint16_t scan_payload(uint8_t rows, uint8_t columns) {
     return static_cast<uint16_t>(sizeof(frames::Scan) +
                                  (readings_in(rows, columns) * uint32_t{frames::ADC_BITS} + 7) / 8);
 }
 
+// Clock cycles in which the line carries a byte.
 uint16_t cycles_per_byte(uint32_t baud) {
     return static_cast<uint16_t>(board::CLOCK_HZ / baud * BITS_PER_BYTE_8N1);
 }
 
 }  // namespace
 
+// Takes the oldest group of codes from the queue, into the scan's frame or the self-test.
 void Device::take_group() {
     Scanner &scanner = board::scanner;
-    if (mode_ == Mode::SelfTesting) {
+    if (activity_ == Activity::SelfTesting) {
         self_test_.take(scanner.group());
         scanner.stop_after_scan();  // one scan is enough
     } else {
@@ -51,9 +67,9 @@ void Device::take_group() {
 
 void Device::begin_scan() {
     if (groups_left_ != 0)
-        drop_open_scan();
+        drop_open_scan();  // its last codes were lost
     account_for_lost_scans();
-    if (hello_pending_ || report_pending_ || ack_count_ != 0)
+    if (answers_wait())
         send_pending();
     const ScanRequest &scan = settings_.request;
     if (writer_.used() <= ring_limit_) {
@@ -68,15 +84,15 @@ void Device::begin_scan() {
     count_scan();
 }
 
-// The main loop was too late for the slots or for the line. That does not happen within the limits
-// of plan_scan() and ring_limit(), but if it does, the scan is lost as a whole.
+// The main loop was too late for the slots or for the line. plan_scan() and ring_limit() refuse
+// scans with which that could happen; if it does happen, the scan is lost as a whole.
 void Device::drop_open_scan() {
     writer_.abandon();
     groups_left_ = 0;
     dropped_++;
 }
 
-// Scan numbers and times go on for scans that never reached the queue.
+// Counts scans that never reached the queue, so that scan numbers and times stay right.
 void Device::account_for_lost_scans() {
     const uint8_t number = board::scanner.scan_number();
     while (static_cast<uint8_t>((number - scan_number_) & (Scanner::SCAN_NUMBERS - 1)) != 0) {
@@ -85,6 +101,7 @@ void Device::account_for_lost_scans() {
     }
 }
 
+// Moves number and time on to the next scan. The rest is carried along, so that times do not drift.
 void Device::count_scan() {
     const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
     const uint32_t cycles = plan_.scan_cycles() + scan_time_rest_;
@@ -93,31 +110,36 @@ void Device::count_scan() {
     scan_time_rest_ = static_cast<uint8_t>(cycles % cycles_per_us);
 }
 
-// Codes of 10 bits, least significant bit first: a group's four make five bytes.
+// Packs a group's four codes of 10 bits into five bytes, least significant bit first. Only a scan's
+// first code has more than its 10 bits set (Scanner::starts_scan()), so code[0] alone is masked.
 void Device::put_group(const uint16_t *code) {
     static_assert(frames::ADC_BITS == 10 && frames::READINGS_PER_CELL == 4, "the shifts below");
-    const uint8_t octets[] = {
+    const uint8_t octets[GROUP_BYTES] = {
         static_cast<uint8_t>(code[0]),
         static_cast<uint8_t>((code[0] & Scanner::CODE) >> 8 | static_cast<uint8_t>(code[1]) << 2),
         static_cast<uint8_t>(code[1] >> 6 | static_cast<uint8_t>(code[2]) << 4),
         static_cast<uint8_t>(code[2] >> 4 | static_cast<uint8_t>(code[3]) << 6),
         static_cast<uint8_t>(code[3] >> 2),
     };
-    // At 500 kbaud the chip's two bytes leave within 640 cycles, and a group's work takes longer.
+    // The chip holds two bytes for the line, which at 500 kbaud leave within 640 cycles, and the
+    // work on a group takes longer. So the line is fed in between, too: it would idle otherwise.
     writer_.put(octets, 3);
     transmit();
-    writer_.put(octets + 3, 2);
+    writer_.put(octets + 3, GROUP_BYTES - 3);
 }
 
-// A scan's bytes come in at a known pace and leave at a known pace, so the most the ring can hold
-// during a scan is known when it begins: max(used, one open block) + what comes in faster than it
-// leaves. A scan begins only where that fits, hence none is ever torn. 0: it never fits.
+// How full the ring may be where a scan begins; 0: the scan never fits.
+//
+// The bytes of a scan come in at a known pace and leave at a known pace. So the most that the ring
+// can hold during a scan is known when it begins: what it holds then, or one open block that cannot
+// leave yet, and what comes in faster than it leaves. A scan begins only where that fits, hence no
+// scan is torn.
 uint16_t Device::ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const {
     const uint16_t frame = FrameWriter::line_bytes(scan_payload(request.rows, request.columns));
     const uint32_t duration =
         static_cast<uint32_t>(plan.slot_cycles) * readings_in(request.rows, request.columns);
     uint32_t leaves = duration / cycles_per_byte(baud);
-    leaves -= leaves / 8;  // what the main loop keeps up with where slots are shortest
+    leaves -= leaves / LINE_IDLE_PART;
     const uint32_t excess = frame > leaves ? frame - leaves : 0;
     const uint16_t most = FrameWriter::SIZE - 1 - ANSWERS_SPACE;
     if (excess + FrameWriter::LONGEST_BLOCK > most)

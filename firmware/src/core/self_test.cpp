@@ -5,8 +5,11 @@ namespace ohmskin {
 
 namespace {
 
+// The largest code.
 constexpr uint16_t FULL_SCALE = (1u << frames::ADC_BITS) - 1;
-// Half of Vdd less 1/16, for resistors that differ by up to a quarter.
+// Codes that are surely below and above half of Vdd: 1/16 of the scale apart from it. If the larger
+// reference resistor is a quarter above the smaller one, the half moves by 1/18. Chosen: that is
+// more than resistors of a kit differ, and faults move a node to a rail.
 constexpr uint16_t HALF_LOW = FULL_SCALE / 2 - FULL_SCALE / 16;
 constexpr uint16_t HALF_HIGH = FULL_SCALE / 2 + FULL_SCALE / 16;
 
@@ -38,29 +41,33 @@ void SelfTest::begin(const ScanRequest &skin) {
         max_[i] = 0;
     }
     far_ = skin.mode == static_cast<uint8_t>(frames::Mode::Far);
-    // A far node that floats takes a column's inputs, two a group, to forget where it was.
-    forgets_ = skin.columns > 1 ? frames::ROWS_MAX / 2 : 0;
-    order_ = 0;
+    // A far node that is connected to nothing still has the potential of the pass before when a
+    // pass begins, and takes that of this pass from the sample capacitor bit by bit. After a
+    // column's inputs, two readings a group, it has it. Where the skin has one column alone, no
+    // other inputs are connected, and none can be left out.
+    ignored_ = skin.columns > 1 ? frames::ROWS_MAX / 2 : 0;
+    pattern_ = 0;
     groups_ = 0;
 }
 
 bool SelfTest::next() {
     groups_ = 0;
-    order_ = order_ < MODES ? MODES : order_ + 1;
-    return far_ && order_ < ORDERS;
+    pattern_ = pattern_ < MODES ? MODES : pattern_ + 1;
+    return far_ && pattern_ < PATTERNS;
 }
 
 void SelfTest::take(const uint16_t *codes) {
-    constexpr uint16_t PASS = frames::ROWS_MAX * frames::COLUMNS_MAX / 2;
-    const bool second = groups_ >= PASS;
-    const uint16_t at = second ? groups_ - PASS : groups_;
+    // A group has the two readings of this pass of one cell, and those of the next cell.
+    constexpr uint16_t GROUPS_PER_PASS = frames::ROWS_MAX * frames::COLUMNS_MAX / 2;
+    const bool second = groups_ >= GROUPS_PER_PASS;
+    const uint16_t of_this_pass = second ? groups_ - GROUPS_PER_PASS : groups_;
     groups_++;
-    if (order_ >= MODES && at < forgets_)
+    if (pattern_ >= MODES && of_this_pass < ignored_)
         return;
     for (uint8_t n = 0; n < Scanner::GROUP; n++) {
         const uint8_t of_pass = n & (frames::READINGS_PER_PASS - 1);
         const uint8_t i =
-            index(reading_of(order_, second ? of_pass + frames::READINGS_PER_PASS : of_pass));
+            index(reading_of(pattern_, second ? of_pass + frames::READINGS_PER_PASS : of_pass));
         const uint16_t code = codes[n] & Scanner::CODE;
         if (code < min_[i])
             min_[i] = code;
@@ -82,8 +89,8 @@ frames::SelfTestReport SelfTest::report() const {
                                             bit_if(top.stuck_high(), Finding::TopStuckHigh) |
                                             bit_if(bottom.stuck_low(), Finding::BottomStuckLow) |
                                             bit_if(bottom.stuck_high(), Finding::BottomStuckHigh));
-    // A rail at one node pulls others across half of Vdd: through a pressed cell, or at the far
-    // end.
+    // A node at a rail pulls others across half of Vdd: through a pressed cell, or at the far end.
+    // So other faults are looked for only where no near node is at a rail, then no far node.
     if (report.findings == 0 && far_)
         report.findings =
             static_cast<uint16_t>(bit_if(far_top.stuck_low(), Finding::FarTopStuckLow) |

@@ -7,30 +7,48 @@
 
 namespace ohmskin {
 
-// Judges the sense nodes by what one scan of all multiplexer inputs reads, in mode far by three.
+// Judges the sense nodes by one scan of all multiplexer inputs; in mode far by two more, for the
+// far nodes.
+//
 // With equal reference resistors a node cannot read below half of Vdd while its own pin is high,
 // nor above it while the pin is low, whatever the skin does: current only ever flows through both
-// resistors in series. A far node that is connected to nothing follows the sample capacitor, which
-// brings the potential of the other layer: it reads low where the rows are high.
+// resistors in series. So what reads otherwise is a fault of the wiring.
+//
+// A far node has no resistor. One that is connected to nothing keeps the potential that the sample
+// capacitor brings, that of the reading before. The self-test's patterns therefore read a near node
+// of the other layer first: such a far node reads low where it should read high.
 class SelfTest {
   public:
     OHMSKIN_RARE void begin(const ScanRequest &skin);
-    // How the next scan takes all inputs: slow enough for any skin's wiring to settle.
+    // Takes all inputs, whatever the skin's size: a wire may be in the wrong one.
     static ScanRequest request() {
-        return ScanRequest{frames::ROWS_MAX, frames::COLUMNS_MAX, 0, 50, 32, 0};
+        return ScanRequest{frames::ROWS_MAX,
+                           frames::COLUMNS_MAX,
+                           0,  // rate: as fast as the settle time allows
+                           SETTLE_US,
+                           static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz),
+                           static_cast<uint8_t>(frames::Mode::Near)};
     }
-    uint8_t order() const { return order_; }        // of its readings
-    OHMSKIN_RARE void take(const uint16_t *codes);  // its groups, in order
-    OHMSKIN_RARE bool next();                       // false: it was the last one
+    // Which readings the next scan takes (scan_sequence.h): pattern() goes beyond the request's
+    // mode.
+    uint8_t pattern() const { return pattern_; }
+    OHMSKIN_RARE void take(const uint16_t *codes);  // the scan's groups, in order
+    OHMSKIN_RARE bool next();                       // to the next scan; false: it was the last one
     OHMSKIN_RARE frames::SelfTestReport report() const;
 
   private:
+    // Settle time [us] of the self-test's scans. Chosen: the largest node that the firmware reckons
+    // with, 244 pF at 30 kOhm (docs/timing.md, "Mode far"), has a time constant of 7.3 us, and is
+    // off by a code after 50 us. A test need not be fast.
+    static constexpr uint16_t SETTLE_US = 50;
+
+    // Smallest and largest code of each reading, over all inputs.
     uint16_t min_[frames::READINGS] = {};
     uint16_t max_[frames::READINGS] = {};
-    uint16_t groups_ = 0;  // taken so far of this scan
-    uint16_t forgets_ = 0;
-    uint8_t order_ = 0;
-    bool far_ = false;
+    uint16_t groups_ = 0;   // taken so far of this scan
+    uint16_t ignored_ = 0;  // groups at the start of each pass that are not judged
+    uint8_t pattern_ = 0;   // of this scan
+    bool far_ = false;      // whether the far nodes are judged
 };
 
 }  // namespace ohmskin

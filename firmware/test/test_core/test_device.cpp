@@ -150,7 +150,7 @@ Bench &fresh() {
 }
 
 uint16_t ramp(const Selection &s) {
-    return static_cast<uint16_t>(s.row * 40 + s.column * 4 + s.reading);
+    return static_cast<uint16_t>(s.row * 40 + s.column * 4 + s.pattern_entry);
 }
 
 bool same(const frames::Hello &a, const frames::Hello &b) { return memcmp(&a, &b, sizeof a) == 0; }
@@ -190,13 +190,13 @@ TEST(mode_far_reads_both_ends_under_one_drive) {
             const char name = orders[mode][n];
             const uint8_t reading = static_cast<uint8_t>(reading_of(mode, n));
             CHECK_EQ(name - 'a', reading);
-            const Configuration found = CONFIGURATIONS[reading];
-            CHECK_EQ(strchr("cd", name) ? Drive::Bottom : Drive::Top, found.drive);
+            const ReadingDefinition definition = READING_DEFINITIONS[reading];
+            CHECK_EQ(strchr("cd", name) ? Drive::Bottom : Drive::Top, definition.drive);
             const Sense near = strchr("ad", name) ? Sense::Top : Sense::Bottom;
             CHECK_EQ(name == 'e'   ? Sense::FarTop
                      : name == 'f' ? Sense::FarBottom
                                    : near,
-                     found.sense);
+                     definition.sense);
         }
 }
 
@@ -437,13 +437,16 @@ TEST(an_unconfirmed_speed_falls_back) {
 
 namespace {
 // Nodes as a skin of 1 MOhm cells and 30 kOhm resistors reads, and as faults make them.
-uint16_t sound(const Selection &s) { return (s.reading & 1) ? 30 : 993; }
-uint16_t bottom_low(const Selection &s) { return s.reading == 0 ? 993 : s.reading == 3 ? 29 : 0; }
-uint16_t top_high(const Selection &s) {
-    return (s.reading & 1) == 0 ? 1023 : s.reading == 3 ? 1023 : 30;
+// In mode near, pattern entries 0 to 3 are A to D.
+uint16_t sound(const Selection &s) { return (s.pattern_entry & 1) ? 30 : 993; }
+uint16_t bottom_low(const Selection &s) {
+    return s.pattern_entry == 0 ? 993 : s.pattern_entry == 3 ? 29 : 0;
 }
-uint16_t no_top_resistor(const Selection &s) { return s.reading < 2 ? 0 : 1020; }
-uint16_t all_pressed(const Selection &s) { return (s.reading & 1) ? 500 : 523; }
+uint16_t top_high(const Selection &s) {
+    return (s.pattern_entry & 1) == 0 ? 1023 : s.pattern_entry == 3 ? 1023 : 30;
+}
+uint16_t no_top_resistor(const Selection &s) { return s.pattern_entry < 2 ? 0 : 1020; }
+uint16_t all_pressed(const Selection &s) { return (s.pattern_entry & 1) ? 500 : 523; }
 }  // namespace
 
 TEST(self_test_names_what_no_skin_can_cause) {

@@ -20,7 +20,7 @@ ScanRequest request(uint8_t rows, uint8_t columns, uint32_t rate_mhz, uint16_t s
 // The code a fake skin gives for a selection, unique up to 16x16 within 10 bits of each cell's
 // part.
 uint16_t code_of(const Selection &s) {
-    return static_cast<uint16_t>((s.row * 16 + s.column) << 2 | s.reading);
+    return static_cast<uint16_t>((s.row * 16 + s.column) << 2 | s.pattern_entry);
 }
 
 // Runs slots the way the hardware does: hold, set the pins, step.
@@ -133,20 +133,20 @@ TEST(what_is_out_of_range_is_refused_by_name) {
 }
 
 TEST(a_scan_passes_over_all_cells_twice_and_rows_run_fastest) {
-    for (uint8_t order = 0; order < ORDERS; order++) {
+    for (uint8_t pattern = 0; pattern < PATTERNS; pattern++) {
         ScanSequence sequence;
-        sequence.begin(2, 3, order);
+        sequence.begin(2, 3, pattern);
         for (uint8_t first = 0; first < 4; first = static_cast<uint8_t>(first + 2))
             for (uint8_t column = 0; column < 3; column++)
                 for (uint8_t row = 0; row < 2; row++)
                     for (uint8_t n = first; n < first + 2; n++) {
                         CHECK_EQ(row << 8 | column, sequence.at().row << 8 | sequence.at().column);
-                        CHECK_EQ(order * 4 + n, sequence.at().reading);
+                        CHECK_EQ(pattern * 4 + n, sequence.at().pattern_entry);
                         const bool last = column == 2 && row == 1 && n == 3;
                         CHECK_EQ(last, sequence.next());
                     }
         CHECK_EQ(0, sequence.at().column);
-        CHECK_EQ(order * 4, sequence.at().reading);
+        CHECK_EQ(pattern * 4, sequence.at().pattern_entry);
     }
 }
 
