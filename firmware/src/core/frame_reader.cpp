@@ -14,7 +14,7 @@ bool FrameReader::feed(uint8_t octet) {
         return false;
     }
     // A new block begins; the one before it stood for a zero, unless it was full or the first.
-    if (code_ != 0 && code_ != 0xFF)
+    if (code_ != 0 && code_ != FULL_BLOCK)
         store(0);
     code_ = octet;
     left_ = static_cast<uint8_t>(octet - 1);
@@ -31,17 +31,17 @@ void FrameReader::store(uint8_t octet) {
 
 bool FrameReader::finish() {
     const bool empty = code_ == 0 && !damaged_;
-    bool valid = !damaged_ && left_ == 0 && size_ >= 4;
+    bool valid = !damaged_ && left_ == 0 && size_ >= FRAME_BYTES_MIN;
     if (valid) {
         Crc16 crc;
-        for (uint8_t i = 0; i < size_ - 2; i++)
+        for (uint8_t i = 0; i < size_ - CRC_BYTES; i++)
             crc.add(content_[i]);
-        valid = content_[size_ - 2] == crc.low() && content_[size_ - 1] == crc.high();
+        valid = content_[size_ - CRC_BYTES] == crc.low() && content_[size_ - 1] == crc.high();
     }
     // A delimiter alone is how a host flushes the line: not an error.
     if (!valid && !empty)
         errors_++;
-    frame_size_ = valid ? size_ : 4;
+    frame_size_ = valid ? size_ : FRAME_BYTES_MIN;
     size_ = code_ = left_ = 0;
     damaged_ = false;
     return valid;

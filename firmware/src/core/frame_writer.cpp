@@ -18,8 +18,9 @@ void FrameWriter::begin(frames::Type type) {
     put(octets, sizeof octets);
 }
 
-// The path every code takes: the state is in registers meanwhile. A full block of 254 bytes stands
-// for no zero; the next opens when a byte comes.
+// Every code takes this path, so it is written for speed: the state is in registers meanwhile. A
+// full block stands for no zero, and the next block opens only when a byte comes: a frame may end
+// there.
 void FrameWriter::put(const void *octets, uint8_t size) {
     const uint8_t *octet = static_cast<const uint8_t *>(octets);
     Crc16 crc = crc_;

@@ -7,20 +7,26 @@
 
 namespace ohmskin {
 
-// Frames, as they are written byte by byte, straight into the ring the serial line is fed from.
+// Writes frames byte by byte, straight into the ring that the serial line is fed from.
 //
 // A COBS block starts with its length, so a block leaves for the line only when it is complete: at
-// a zero byte, after 254 others, or at the frame's end. Nothing larger is ever held back, which is
-// what lets a 16x16 scan of 1.3 kB stream through a 512-byte ring.
+// a zero byte, after 254 others, or at the frame's end. Nothing larger is ever held back. So a
+// 16x16 scan of 1.3 kB streams through a ring of 512 bytes.
 class FrameWriter {
   public:
-    static constexpr uint16_t SIZE = 512;  // a power of two
+    // Bytes of the ring: a power of two. Chosen: a quarter of the Uno's RAM. docs/timing.md,
+    // "What limits the rate", says what it costs.
+    static constexpr uint16_t SIZE = 512;
+    // Bytes of the longest COBS block, its length byte included, and without it.
     static constexpr uint16_t LONGEST_BLOCK = 255;
-    static constexpr uint8_t OVERHEAD = 2 + 2 + 2;  // type, sequence; CRC; two delimiters
+    static constexpr uint16_t BLOCK_CONTENT_MAX = LONGEST_BLOCK - 1;
+    // Bytes of a frame besides payload and length bytes: type, sequence; CRC; two delimiters.
+    static constexpr uint8_t OVERHEAD = 2 + 2 + 2;
 
     // Bytes on the line for a frame of `payload` bytes, at most.
     static constexpr uint16_t line_bytes(uint16_t payload) {
-        return static_cast<uint16_t>(payload + OVERHEAD + 1 + (payload + OVERHEAD) / 254);
+        return static_cast<uint16_t>(payload + OVERHEAD + 1 +
+                                     (payload + OVERHEAD) / BLOCK_CONTENT_MAX);
     }
 
     void begin(frames::Type type);

@@ -12,19 +12,25 @@ namespace {
 
 using Record = SettingsRecord;
 
-// Two records are written in turn: while one is being written, the other stays whole.
+// Addresses of the two records in EEPROM. They are written in turn: while one is being written, the
+// other stays whole.
 constexpr uint8_t FIRST_AT = 32, SECOND_AT = 64;
-// Older firmware had one record here, with the protocol's layout CRC in place of version and
-// sequence. It is read where there is no other, and never written.
+// Address at which older firmware had its one record, with the protocol's layout CRC in place of
+// version and sequence. It is read where there is no other, and never written.
 constexpr uint8_t OLD_AT = 0;
+// In place of an address: there is no record.
 constexpr uint8_t NOWHERE = 0xFF;
+// A byte of EEPROM that was never written (data sheet: erased bytes read 0xFF).
 constexpr uint8_t BLANK = 0xFF;
+// Bytes of the CRC at a record's end.
+constexpr uint8_t CRC_BYTES = 2;
 
 uint8_t *bytes_of(Record *record) { return reinterpret_cast<uint8_t *>(record); }
 
+// size: of the record, its CRC included.
 Crc16 crc_of(Record *record, uint8_t size) {
     Crc16 crc;
-    for (uint8_t i = 0; i < size - 2; i++)
+    for (uint8_t i = 0; i < size - CRC_BYTES; i++)
         crc.add(bytes_of(record)[i]);
     return crc;
 }
@@ -38,6 +44,7 @@ bool read(uint8_t at, Record *record) {
     uint8_t *bytes = bytes_of(record);
     for (uint8_t i = 0; i < sizeof *record; i++)
         bytes[i] = board::eeprom_read(at + i);
+    // A record without mode is a byte shorter, so its CRC lies where the mode would be.
     const bool has_mode = at != OLD_AT && record->version != Record::VERSION_WITHOUT_MODE;
     const uint8_t size = has_mode ? sizeof *record : sizeof *record - 1;
     const Crc16 crc = crc_of(record, size);
@@ -49,17 +56,18 @@ bool read(uint8_t at, Record *record) {
 
 // Reads the newest sound record of a version that is known; where it is, or NOWHERE.
 uint8_t read_newest(Record *newest) {
-    uint8_t found = NOWHERE;
+    uint8_t newest_at = NOWHERE;
     for (uint8_t at = FIRST_AT; at <= SECOND_AT; at += SECOND_AT - FIRST_AT) {
         Record record;
         if (!read(at, &record) || !known(record.version))
             continue;
-        if (found != NOWHERE && static_cast<int8_t>(record.sequence - newest->sequence) <= 0)
+        // Sequences wrap: the newer one is at most half a turn ahead.
+        if (newest_at != NOWHERE && static_cast<int8_t>(record.sequence - newest->sequence) <= 0)
             continue;
         *newest = record;
-        found = at;
+        newest_at = at;
     }
-    return found;
+    return newest_at;
 }
 
 bool all_blank() {
@@ -69,7 +77,8 @@ bool all_blank() {
     return true;
 }
 
-// Of another version, as newer firmware may have left it.
+// Whether a record of another version is there, as newer firmware may have left it. It is not
+// overwritten as long as there is another place.
 bool foreign(uint8_t at) {
     const uint8_t version = board::eeprom_read(at);
     return !known(version) && version != BLANK;
@@ -96,6 +105,7 @@ void SettingsWriter::begin(const Settings &settings) {
     Record last = {};
     const uint8_t newest = read_newest(&last);
     const ScanRequest &scan = settings.request;
+    // The sequence and the CRC of the last record, for the comparison below.
     record_ = {Record::VERSION, last.sequence, settings.unit_id, scan.rows,
                scan.columns,    scan.rate_mhz, scan.settle_us,   scan.adc_prescaler,
                scan.mode,       last.crc_low,  last.crc_high};
@@ -115,13 +125,14 @@ void SettingsWriter::begin(const Settings &settings) {
     record_.crc_high = crc.high();
 }
 
-// The bytes are written from the last to the first. So until all others are there, a record keeps
-// its old sequence, by which the other one is newer, or is still of no version.
+// The bytes are written from the last to the first, so version and sequence come last. Until all
+// other bytes are there, the record still has its old sequence, and the other record is the newer
+// one; or it has no version yet, and counts for nothing.
 SettingsWriter::State SettingsWriter::poll() {
     if (state_ != State::Writing || board::eeprom_busy())
         return State::Idle;
     if (left_ != 0) {
-        // Cells that already hold their value are spared too.
+        // Bytes that already hold their value are not worn by another write.
         left_--;
         const uint8_t octet = bytes_of(&record_)[left_];
         if (board::eeprom_read(at_ + left_) != octet)

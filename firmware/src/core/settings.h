@@ -12,13 +12,24 @@ struct Settings {
     ScanRequest request;
 };
 
-constexpr Settings DEFAULT_SETTINGS = {0, {8, 8, 90000, 0, 32, 0}};
+// How a board scans that nobody has configured. These numbers are the firmware's own. The protocol
+// says what may be asked for, not what a board begins with, and hosts read that from `hello`.
+constexpr Settings DEFAULT_SETTINGS = {
+    0,  // unit id: none yet
+    {
+        8,
+        8,      // rows and columns. Chosen: the size of skin that docs/ reckons with
+        90000,  // rate [mHz]. Chosen: the fastest round one that leaves 8x8 cells SETTLE_US
+        0,      // settle time: as long as the rate allows
+        static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz),
+        static_cast<uint8_t>(frames::Mode::Near),
+    }};
 
 // Settings as the EEPROM holds them. The fields are the record's own, not the protocol's, so that a
 // change of the protocol forgets nothing. A change of the fields needs a new VERSION; `version` and
 // `sequence` stay the first two bytes.
 struct __attribute__((packed)) SettingsRecord {
-    static constexpr uint8_t VERSION = 2;
+    static constexpr uint8_t VERSION = 2;  // of the record's fields
     // A record of before there were modes. It is still read: the mode is near.
     static constexpr uint8_t VERSION_WITHOUT_MODE = 1;
 
@@ -53,7 +64,7 @@ class SettingsWriter {
 
   private:
     SettingsRecord record_ = {};
-    uint8_t at_ = 0;    // in EEPROM
+    uint8_t at_ = 0;    // address of the record in EEPROM
     uint8_t left_ = 0;  // bytes still to be written: from the last to the first
     State state_ = State::Idle;
 };
