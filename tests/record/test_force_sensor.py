@@ -25,6 +25,7 @@ from ohmskin.cli.record import PressDisplay
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
 from ohmskin.force.calibration import load_calibration
+from ohmskin.link.device import scans_for
 from ohmskin.link.messages import Scan
 from ohmskin.record.force_sensor import QUEUE_SAMPLES, ForceLineDecoder, ForceSensor
 from ohmskin.record.recorder import Recorder, record
@@ -356,7 +357,7 @@ def test_a_display_counts_what_is_pressed(tmp_path: Path) -> None:
             if scan.number % 4 == 0:
                 heads.append(picture()[0])
 
-        record(skin, recorder, skin, seconds=8.4, tare_s=1.5, beside=see)
+        record(skin, recorder, scans_for(skin, 8.4), tare_s=1.5, beside=see)
     assert heads[0] == "1 scans   force 0.50 N   touch nothing yet"
     assert any(head.endswith("N   pressed: (0, 1)") for head in heads)
     assert heads[-1].endswith("N   pressed: none")

@@ -125,7 +125,7 @@ def test_cut_off_at_any_byte(tmp_path: Path, hello: Hello) -> None:
     with Recorder(whole, hello) as recorder:
         for number in range(6):
             recorder.add(scan(number))
-            recorder._flush()
+            recorder.flush()
     octets = whole.read_bytes()
     counts = []
     ends = ends_of_records(octets)
@@ -282,7 +282,7 @@ def test_a_file_that_is_removed_ends_the_recording(
         path.unlink()
     refused = partial(pytest.raises, RecordingError, match="has removed the file, and 1 scans")
     try:
-        until(lambda: not recorder._flusher.is_alive(), LATE_S)
+        until(lambda: recorder.failure, LATE_S)
         with refused():
             recorder.add(scan(1))
     finally:
@@ -315,7 +315,7 @@ def test_a_full_disk_is_told_with_the_number_of_scans_that_are_readable(
             for number in range(40):
                 recorder.add(scan(number))
                 if number % 5 == 4:
-                    recorder._flush()
+                    recorder.flush()
 
     for room in range(5200, 6800, 23):
         file = FullDisk(path := tmp_path / f"{room}.mcap", "wb")

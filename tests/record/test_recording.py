@@ -13,7 +13,6 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -111,7 +110,7 @@ def test_size_on_disk(path: Path, hello: Hello) -> None:
                 Scan(board.codes_at(3 + number / 90), number, 11_111 * number, number / 90, 0)
             )
             if number % 45 == 44:
-                recorder._flush()
+                recorder.flush()
     assert path.stat().st_size < 5 * 40_000
 
 
@@ -125,35 +124,33 @@ def test_an_existing_file_is_left_alone(tmp_path: Path, path: Path, hello: Hello
 
 
 @pytest.mark.parametrize(
-    ("limits", "scans", "tared"),
+    ("tare_s", "scans", "tared"),
     [
-        ({}, 20, None),
-        ({"count": 7}, 7, None),
-        ({"seconds": 0.02}, 9, None),  # at 400 Hz, and the one that comes then
-        ({"tare_s": 0.01}, 20, slice(0, 5)),
-        ({"tare_s": 0.03}, 20, slice(10, 13)),  # of the later size
-        ({"tare_s": 1.0, "count": 15}, 15, slice(10, 15)),
+        (0.0, 7, None),
+        (0.01, 20, slice(0, 5)),  # at 400 Hz, and the one that comes then
+        (0.03, 20, slice(10, 13)),  # of the later size
+        (1.0, 15, slice(10, 15)),
     ],
 )
 def test_the_record_loop(
-    path: Path, hello: Hello, limits: dict[str, Any], scans: int, tared: slice | None
+    path: Path, hello: Hello, tare_s: float, scans: int, tared: slice | None
 ) -> None:
     """Its board is configured anew after ten scans."""
     board = SimpleNamespace(info=hello)
     given = [scan(n, rows=3 if n < 10 else 2) for n in range(20)]
-    seen: list[int] = []
+    seen: list[Scan] = []
 
     def scanned() -> Iterator[Scan]:
-        for each in given:
+        for each in given[:scans]:
             if each.number == 10:
                 board.info = replace(hello, rows=2)
             yield each
 
     with Recorder(path, hello) as recorder:
-        record(board, recorder, scanned(), beside=lambda each: seen.append(each.number), **limits)
+        record(board, recorder, scanned(), tare_s=tare_s, beside=seen.append)
     found = load_recording(path)
     assert_same(found.scans, given[:scans])
-    assert seen == list(range(scans))
+    assert [each.number for each in seen] == list(range(scans))
     assert [each.rows for each in found.hellos] == ([3, 2] if scans > 10 else [3])
     assert len(found.tares) == (tared is not None)
     if tared is not None:
@@ -309,7 +306,7 @@ def test_a_tare_that_says_no_mode_is_of_mode_near(path: Path, hello: Hello) -> N
 def test_a_tare_is_recorded_with_the_mode_of_its_scans(tmp_path: Path) -> None:
     bench = Bench("emulator://3x4?mode=far")
     with Recorder(tmp_path / "far.mcap", bench.info) as recorder:
-        record(bench, recorder, bench, count=20, tare_s=0.1)
+        record(bench, recorder, islice(bench, 20), tare_s=0.1)
     [tare] = load_recording(tmp_path / "far.mcap").tares
     assert tare.mode == "far"
 

@@ -2,12 +2,15 @@
 """``ohmskin ports``, ``info``, ``configure`` and ``flash``: boards, and how they scan."""
 
 import json
+import math
 import os
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -18,7 +21,8 @@ from typer import Argument, Option
 import ohmskin
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
-from ohmskin.link.messages import Hello
+from ohmskin.link.device import scans_for
+from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.link.serial_port import SerialPort, serial_ports
 
@@ -41,6 +45,11 @@ Wires = Annotated[str, Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 
 
 Scans = Annotated[int, Option(min=0, help="stop after so many; 0: never")]
 Seconds = Annotated[float, Option(min=0, help="stop after so long; 0: never")]
+
+
+def asked_for(scans: Iterable[Scan], count: int, seconds: float) -> Iterator[Scan]:
+    """The scans that the options `Scans` and `Seconds` ask for."""
+    return islice(scans_for(scans, seconds or math.inf), count or None)
 
 
 def wires_of(text: str) -> WireOhm:

@@ -21,7 +21,7 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli.board import Port, Scans, Seconds
+from ohmskin.cli.board import Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
@@ -84,9 +84,7 @@ def record(
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
             recording.record(
-                *(skin, recorder, until_ctrl_c(skin)),
-                count=scans,
-                seconds=seconds,
+                *(skin, recorder, asked_for(until_ctrl_c(skin), scans, seconds)),
                 tare_s=tare_s,
                 sensor=sensor,
                 beside=see,

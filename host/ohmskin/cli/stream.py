@@ -2,12 +2,10 @@
 """``ohmskin stream``: the skin at a port, live in a terminal or as JSON."""
 
 import json
-import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -22,12 +20,12 @@ from typer import Option
 
 import ohmskin
 from ohmskin.arrays import Float
-from ohmskin.cli.board import Port, Scans, Seconds
+from ohmskin.cli.board import Port, Scans, Seconds, asked_for
 from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
-from ohmskin.link.device import Device, scans_for
+from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
 _out = Console()
@@ -75,7 +73,7 @@ def stream(
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
         with ends_by_ctrl_c():
-            given = islice(scans_for(skin, seconds or math.inf), scans or None)
+            given = asked_for(skin, scans, seconds)
             if as_json:
                 _print_scans(reader, given)
             else:

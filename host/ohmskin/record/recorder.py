@@ -2,17 +2,16 @@
 """Writes recordings (`ohmskin.record.recording` says what is in them).
 
 What is added reaches the file within `FLUSH_EVERY_S`, as a chunk. The file of a recorder that was
-killed, or whose disk was full, can be read up to its last whole chunk.
+killed, or whose disk was full, can be read up to its last whole chunk. So whoever records for an
+hour loses half a second at most, whatever happens to the program.
 """
 
 import json
-import math
 import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -25,7 +24,7 @@ from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.force_sensor import ForceSensor
 from ohmskin.record.recording import (
     KINDS,
-    LARGEST_RECORD,
+    LARGEST_RECORD_BYTES,
     SCHEMAS,
     TOPIC,
     ForceSample,
@@ -33,17 +32,25 @@ from ohmskin.record.recording import (
     Tare,
 )
 
-# A recording that is killed lacks what came in so long, and while that was written [s]: below 0.5.
+# Messages are kept for so long before they are written. A recording that is killed lacks them, and
+# what came while they were written. Chosen: together less than half a second.
 FLUSH_EVERY_S: Final = 0.4
-# A record of an MCAP file begins with its kind and 8 bytes of its length.
-_HEAD_SIZE: Final = 9
+# A record of an MCAP file begins with a byte for its kind and eight for its length (MCAP's
+# specification, "Records").
+_HEAD_BYTES: Final = 9
 
 
 class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed, removed, or the disk is full.
 
-    board: what the board says of itself, which comes first. scans, missed, forces: counts of what
-    was added. size: bytes of the file. board, tare, force: the newest that was added.
+    board: what the board says of itself. It comes first; later, the newest that was added.
+    tare: the newest that was added; None if none was.
+    force: the newest that was added; None if none was.
+    scans: how many were added.
+    missed: how many scans were missed before those.
+    forces: how many were added.
+    size: bytes of the file.
+    failure: why nothing more is written; None as long as all is well. `add` and `close` raise it.
 
     :raises RecordingError: the file is there already, or cannot be written. From then on nothing
         more is written, and what was written before can be read.
@@ -52,11 +59,12 @@ class Recorder(Closing):
     def __init__(self, path: PathName, board: Hello) -> None:
         self.path = Path(path)
         self.scans = self.missed = self.forces = 0
-        self.size = self._readable = 0
+        self.size = 0
+        self._readable = 0  # scans that are in the file
         self.board = board
         self.tare: Tare | None = None
         self.force: ForceSample | None = None
-        self._failure: RecordingError | None = None
+        self.failure: RecordingError | None = None
         self._closed = threading.Event()
         self._lock = threading.Lock()
         try:
@@ -65,16 +73,18 @@ class Recorder(Closing):
             raise RecordingError(f"{path} is there already: choose another name") from None
         except OSError as exc:
             raise RecordingError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
+        # Names of the file. Where there are fewer later, somebody has removed it.
         self._links = os.fstat(self._file.fileno()).st_nlink
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()
-        self._writer = Writer(self._file, chunk_size=LARGEST_RECORD // 4)
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()  # from the host's clock to 1970
+        # `flush` ends a chunk long before it has this size.
+        self._writer = Writer(self._file, chunk_size=LARGEST_RECORD_BYTES // 4)
         self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
         try:
             with self._writing():
                 self._writer.start(profile="", library="ohmskin")
                 self._channels = {name: self._channel(name) for name in SCHEMAS}
             self.add(board)
-            self._flush()
+            self.flush()
         except BaseException:
             with suppress(OSError):
                 self._file.close()
@@ -82,6 +92,7 @@ class Recorder(Closing):
         self._flusher.start()
 
     def _channel(self, name: str) -> int:
+        """Make the channel of a topic, with its schema. Returns the channel's id."""
         properties = SCHEMAS[name]
         schema = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -106,7 +117,7 @@ class Recorder(Closing):
             readings = content[array]
             rows, columns, _ = readings.shape
             content |= {"rows": rows, "columns": columns, array: readings.reshape(-1).tolist()}
-        number = content.get("number", 0) & 0xFFFFFFFF
+        number = content.get("number", 0) & 0xFFFFFFFF  # MCAP has 32 bits for it
         content = {key: content[key] for key in SCHEMAS[name]}
         octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
         log_ns = self._epoch_ns + round(content["host_time_s"] * 1e9)
@@ -126,47 +137,53 @@ class Recorder(Closing):
                     self.force = message
                     self.forces += 1
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Write what was added to the file now, as a chunk.
+
+        :raises RecordingError: as `add`.
+        """
         with self._writing():
             self._writer.flush()  # type: ignore[no-untyped-call]
-            self._kept()
+            self._count_written()
 
-    def _kept(self) -> None:
-        """Count what reached the file, if there still is one."""
+    def _count_written(self) -> None:
+        """Note how far the file has got, and fail if there is none any more."""
         self._readable, self.size = self.scans, self._file.tell()
         if os.fstat(self._file.fileno()).st_nlink < self._links:
-            self._failure = RecordingError(
+            # The system keeps a removed file until it is closed, so that writing does not fail.
+            self.failure = RecordingError(
                 f"{self.path}: recording ended: somebody has removed the file, and {self.scans} "
                 "scans with it: record to a new one"
             )
-            raise self._failure
+            raise self.failure
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         """One thread at a time, and none after the file could not be written once."""
         with self._lock:
-            if self._failure is not None:
-                raise self._failure
+            if self.failure is not None:
+                raise self.failure
             try:
                 yield
             except OSError as exc:
                 with suppress(OSError), self.path.open("rb") as file:
-                    # The last chunk may be whole, and only the index after it cut off.
+                    # A chunk and the index after it are written together. If the chunk is whole,
+                    # and only the index cut off, the scans in the chunk can be read.
                     file.seek(self.size)
-                    size = int.from_bytes(file.read(_HEAD_SIZE)[1:], "little")
-                    if self.size + _HEAD_SIZE + size <= os.fstat(file.fileno()).st_size:
+                    chunk_bytes = int.from_bytes(file.read(_HEAD_BYTES)[1:], "little")
+                    if self.size + _HEAD_BYTES + chunk_bytes <= os.fstat(file.fileno()).st_size:
                         self._readable = self.scans
-                self._failure = RecordingError(
+                self.failure = RecordingError(
                     f"{self.path}: recording ended: {exc.strerror or exc}; {self._readable} scans "
                     "are in the file and can be read"
                 )
-                raise self._failure from exc
+                raise self.failure from exc
 
     def _flush_often(self) -> None:
         # A thread, because a board that falls silent must not keep its last scans from the file.
         while not self._closed.wait(FLUSH_EVERY_S):
             try:
-                self._flush()
+                self.flush()
             except RecordingError:
                 return  # the next `add` or `close` raises it
 
@@ -183,7 +200,7 @@ class Recorder(Closing):
             with self._writing():
                 self._writer.finish()  # type: ignore[no-untyped-call]
                 self._file.flush()
-                self._kept()
+                self._count_written()
                 os.fsync(self._file.fileno())
         finally:
             with suppress(OSError):  # what did not fit still does not
@@ -195,17 +212,18 @@ def record(
     recorder: Recorder,
     scans: Iterable[Scan],
     *,
-    count: int = 0,
-    seconds: float = 0.0,
     tare_s: float = 0.0,
     sensor: ForceSensor | None = None,
     beside: Callable[[Scan], None] | None = None,
 ) -> None:
-    """Record these scans of `skin`: all of them, or so many, or those of so many seconds (0: all).
+    """Record scans of `skin` until there are no more.
 
-    What the board says of itself is recorded whenever it changes. tare_s: the mean of the scans of
-    so many seconds at first is recorded as a tare, also if less of them come. sensor: its forces
-    are recorded as well. beside: is called after each scan.
+    What the board says of itself is recorded whenever it changes.
+
+    tare_s: the mean of the scans of so many seconds at first is recorded as a tare, also if fewer
+        of them come; 0: no tare.
+    sensor: its forces are recorded beside the scans.
+    beside: is called after each scan, when it is recorded.
 
     :raises RecordingError: as `Recorder.add`.
     :raises DeviceLost: as `ForceSensor.take`.
@@ -220,13 +238,13 @@ def record(
         if beside is not None:
             beside(scan)
 
-    coming = islice(scans_for(scans, seconds or math.inf), count or None)
+    coming = iter(scans)
     untouched: list[Scan] = []
     try:
         for scan in scans_for(coming, tare_s) if tare_s else ():
             keep(scan)
             untouched.append(scan)
-    finally:
+    finally:  # whatever ends the scans amid the tare
         if untouched:
             recorder.add(Tare(mean_ratio(untouched), time.monotonic(), untouched[-1].mode))
     for scan in coming:

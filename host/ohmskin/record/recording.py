@@ -20,6 +20,16 @@ other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were a
 `recorder` writes them; `messages` reads one by one, `load_recording` all at once. A file
 that was cut off anywhere is read up to its last whole chunk. `export` writes readings files (.npz),
 for `ohmskin estimate`, and tables (.csv).
+
+Files come from anywhere, so nothing in one is believed before it was checked:
+
+=============  ===============================================================================
+by             what could go wrong without it
+=============  ===============================================================================
+`_Bounded`     a length or a chunk that states more bytes than there are fills the memory
+`_records`     the library raises whatever its packers raise, in many kinds
+`_message`     a field that is missing, of another type or beyond any range gets into a `Scan`
+=============  ===============================================================================
 """
 
 import json
@@ -47,22 +57,22 @@ from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, save_table
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import ADC_BITS, MODES
+from ohmskin.link.protocol import LARGEST_CODE, MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 
-# A second of 16x16 at full rate is 0.2 MB; rewriting tools make chunks of 4 MB.
-LARGEST_RECORD: Final = 16_000_000
-# A tare of `MAX_CELLS` cells is 0.4 MB.
-_LARGEST_MESSAGE: Final = 1_000_000
-# Chunks of a recording unpack to at most so many times the file's bytes, besides `_SMALL` of them.
-# Codes without noise pack best, 115 times.
+# Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
+# 0.2 MB, and tools that write files anew make chunks of 4 MB.
+LARGEST_RECORD_BYTES: Final = 16_000_000
+# Largest message, unpacked. Chosen: a tare of `MAX_CELLS` cells is 0.4 MB.
+_LARGEST_MESSAGE_BYTES: Final = 1_000_000
+# Chunks unpack to at most so many times the file's bytes. Chosen: codes without noise pack best,
+# 115 times.
 _MOST_UNPACKED: Final = 200
-_SMALL: Final = 1_000_000
-_LARGEST_CODE: Final = (1 << ADC_BITS) - 1
-_LARGEST_COUNTER: Final = (1 << 63) - 1
+# Counters are kept in 64 bits.
+_LARGEST_COUNTER: Final = np.iinfo(np.int64).max
 # What `export` writes.
 FORMATS: Final = (".npz", ".csv")
-# What both formats have of each scan, besides its readings.
+# What both formats have of each scan, besides its readings: attributes of `Scan`.
 _OF_SCAN: Final = ("number", "time_us", "host_time_s", "missed")
 # What mcap and its packers raise for bytes that are no MCAP file.
 _DAMAGE: Final = (
@@ -74,7 +84,12 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class Tare:
-    """Mean readings of the untouched skin, `rest_ratio` of shape (rows, columns, 4), of a mode."""
+    """Mean readings of the untouched skin.
+
+    rest_ratio: shape (rows, columns, 4) [V/Vdd].
+    host_time_s: when it was taken, on the host's monotonic clock [s].
+    mode: which readings these are.
+    """
 
     rest_ratio: Float
     host_time_s: float
@@ -87,7 +102,11 @@ class Tare:
 
 @dataclass(frozen=True)
 class Mark:
-    """A text that somebody set at a time."""
+    """A text that somebody set.
+
+    text: any.
+    host_time_s: when, on the host's monotonic clock [s].
+    """
 
     text: str
     host_time_s: float
@@ -95,7 +114,12 @@ class Mark:
 
 @dataclass(frozen=True)
 class ForceSample:
-    """A reference force [N], and what measured it."""
+    """A reference force.
+
+    force_n: the force [N].
+    host_time_s: when it was measured, on the host's monotonic clock [s].
+    source: what measured it.
+    """
 
     force_n: float
     host_time_s: float
@@ -106,6 +130,7 @@ Recorded = Hello | Scan | Tare | Mark | ForceSample
 
 
 def _is(kind: str, description: str, **more: Any) -> dict[str, Any]:
+    """What JSON Schema says of a property."""
     return {"type": kind, "description": description, **more}
 
 
@@ -151,7 +176,12 @@ KINDS: Final[dict[str, type[Recorded]]] = dict(
 
 @dataclass(eq=False)
 class Recording:
-    """All of a recording. `cut_off`: it was not ended properly, and its last second may be gone."""
+    """All of a recording, each kind of message in order.
+
+    hellos: at least one.
+    scans, tares, marks, forces: perhaps none.
+    cut_off: whether it was not ended properly, so that its last second may be missing.
+    """
 
     hellos: list[Hello]
     scans: list[Scan]
@@ -166,22 +196,24 @@ def load_recording(path: PathName) -> Recording:
 
     :raises RecordingError: one line that names the file and what is wrong with it.
     """
-    found = list(messages(path))
+    in_order = list(messages(path))
 
     def of(kind: type[_T]) -> list[_T]:
-        return [message for message in found if isinstance(message, kind)]
+        return [message for message in in_order if isinstance(message, kind)]
 
-    whole = found[-1] is None
-    return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), not whole)
+    cut_off = in_order[-1] is not None
+    return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), cut_off)
 
 
 def messages(path: PathName) -> Generator[Recorded | None, None, None]:
     """The messages of a recording in order, hello first; None last of all if it ended properly.
 
+    Topics that are not ours are passed over, so that other programs may write into a recording.
+
     :raises RecordingError: as `load_recording`.
     """
-    topics: dict[int, str] = {}
-    known = ended = False
+    topics: dict[int, str] = {}  # by the id of their channel
+    has_hello = is_whole = False
     try:
         with open(path, "rb") as file:
             for record in _records(_Bounded(file)):
@@ -190,15 +222,15 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
                         topics[record.id] = topic.removeprefix(TOPIC)
                     case McapMessage() if topics.get(record.channel_id) in SCHEMAS:
                         message = _message(topics[record.channel_id], record.data)
-                        if not known and not isinstance(message, Hello):
+                        if not has_hello and not isinstance(message, Hello):
                             raise ValueError("no board says hello in it before the first message")
-                        known = True
+                        has_hello = True
                         yield message
                     case Footer():
-                        ended = True
-        if not known:
+                        is_whole = True
+        if not has_hello:
             raise ValueError("no recording of a skin, or cut off before a board says hello in it")
-        if ended:
+        if is_whole:
             yield None
     except OSError as exc:
         raise RecordingError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
@@ -208,31 +240,40 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
 
 
 class _Bounded:
-    """A file that never gives less than was asked for, nor tries to hold what is not there."""
+    """A file, and how much may be made of it: what it holds, and so many times that when unpacked.
+
+    A length that is stated in the file is compared with what is there before memory is taken for
+    it. Without that, a file of 100 bytes could ask for gigabytes.
+    """
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
-        self._left = os.fstat(file.fileno()).st_size
-        self._may_unpack = _SMALL
+        self._unread_bytes = os.fstat(file.fileno()).st_size
+        # What chunks may still unpack to. A message alone may pack better than those of a skin.
+        self._may_unpack_bytes = _LARGEST_MESSAGE_BYTES
 
     def read(self, size: int) -> bytes:
-        if size > self._left:
+        """So many bytes, never less. Raises EndOfFile where there are fewer."""
+        if size > self._unread_bytes:
             raise EndOfFile
-        self._left -= size
-        self._may_unpack += _MOST_UNPACKED * size
+        self._unread_bytes -= size
+        self._may_unpack_bytes += _MOST_UNPACKED * size
         return self._file.read(size)
 
     def unpacked(self, chunk: Chunk) -> list[McapRecord]:
-        """The records of a chunk, where its true size is the one it states, and no bomb's."""
+        """The records of a chunk, if it states its true size, and that is not out of proportion.
+
+        It is unpacked to one byte more than it states at most, which is enough to see that it lied.
+        """
         size = chunk.uncompressed_size
-        self._may_unpack -= size
-        if size > LARGEST_RECORD:
+        self._may_unpack_bytes -= size
+        if size > LARGEST_RECORD_BYTES:
             raise ValueError("damaged: a chunk larger than any recorder writes")
-        if self._may_unpack < 0:
+        if self._may_unpack_bytes < 0:
             raise ValueError(f"damaged: it unpacks to over {_MOST_UNPACKED} times its size")
         octets = chunk.data
         if chunk.compression == "zstd":
-            unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_RECORD)
+            unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_RECORD_BYTES)
             octets = unpacker.stream_reader(octets).read(size + 1)
         elif chunk.compression == "lz4":
             octets = lz4.frame.LZ4FrameDecompressor().decompress(octets, size + 1)
@@ -240,34 +281,39 @@ class _Bounded:
             raise ValueError(f"damaged: a chunk that states {size} bytes has not as many")
         try:
             return breakup_chunk(replace(chunk, compression="", data=octets), validate_crc=True)
-        except EndOfFile as exc:  # of the chunk: the file goes on
+        except EndOfFile as exc:  # a record goes beyond the chunk: the file is not cut off here
             raise ValueError(f"damaged: {exc}") from exc
 
 
 def _records(file: _Bounded) -> Iterator[McapRecord]:
-    """The records of an MCAP file, up to its footer or to where it was cut off."""
-    reader = StreamReader(cast(IO[bytes], file), emit_chunks=True, record_size_limit=LARGEST_RECORD)
-    first = True
+    """The records of an MCAP file, up to its footer or to where it was cut off.
+
+    Raises ValueError for a file that is damaged, or of another kind.
+    """
+    source, limit = cast(IO[bytes], file), LARGEST_RECORD_BYTES
+    reader = StreamReader(source, emit_chunks=True, record_size_limit=limit)
+    is_first = True
     try:
         for record in reader.records:
-            first = False
+            is_first = False
             yield from file.unpacked(record) if isinstance(record, Chunk) else [record]
             if isinstance(record, Footer):
                 return
     except EndOfFile:
-        if first:
+        if is_first:
             raise ValueError("the file is cut off before its first record") from None
     except _DAMAGE as exc:
-        raise ValueError("no MCAP file" if first else f"damaged: {exc}") from exc
+        raise ValueError("no MCAP file" if is_first else f"damaged: {exc}") from exc
 
 
 def _message(name: str, octets: bytes) -> Recorded:
-    if len(octets) > _LARGEST_MESSAGE:
+    """The message of a topic. Raises ValueError or KeyError for what no recorder writes."""
+    if len(octets) > _LARGEST_MESSAGE_BYTES:
         raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
-    content.setdefault("mode", "near")  # older recordings know no other
+    content.setdefault("mode", "near")  # recordings from before there was another do not say it
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
@@ -289,6 +335,7 @@ def _hello(values: dict[str, Any]) -> Hello:
 
 
 def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
+    """The readings of all cells, of this shape, from the list that stands for them."""
     rows, columns, _ = shape
     if rows * columns > MAX_CELLS:
         raise ValueError(f"{name}: no {rows}x{columns} cells")
@@ -296,14 +343,14 @@ def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
     if readings.size != math.prod(shape):
         raise ValueError(f"{readings.size} {name} do not make {rows}x{columns} cells")
     if name == "codes":
-        if readings.dtype.kind != "i" or readings.min() < 0 or readings.max() > _LARGEST_CODE:
+        if readings.dtype.kind != "i" or readings.min() < 0 or readings.max() > LARGEST_CODE:
             raise ValueError("a code is out of range")
         readings = readings.astype(np.uint16)
     return readings.reshape(shape)
 
 
 def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
-    """A value that has this form. Those of arrays are not looked at."""
+    """A value, if it has this form. What arrays hold is checked in `_cells`."""
     if form["type"] == "integer":
         least = form.get("minimum", 0)
         if type(value) is not int or not least <= value <= _LARGEST_COUNTER:
@@ -350,9 +397,10 @@ def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
 
 
 def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
-    """The arrays of a readings file, and besides those of `_OF_SCAN`.
+    """The arrays of a readings file, and those of `_OF_SCAN` besides.
 
-    `rest_ratio` is the last tare of this size and mode. `ratio` in single precision is exact.
+    `rest_ratio` is the last tare of this size and mode. Single precision has 24 bits, so `ratio` is
+    exact in it.
     """
     board = recording.hellos[0]
     codes = np.array([scan.codes for scan in scans])
@@ -371,7 +419,7 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
     for tare in recording.tares:
         if tare.is_of(scans[0]):
             arrays["rest_ratio"] = tare.rest_ratio
-    return {name: np.array(each) for name, each in arrays.items()}
+    return {name: np.array(values) for name, values in arrays.items()}
 
 
 def _save_csv(scans: list[Scan], out: Path) -> None:
