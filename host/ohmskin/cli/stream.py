@@ -67,9 +67,9 @@ def stream(
     told = None if calibration is None else load_calibration(calibration)
     with ohmskin.open(port) as skin:
         board = skin.info
-        if told is not None:
-            told.check(board, force=force)
-        reader = None if method == "none" else SkinReader(board, told, method=method)
+        reader = None
+        if method != "none":
+            reader = SkinReader(board, told, method=method, force=force)
         if tare_s and reader is not None:
             reader.tare(skin.mean_ratio(tare_s), force=told is None)
         with ends_by_ctrl_c():

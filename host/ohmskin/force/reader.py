@@ -3,24 +3,25 @@
 
     scan -> estimate (a method, told the untouched skin) -> forces (a calibration) -> contacts
 
-`SkinReader` goes it for one scan after the other. `CalibratedSkin` is a device and such readers.
+`SkinReader` reads one scan after the other in this way. `CalibratedSkin` is a device with such
+readers: one for `latest`, and one for each loop over its scans, because every way of reading sees
+other scans and so must follow contacts by itself.
 """
 
 from __future__ import annotations
 
-import copy
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.errors import TareRefused
-from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
@@ -32,11 +33,12 @@ from ohmskin.link.messages import BoardStats, Hello, Scan
 if TYPE_CHECKING:
     from ohmskin.record.recording import Tare
 
-# The method where neither a calibration nor the user says one.
+# The method where neither a calibration nor the user says one: docs/accuracy.md compares them.
 DEFAULT_METHOD: Final = "joint"
-# Scans of so many seconds make a tare, unless told.
+# A tare is the mean of the scans of so many seconds [s], unless told. Chosen: the mean of 90 scans
+# has a tenth of the noise of one scan, and nobody has to wait for long.
 TARE_S: Final = 1.0
-# An error text names so many touched cells at most.
+# An error text names so many touched cells, and counts the others. Chosen: they fit into a line.
 _NAMED_CELLS: Final = 4
 
 
@@ -44,10 +46,13 @@ _NAMED_CELLS: Final = 4
 class ForceScan(Scan):
     """A scan, and what it shows.
 
-    force_n, force_n_std: normal force of each cell and its standard deviation, (R, C) [N]; NaN
-    where `ForceModel.predict` has none, and everywhere without a calibration. contacts: touched
-    cells that adjoin; without a calibration their force is the rise of their conductance [S].
-    estimate: what all of this is from; its ``message`` says why readings cannot be trusted.
+    force_n: normal force of each cell, (R, C) [N]; NaN where `ForceModel.predict` has none, and
+        everywhere without a calibration.
+    force_n_std: its standard deviation, (R, C) [N]; NaN where `predict` has none.
+    contacts: touched cells that adjoin. Without a calibration, their force is the rise of their
+        conductance [S].
+    estimate: what all of this was read from. Its ``message`` says why readings cannot be
+        trusted.
     """
 
     force_n: Float
@@ -58,10 +63,62 @@ class ForceScan(Scan):
 
 @dataclass(frozen=True, eq=False)
 class Untouched:
-    """Readings (R, C, 4) of the untouched skin, and when they were taken (ISO 8601)."""
+    """The untouched skin as it was read, before any method has judged it.
+
+    ratio: its mean readings, (R, C, 4) [1].
+    date: when they were taken, ISO 8601.
+    """
 
     ratio: Float
     date: str
+
+
+class _SharedKnowledge:
+    """What all readers of one skin know together, whatever way each of them reads its scans.
+
+    A tare that one reader takes must hold for all, and what one has learned of the wires must be
+    kept, whichever reader is asked.
+
+    board: the one that scans the skin.
+    calibration: gives newtons; None: there is none.
+    rests: the rests before each tare, oldest first. The last one is in force. None stands for
+        a rest that is not known.
+    last_estimator: that of the reader that has read last. It knows most of the wires.
+    """
+
+    def __init__(
+        self, board: Hello, calibration: Calibration | None, rest_ratio: Float | None
+    ) -> None:
+        self.board = board
+        self.calibration = calibration
+        self.rests: list[Rest | Untouched | None] = [None]
+        self.last_estimator: Estimator | None = None
+        self._recorded: list[Float] = []  # the recorded tares that some reader has come to
+        self._lock = threading.Lock()  # held while a reader looks into them
+        if calibration is not None:
+            self.rests = [calibration.rest, *filter(None, [calibration.tare])]
+        elif rest_ratio is not None:
+            self.rests = [Untouched(rest_ratio, now())]
+
+    def take_recorded(self, ratio: Float) -> None:
+        """Take a recorded tare, once: several readers may come to it, one after the other.
+
+        Its array is looked for, and not equal numbers. An undone tare is recorded as another tare
+        with the numbers of the rest before it.
+        """
+        with self._lock:
+            if not any(ratio is recorded for recorded in self._recorded):
+                self._recorded.append(ratio)
+                self.rests.append(Untouched(ratio, now()))
+
+    def estimator(self, method: str, rest: Rest | Untouched | None) -> Estimator:
+        """A new estimator that knows this rest, and the wires that the calibration knows."""
+        return make_estimator(method, self.at(rest))
+
+    def at(self, rest: Rest | Untouched | None) -> SkinKnowledge:
+        """What a method is told of the skin, with this rest."""
+        wires = NO_WIRES if self.calibration is None else self.calibration.nominal_wire_ohm
+        return SkinKnowledge.of(self.board, None if rest is None else rest.ratio, wires)
 
 
 class SkinReader:
@@ -69,12 +126,13 @@ class SkinReader:
 
     board: the one that scans it. calibration: gives newtons, as long as the method is its own.
     method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
-    rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration.
+    rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration. force: take
+    the calibration of another unit.
 
     Of recorded tares (`Scan.rest_ratio`) and those taken by `tare`, the latest is the rest. Scans
     are read by one thread; all else may be called from any thread.
 
-    :raises ValueError: no such method, or other cells or another mode than were calibrated.
+    :raises ValueError: no such method, or other cells, another mode or unit than were calibrated.
     """
 
     def __init__(
@@ -84,35 +142,27 @@ class SkinReader:
         *,
         method: str = "",
         rest_ratio: Float | None = None,
+        force: bool = False,
     ) -> None:
+        if calibration is not None:
+            calibration.check(board, force=force)
         self.board = board
         self._calibration = calibration
-        self._wanted = method or DEFAULT_METHOD
-        # The rests before each tare, and the one in force. All readers of one skin share it, and
-        # the recorded tares that one of them has come to.
-        self._rests: list[Rest | Untouched | None] = [None]
-        self._replayed: list[Float] = []
-        self._lock = threading.Lock()
-        if calibration is not None:
-            calibration.check(board, force=True)
-            self._wanted = method or calibration.method
-            known = (calibration.rest, calibration.tare)
-            self._rests = [each for each in known if each is not None]
-        elif rest_ratio is not None:
-            self._rests = [Untouched(rest_ratio, now())]
+        self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
+        self._shared = _SharedKnowledge(board, calibration, rest_ratio)
         self._begin()
-        self._taught = [self._estimator]  # of all readers of this skin, the one that read last
 
-    def another(self) -> Self:
+    def another(self) -> SkinReader:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
-        other = copy.copy(self)
+        other = SkinReader(self.board, self._calibration, method=self._wanted, force=True)
+        other._shared = self._shared
         other._begin()
         return other
 
     @property
     def method(self) -> str:
-        """The method of the scan that was read last, and of the next one before the first."""
-        return self._made[0]
+        """The method that the last scan was read by; before the first scan, the one to be used."""
+        return self._made_for[0]
 
     @property
     def force_method(self) -> str | None:
@@ -127,27 +177,28 @@ class SkinReader:
     @property
     def rest(self) -> Rest | Untouched | None:
         """The rest in force; None where it is not known."""
-        return self._rests[-1]
+        return self._shared.rests[-1]
 
     @property
     def is_tared(self) -> bool:
         """Whether there is a tare to undo."""
-        return len(self._rests) > 1
+        return len(self._shared.rests) > 1
 
     @property
     def calibration(self) -> Calibration | None:
         """The calibration with the latest tare and the wires learned since; `save` keeps them."""
         if self._calibration is None:
             return None
-        calibration = replace(self._calibration, nominal_wire_ohm=self._taught[0].wires())
+        wires = (self._shared.last_estimator or self._estimator).wires()
+        calibration = replace(self._calibration, nominal_wire_ohm=wires)
         rest = self.rest
         if isinstance(rest, Untouched):
-            rest = Rest.of(calibration.method, self._knowledge(rest), rest.date)
+            rest = Rest.of(calibration.method, self._shared.at(rest), rest.date)
         return replace(calibration, tare=None if rest is calibration.rest else rest)
 
     def use(self, method: str) -> None:
         """Go on with another method, from the next scan on. Raises ValueError for no such."""
-        make_estimator(method, self._knowledge(self.rest))
+        self._shared.estimator(method, self.rest)
         self._wanted = method
 
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
@@ -157,12 +208,13 @@ class SkinReader:
 
         :raises TareRefused: something touches the skin.
         """
-        touched = self.another().estimate(rest_ratio).touched
+        # By an estimator that has seen no touch: this one may be in the middle of one.
+        touched = self._shared.estimator(self._wanted, self.rest).estimate(rest_ratio).touched
         if touched.any() and not force:
             remedy = "take everything off the skin, or force the tare if nothing is on it"
             raise TareRefused(touched_cells(touched), remedy)
-        self._rests.append(Untouched(rest_ratio, now()))
-        return self._recorded(rest_ratio)
+        self._shared.rests.append(Untouched(rest_ratio, now()))
+        return self._to_record(rest_ratio)
 
     def undo_tare(self) -> Tare | None:
         """Return to the rest before the last tare. Returns that, for a `Recorder`, if it is known.
@@ -171,10 +223,10 @@ class SkinReader:
         """
         if not self.is_tared:
             raise TareRefused("there is no tare to undo")
-        self._rests.pop()
-        return None if self.rest is None else self._recorded(self.rest.ratio)
+        self._shared.rests.pop()
+        return None if self.rest is None else self._to_record(self.rest.ratio)
 
-    def _recorded(self, rest_ratio: Float) -> Tare:
+    def _to_record(self, rest_ratio: Float) -> Tare:
         from ohmskin.record.recording import Tare  # its library is loaded when needed
 
         return Tare(rest_ratio, time.monotonic(), self.board.mode)
@@ -188,35 +240,32 @@ class SkinReader:
         if mode != self.board.mode:
             raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
 
-    def rise(self, found: Estimate) -> Float:
+    def rise(self, frame: Estimate) -> Float:
         """Level above rest, (R, C) [S; 1 for `voltage`]; above its median where rest is unknown."""
-        at_rest = float(np.median(found.level)) if self._rest_level is None else self._rest_level
-        return np.asarray(found.level - at_rest)
+        at_rest = float(np.median(frame.level)) if self._rest_level is None else self._rest_level
+        return np.asarray(frame.level - at_rest)
 
     def read(self, scan: Scan) -> ForceScan:
         """What a scan shows. Raises ValueError if it is of other cells, or of another mode."""
         self.check_mode(scan.mode)
         if scan.rest_ratio is not None and scan.rest_ratio.shape == scan.codes.shape:
-            self._replay(scan.rest_ratio)
-        if self._made != (self._wanted, self.rest):
+            self._shared.take_recorded(scan.rest_ratio)
+        if self._made_for != (self._wanted, self.rest):
             self._make()
-        found = self.estimate(scan.ratio)
-        self._taught[:] = [self._estimator]
-        rise = self.rise(found)
+        frame = self.estimate(scan.ratio)
+        self._shared.last_estimator = self._estimator
+        rise = self.rise(frame)
         force_n = force_n_std = np.full(rise.shape, np.nan)
-        weights = np.maximum(rise, 0.0), found.level_std
+        weights = np.maximum(rise, 0.0), frame.level_std
         if self._calibration is not None and self.has_forces:
-            weights = force_n, force_n_std = self._calibration.model.predict(rise, found.level_std)
-        contacts = self._tracker.update(scan.time_us, found.touched, *weights)
-        seen = {"force_n": force_n, "force_n_std": force_n_std}
-        return ForceScan(**(vars(scan) | seen | {"contacts": contacts, "estimate": found}))
-
-    def _replay(self, ratio: Float) -> None:
-        """Take a recorded tare, when the first reader comes to it."""
-        with self._lock:
-            if not any(ratio is each for each in self._replayed):
-                self._replayed.append(ratio)
-                self._rests.append(Untouched(ratio, now()))
+            weights = force_n, force_n_std = self._calibration.model.predict(rise, frame.level_std)
+        shown: dict[str, object] = {
+            "force_n": force_n,
+            "force_n_std": force_n_std,
+            "contacts": self._tracker.update(scan.time_us, frame.touched, *weights),
+            "estimate": frame,
+        }
+        return ForceScan(**(vars(scan) | shown))
 
     def _begin(self) -> None:
         """Begin with no contact, and as if no scan had come before."""
@@ -224,18 +273,14 @@ class SkinReader:
         self._make()
 
     def _make(self) -> None:
-        """Estimate anew with the method and the rest that are in force."""
-        method, rest = self._made = self._wanted, self.rest
-        self._estimator = make_estimator(method, self._knowledge(rest))
+        """Make the estimator for the method and the rest that are in force."""
+        method, rest = self._made_for = self._wanted, self.rest
+        self._estimator = self._shared.estimator(method, rest)
         self._rest_level: Float | None = None
         if isinstance(rest, Rest) and self.has_forces:
             self._rest_level = rest.level
         elif rest is not None:
             self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
-
-    def _knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
-        wires = NO_WIRES if self._calibration is None else self._calibration.nominal_wire_ohm
-        return SkinKnowledge.of(self.board, None if rest is None else rest.ratio, wires)
 
 
 class CalibratedSkin(Closing):
@@ -251,9 +296,7 @@ class CalibratedSkin(Closing):
         self.device = device
         self.name = device.name
         """See `Device.name`."""
-        board = device.info
-        calibration.check(board, force=force)
-        self._reader = SkinReader(board, calibration)
+        self._reader = SkinReader(device.info, calibration, force=force)
         self._lock = threading.Lock()
 
     @property
@@ -269,9 +312,9 @@ class CalibratedSkin(Closing):
     @property
     def calibration(self) -> Calibration:
         """What forces are read by, with the latest tare and learned wires; `save` keeps them."""
-        found = self._reader.calibration
-        assert found is not None
-        return found
+        calibration = self._reader.calibration
+        assert calibration is not None  # the reader was made with one
+        return calibration
 
     def start(self) -> None:
         """See `Device.start`."""

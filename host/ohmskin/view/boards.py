@@ -324,8 +324,7 @@ class ViewedBoard(Closing):
         self._note = note = ""
         for calibration in self._calibrations:
             try:
-                calibration.check(board, force=self._force)
-                return SkinReader(board, calibration)
+                return SkinReader(board, calibration, force=self._force)
             except ValueError as exc:
                 note = f"no forces: {exc}"
         self._note = note
