@@ -7,24 +7,28 @@ field                    shape             meaning
 format, schema                             "ohmskin calibration", 1
 unit_id                                    the board's, 0 to 2^32 - 1
 date                                       ISO 8601
-method                                     the estimator that told the cells, or "voltage"
+method                                     the estimator whose conductances were learned from, or
+                                           "voltage"
 rows, columns                              R, C
 mode                                       which readings its scans hold, "near" if absent
-nominal_top_wire_ohm                       one wire segment of each layer [ohm], null: not told
+nominal_top_wire_ohm                       one wire segment of each layer [ohm]; null: not known
 nominal_bottom_wire_ohm
-wire_log_std                               deviation of the log of both, null: not measured
+wire_log_std                               standard deviation of the logarithm of both; null: not
+                                           measured
 indenter_area_m2                           what the skin was pressed with [m^2]
 rest.date                                  ISO 8601
 rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
 rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
-tare                                       the same of a later date, in force instead; null: none
+tare                                       the same of a later date, used in place of rest; null:
+                                           there is none
 kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
 
-Forces are `model.predict` of levels above `untouched.level`. Numbers are read back bit for bit. A
-file from elsewhere is data: its size, its fields, their types, shapes and ranges are checked before
-anything is made of them.
+Forces are `model.predict` of levels above `untouched.level`. Numbers are read back bit for bit.
+
+A file may come from somebody else. So its size is checked before it is read, its fields and their
+types and shapes before anything is made of them, and their ranges when the objects are made.
 """
 
 import json
@@ -42,29 +46,34 @@ from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
 from ohmskin.link.messages import Hello
-from ohmskin.link.protocol import MODES
+from ohmskin.link.protocol import FRAMES, MODES
 from ohmskin.record.readings import MAX_CELLS
 
 FORMAT: Final = "ohmskin calibration"
 SCHEMA: Final = 1
-# 4096 cells of 13 fields take about 1 MB.
+# A larger file is not read: `MAX_CELLS` cells of 13 fields take about 1 MB.
 MAX_FILE_BYTES: Final = 4_000_000
-# A unit id has 32 bits on the link.
-MAX_UNIT_ID: Final = 2**32 - 1
-# Far beyond the slope of any power law in siemens, and predictions do not overflow.
+# There are so many unit ids: the link has an integer for them.
+UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
+# No number of a file is larger. Chosen: far beyond the slope of any power law in siemens, and its
+# square does not overflow in predictions.
 MAX_NUMBER: Final = 1e60
-_NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
+# The fields of the file, by where their values are kept: in the calibration itself, with their
+# types; in its rests; in its `WireOhm`; in its model, of which some may be null.
+_OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str, "indenter_area_m2": float}
 _RESTS: Final = ("rest", "tare")
 _WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
-_OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str, "indenter_area_m2": float}
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
+_NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """The untouched skin: when, its readings (R, C, 4) [1], and the levels (R, C) that they show.
+    """The untouched skin, as a method sees it. Raises ValueError, naming the field, for bad values.
 
-    Raises ValueError, naming the field, for a value that cannot be.
+    date: when it was read, ISO 8601.
+    ratio: its readings, (R, C, 4) [1].
+    level: what the method makes of them, (R, C) [S; 1 for `voltage`].
     """
 
     date: str
@@ -83,16 +92,26 @@ class Rest:
     @classmethod
     def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
         """What `method` makes of the rest readings in `knowledge`."""
-        # A reading below its offset is a cell of no conductance, within the noise.
+        # Noise may put the level of a cell that conducts nothing below 0, which no level is.
         level = np.maximum(make_estimator(method, knowledge).rest_level(), 0.0)
         return cls(date, np.asarray(knowledge.rest_ratio), level)
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a calibration file holds, checked; fields, shapes and units in the module's table.
+    """What a calibration file holds, checked. The module's table has shapes and units.
 
     Raises ValueError, naming the field, for a value that cannot be.
+
+    unit_id: of the board whose skin it is.
+    date: when the skin was calibrated, ISO 8601.
+    method: the one that gave the levels, one of `LEVEL_METHODS`.
+    rest: the untouched skin before the presses.
+    model: the curve of every cell.
+    indenter_area_m2: what the skin was pressed with [m^2].
+    nominal_wire_ohm: a wire segment of each layer.
+    tare: the untouched skin of a later date, which is used in place of `rest`; None: there is none.
+    mode: which readings the scans hold, a name of the enum `mode`.
     """
 
     unit_id: int
@@ -106,8 +125,8 @@ class Calibration:
     mode: str = "near"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.unit_id <= MAX_UNIT_ID:
-            raise ValueError(f"unit_id is {self.unit_id}, not in 0..{MAX_UNIT_ID}")
+        if not 0 <= self.unit_id < UNIT_IDS:
+            raise ValueError(f"unit_id is {self.unit_id}, not in 0..{UNIT_IDS - 1}")
         _check_date(self.date)
         if self.method not in LEVEL_METHODS:
             methods = ", ".join(LEVEL_METHODS)
@@ -196,9 +215,9 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
     if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
-    content = {"wire_log_std": None, "mode": "near", **content}  # files of before have none
-    known = {"format", "schema", "rows", "columns", *_OWN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
-    _require_fields(content, known)
+    content = {"wire_log_std": None, "mode": "near", **content}  # older files do not have them
+    names = {"format", "schema", "rows", "columns", *_OWN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
+    _require_fields(content, names)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
     wires = (
@@ -213,10 +232,11 @@ def _from_content(content: Any) -> Calibration:
     )
 
 
-def _require_fields(content: dict[str, Any], known: set[str], place: str = "") -> None:
-    for name in sorted(known - content.keys()):
+def _require_fields(content: dict[str, Any], names: set[str], place: str = "") -> None:
+    """Raise ValueError unless these are the fields. place: what the error puts before a name."""
+    for name in sorted(names - content.keys()):
         raise ValueError(f"no field '{place}{name}'")
-    for name in sorted(content.keys() - known):
+    for name in sorted(content.keys() - names):
         raise ValueError(f"unknown field '{place}{name[:40]}'")
 
 
@@ -236,19 +256,19 @@ def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         raise ValueError(f"{name} has not the shape {shape}")
     wanted = {"pooled": bool, "kind": str}.get(name, float)
     may_be_null = name in _NULL_FIELDS
-    found = [
+    values = [
         np.nan if cell is None and may_be_null else _value(name, cell, wanted)
         for cell in cells.flat
     ]
-    # Texts are cut, because a long one makes all cells as long.
-    return np.array(found, dtype="U16" if wanted is str else wanted).reshape(shape)
+    # Texts are cut: an array keeps as many characters for each cell as its longest text has.
+    return np.array(values, dtype="U16" if wanted is str else wanted).reshape(shape)
 
 
 def _value(name: str, value: Any, wanted: type) -> Any:
     """A value of JSON, if it is of this type; float: any number within `MAX_NUMBER`."""
-    found = type(value)
-    if found is not wanted and (found, wanted) != (int, float):
-        raise ValueError(f"{name} holds {found.__name__}, not {wanted.__name__}")
+    kind = type(value)
+    if kind is not wanted and (kind, wanted) != (int, float):
+        raise ValueError(f"{name} holds {kind.__name__}, not {wanted.__name__}")
     if wanted is not float:
         return value
     if not abs(value) <= MAX_NUMBER:  # so that NaN fails too

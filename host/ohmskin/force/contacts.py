@@ -8,27 +8,30 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 
-# A contact moves by at most so many cells between two scans: at 30 Hz a finger at 0.5 m/s passes
-# over 1.7 cells of 1 cm.
+# A contact moves by at most so many cells between two scans: at 30 Hz, a finger at 0.5 m/s passes
+# over 1.7 cells of 1 cm. What is farther away is another contact.
 FARTHEST_CELLS: Final = 2.0
-# A contact that is gone for less [us] stays the same: a light touch flickers about its threshold.
+# A contact that is gone for less time [us] stays the same. Chosen: a light touch flickers about its
+# threshold for some scans, and no finger comes back to a place within a tenth of a second.
 MEMORY_US: Final = 100_000
-# Contacts of the scan before are remembered for so long [us], because boards may scan slowly.
+# Contacts of the scan before are remembered for so long [us]: a board may scan once a second
+# (rate_mhz_min of frames.toml), and a scan may be lost.
 SLOWEST_SCAN_US: Final = 20 * MEMORY_US
-# Cells that adjoin, for scipy: along an edge or at a corner.
+# Which neighbours adjoin, for scipy: those along an edge or at a corner.
 _EIGHT_NEIGHBOURS: Final = np.ones((3, 3), dtype=np.int_)
-# Distance of what must not be matched, in cells: more than any skin has.
-_FAR: Final = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
     """Touched cells that adjoin, along an edge or at a corner.
 
-    identity: the same number for as long as the contact lasts, from 1. row, column: the centre,
-    sum of F_e position_e / sum of F_e over its cells e, in cell units (0: centre of the first).
-    force_n: sum of F_e [N]; force_n_std: the sum of the cells' standard deviations, because these
-    cells share wires, and their errors may all have one sign. cells: which it covers, (R, C).
+    identity: the same number for as long as the contact lasts, from 1.
+    row, column: the centre, sum of F_e position_e / sum of F_e over the contact's cells e, in cell
+        units; 0 is the centre of the first cell.
+    force_n: sum of F_e [N].
+    force_n_std: sum of the cells' standard deviations [N]: they share wires, so that their errors
+        may all have one sign.
+    cells: which cells it covers, (R, C).
     """
 
     identity: int
@@ -47,60 +50,65 @@ class Contact:
 
 
 class ContactTracker:
-    """Finds the contacts of each scan, and tells which of them were there before.
+    """Finds the contacts of each scan, and gives those that were there before the same numbers.
 
     Contacts of two scans are matched so that the sum of the distances of their centres is least
-    (the assignment problem). None is taken for one farther than `FARTHEST_CELLS` away. One that is
-    gone is remembered for `MEMORY_US`. Where two merge, one number ends.
+    (the assignment problem). A contact is never matched with one farther than `FARTHEST_CELLS`
+    away. A contact that is gone is remembered for `MEMORY_US`. Where two merge, one number ends.
     """
 
     def __init__(self) -> None:
-        self._known: dict[int, tuple[Contact, int]] = {}  # by identity, with when last seen [us]
-        self._last = 0
-        self._before_us = 0
+        # By identity: a contact that is remembered, and the time of the last scan that had it [us].
+        self._remembered: dict[int, tuple[Contact, int]] = {}
+        self._last_identity = 0
+        self._before_us = 0  # the time of the scan before
 
     def update(
         self, time_us: int, touched: Bool, force_n: Float, force_n_std: Float
     ) -> tuple[Contact, ...]:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
-        for identity, (_, seen_us) in list(self._known.items()):
-            longest_us = SLOWEST_SCAN_US if seen_us == self._before_us else MEMORY_US
-            if not 0 <= time_us - seen_us <= longest_us:
-                del self._known[identity]
+        for identity, (_, last_us) in list(self._remembered.items()):
+            longest_us = SLOWEST_SCAN_US if last_us == self._before_us else MEMORY_US
+            # The time goes back where a board was reset.
+            if not 0 <= time_us - last_us <= longest_us:
+                del self._remembered[identity]
         self._before_us = time_us
-        found = _found(touched, force_n, force_n_std)
-        identities = _identities(found, [contact for contact, _ in self._known.values()])
-        for index, contact in enumerate(found):
+        contacts = _unnumbered(touched, force_n, force_n_std)
+        identities = _identities(contacts, [contact for contact, _ in self._remembered.values()])
+        for index, contact in enumerate(contacts):
             if index not in identities:
-                self._last += 1
-            found[index] = replace(contact, identity=identities.get(index, self._last))
-        self._known |= {contact.identity: (contact, time_us) for contact in found}
-        return tuple(sorted(found, key=lambda contact: contact.identity))
+                self._last_identity += 1
+            identity = identities.get(index, self._last_identity)
+            contacts[index] = replace(contact, identity=identity)
+        self._remembered |= {contact.identity: (contact, time_us) for contact in contacts}
+        return tuple(sorted(contacts, key=lambda contact: contact.identity))
 
 
-def _identities(found: list[Contact], known: list[Contact]) -> dict[int, int]:
-    """By the index of each contact that is found and was known: the identity it had."""
+def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
+    """The identities of those contacts of now that were there before, by their index in `now`."""
     from scipy.optimize import linear_sum_assignment
 
-    if not found or not known:
+    if not now or not before:
         return {}
-    new, old = (np.array([(each.row, each.column) for each in some]) for some in (found, known))
-    away = np.hypot(*(new[:, None] - old[None]).transpose(2, 0, 1))
-    away[away > FARTHEST_CELLS] = _FAR
+    centres, were = (np.array([(c.row, c.column) for c in contacts]) for contacts in (now, before))
+    away = np.hypot(*(centres[:, None] - were[None]).transpose(2, 0, 1))
+    too_far = away > FARTHEST_CELLS
+    # One pair too far apart costs more than all others together: as few as possible are made.
+    away[too_far] = FARTHEST_CELLS * (1 + sum(away.shape))
     pairs = zip(*linear_sum_assignment(away), strict=True)
-    return {one: known[other].identity for one, other in pairs if away[one, other] < _FAR}
+    return {one: before[other].identity for one, other in pairs if not too_far[one, other]}
 
 
-def _found(touched: Bool, force_n: Float, force_n_std: Float) -> list[Contact]:
-    """The contacts of a scan, without their numbers."""
+def _unnumbered(touched: Bool, force_n: Float, force_n_std: Float) -> list[Contact]:
+    """The contacts of a scan, with the identity 0."""
     from scipy.ndimage import center_of_mass, label
 
     labels, count = label(touched, structure=_EIGHT_NEIGHBOURS)
     contacts = []
     for number in range(1, count + 1):
         cells = labels == number
-        total_n, std_n = (float(each[cells].sum()) for each in (force_n, force_n_std))
-        # Where it is too light for its curve, all cells count alike.
+        total_n, std_n = float(force_n[cells].sum()), float(force_n_std[cells].sum())
+        # A touch that is too light for its curve has no force: then all its cells count alike.
         row, column = center_of_mass(force_n if total_n > 0 else cells, cells)
         contacts.append(Contact(0, float(row), float(column), total_n, std_n, cells))
     return contacts

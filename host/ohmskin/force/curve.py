@@ -36,20 +36,29 @@ from ohmskin.arrays import Bool, Float
 
 LINEAR: Final = "linear"
 POWER: Final = "power"
-# Exponents that a fit may give: presses of known skins lie well inside.
+# The smallest and largest exponents that a fit may give. Chosen: presses of known skins lie well
+# inside, and a fit that runs into one of them has found no curve.
 MIN_EXPONENT: Final = 0.2
-MAX_EXPONENT: Final = 5.0
+MAX_EXPONENT: Final = 1 / MIN_EXPONENT
 
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
     """The curve of every cell, each array (R, C); symbols and units in the module's table.
 
-    kind: "linear" or "power". slope, exponent and their standard errors (0: fixed). correlation: of
-    these two errors. pooled: the cell has no curve of its own but the skin's. residual_std,
-    residual_share: s0 and s1; held_out_rmse: error on presses not fitted [N], of pooled cells on
-    cells not fitted. These three are NaN where nothing tells them.
     Raises ValueError, naming the array, for what no fit gives.
+
+    kind: "linear" or "power".
+    slope: a.
+    slope_std: its standard error.
+    exponent: b.
+    exponent_std: its standard error; 0 where the exponent is not fitted.
+    correlation: of these two errors, -1 to 1.
+    residual_std: s0; NaN where nothing tells it.
+    residual_share: s1; NaN where nothing tells it.
+    pooled: the cell has no curve of its own, but that of all presses.
+    held_out_rmse: error on presses that were not fitted [N]; of pooled cells, on cells that were
+        not fitted; NaN where nothing tells it.
     """
 
     kind: NDArray[np.str_]
@@ -81,8 +90,8 @@ class ForceModel:
             std = getattr(self, name)
             require(name, np.isfinite(std) & (std >= 0), "not finite and >= 0")
         for name in ("residual_std", "residual_share", "held_out_rmse"):
-            known = getattr(self, name)
-            require(name, np.isnan(known) | (np.isfinite(known) & (known >= 0)), "negative or inf")
+            error = getattr(self, name)
+            require(name, np.isnan(error) | (np.isfinite(error) & (error >= 0)), "negative or inf")
         require("exponent", power | (self.exponent == 1), "not 1, as of a linear cell")
         require("exponent_std", power | (self.exponent_std == 0), "not 0, as of a linear cell")
 
@@ -93,29 +102,30 @@ class ForceModel:
         `rise_std` is (the method gives none), and where the scatter is unknown. Raises ValueError,
         naming the cell, for a shape or a value that cannot be.
         """
-        x, dx = (np.asarray(each, dtype=np.float64) for each in (rise, rise_std))
+        x, dx = np.asarray(rise, dtype=np.float64), np.asarray(rise_std, dtype=np.float64)
         for name, array in (("rise", x), ("rise_std", dx)):
             if array.shape != (shape := self.kind.shape):
                 raise ValueError(f"{name} has shape {array.shape}, this calibration {shape}")
         require("rise", np.isfinite(x), "not finite")
         require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
-        of_rise = spread(self, x, np.nan_to_num(dx))
+        by_rise = spread(self, x, np.nan_to_num(dx))
         above = np.maximum(x, 0.0)
         logarithm = np.log(np.where(above > 0, above, 1.0))
         powered = above**self.exponent
         by_slope = np.where(self.kind == POWER, powered, x) * self.slope_std
         by_exponent = self.slope * powered * logarithm * self.exponent_std
-        # The two nearly cancel in a power law, whose slope is that at 1 S: far from any press.
-        of_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
+        # J K J^T. The slope of a power law is that at 1 S, far from any press: where its error is
+        # large, so is that of the exponent, and the two nearly cancel.
+        by_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
         reported_n = np.maximum(force_by(self, x), 0.0)
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
-        variance = of_rise**2 + scatter + np.maximum(of_fit, 0.0)
+        variance = by_rise**2 + scatter + np.maximum(by_fit, 0.0)
         return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One cell's curve: the fields of `ForceModel`, as numbers."""
+    """One cell's curve. `ForceModel` says what the fields are, here as numbers."""
 
     kind: str
     slope: float
@@ -141,7 +151,7 @@ def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
 
 
 def require(name: str, good: Bool, what: str) -> None:
-    """Raise ValueError, naming the first cell where it is not so. good: (R, C)."""
+    """Raise ValueError, naming the first cell, unless all are good, (R, C). what: a bad cell is."""
     if not good.all():
         row, column = (int(index) for index in np.argwhere(~good)[0])
         raise ValueError(f"{name} of cell ({row}, {column}) is {what}")
@@ -150,9 +160,9 @@ def require(name: str, good: Bool, what: str) -> None:
 def require_rows(
     name: str, values: NDArray[Any], good: Bool, must: str, rows: NDArray[np.int64] | None = None
 ) -> None:
-    """Raise ValueError, naming the first row where it is not so, by its number in `rows`, if told.
+    """Raise ValueError, naming the first row that is not good and its value. Arrays (n,).
 
-    values, good, rows: (n,). must: what the value has to be.
+    must: what the value has to be. rows: by which number each row is named; None: its index.
     """
     if not good.all():
         at = int(np.argmin(good))

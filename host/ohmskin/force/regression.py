@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learns the force curve of every cell from presses of single cells.
 
-Symbols, of the n rows that a curve is learned from (`curve` has those of the curves)
+Symbols of the n rows that a curve is learned from; `curve` has a table of the other symbols.
 
 ====== ======= ============================================================ ======
 symbol shape   meaning                                                      unit
@@ -33,10 +33,13 @@ presses (the rule of one standard error, Breiman et al. 1984). How presses scatt
 the textile: growing scatter is taken for all cells if their l together is higher by two standard
 errors.
 
-s comes from few presses, so that of a force is the standard deviation of Student's t with n - p
-degrees of freedom: s^2 (n - p) / (n - p - 2). The mean of d^2 / v over the presses is taken off,
-because predicting adds it again. s is at least that of held-out presses, if they have several rows,
-and for cells that nobody pressed that of held-out cells.
+The s that a curve is kept with differs from that of the fit in three ways:
+
+1. It comes from few presses, so a force is distributed as Student's t with n - p degrees of
+   freedom, whose variance is s^2 (n - p) / (n - p - 2).
+2. The mean of d^2 / v over the presses is taken off, because predicting adds it again.
+3. It is at least the s of held-out presses where presses have several rows, which are alike and so
+   scatter too little. For cells that nobody pressed, it is at least that of held-out cells.
 """
 
 from dataclasses import fields, replace
@@ -59,20 +62,25 @@ from ohmskin.force.curve import (
     spread,
 )
 
-# A curve has 2 coefficients: fewer presses leave 2 degrees of freedom, for which Student's t has no
-# finite variance.
+# A cell with fewer presses has no curve of its own. A curve has 2 coefficients, and 4 presses would
+# leave 2 degrees of freedom, for which Student's t has no finite variance.
 MIN_PRESSES: Final = 5
-# The presses of a cell are split into so many parts, each held out once.
-PRESS_FOLDS: Final = 5
-# Cells are held out in at most so many parts, so that a large skin takes no longer.
+# The presses of a cell are split into so many parts, each held out once: none of them is empty.
+PRESS_FOLDS: Final = MIN_PRESSES
+# Cells are held out in at most so many parts. Chosen: the usual ten, so that a large skin takes no
+# longer than a small one.
 MAX_CELL_FOLDS: Final = 10
-# Scatter that grows must be better by so many standard errors.
+# Scatter that grows must predict better by so many standard errors. Chosen: more than the one of
+# Breiman's rule, because all cells are changed by it.
 SCATTER_ERRORS: Final = 2.0
-# F0: below this share of the largest force, scatter no longer shrinks with force.
+# F0: below this share of the largest force, scatter no longer shrinks with force. Chosen: without
+# it, a press of almost no force would have almost all the weight.
 FLOOR_SHARE: Final = 0.1
-# Exponents of power laws are first tried on this grid, because errors may have several minima.
+# Exponents of power laws are first tried on this grid, because the sum of squares may have several
+# minima. Each is a tenth above the one before.
 EXPONENTS: Final = np.geomspace(MIN_EXPONENT, MAX_EXPONENT, 33)
-# Presses that fit exactly still scatter by this share of their force.
+# Presses that fit exactly count as scattered by this share of their force, so that the logarithm of
+# their scatter is finite. Chosen: far below what any force sensor resolves.
 _LEAST_SHARE: Final = 1e-6
 
 
@@ -132,7 +140,12 @@ class ForceRegression:
 
 
 class _Rows(NamedTuple):
-    """What a curve is learned from, arrays (n,): x, F, dx, flat index of the cell, press."""
+    """What a curve is learned from, arrays (n,).
+
+    x, force, dx: as in the module's table.
+    cell: flat index of the cell that was pressed.
+    press: number of the press that the row is of.
+    """
 
     x: Float
     force: Float
@@ -146,13 +159,13 @@ def _curve_of_skin(rows: _Rows) -> Curve:
     is_one_cell = np.unique(rows.cell).size == 1
     if is_one_cell:
         trial = _Trial(rows, rows.press, PRESS_FOLDS)
-    else:  # what counts is the error on cells that were not fitted
+    else:  # it is for cells that were not fitted, so their error counts
         trial = _Trial(rows, rows.cell, MAX_CELL_FOLDS)
     grows = _is_clear(trial.gain_of_growing(), SCATTER_ERRORS)
     curve = trial.best(grows, of_skin=True)
     if curve is None:
         raise ValueError("force does not rise with the cells' rise: is the rest of this skin?")
-    if is_one_cell:  # nothing tells how far it is off on others
+    if is_one_cell:  # nothing tells how large the error is on other cells
         nan = np.nan
         return replace(curve, residual_std=nan, residual_share=nan, held_out_rmse=nan)
     return curve
@@ -162,7 +175,7 @@ def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
     """The curves that cells have of their own, by flat index."""
     trials = {}
     for cell in np.unique(rows.cell).tolist():
-        of_cell = _Rows(*(each[rows.cell == cell] for each in rows))
+        of_cell = _Rows(*(column[rows.cell == cell] for column in rows))
         varied = np.ptp(of_cell.force) > 0 and np.ptp(of_cell.x) > 0
         if varied and np.unique(of_cell.press).size >= MIN_PRESSES:
             trials[cell] = _Trial(of_cell, of_cell.press, PRESS_FOLDS)
@@ -175,7 +188,7 @@ def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
 def fit_line(x: Float, force: Float, v: Float | float = 1.0) -> Curve | None:
     """Weighted least squares of F = a x. None if a is not above 0.
 
-    x, force (n,); v: see the module, (n,) or alike for all.
+    x, force, v: as in the module's table; v may be one number for all rows.
     """
     weight = np.ones_like(x) / v
     information = float(weight @ x**2)  # J^T V^-1 J
@@ -190,8 +203,8 @@ def fit_power(
 ) -> Curve | None:
     """Weighted least squares of F = a x^b: for each b the best a is known, so b alone is searched.
 
-    x, force, v: as of `fit_line`; exponents: where b is searched, rising. None if b runs into their
-    ends, or if the presses do not tell it.
+    x, force, v: as for `fit_line`. exponents: where b is searched, rising. None if the best b is
+    the first or the last of them, or if the presses do not tell it.
     """
     from scipy.optimize import minimize_scalar
 
@@ -208,7 +221,7 @@ def fit_power(
     def sum_of_squares(exponent: float) -> float:
         return float(weight @ (force - scale(exponent) * z**exponent) ** 2)
 
-    # It may have several minima: the deepest on the grid is refined.
+    # The deepest minimum on the grid is refined.
     best = int(np.argmin([sum_of_squares(exponent) for exponent in exponents]))
     if best in (0, exponents.size - 1):
         return None
@@ -234,7 +247,7 @@ def fit_power(
 
 
 def _square(residual: Float, weight: Float, coefficients: int) -> float:
-    """s^2 of residuals (n,); 0 where a training fold tells none."""
+    """s^2 of residuals (n,); 0 where a training fold has too few rows to tell it."""
     freedom = residual.size - coefficients
     return float(weight @ residual**2) / freedom if freedom > 0 else 0.0
 
@@ -243,11 +256,13 @@ _FITS: Final = {LINEAR: fit_line, POWER: fit_power}
 
 
 class _Trial:
-    """The errors of all candidates on rows held out.
+    """Compares the four candidates by their errors on rows that were held out.
 
-    of (n,): rows of one value are a group, which is held out together. parts: the groups are split
-    into so many at most. A candidate is (kind, whether scatter grows); it has no errors if it
-    cannot be fitted without some group.
+    A candidate is a pair: the kind of curve, and whether scatter grows. A candidate that could not
+    be fitted while some group was held out has no errors, and is left out.
+
+    of: (n,); rows with the same value are a group, and are held out together.
+    parts: the groups are split into at most so many parts.
     """
 
     def __init__(self, rows: _Rows, of: NDArray[np.intp], parts: int) -> None:
@@ -259,7 +274,8 @@ class _Trial:
         self._errors: dict[tuple[str, bool], Float] = {}
         self._likelihoods: dict[tuple[str, bool], Float] = {}  # logarithms, of each group
         parts = min(parts, self._groups)
-        # Shuffled, for the forces of successive presses often follow a pattern of their own.
+        # Shuffled, because forces often rise from press to press: a part that is held out must not
+        # be all of the large ones.
         fold = np.random.default_rng(0).permutation(self._groups)[self._group] % parts
         for (kind, fit), grows in product(_FITS.items(), (False, True)):
             error = np.full_like(rows.force, np.inf)
@@ -273,24 +289,24 @@ class _Trial:
                 self._likelihoods[kind, grows] = self._log_likelihood(error, self._v[grows])
 
     def best(self, grows: bool, *, of_skin: bool = False) -> Curve | None:
-        """The kind that predicts held-out groups better, with s; None where no curve rises.
+        """The curve of the kind that predicts held-out groups better; None where no curve rises.
 
-        of_skin: for cells that nobody pressed, the groups being cells.
+        of_skin: the curve is for cells that nobody pressed, and the groups are cells.
         """
         rows, v = self._rows, self._v[grows]
         fits = (_FITS[kind](rows.x, rows.force, v) for kind in self._kinds(grows))
-        curve = next((each for each in fits if each is not None), None)
+        curve = next((fit for fit in fits if fit is not None), None)
         if curve is None:
             return None
         coefficients = 2 if curve.kind == POWER else 1
-        # Of Student's t: rss / (n - p) times (n - p) / (n - p - 2).
+        # 1. in the module: rss / (n - p) times (n - p) / (n - p - 2).
         freedom = rows.x.size - coefficients
         square = float(np.sum((rows.force - force_by(curve, rows.x)) ** 2 / v)) / (freedom - 2)
-        of_rise = float(np.mean(spread(curve, rows.x, rows.dx) ** 2 / v))
-        s = float(np.sqrt(max(square - of_rise, 0.0)))
+        by_rise = float(np.mean(spread(curve, rows.x, rows.dx) ** 2 / v))  # 2.
+        s = float(np.sqrt(max(square - by_rise, 0.0)))
         error = self._errors.get((curve.kind, grows), np.full_like(v, np.nan))
         held_out_s = _rms(error / np.sqrt(v))
-        if of_skin:
+        if of_skin:  # 3.
             s = float(np.maximum(s, held_out_s))  # NaN stays
         elif self._groups < rows.x.size:
             freedom = self._groups - coefficients
@@ -299,22 +315,22 @@ class _Trial:
         return replace(curve, residual_std=s0, residual_share=s1, held_out_rmse=_rms(error))
 
     def gain_of_growing(self) -> Float:
-        """Log likelihood gained by scatter that grows, of each group; empty if unknown."""
+        """How much growing scatter raises the log likelihood of each group; empty if unknown."""
         constant, growing = ((self._kinds(grows)[0], grows) for grows in (False, True))
         if constant not in self._errors or growing not in self._errors:
             return np.empty(0)
         return self._likelihoods[growing] - self._likelihoods[constant]
 
     def _kinds(self, grows: bool) -> list[str]:
-        """The better kind first; a line of unknown error, if none is known."""
-        known = [kind for kind in _FITS if (kind, grows) in self._errors]
-        if len(known) == 2:
+        """The kinds to try, the better one first; a line if no kind has errors to compare."""
+        tried = [kind for kind in _FITS if (kind, grows) in self._errors]
+        if len(tried) == 2:
             gain = self._likelihoods[POWER, grows] - self._likelihoods[LINEAR, grows]
-            return [POWER, LINEAR] if _is_clear(gain, 1) else known
-        return known or [LINEAR]
+            return [POWER, LINEAR] if _is_clear(gain, 1) else tried
+        return tried or [LINEAR]
 
     def _log_likelihood(self, error: Float, v: Float) -> Float:
-        """l of the module's equation, mean of each group."""
+        """l of the module's equation, the mean of each group."""
         least = _LEAST_SHARE**2 * float(np.mean(self._rows.force**2 / v))
         v = v * max(float(np.mean(error**2 / v)), least)
         of_rows = -0.5 * np.log(v) - 0.5 * error**2 / v
