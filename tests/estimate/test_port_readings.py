@@ -9,7 +9,8 @@ import pytest
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.port_readings import ALIKE_FRAMES, PortReader
+from ohmskin.estimate.port_faults import ALIKE_FRAMES
+from ohmskin.estimate.port_readings import PortReader
 from skins import ten_bits, told
 from studies.conditions import shorted_readings
 from studies.trials import random_trial, skin_at_rest, touch

@@ -4,14 +4,14 @@
 import numpy as np
 import pytest
 
-from ohmskin.estimate import full_fit, joint, port_readings, prior, sparse_fit
+from ohmskin.estimate import full_fit, joint, port_faults, port_noise, prior, sparse_fit
 from studies import ablate
 from studies.ablate import OFF, Constant, Row
 from studies.ablate_scenes import Plan
 
 TINY = Plan(skins=3, frames=4)
 SCENE = "ngspice_random"
-MODULES = (full_fit, joint, port_readings, prior, sparse_fit)
+MODULES = (full_fit, joint, port_faults, port_noise, prior, sparse_fit)
 BY_LABEL = {constant.label: constant for constant in ablate.constants()}
 TRIED = [BY_LABEL["prior.SEGMENT_STD"], BY_LABEL["sparse_fit.SHARE"]]
 

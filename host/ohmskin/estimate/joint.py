@@ -29,7 +29,8 @@ from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import CellFit
-from ohmskin.estimate.port_readings import PortReadings, cell_of
+from ohmskin.estimate.port_faults import cell_of
+from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CROWDED,
     HIDDEN,

@@ -18,10 +18,8 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
-from ohmskin.estimate.port_readings import PortReadings, cell_of
-
-# Beyond what any cell could draw by this many standard deviations, a reading is at fault.
-_FAULT_STDS = 5.0
+from ohmskin.estimate.port_faults import FAULT_STDS, cell_of
+from ohmskin.estimate.port_readings import PortReadings
 
 
 def conductance_from_current(current_siemens: Float, ref_ohm: float) -> Float:
@@ -47,7 +45,7 @@ class OhmEstimator(Estimator):
         ref_ohm = self.knowledge.ref_ohm
         current = ports.current
         cell = conductance_from_current(current, ref_ohm)
-        allowed = port_current(MAX_CELL_SIEMENS, ref_ohm) + _FAULT_STDS * self.knowledge.current_std
+        allowed = port_current(MAX_CELL_SIEMENS, ref_ohm) + FAULT_STDS * self.knowledge.current_std
         excess = current - allowed
         message = ""
         if (excess > 0).any():

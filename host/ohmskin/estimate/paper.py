@@ -57,7 +57,8 @@ from ohmskin.ctrl_c import ctrl_c_kept
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.matrix import CellFit, solve_ports
-from ohmskin.estimate.port_readings import PortReadings, cell_of
+from ohmskin.estimate.port_faults import FAULT_STDS, cell_of
+from ohmskin.estimate.port_readings import PortReadings
 
 OHM_PER_MEGOHM: Final = 1e6
 # The top pin is high where the sensed electrode is the top one and on the source side, or neither.
@@ -73,7 +74,6 @@ _START_CELL_MEGOHM: Final = (2e-6, 15.0)  # the least and the highest cell of st
 # Ports of less resistance, or of cells with more, have no solution within the bounds, or on them.
 _LEAST_PORT_MEGOHM: Final = 1e-5
 _MOST_CELL_MEGOHM: Final = 18.0
-_FAULT_STDS: Final = 5.0  # a reading that is further from such ports is at fault
 # The states' mean must give back the readings to this (root mean square, of Vdd): if not, the
 # states are different circuits, and their mean is none of them.
 MISFIT_RATIO: Final = 1e-3
@@ -230,7 +230,7 @@ class PaperEstimator(Estimator):
         ports_ohm = OHM_PER_MEGOHM * np.array([_MOST_CELL_MEGOHM * share, _LEAST_PORT_MEGOHM])
         feasible = np.clip(current, *1.0 / (ports_ohm + known.ref_ohm))
         excess = np.abs(current - feasible)
-        if excess.max() <= _FAULT_STDS * known.current_std:
+        if excess.max() <= FAULT_STDS * known.current_std:
             return feasible, ""
         said = f"is none of a port from {ports_ohm[1]:.0f} to {ports_ohm[0]:.3g} ohm"
         return feasible, f"the current of {cell_of(excess.argmax(), excess)} {said}"

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the readings of a cell to one current through its port.
+
+Symbols
+
+======== ========= ============================================================== =========
+symbol   shape     meaning                                                        unit
+======== ========= ============================================================== =========
+n                  readings of near ends that a cell has: 4 (A to D), or 2 (A, B)
+y_k      (R, C, n) reading k of each cell                                         V/Vdd
+I        (R, C)    current through a port, per Vdd                                S
+R_k      (n,)      reference resistor that reading k senses                       ohm
+s_k      (n,)      sign of the current in reading k: +1 or -1                     1
+b_k      (n,)      reading k where no current flows: 0 or 1                       V/Vdd
+c        (R, C)    half of the current that floating lines draw from a port       S
+a, b     (R, C)    potentials of the near ends of row and column                  V/Vdd
+e, f     (R, C)    potentials of the far ends of row and column                   V/Vdd
+D        (R, C)    voltage between the sensed ends, e - f                         V/Vdd
+u        (R, C)    current of the port, were there no wires up to its far ends    S
+p_r, p_c (R, C)    what the wires of row and column lose per current              ohm
+======== ========= ============================================================== =========
+
+**The current.** Reading k is y_k = b_k + s_k R_k I. All readings of a cell show the same current,
+so it is that of least squares,
+
+    I = sum_k s_k R_k (y_k - b_k) / sum_k R_k^2 .
+
+**Offsets.** A and D are readings of the row's sense node, B and C of the column's. An offset of a
+node adds the same to both of its readings, but the current has opposite signs in them. So the
+offset cancels in I, and the mean of the two residuals shows it. It belongs to the board, not to a
+cell, so it is the median over all cells. In mode far, only A and B are read. The mean of these two
+residuals shows only the offset that both nodes have in common.
+
+**Lines that charge.** The lines of other ports float. They have a capacitance, and they charge
+through the skin until they have settled. Until then the current into the row is larger than the
+current out of the column by what these lines draw, 2 c on average over both polarities. Least
+squares give the mean of both currents. The lines draw from the row as well as the row conducts to
+them, and from the column likewise: in the ratio of I_row, the sum of the row's other port currents,
+to I_column, that of the column's. The port's own current is that into the row, I + c, less what the
+lines draw from the row:
+
+    I + c - 2 c I_row / (I_row + I_column) = I - c (I_row - I_column) / (I_row + I_column) .
+
+**Far ends.** Nothing draws current from a far end. So its potential differs from that of the near
+end by what the wires of the line lose, and
+
+    u = I / (D + R I) ,  R = R_top + R_bottom ,    p_r = (a - e) / I ,    p_c = (f - b) / I .
+
+In mode far, a node is read at one supply only. An offset of all readings, and lines that charge,
+move a and b alike, but neither moves I. So a and b are not taken as they are read, but as the
+current gives them: 1 - R_top I and R_bottom I.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import (
+    EXCHANGED,
+    NEAR,
+    READING_OFFSET,
+    READING_SENSES_TOP,
+    READING_SIGN,
+    READINGS_PER_CELL,
+    as_near,
+    node_ratio,
+    reference_ohm,
+)
+from ohmskin.estimate.knowledge import SkinKnowledge
+
+# Largest offset of a sense node that is believed, over Vdd. A larger one stays in the residuals and
+# counts as noise. Chosen: 8 LSB of 10 bits, some times what a converter's data sheet allows.
+MOST_OFFSET_RATIO: Final = 0.008
+# The current into the row, and not that out of the column, has what floating lines draw (`c`).
+# Readings of the row's node (top) tell the one, readings of the column's the other.
+_INTO_ROW: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
+
+
+class PortCurrents(NamedTuple):
+    """A current per Vdd of each port, and its standard deviation, both (R, C) [S]."""
+
+    current: Float
+    std: Float
+
+
+class NearReadings(NamedTuple):
+    """What the near ends of one frame show.
+
+    ratio: readings of near ends alone (R, C, n) [V/Vdd].
+    current: of each port, by least squares over its readings (R, C) [S].
+    residual: of each reading, less the offset of its node (R, C, n) [V/Vdd].
+    offset_ratio: of the sense node of each reading (n,) [V/Vdd].
+    """
+
+    ratio: Float
+    current: Float
+    residual: Float
+    offset_ratio: Float
+
+
+class BestThree(NamedTuple):
+    """The three of a cell's four readings that agree best.
+
+    disagreement_ratio: root of the mean square of what they disagree [V/Vdd].
+    current: what these three show [S].
+    """
+
+    disagreement_ratio: float
+    current: float
+
+
+class NearEnds:
+    """Reads the currents at the near ends of the lines. per_cell: n, readings of a cell there."""
+
+    def __init__(self, knowledge: SkinKnowledge) -> None:
+        names = knowledge.reading_names
+        for node in "ab":
+            if node not in names and EXCHANGED[node] not in names:
+                raise ValueError(f"readings {' '.join(names)}: of each near end, one is needed")
+        self._names = names
+        self.per_cell = n = READINGS_PER_CELL if names == NEAR else 2
+        reference = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)[:n]
+        self._slope_ohm, self._at_no_current = READING_SIGN[:n] * reference, READING_OFFSET[:n]
+        self.square_ohm = float(np.sum(reference**2))  # sum_k R_k^2
+        self._into_row = _INTO_ROW[:n] / reference / n
+        # The node of each reading: the two nodes' offsets, in the order of A, B, C, D.
+        self._node = [0, 1, 1, 0][:n]
+
+    def read(self, ratio: Float) -> NearReadings:
+        """Currents and residuals of checked readings (R, C, m), of all m names of this skin."""
+        ratio = as_near(ratio, self._names)[..., : self.per_cell]
+        signal = ratio - self._at_no_current
+        current: Float = signal @ self._slope_ohm / self.square_ohm
+        residual = signal - current[..., None] * self._slope_ohm
+        # A with D and B with C; where there are only A and B, A with B for both nodes.
+        of_nodes = 0.5 * (residual[..., :2] + residual[..., :-3:-1]).reshape(-1, 2)
+        middle = len(of_nodes) // 2
+        offset = np.partition(of_nodes.T, middle)[self._node, middle]  # faster than median
+        offset = np.minimum(np.maximum(offset, -MOST_OFFSET_RATIO), MOST_OFFSET_RATIO)
+        residual -= offset
+        return NearReadings(ratio, current, residual, offset)
+
+    def charging(self, near: NearReadings) -> Float:
+        """What lines that charge add to the currents of least squares, (R, C) [S]."""
+        current = near.current
+        by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
+        share = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
+        charging = near.residual @ self._into_row  # c
+        return np.asarray(charging * np.clip(share, -1.0, 1.0))
+
+    def best_three(self, ratio: Float) -> BestThree:
+        """Of the four readings (4,) of one cell. It is for mode near: far has two readings."""
+        threes = []
+        for left_out in range(READINGS_PER_CELL):
+            kept = np.arange(READINGS_PER_CELL) != left_out
+            slope, signal = self._slope_ohm[kept], (ratio - self._at_no_current)[kept]
+            current = float(slope @ signal / (slope @ slope))
+            residual = signal - slope * current
+            degrees = kept.sum() - 1  # three readings, one current
+            threes.append(BestThree(float(residual @ residual / degrees) ** 0.5, current))
+        return min(threes)
+
+
+class FarReadings(NamedTuple):
+    """What the far ends of one frame show.
+
+    ports: u and its standard deviation.
+    near_current: I, but at least one standard deviation: others are divided by it (R, C) [S].
+    drop: what the wires of row and of column lose, p_r I and p_c I, (2, R, C) [V/Vdd].
+    """
+
+    ports: PortCurrents
+    near_current: Float
+    drop: Float
+
+
+class FarEnds:
+    """Reads the far ends of rows, of columns, or of both. sensed: which of the two have any."""
+
+    def __init__(self, knowledge: SkinKnowledge) -> None:
+        self._names = names = knowledge.reading_names
+        row, column = (node in names or EXCHANGED[node] in names for node in "ef")
+        self.sensed = row, column
+        self._ref_ohm = (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
+        self._least_current = knowledge.current_std
+
+    def read(self, ratio: Float, near: PortCurrents, variance: Float) -> FarReadings:
+        """variance (R, C): of the difference between readings at two ends [V^2/Vdd^2]."""
+        current = np.maximum(near.current, self._least_current)
+        near_end = 1.0 - self._ref_ohm[0] * current, self._ref_ohm[1] * current  # a, b
+        row_end, column_end = (
+            node_ratio(ratio, self._names, node) if is_sensed else potential
+            for node, is_sensed, potential in zip("ef", self.sensed, near_end, strict=True)
+        )
+        apart = np.maximum(row_end - column_end, 0.0)  # D
+        whole = apart + sum(self._ref_ohm) * current
+        # By d u / d I = D / (D + R I)^2 and d u / d D = - I / (D + R I)^2.
+        std = np.sqrt(apart**2 * near.std**2 + variance * current**2) / whole**2
+        drop = np.stack([near_end[0] - row_end, column_end - near_end[1]])
+        return FarReadings(PortCurrents(current / whole, std), current, drop)

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What no touches can make of a skin: readings and currents that a fault must be behind.
+
+A frame is at fault, and its answer not to be relied on, where
+
+- the readings of most cells disagree by far more than noise, or those of one cell do so that no
+  three of its four readings agree (one reading that is stuck is left out);
+- a current is below that at rest. Touches lower resistances, and that lowers the resistance between
+  any two electrodes (Rayleigh's monotonicity law). So touches cannot do this, but open lines do;
+- a port has less resistance than it had if every cell were pressed as hard as can be, by the same
+  law: a row is shorted to a column;
+- two lines that differed at rest draw the same current from every other line, and all of it more
+  than at rest: their electrodes are shorted. Or they did so at rest already, and more than the
+  other lines. A finger between two lines makes them alike for a moment. So lines that frames have
+  shown apart must be alike for `ALIKE_FRAMES`;
+- a line showed no current at rest, though others did;
+- the far end of a line has a potential that is not between those of the near ends: it is open, or
+  it belongs to another line.
+
+A check answers with words, and with no words where nothing is wrong. What frames have shown of
+pairs of lines is the only state here; `LinePairs.tell` changes it, and nothing else does.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import PortCircuit
+from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.port_currents import NearEnds, NearReadings, PortCurrents
+from ohmskin.estimate.port_noise import Spread
+from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
+
+# What is beyond a limit by more standard deviations is no noise. Chosen: by chance, one normal
+# error of 3.5 million is.
+FAULT_STDS: Final = 5.0
+# Root of the mean square by which the readings of a cell disagree, over Vdd. If it is more for the
+# median cell, most cells are at fault. Chosen: the simulated desk (`make bench-desk`) stays below.
+MOST_CELLS_RATIO: Final = 0.016
+# The same for one cell: if it is more, this cell is at fault. Chosen: about twice as much, because
+# one of many cells is the worst even on a sound skin.
+ONE_CELL_RATIO: Final = 0.03
+# In noise, a cell at fault also disagrees by more than so many times the median cell. Chosen: one
+# more than `FAULT_STDS`, as the median cell is not the noisiest.
+ONE_CELL_TIMES: Final = 6.0
+# Three readings of a cell agree if they disagree by less than so many standard deviations of
+# rounding. Chosen: 1.2 LSB, more than rounding alone can make of them.
+AGREE_STDS: Final = 4.0
+# Share of a port's current at rest by which it may drift, up or down. Chosen: three deviations of
+# the drift that `prior.REST_STD` expects.
+DRIFT_SHARE: Final = 0.15
+# Two lines are alike if none of their currents differ by more standard deviations. Chosen: joined
+# electrodes give the same code, or differ by noise, and one code is 3.5 deviations of rounding.
+SAME_STDS: Final = 3.4
+# Lines that frames have shown apart are shorted if they are alike for so many frames: three seconds
+# at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
+ALIKE_FRAMES: Final = 270
+# Lines that were shorted at rest already drew more than this times the median line. Chosen: more
+# than lines at rest scatter, and less than the double that two lines in one draw.
+PAIR_TIMES: Final = 1.15
+# Share of its nominal wires that a skin has at least. Chosen: no bend or wrong number halves them.
+WIRE_SHARE: Final = 0.5
+
+_LINES: Final = ("row", "column")  # By axis: rows are counted by axis 0 of an array of ports.
+
+
+class Mended(NamedTuple):
+    """Currents without the readings that contradict the others of their cell.
+
+    fault: what could not be mended, or empty.
+    """
+
+    ports: PortCurrents
+    fault: str
+
+
+class Contradictions:
+    """Checks whether the readings of a cell agree, and leaves out one that is stuck."""
+
+    def __init__(self, near_ends: NearEnds, ratio_std: float) -> None:
+        self._near_ends, self._ratio_std = near_ends, ratio_std
+        self._degrees = near_ends.per_cell - 1
+        self._has_four = near_ends.per_cell == 4
+        # The multiplexers at far ends double the capacitance that charges.
+        charging = 1.0 if self._has_four else 2.0
+        self._most_cells, self._one_cell = charging * MOST_CELLS_RATIO, charging * ONE_CELL_RATIO
+
+    def mended(self, near: NearReadings, spread: Spread, ports: PortCurrents) -> Mended:
+        """ports: the currents of these readings, which stay as they are."""
+        typical = (spread.median_square / self._degrees) ** 0.5
+        if typical > self._most_cells:
+            text = f"the readings of most cells disagree, by {100 * typical:.0f} % of Vdd"
+            return Mended(ports, text)
+        limit = max(self._one_cell, ONE_CELL_TIMES * typical)
+        if spread.square.max() <= self._degrees * limit**2:
+            return Mended(ports, "")
+        current, std, fault = ports.current.copy(), ports.std.copy(), ""
+        for index in np.flatnonzero(spread.square > self._degrees * limit**2):
+            cell = np.unravel_index(index, spread.square.shape)
+            if self._has_four:
+                best = self._near_ends.best_three(near.ratio[cell])
+                agree = max(AGREE_STDS * self._ratio_std, ONE_CELL_TIMES * typical)
+                if best.disagreement_ratio < agree:
+                    current[cell] = best.current
+                    # In three readings, offsets and what lines draw do not cancel. Chosen: this
+                    # doubles the deviation.
+                    std[cell] = 2.0 * std.min()
+                    continue
+            by = 100 * float(spread.square[cell] / self._degrees) ** 0.5
+            fault = f"{cell_of(index, current)}: its readings disagree by {by:.0f} % of Vdd"
+        return Mended(PortCurrents(current, std), fault)
+
+
+class LinePairs:
+    """Tells which rows (axis 0), or which columns (axis 1), read alike though they did not at rest.
+
+    Two shorted lines are one node, so their currents from every other line are the same. It is told
+    what frames show, and then says which pairs have been alike for long enough to be shorted.
+    """
+
+    def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
+        """least_std [S]: of a current that is only rounded; none is believed to be known better."""
+        self._axis, self._least_std = axis, least_std
+        self._lines, self._ports = (rest.current if axis == 0 else rest.current.T).shape
+        self._rest_std = self._largest_std(rest)
+        self._rest_apart = self._apart(rest)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames before: no frame has shown any two lines apart."""
+        self._alike_frames: NDArray[np.intp] = np.full((self._lines, self._lines), ALIKE_FRAMES)
+        self._is_shorted = np.zeros((self._lines, self._lines), dtype=bool)
+
+    def were_shorted_at_rest(self, high: NDArray[np.bool_]) -> str:
+        """The first pair of the lines `high` that was alike at rest already, in words, or empty.
+
+        Of fewer lines, the median says little; lines with few ports may be alike by chance.
+        """
+        if self._lines < 4 or self._ports < 3:
+            return ""
+        return self._first(self._rest_apart < SAME_STDS, high)
+
+    def need_telling(self, high: NDArray[np.bool_]) -> bool:
+        """Whether a frame in which these lines are `high` (lines,) can show shorted lines.
+
+        This is asked first because it saves time: comparing all pairs takes long. A pair needs two
+        high lines. But as long as some pair has not been seen apart, every frame may show it so.
+        Lines with fewer than three ports may be alike by chance.
+        """
+        all_seen_apart = self._alike_frames.max() < ALIKE_FRAMES
+        return self._ports >= 3 and not (all_seen_apart and np.count_nonzero(high) < 2)
+
+    def tell(self, now: PortCurrents) -> None:
+        """What a frame shows of all pairs."""
+        apart = self._apart(now)
+        # A frame that is noisier than rest may not tell lines apart that differed at rest. What is
+        # alike then counts as apart: nobody can know.
+        noisier = max(self._largest_std(now) / self._rest_std, 1.0)
+        apart[self._rest_apart <= 2 * SAME_STDS * noisier] = np.inf
+        # Between one and two times the limit, noise may be what differs: it shows nobody apart.
+        self._alike_frames = np.where(apart > 2 * SAME_STDS, 0, self._alike_frames + 1)
+        self._is_shorted = (apart < SAME_STDS) & (self._alike_frames >= ALIKE_FRAMES)
+
+    def shorted(self, high: NDArray[np.bool_]) -> str:
+        """The first pair of the lines `high` that is shorted, by what was told; or empty."""
+        return self._first(self._is_shorted, high)
+
+    def _first(self, is_alike: NDArray[np.bool_], high: NDArray[np.bool_]) -> str:
+        if not is_alike.any():
+            return ""
+        pairs = np.argwhere(np.triu(is_alike & high & high[:, None], 1))
+        return f"{_LINES[self._axis]}s {pairs[0][0]} and {pairs[0][1]}" if len(pairs) else ""
+
+    def _apart(self, ports: PortCurrents) -> Float:
+        """Largest difference between two lines' currents, in deviations (lines, lines)."""
+        current, std = ports.current, np.maximum(ports.std, self._least_std)
+        if self._axis == 1:
+            current, std = current.T, std.T
+        difference = np.abs(current[:, None, :] - current)
+        difference /= np.maximum(std[:, None, :], std)
+        return np.asarray(difference.max(axis=2))
+
+    def _largest_std(self, ports: PortCurrents) -> float:
+        return max(float(ports.std.max()), self._least_std)
+
+
+class SkinFaults:
+    """Compares the currents of frames with those at rest, and with what the wires allow."""
+
+    def __init__(self, knowledge: SkinKnowledge, rest: PortCurrents | None) -> None:
+        """rest: currents of the untouched skin. Without them, only short ports are found."""
+        self._highest = _highest_current(knowledge)
+        self._rest = rest
+        self._pairs: list[LinePairs] = []
+        if rest is not None:
+            self._pairs = [LinePairs(axis, rest, knowledge.current_std) for axis in (0, 1)]
+
+    def reset(self) -> None:
+        """Forget the frames before."""
+        for pairs in self._pairs:
+            pairs.reset()
+
+    def at_rest(self) -> str:
+        """What is wrong at rest already: a line that is open, or two that are shorted."""
+        if self._rest is None:
+            return ""
+        clear = self._rest.current / self._rest.std
+        for axis, pairs in enumerate(self._pairs):
+            most = clear.max(axis=1 - axis)
+            # Where the whole skin hardly conducts, a line without a clear current is like the
+            # others. So the median line must be clear by far. Chosen: four times the limit, so that
+            # no line counts as open that conducts a quarter of the median line.
+            is_dark = (most < FAULT_STDS) & (float(np.median(most)) > 4 * FAULT_STDS)
+            if is_dark.any():
+                return (
+                    f"{_LINES[axis]} {int(is_dark.argmax())} conducted nothing at rest: is it open?"
+                )
+            median_line = np.median(self._rest.current, axis=axis, keepdims=True)
+            high = np.all(self._rest.current > PAIR_TIMES * median_line, axis=1 - axis)
+            if pair := pairs.were_shorted_at_rest(high):
+                return f"{pair} conducted alike at rest, and more than others"
+        return ""
+
+    def find(self, now: PortCurrents) -> str:
+        """The first fault that a frame's currents show. The frame is told to the pairs of lines."""
+        fault = self._short(now)
+        if fault or self._rest is None:
+            return fault
+        if fault := self._loss(now, self._rest):
+            return fault
+        is_higher = now.current > (1.0 + DRIFT_SHARE) * self._rest.current
+        for axis, pairs in enumerate(self._pairs):
+            high = np.asarray(is_higher.all(axis=1 - axis))
+            if pairs.need_telling(high):
+                pairs.tell(now)
+                if pair := pairs.shorted(high):
+                    return f"{pair} read alike as they did not at rest: shorted?"
+        return ""
+
+    def _short(self, now: PortCurrents) -> str:
+        """A port with less resistance than a skin can have."""
+        excess = now.current - self._highest - FAULT_STDS * now.std
+        worst = excess.argmax()
+        if excess.flat[worst] <= 0:
+            return ""
+        return f"{cell_of(worst, excess)}: less resistance than wires have: row and column shorted?"
+
+    def _loss(self, now: PortCurrents, rest: PortCurrents) -> str:
+        """A current that is below that at rest, by more than drift and noise."""
+        std = np.hypot(now.std, rest.std)
+        loss = (1.0 - DRIFT_SHARE) * rest.current - now.current - FAULT_STDS * std
+        worst = loss.argmax()
+        if loss.flat[worst] <= 0:
+            return ""
+        if np.count_nonzero(loss > 0) > 0.5 * loss.size:
+            return "the whole skin conducts less than at rest: take the rest readings anew"
+        return f"{cell_of(worst, loss)}: conducts less than at rest, is a line open?"
+
+
+def far_line_fault(drop: Float, drop_std: Float) -> str:
+    """A line whose far end is not between the near ends, by all its ports together.
+
+    drop (2, R, C): what the wires of row and of column lose up to the far ends; drop_std (R, C).
+    """
+    for axis, line in enumerate(_LINES):
+        most = (drop[axis] + FAULT_STDS * drop_std).sum(axis=1 - axis)
+        if most.min() < 0:
+            return f"{line} {most.argmin()}: its far end does not follow it, is it open?"
+    return ""
+
+
+def _highest_current(knowledge: SkinKnowledge) -> Float:
+    """What ports draw if every cell is pressed as hard as can be, (R, C) [S]; inf if not known."""
+    shape = knowledge.rows, knowledge.columns
+    if knowledge.nominal_wire_ohm.both is None:
+        return np.full(shape, np.inf)
+    top, bottom = (WIRE_SHARE * ohm for ohm in knowledge.nominal_wire_ohm.both)
+    pressed = PortCircuit(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
+    return np.asarray(1.0 / (pressed.port_ohm.reshape(shape) + knowledge.ref_ohm))
+
+
+def cell_of(index: int | np.intp, ports: Float) -> str:
+    """The cell of this flat index into an array of ports (R, C), in words."""
+    row, column = np.unravel_index(index, ports.shape)
+    return f"cell ({row}, {column})"

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How noisy readings are, by how far the readings of a cell disagree, and by what changes.
+
+Symbols; variances are of one reading, in V^2/Vdd^2
+
+======== ========= ==============================================================
+symbol   shape     meaning
+======== ========= ==============================================================
+n                  readings of a cell at near ends: 4, or 2 in mode far
+s^2                variance of rounding to a code, from the converter's bits
+v_cell   (R, C)    variance of a cell's residuals
+v                  that of the usual cell
+v_n                variance of noise: of what changes from frame to frame
+v_I      (R, C)    what counts as error of a current
+R_k      (n,)      reference resistor that reading k senses [ohm]
+s_I      (R, C)    standard deviation of a port's current per Vdd [S]
+======== ========= ==============================================================
+
+**From residuals.** n readings of a cell show one current, so n - 1 of the residuals are free. The
+offsets of the board are fitted, too, one for two readings: n / 2 of them, shared by all RC cells,
+
+    v_cell = sum_k residual_k^2 / (n - 1 - n / (2 RC)) .
+
+**Noise, and what stays.** Residuals have three causes: noise; lines that charge; the converter's
+curve. Noise changes from frame to frame, the other two stay while nothing moves. The difference
+of the residuals of two frames has twice the variance of noise, and nothing of what stays. Where
+v_n, so measured, is much less than v, most of a disagreement stays. Of that, most is taken from
+the current (`port_currents`), and a share of it counts as error:
+
+    v_I = v_n + STAYING_SHARE^2 max(0, v_cell - v_n) .
+
+Otherwise, all of a disagreement counts as noise: v_I = max(v_cell, v).
+
+**The current.** Without noise, the four readings of a cell round alike, because D is 1 - A and C is
+1 - B. Then they agree, and their mean is no better than one of them. Noise makes them disagree, and
+round independently as soon as it has the variance of rounding: v = 2 s^2. Between both,
+
+    s_I^2 = v_I / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2 .
+
+This is exact at both ends; between them, s_I is 1.0 to 1.2 times too large.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.estimate.knowledge import SkinKnowledge
+
+# Median of chi-square, by its degrees of freedom: from tables of the distribution.
+_MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}
+# A cell is usual if its readings disagree by less than so many standard deviations, of the median
+# cell or of rounding. Chosen: noise hardly ever exceeds it; what does has a cause of its own.
+USUAL_STDS: Final = 3.0
+# If noise is less than this share of the variance, most of a disagreement stays. Chosen: then what
+# stays is larger than noise, and by chance no frame shows half of the deviation it has.
+NOISE_SHARE: Final = 0.25
+# Share of a staying disagreement that is still in the current after what floating lines draw is
+# taken from it. Measured in firmware/sim with its preset `desk`, as `make bench-desk` does.
+STAYING_SHARE: Final = 0.12
+
+
+class Spread(NamedTuple):
+    """How far the readings of the cells of one frame disagree.
+
+    square: sum of the squares of a cell's residuals (R, C) [V^2/Vdd^2].
+    median_square: that of the median cell.
+    by_cell: v_cell (R, C).
+    usual: v, the mean over all usual cells.
+    """
+
+    square: Float
+    median_square: float
+    by_cell: Float
+    usual: float
+
+
+class Variances(NamedTuple):
+    """Variances of a reading, from one frame and the one before it.
+
+    noise: v_n, or v where noise cannot be told from what stays.
+    error: v_I, what counts as error of a current (R, C).
+    """
+
+    noise: float
+    error: Float
+
+
+class ReadingNoise:
+    """Measures the noise of readings, frame after frame."""
+
+    def __init__(self, knowledge: SkinKnowledge, per_cell: int, square_ohm: float) -> None:
+        """per_cell: n. square_ohm: sum_k R_k^2 [ohm^2]."""
+        self.degrees = per_cell - 1
+        cells = knowledge.rows * knowledge.columns
+        self._free_degrees = max(self.degrees - per_cell / (2.0 * cells), 0.5)
+        self._ratio_std, self._rounding = knowledge.ratio_std, knowledge.ratio_std**2
+        # v where readings round independently: rounding, and as much noise.
+        self._independent = 2.0 * self._rounding
+        self._square_ohm, self._alike_std = square_ohm, knowledge.current_std
+        self._staying_share = np.full((knowledge.rows, knowledge.columns), STAYING_SHARE)
+        if per_cell == 2:
+            # Mode far reads a and e of all ports in one pass, and b and f in the next. Before the
+            # first pass the board waits for the scan to begin, and the lines settle at the first
+            # port. Before the second pass they do not. So there they move b but not a, and nothing
+            # cancels in the current: all of this port's disagreement counts.
+            self._staying_share[0, 0] = 1.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frame before."""
+        self._residual: Float | None = None
+
+    def keep(self, residual: Float) -> None:
+        """The next frame's residuals will be compared with these (R, C, n)."""
+        self._residual = residual
+
+    def spread(self, residual: Float) -> Spread:
+        """How far readings of these residuals (R, C, n) disagree."""
+        square = np.einsum("ijk,ijk->ij", residual, residual)
+        median = _median(square)
+        by_cell = square / self._free_degrees
+        level = max(self._rounding, median / _MEDIAN_CHI2[self.degrees])
+        usual = by_cell[by_cell <= USUAL_STDS**2 * level]
+        return Spread(square, median, by_cell, float(usual.sum()) / usual.size)  # faster than mean
+
+    def explains(self, spread: Spread) -> bool:
+        """Whether rounding and a converter's noise can be all that makes readings disagree."""
+        return self._independent >= NOISE_SHARE * spread.usual
+
+    def of_change(self, residual: Float) -> float:
+        """v_n by the change of the residuals since the frame before; inf if there is none."""
+        if self._residual is None:
+            return np.inf
+        change = residual - self._residual
+        square = np.einsum("ijk,ijk->ij", change, change)
+        return _median(square) / (2.0 * _MEDIAN_CHI2[self.degrees])
+
+    def of_mean(self, ratio: Float) -> float:
+        """v_n of readings (R, C, n) at rest: 0 in a mean of many scans, inf (unknown) in one scan.
+
+        Readings of one scan are codes; a mean of many lies between codes.
+        """
+        code = ratio / (self._ratio_std * 12**0.5) - 0.5
+        return 0.0 if np.abs(code - np.rint(code)).max() > 0.01 else np.inf
+
+    def variances(self, spread: Spread, changing: float) -> Variances:
+        """Noise, and what counts as error. changing: v_n, inf where it is not known."""
+        # Codes that do not change are no proof of readings without error: they are rounded.
+        noise = max(changing, self._independent)
+        if noise < NOISE_SHARE * spread.usual:
+            staying = np.maximum(spread.by_cell - noise, 0.0)
+            return Variances(noise, noise + self._staying_share**2 * staying)
+        return Variances(spread.usual, np.maximum(spread.by_cell, spread.usual))
+
+    def current_std(self, variances: Variances) -> Float:
+        """s_I (R, C) [S]."""
+        alike = max(0.0, 1.0 - variances.noise / self._independent)
+        return np.sqrt(variances.error / self._square_ohm + alike * self._alike_std**2)
+
+    def between_ends(self, variances: Variances) -> Float:
+        """Variance of the difference between readings at two ends of mode far, (R, C) [V^2/Vdd^2].
+
+        Noise of both readings adds up. What stays has moved both near readings of a cell by the
+        same d. Their variance, of one degree of freedom, counts it as 2 d^2; the difference has it
+        once, as d^2: half of that variance. Rounding of two readings is the least.
+        """
+        staying = np.maximum(variances.error - variances.noise, 0.0)
+        return np.maximum(2.0 * variances.noise + 0.5 * staying, 2.0 * self._rounding)
+
+    def offset_std(self, spread: Spread, offset_ratio: float) -> float:
+        """Standard deviation of the offset that far ends may have against near ends [V/Vdd].
+
+        What near ends a and b have in common may be an offset of all readings, which far ends have
+        as well, or be of lines that charge, which far ends have not. This covers both.
+        """
+        return float((spread.usual + offset_ratio * offset_ratio) ** 0.5)
+
+
+def _median(square: Float) -> float:
+    """The median cell; of an even number, the upper one of the two: faster than np.median."""
+    middle = square.size // 2
+    return float(np.partition(square, middle, axis=None)[middle])
