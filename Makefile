@@ -26,7 +26,7 @@ C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h'
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware check-firmware sim \
+.PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware test-arduino-gcc check-firmware sim \
         test-host fuzz chart stability ablate far experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-far bench-desk bench-force bench-view \
         bench-boards clean distclean
 
@@ -78,6 +78,9 @@ wheel: firmware ## build dist/ohmskin-*.whl with the firmware of all boards, to 
 
 test-firmware: setup ## unit tests of the firmware: on this machine and in simulated AVRs
 	$(BIN)/pio test -e native -e uno_sim -e mega_sim
+
+test-arduino-gcc: setup sim ## test the firmware as built with avr-gcc 7.3, which Arduino's users have
+	$(ONE_THREAD) tools/test_arduino_gcc.sh
 
 check-firmware: setup ## cppcheck
 	$(BIN)/pio check -e uno --fail-on-defect low --fail-on-defect medium --fail-on-defect high

@@ -19,11 +19,11 @@ from serial.tools.list_ports_common import ListPortInfo
 
 import second_simulator
 from command_line import ENVIRONMENT, Command, Done, Run
+from lockstep import elf_of
 from ohmskin.cli import main as cli
 from ohmskin.emulate.board import EmulatedBoard, PtyServer
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.opening import emulated
-from places import ROOT
 from ports import USB_IDS, Attach, Serve
 from studies.__main__ import app as studies
 
@@ -39,9 +39,7 @@ settings.load_profile("repeatable")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    if item.get_closest_marker("simavr") and not (
-        PROGRAM.exists() and (ROOT / ".pio/build/uno/firmware.elf").exists()
-    ):
+    if item.get_closest_marker("simavr") and not (PROGRAM.exists() and elf_of("uno").exists()):
         pytest.skip("needs 'make firmware sim'")
     if item.get_closest_marker("ngspice") and not shutil.which("ngspice"):
         _is_missing("ngspice", "ngspice")

@@ -6,6 +6,7 @@ figure is exact and repeatable. In real time there is ``simavr://`` (`ohmskin.em
 """
 
 import json
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,8 +122,12 @@ class LockstepSim(SkinSim):
 
 
 def elf_of(board: str) -> Path:
-    """Where PlatformIO leaves the firmware; it need not exist."""
-    return ROOT / ".pio" / "build" / board / "firmware.elf"
+    """Where PlatformIO leaves the firmware; it need not exist.
+
+    PlatformIO reads the variable too: by it, `make test-arduino-gcc` builds, and tests, elsewhere.
+    """
+    built = os.environ.get("PLATFORMIO_BUILD_DIR", ROOT / ".pio" / "build")
+    return Path(built) / board / "firmware.elf"
 
 
 def first_holds(holds: NDArray[np.void], mode: str = "near") -> NDArray[np.intp]:

@@ -80,7 +80,9 @@ def core_version(package: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("core_dir", type=Path, help="the PLATFORMIO_CORE_DIR to fill")
-    core = Core(parser.parse_args().core_dir.absolute())
+    parser.add_argument("--compiler", type=Path, default=BIN, help="the folder that has avr-gcc")
+    arguments = parser.parse_args()
+    core, compiler = Core(arguments.core_dir.absolute()), arguments.compiler.absolute()
 
     if missing := [str(path) for path in NEEDED if not path.exists()]:
         sys.exit(f"seed.py: missing {', '.join(missing)}: run 'make setup', or see README.md")
@@ -90,7 +92,7 @@ def main() -> None:
     core.tool(
         "toolchain-atmelavr",
         "1.50400.0",
-        {f"bin/{program.name}": program for program in BIN.glob("avr-*")},
+        {f"bin/{program.name}": program for program in compiler.glob("avr-*")},
     )
     core.tool("framework-arduino-avr", "5.1.0", {path.name: path for path in ARDUINO.iterdir()})
     core.tool("tool-avrdude", "1.70100.0", {"bin/avrdude": BIN / "avrdude"})
