@@ -13,7 +13,7 @@ import pytest
 from bench_board import Bench, evidence
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.examine import Evidence, examine
-from ohmskin.doctor.findings import Diagnosis, Finding, Kind, Place, Severity
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, Severity, merged
 from ohmskin.doctor.gather import gather
 from ohmskin.doctor.signal import Rest, RestScans, examine_signal, find_hum, second_look
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
@@ -321,6 +321,36 @@ def test_order_and_verdict() -> None:
     assert verdict(diagnosis) == "not sound: 1 finding, first lost (board)"
     with pytest.raises(ValueError, match="lost has"):
         diagnosis.add(Kind.LOST)
+
+
+def test_what_another_finding_explains_is_not_told() -> None:
+    change = dict.fromkeys(Kind.SETTLING.names, 1)
+    dead = Finding(Kind.DEAD_CELL, Place(cells=((0, 0), (4, 6), (4, 7))), {"percent_of_usual": 0.0})
+    yarn = {"between": (5, 6)}
+    found = [
+        Finding(Kind.TOUCHED, Place(cells=((4, 6),)), {"moves": False}),
+        Finding(Kind.SETTLING, Place(cells=((1, 1),)), change),
+        dead,
+        Finding(Kind.SETTLING_PRESSED, WHOLE_SKIN, change),
+        Finding(Kind.SHORT_ROWS, Place(rows=(2, 3)), {}),
+        Finding(Kind.SHORT_ROWS, Place(rows=(5, 6)), {}),
+        Finding(Kind.BROKEN_YARN, Place(rows=(4,)), yarn, Place(cells=((4, 6), (4, 7)))),
+        Finding(Kind.SHORT_FAR, Place(rows=(2, 3)), {}),
+    ]
+    assert [(each.kind, each.place) for each in merged(found)] == [
+        (Kind.SHORT_ROWS, Place(rows=(5, 6))),
+        (Kind.SHORT_FAR, Place(rows=(2, 3))),
+        (Kind.BROKEN_YARN, Place(rows=(4,))),
+        (Kind.DEAD_CELL, Place(cells=((0, 0),))),
+        (Kind.SETTLING_PRESSED, WHOLE_SKIN),
+        (Kind.TOUCHED, Place(cells=((4, 6),))),
+    ]
+    assert merged([dead, found[6]])[1].values is dead.values
+    assert merged([dead]) == [dead]
+
+
+def test_a_kind_explains_kinds_that_there_are() -> None:
+    assert set().union(*(kind.explains for kind in Kind)) <= set(Kind.__members__)
 
 
 def test_places_are_named() -> None:

@@ -70,8 +70,7 @@ def diagnosis_of(ratio: Float, noise_lsb: float, scans: int = 225) -> Diagnosis:
     board = replace(Bench(FAR).info, rows=ratio.shape[0], columns=ratio.shape[1])
     seen_lsb = float(np.hypot(noise_lsb, 12**-0.5))
     rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0)), Diagnosis()
-    examine_circuit(near_ends(rest), diagnosis)
-    examine_far(rest, None, diagnosis)
+    examine_far(rest, examine_circuit(near_ends(rest), diagnosis), None, diagnosis)
     return diagnosis
 
 
@@ -156,8 +155,7 @@ def test_the_firmware_on_a_desk(far_open: int) -> None:
     board = Bench(FAR).info
     noise_lsb = float(np.sqrt(np.mean(np.diff(codes, axis=0) ** 2) / 2))
     rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb, (100.0, 200.0)), Diagnosis()
-    examine_circuit(near_ends(rest), diagnosis)
-    examine_far(rest, None, diagnosis)
+    examine_far(rest, examine_circuit(near_ends(rest), diagnosis), None, diagnosis)
     if far_open:
         assert [each.kind for each in diagnosis.findings] == [Kind.OPEN_FAR, Kind.OPEN_FAR]
         assert diagnosis.lines == []
@@ -214,6 +212,14 @@ def test_several_faults_are_named_at_once() -> None:
         ("dead_cell", "cell (0, 0)"),
         ("open_far", "far end of column 5"),
         ("swapped_far", "far ends of rows 1, 2"),
+    ]
+
+
+def test_two_broken_lines_that_cross_are_both_named() -> None:
+    """Cell (4, 5) is beyond both breaks."""
+    assert told(f"{FAR}&broken_row=4,3&broken_column=1,5") == [
+        ("broken_yarn", "row 4, between columns 2 and 3"),
+        ("broken_yarn", "column 5, between rows 0 and 1"),
     ]
 
 

@@ -7,22 +7,13 @@ from typing import Any, Final
 
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, LineWire, Place, WireShare
 from ohmskin.doctor.gather import Step
-from ohmskin.doctor.wires import CornerScans
+from ohmskin.doctor.wires import KNOWN_STD, CornerScans
 from ohmskin.link.protocol import ENUMS
 
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
 MOST_CELLS: Final = 6  # [cells] More are not named one by one.
-SEGMENT_KNOWN: Final = 0.15  # [1] A segment with a larger deviation is not told from the others.
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-_STEPS: Final = {
-    Step.SELF_TEST: "self-test",
-    Step.SKIN: "scanning the untouched skin for {:g} s",
-    Step.PLATE: "scanning the plate for {:g} s",
-    Step.LONGER_SETTLING: "scanning with a longer settle time",
-    Step.ADC_CLOCK: "scanning by {}",
-    Step.PRESSED_SETTLING: "comparing settle times",
-}
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
 _WIDE: Final = "not known: press with something smaller than a cell, further apart"
@@ -148,7 +139,7 @@ def _ohm(share: WireShare, nominal_ohm: tuple[float, float]) -> str:
 def line_wire_in_words(line: LineWire) -> str:
     """A line of the table of wires."""
     pairs = zip(line.segment_ohm, line.segment_std_ohm, strict=True)
-    each = " ".join(f"{ohm:6.0f}" if std < SEGMENT_KNOWN * ohm else "     ?" for ohm, std in pairs)
+    each = " ".join(f"{ohm:6.0f}" if std < KNOWN_STD * ohm else "     ?" for ohm, std in pairs)
     return f"{named(line.place):<18}{line.ohm:6.0f} +- {line.std_ohm:<4.0f}{each}"
 
 
@@ -157,7 +148,7 @@ def step_in_words(step: Step, detail: Any) -> tuple[str, str]:
     if step is Step.PRESSES:
         return guidance(detail)
     request = "keep pressing" if step is Step.PRESSED_SETTLING else ""
-    return _STEPS[step].format(detail), request
+    return _TABLES["steps"][step.name].format(detail), request
 
 
 def guidance(presses: CornerScans) -> tuple[str, str]:

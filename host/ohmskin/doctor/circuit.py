@@ -3,119 +3,154 @@
 
 Symbols
 
-====== ======== ============================================================================
-symbol shape    meaning
-====== ======== ============================================================================
-n      (R, C)   mean current of a port in codes: of B, D, and of what A and C lack to Vdd
-g      (R, C)   cell conductances by the method `matrix`, lines that are open left out [S]
-====== ======== ============================================================================
+======== ======== ==========================================================================
+symbol   shape    meaning
+======== ======== ==========================================================================
+shown    (R,C,4)  what each reading shows of its current: B, D, and what A, C lack to Vdd [LSB]
+current  (R, C)   mean of these: the current of a port [LSB]
+siemens  (R, C)   conductances of the cells by the method `matrix`, open lines left out [S]
+======== ======== ==========================================================================
 
 The rules, in this order; each leaves out what those before it have found:
 
 - A line is open if no port of it draws current. If it has one port only, its cell may be dead.
-- Two lines are shorted if their ports draw the same currents and if `matrix`, which knows nothing
-  of a short, finds twice the conductance of other lines in both. Where there are no other lines,
-  it is enough that many ports agree.
-- A cell is dead if its g is far below that of other cells. A cell whose row and whose column have a
+- Two lines are shorted if their ports draw the same currents, and if `matrix` finds twice the
+  conductance of other lines in both: it takes them for two lines, of which each draws the current
+  of both. Where there are no other lines, it is enough that many ports agree.
+- A cell is dead if it conducts far less than other cells. A cell whose row and whose column have a
   touched cell is not judged, because little current goes through it.
-- A cell whose g is above that of other cells is touched, or saturated if 1/g is no more than the
-  wires to it.
+- A cell that conducts more than other cells is touched, or saturated if its resistance is no more
+  than that of the wires to it.
 
 By reciprocity a port has the same resistance in both directions, so R_top / R_bottom is the sum of
 what A and D show over that of B and C. The readings are ratios: a factor common to all resistances,
 references included, changes none of them and cannot be known.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
-from ohmskin.doctor.signal import Rest
+from ohmskin.doctor.findings import (
+    ALL_STDS,
+    MANY_STDS,
+    ONE_STDS,
+    Diagnosis,
+    Kind,
+    Place,
+    lines_of,
+)
+from ohmskin.doctor.signal import ADC_ERROR_LSB, ROUNDING_LSB, Rest
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 
-WIRE_OHM: Final = (100.0, 200.0)  # [ohm] Top and bottom segments are so unless told otherwise.
-
-# Open lines.
-DARK_LSB: Final = 0.7  # [LSB] No current is read as less than this, because of rounding.
-DARK_NOISE: Final = 0.4  # [1] Noise adds this share of itself, because no code is below zero.
-OFFSET_LSB: Final = 2.5  # [LSB] The converter's offset makes no current look like up to this.
-DARK_SHARE: Final = 0.08  # [1] No more than this share of the usual current is taken for offset.
+# Open lines. A line that draws this little current is dark.
+# [LSB] Rounding alone shows no current as less than this. Chosen: a code, less some noise.
+DARK_LSB: Final = 0.7
+# [1] Noise adds this share of its deviation, since no code is below zero: 1 / sqrt(2 pi) of it.
+DARK_NOISE: Final = 0.4
+# [1] At most this share of the usual current is taken for offset. Chosen: no sound line draws that
+# little.
+DARK_SHARE: Final = 0.08
 
 # Shorted lines.
-ALIKE_LSB: Final = 0.05  # [LSB] Mean readings of shorted lines differ by less, besides noise.
-ALIKE_STDS: Final = 6.0  # [deviations] The noise of hundreds of readings does not reach this.
-DOUBLED: Final = 1.4  # [1] `matrix` finds shorted lines more conductive by this; 2 is expected.
-ALIKE_PORTS: Final = 5  # [ports] So many do not agree by chance.
-RISE_STDS: Final = 3.0  # [deviations] With fewer, the rise must stand out of all lines' scatter.
+# [LSB] Mean readings of shorted lines differ by less, noise apart. Chosen: rounding is the same.
+ALIKE_LSB: Final = 0.05
+# [1] `matrix` finds shorted lines more conductive than others by this factor. Chosen: 2 is exact.
+DOUBLED: Final = 1.4
+# [ports] Lines do not agree in so many ports by chance. Chosen: cells scatter by 10 %.
+ALIKE_PORTS: Final = 5
 
 # Dead cells.
-DEAD_SHARE: Final = 0.3  # [1] A dead cell has less than this share of the usual conductance.
-CLEAR_STDS: Final = 5.0  # [deviations] Beside a touch, a dead cell is below that by this.
+# [1] A cell with less than this share of the conductance that it should have does not conduct.
+# Chosen: cells at rest scatter by 10 %, a dead one has none.
+DEAD_SHARE: Final = 0.3
 
 # Touched and saturated cells.
-REST_QUANTILE: Final = 0.25  # [1] This share of the cells, at least, is taken to be at rest.
-MOST_AT_REST_SIEMENS: Final = 5e-6  # [S] No cell at rest conducts more; 1e-6 is usual.
-TOUCHED_SHARE: Final = 2.0  # [1] A touched cell conducts more than one at rest by this factor.
-TOUCHED_STDS: Final = 5.0  # [deviations] It also stands out of the scatter at rest by this.
-MANY_CELLS: Final = 8  # [cells] The scatter of fewer cells is not known.
-MOST_SPREAD: Final = 0.4  # [log] Cells at rest scatter less: a wider scatter is of touches.
-SHORTED_OHM: Final = 350.0  # [ohm] A saturated cell has less: the hardest touch has 300.
-WIRE_SPREAD: Final = 1.15  # [1] The wires to a cell are over nominal by less: segments scatter.
+# [1] This share of the cells, at least, is taken to be at rest. Chosen: touches cover less.
+REST_QUANTILE: Final = 0.25
+# [S] No cell at rest conducts more. Chosen: 1e-6 is usual.
+MOST_AT_REST_SIEMENS: Final = 5e-6
+# [1] A touched cell conducts more than one at rest by this factor. Chosen: cells scatter by 10 %.
+TOUCHED_SHARE: Final = 2.0
+# [cells] The scatter of fewer cells is not known. Chosen: the lowest 16 % must be a cell or more.
+MANY_CELLS: Final = 8
+# [log] Cells at rest scatter by less: a wider scatter is of touches. Chosen: four times 10 %.
+MOST_SPREAD: Final = 0.4
+# [ohm] A saturated cell has less, besides its wires. Chosen: near the 300 of the hardest touch.
+SHORTED_OHM: Final = 350.0
+# [1] Wires to a cell are above nominal by less than this factor. Chosen: segments scatter by 10 %.
+WIRE_SPREAD: Final = 1.15
 
 # Reference resistors.
-RATIO_TOLERANCE: Final = 0.03  # [1] The ratio of two resistors of 1 % is off by up to 2 %.
-RATIO_STDS: Final = 3.0  # [deviations] Noise and rounding change the ratio by less than this.
+# [1] The ratio of two sound ones is off by less. Chosen: two of 1 % make 2 %, and some for ageing.
+RATIO_TOLERANCE: Final = 0.03
 
 
-def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> tuple[Bool, Bool]:
-    """Adds lines, cells and references to a diagnosis. Returns two masks of cells, (R, C): those
-    that are touched, and those that are dead or saturated or have an open or shorted line.
+@dataclass(frozen=True, eq=False)
+class LinesAndCells:
+    """What the near ends of a skin show of its lines and cells.
 
-    Shorted lines and dead cells are not judged while something moves on the skin.
+    open_lines: which rows (R,) and which columns (C,) are open.
+    shorts: groups of shorted lines by number; of rows, and of columns.
+    touched: which cells are touched, (R, C).
+    dead: which cells are dead, (R, C).
+    wrong: which cells are dead or saturated, or in an open or a shorted line, (R, C).
     """
-    noise_lsb, full = rest.noise_lsb, (1 << rest.board.adc_bits) - 1
-    shown = np.where(READING_SIGN > 0, rest.codes, full - rest.codes)
+
+    open_lines: tuple[Bool, Bool]
+    shorts: tuple[list[list[int]], list[list[int]]]
+    touched: Bool
+    dead: Bool
+    wrong: Bool
+
+
+def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> LinesAndCells:
+    """Add what is wrong with lines, cells and references.
+
+    While something moves on the skin, shorted lines and dead cells are not judged: the means are
+    those of no one skin, in which lines could be alike or cells be dead.
+    """
+    largest_code = (1 << rest.board.adc_bits) - 1
+    shown = np.where(READING_SIGN > 0, rest.codes, largest_code - rest.codes)
     current = shown.mean(axis=2)
-    rows, columns = current.shape
-    usual = float(np.median(current))
-    least = max(DARK_LSB + DARK_NOISE * noise_lsb, min(OFFSET_LSB, DARK_SHARE * usual))
-    dark = current < least
-    shorted = np.zeros(current.shape, dtype=np.bool_)
+    # The converter's offset looks like a current, too.
+    offset_lsb = min(ADC_ERROR_LSB + ROUNDING_LSB, DARK_SHARE * float(np.median(current)))
+    dark = current < max(DARK_LSB + DARK_NOISE * rest.noise_lsb, offset_lsb)
+    open_lines, none = (dark.all(axis=1), dark.all(axis=0)), np.zeros_like(dark)
     if dark.all():
         diagnosis.add(Kind.NOTHING_CONDUCTS, one_cell=dark.size == 1)
         diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
-        return shorted, dark
-    no_row, no_column = dark.all(axis=1), dark.all(axis=0)
-    if no_row.any():
-        place = Place(rows=lines_of(no_row))
-        diagnosis.add(Kind.OPEN_ROW, place, line_count=rows, cells_per_line=columns)
-    if no_column.any():
-        place = Place(columns=lines_of(no_column))
-        diagnosis.add(Kind.OPEN_COLUMN, place, line_count=columns, cells_per_line=rows)
-    out = no_row[:, None] | no_column
-    siemens, siemens_std = _cells(rest, no_row, no_column)
+        return LinesAndCells(open_lines, ([], []), none, none, dark)
+    for axis, kind in enumerate((Kind.OPEN_ROW, Kind.OPEN_COLUMN)):
+        if open_lines[axis].any():
+            place = Place.of_lines(axis, lines_of(open_lines[axis]))
+            counts = {"line_count": dark.shape[axis], "cells_per_line": dark.shape[1 - axis]}
+            diagnosis.add(kind, place, **counts)
+    wrong = open_lines[0][:, None] | open_lines[1]
+    siemens, siemens_std = _cells(rest, *open_lines)
+    shorts: tuple[list[list[int]], list[list[int]]] = ([], [])
     if not rest.moves:
-        std = noise_lsb / (4 * rest.scans) ** 0.5
-        for group in _shorted(current, siemens, std, out):
-            diagnosis.add(Kind.SHORT_ROWS, Place(rows=tuple(group)))
-            shorted[group] = no_row[group[1:]] = True
-        for group in _shorted(current.T, siemens.T, std, out.T):
-            diagnosis.add(Kind.SHORT_COLUMNS, Place(columns=tuple(group)))
-            shorted[:, group] = no_column[group[1:]] = True
-        if shorted.any():
-            # Shorted lines are one: the network without the others is right for all other cells.
-            siemens, siemens_std = _cells(rest, no_row, no_column)
-    wrong = out | shorted
-    touched, bad = _judge_cells(siemens, siemens_std, ~wrong, rest, diagnosis)
+        std_lsb = rest.noise_lsb / (4 * rest.scans) ** 0.5
+        judged = ~wrong
+        one_of_each = [lines.copy() for lines in open_lines]  # lines that are left out
+        for axis, kind in enumerate((Kind.SHORT_ROWS, Kind.SHORT_COLUMNS)):
+            for group in _shorted(axis, current, siemens, judged, std_lsb):
+                diagnosis.add(kind, Place.of_lines(axis, group))
+                shorts[axis].append(group)
+                np.moveaxis(wrong, axis, 0)[group] = True
+                one_of_each[axis][group[1:]] = True
+        if any(shorts):
+            # Shorted lines are one line: with one of them alone, all other cells come out right.
+            siemens, siemens_std = _cells(rest, *one_of_each)
+    touched, dead, saturated = _judge_cells(siemens, siemens_std, ~wrong, rest, diagnosis)
     ratio = _reference_ratio(shown[~dark], rest, diagnosis)
     cell_ohm = 1 / np.nanmedian(siemens)
     diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
-    return touched, wrong | bad
+    return LinesAndCells(open_lines, shorts, touched, dead, wrong | dead | saturated)
 
 
 def _cells(rest: Rest, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
@@ -129,12 +164,20 @@ def _cells(rest: Rest, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
     return siemens, std
 
 
-def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list[int]]:
-    """Groups of lines that are one electrode; the arrays are (lines, ports)."""
-    lines, ports = np.flatnonzero(~out.all(axis=1)), np.flatnonzero(~out.all(axis=0))
+def _shorted(
+    axis: int, current: Float, siemens: Float, judged: Bool, std_lsb: float
+) -> list[list[int]]:
+    """Groups of rows (axis 0) or columns (axis 1) that are one electrode.
+
+    judged: which cells are in no open line, (R, C).
+    std_lsb: deviation of a port's current, by noise [LSB].
+    """
+    if axis:
+        current, siemens, judged = current.T, siemens.T, judged.T
+    lines, ports = np.flatnonzero(judged.any(axis=1)), np.flatnonzero(judged.any(axis=0))
     current, siemens = current[np.ix_(lines, ports)], siemens[np.ix_(lines, ports)]
-    apart = np.abs(current[:, None] - current[None, :]).max(axis=2)
-    alike = apart < ALIKE_LSB + ALIKE_STDS * std * 2**0.5
+    apart_lsb = np.abs(current[:, None] - current[None, :]).max(axis=2)
+    alike = apart_lsb < ALIKE_LSB + ALL_STDS * std_lsb * 2**0.5
     level, few = np.median(siemens, axis=1), len(ports) < ALIKE_PORTS
     groups: list[list[int]] = []
     for line in range(len(lines)):
@@ -144,7 +187,8 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
         is_short, others = not few, np.log(np.delete(level, members))
         if len(others):
             rise = float(np.log(level[members].min()) - np.median(others))
-            is_short = rise > max(np.log(DOUBLED), RISE_STDS * few * float(np.std(others)))
+            # Few ports may agree by chance: then the rise must stand out of the others' scatter.
+            is_short = rise > max(np.log(DOUBLED), ONE_STDS * few * float(np.std(others)))
         if is_short:
             groups.append([int(lines[member]) for member in members])
     return groups
@@ -152,23 +196,24 @@ def _shorted(current: Float, siemens: Float, std: float, out: Bool) -> list[list
 
 def _judge_cells(
     siemens: Float, std: Float, judged: Bool, rest: Rest, diagnosis: Diagnosis
-) -> tuple[Bool, Bool]:
-    """Adds dead and saturated cells. Returns touched cells, and these."""
+) -> tuple[Bool, Bool, Bool]:
+    """Add dead and saturated cells. Returns which are touched, dead and saturated, (R, C) each."""
     dead: Bool = np.zeros(siemens.shape, dtype=np.bool_)
     if not judged.any():
-        return dead, dead
+        return dead, dead, dead
     level = min(float(np.quantile(siemens[judged], REST_QUANTILE)), MOST_AT_REST_SIEMENS)
     share = TOUCHED_SHARE
-    if judged.sum() >= MANY_CELLS:  # cells at rest differ
+    if judged.sum() >= MANY_CELLS:  # where cells at rest scatter widely, a touch is above that
         lower, middle = np.quantile(siemens[judged], (0.16, 0.5))  # one deviation apart
         spread = min(float(np.log(middle / lower)), MOST_SPREAD)
-        share = max(share, float(np.exp(TOUCHED_STDS * spread)))
+        share = max(share, float(np.exp(MANY_STDS * spread)))
     high: Bool = judged & (siemens > share * level)
     if not rest.moves and high.sum() < judged.sum() > 1:
         usual = float(np.median(siemens[judged & ~high]))
         hidden = np.logical_and.outer(high.any(axis=1), high.any(axis=0))
-        # Untouched cells are well known; their deviation has what a wrong reference does to it.
-        doubt = CLEAR_STDS * std if high.any() else 0.0
+        # Cells of an untouched skin are known well. Their deviation also has what wrong references
+        # would do to it, but that would do the same to all cells.
+        doubt = MANY_STDS * std if high.any() else 0.0
         dead = np.asarray(judged & ~hidden & (siemens + doubt < DEAD_SHARE * usual))
     if dead.any():
         percent = 100 * float(np.max(siemens[dead] / usual))
@@ -180,20 +225,21 @@ def _judge_cells(
     if saturated.any():
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
         diagnosis.add(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / level)
-    return high & ~saturated, dead | saturated
+    return high & ~saturated, dead, saturated
 
 
-def _reference_ratio(lit: Float, rest: Rest, diagnosis: Diagnosis) -> float:
+def _reference_ratio(shown: Float, rest: Rest, diagnosis: Diagnosis) -> float:
     """R_top / R_bottom. Adds a finding if it is far from what the board says.
 
-    lit: what the ports (P, 4) with a current show of it [LSB].
+    shown: what the readings show of the current, of ports that draw some, (P, 4) [LSB].
     """
-    ratio = float(lit[:, READING_SENSES_TOP].sum() / lit[:, ~READING_SENSES_TOP].sum())
-    # Of A and D, one rounds as the other; the same of B and C.
-    ratio_std = rest.std_lsb * 2**0.5 / (float(lit.mean()) * len(lit) ** 0.5)
+    ratio = float(shown[:, READING_SENSES_TOP].sum() / shown[:, ~READING_SENSES_TOP].sum())
+    mean_lsb = float(shown.mean())
+    # A and D round alike, and so do B and C: of four readings, two are independent.
+    ratio_std = rest.std_lsb * 2**0.5 / (mean_lsb * len(shown) ** 0.5)
     top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
-    doubt = RATIO_STDS * ratio_std + 2 * rest.offset_lsb / float(lit.mean())
+    doubt = ONE_STDS * ratio_std + 2 * rest.offset_lsb / mean_lsb
     if abs(off) >= RATIO_TOLERANCE + doubt:
         nominal = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
         diagnosis.add(Kind.REFERENCE_RATIO, ratio=ratio, off_percent=100 * off, **nominal)

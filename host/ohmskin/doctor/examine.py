@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with a skin board, from scans of the untouched skin and what the board says.
 
-The parts: `signal` (hum, noise, movement, settling), `circuit` (lines, cells, references), `wires`;
-here, what the board says of itself, what was lost on the line, and the scan rate.
+The parts: `signal` (hum, noise, movement, settling), `circuit` (lines, cells, references), `far`
+(far ends, and wires by these), `wires` (by presses); here, what the board says of itself, what was
+lost on the line, and the scan rate.
 
-A skin that is touched is not at fault: touched cells are told and left out, and what movement hides
-is not judged.
+A skin that is touched is not at fault: touched cells are named and left out, and what movement
+hides is not judged.
 """
 
 from collections.abc import Callable
@@ -15,28 +16,40 @@ from typing import Final
 import numpy as np
 
 from ohmskin.circuit.small import one_blas_thread
-from ohmskin.doctor.circuit import WIRE_OHM, examine_circuit
+from ohmskin.doctor.circuit import examine_circuit
 from ohmskin.doctor.far import examine_far, near_ends, segments_of
-from ohmskin.doctor.findings import Diagnosis, Kind, Place
+from ohmskin.doctor.findings import Diagnosis, Kind, Place, merged
 from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 
-LEAST_TIMER_MS: Final = 1  # [ms] The timer of a USB bridge cannot be set to less.
-BAD_RESETS: Final = ("brown_out", "watchdog")  # A sound board is not reset by these.
+# [ms] The latency timer of a USB bridge cannot be set to less (FTDI, application note AN232B-04).
+LEAST_TIMER_MS: Final = 1
+# A sound board is not reset by these.
+BAD_RESETS: Final = ("brown_out", "watchdog")
 
 
 @dataclass
 class Evidence:
-    """What `examine` goes by. What could not be had is None, and is not judged.
+    """What `examine` goes by. What could not be had is None or empty, and is not judged.
 
-    scans: as the board is configured. settled: what the board said of itself with a longer settle
-    time, and its scans. stats: of the connection. lost: why the board went away meanwhile.
-    wire_ohm: nominal wires of a segment, top and bottom. presses: of the same skin, after all else.
-    latency: the USB bridge's timer [ms] and the file that sets it. clocks: what the board said of
-    itself with each ADC clock, and its scans. loss: so large a share of missing scans is no fault.
-    pressed: while corners are pressed, as configured and with a longer settle time, by turns.
+    A look is what the board said of itself and its scans then.
+
+    board: what the board says of itself, as it is configured.
+    scans: the first look, by this configuration.
+    stats: counts of the connection.
+    settled: a look with a longer settle time.
+    report: the board's self-test.
+    wire_ohm: nominal wires of a segment, top and bottom [ohm].
+    presses: what presses of corners show, after all else.
+    latency: timer of the USB bridge [ms], and the file that sets it.
+    host_version: version of this package.
+    lost: why the board went away meanwhile.
+    clocks: a look by each ADC clock.
+    loss: this share of missing scans is no fault [1].
+    pressed: looks at pressed corners, by turns as configured and with a longer settle time.
     """
 
     board: Hello
@@ -55,40 +68,47 @@ class Evidence:
 
 
 def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
-    """Adds what the scans show: signal, circuit, and the wires if somebody pressed and nothing
-    hides them. Wires are at fault only if nominal ones were told.
+    """Add what the scans show of a skin: signal, lines, cells, far ends, and wires.
+
+    usual: the first look. Wires are at fault only if nominal ones are known.
     """
     settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
-    moves, scans = bool(moved.any()), usual
-    far = usual.board.mode == "far"
+    moves, scans, far = bool(moved.any()), usual, usual.board.mode == "far"
+    # Far ends are always read with more time: even a part of a code counts there.
     if settled is not None and not moves and (examine_settling(usual, settled, diagnosis) or far):
         scans = settled
-    wire_ohm, presses = evidence.wire_ohm or WIRE_OHM, evidence.presses
+    # Unless told otherwise, wires are as those of emulated skins.
+    wire_ohm = evidence.wire_ohm or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    presses = evidence.presses
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
     rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
-    touched, wrong = examine_circuit(near_ends(rest) if far else rest, diagnosis)
-    if far and not moves and not wrong.all():
-        examine_far(rest, evidence.wire_ohm, diagnosis)
-    touched = touched if touched.any() else moved
+    near = examine_circuit(near_ends(rest) if far else rest, diagnosis)
+    if far and not moves and not near.wrong.all():
+        examine_far(rest, near, evidence.wire_ohm, diagnosis)
+    touched = near.touched if near.touched.any() else moved
     if touched.any():
         diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
-    if far or touched.any() or wrong.any():
-        return
+    if far or touched.any() or near.wrong.any():
+        return  # far ends show the wires, or touches and faults hide them
     diagnosis.nominal_ohm = wire_ohm
     if presses is not None:
         diagnosis.pressed = presses.measure(rest)
-    for each in diagnosis.pressed or ():
-        if each.differs and evidence.wire_ohm is not None:
-            diagnosis.add(Kind.WIRES, each.place, share=each, nominal_ohm=wire_ohm)
+    for share in diagnosis.pressed or ():
+        if share.differs and evidence.wire_ohm is not None:
+            diagnosis.add(Kind.WIRES, share.place, share=share, nominal_ohm=wire_ohm)
 
 
 def examine(
     evidence: Evidence,
     of_scans: Callable[[Evidence, RestScans, Diagnosis], None] = examine_skin,
 ) -> Diagnosis:
-    """All findings, and the figures behind them. of_scans: adds what the scans show."""
+    """All findings, and the figures behind them.
+
+    of_scans: adds what the scans show, of a skin or of a plate. Each examiner adds its findings
+    without regard to those of others; here they are merged.
+    """
     board, stats = evidence.board, evidence.stats
     usual = RestScans.of(board, evidence.scans)
     diagnosis = Diagnosis()
@@ -109,8 +129,7 @@ def examine(
     if usual is not None:
         with one_blas_thread:
             of_scans(evidence, usual, diagnosis)
-    order = list(Kind)
-    diagnosis.findings.sort(key=lambda finding: order.index(finding.kind))
+    diagnosis.findings = merged(diagnosis.findings)
     return diagnosis
 
 
@@ -124,7 +143,7 @@ def measured_wires(diagnosis: Diagnosis) -> WireOhm | None:
 
 
 def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
-    """Adds what the board, its self-test and its USB bridge say."""
+    """Add what the board, its self-test and its USB bridge say."""
     board, report, add = evidence.board, evidence.report, diagnosis.add
     if evidence.lost:
         add(Kind.LOST, problem=evidence.lost)
@@ -141,7 +160,7 @@ def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
 
 
 def _examine_line(evidence: Evidence, diagnosis: Diagnosis) -> None:
-    """Adds what the connection has counted."""
+    """Add what the connection has counted."""
     board, stats, add = evidence.board, evidence.stats, diagnosis.add
     line, commands = stats.line, stats.board_rx_errors
     if stats.restarts:
@@ -161,8 +180,8 @@ def _examine_line(evidence: Evidence, diagnosis: Diagnosis) -> None:
 
 
 def _rate_hz(scans: list[Scan]) -> float:
-    """Scan rate by the board's clock [Hz]."""
+    """Scan rate by the board's clock [Hz]. A restart sets number and clock back: it is left out."""
     step = np.diff([float(scan.number) for scan in scans])
     took_s = np.diff([1e-6 * scan.time_us for scan in scans])
-    forward = (step > 0) & (took_s > 0)  # but for restarts
+    forward = (step > 0) & (took_s > 0)
     return round(float(step[forward].sum() / took_s[forward].sum()), 3) if forward.any() else 0.0

@@ -1,281 +1,408 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wires of a skin whose far ends are sensed, line by line, and what is wrong with far ends.
 
-Symbols. A layer has L lines, rows or columns, of n crossings and n segments, the near end first.
+In mode far, each port is read at four nodes: a and e are the near and the far end of its row, b and
+f the near and the far end of its column. A layer is all rows, or all columns. It has L lines of n
+crossings each, and a line has n segments, the one at the near end first.
 
-====== ============ =====================================================================
-symbol shape        meaning
-====== ============ =====================================================================
-I      (R, C)       current of a port per Vdd, from readings a and b [S]
-u, s   (L, n)       (a - e) / I of rows, (f - b) / I of columns; deviations [ohm]
-w      (L, n)       as u, with what the far node had at the cell before in place of e, f [ohm]
-A      (L, n, n)    share of each port's current that goes through each segment of its line
-r      (L, n)       segments [ohm]
-m      (L,)         mean of a line's segments, or the usual one of the layer [ohm]
-====== ============ =====================================================================
+Symbols
 
-A far end carries no current, so that u = A r. An untouched skin draws current at all crossings of a
-line, a touch draws it at its own. A follows from the cells, these from the ports less their wires,
-and these from u: three times around. The cost |(u - A r) / s|^2 + |(r - m) / (SPREAD m)|^2, with m
-free, tells r; with the usual m and one segment free, it finds a bad one. A far end is at fault if
-neither fits, or less well than u = k w, which is of an end that floats. The circuit says what all
-far ends have while a port is selected: if that of another line fits, the ends are swapped.
+====== ========= ===========================================================================
+symbol shape     meaning
+====== ========= ===========================================================================
+I      (R, C)    current of a port per Vdd, from readings a and b [S]
+u      (L, n)    loss_ohm: what a line loses between its ends, per current of each of its ports:
+                 (a - e) / I of rows, (f - b) / I of columns [ohm]
+s      (L, n)    std_ohm: standard deviation of u [ohm]
+w      (L, n)    floating_ohm: what u would be if the far node still had the voltage of the cell
+                 that was read before [ohm]
+A      (L, n, n) current_share: share of each port's current in each segment of its line [1]
+r      (L, n)    resistances of the segments [ohm]
+m      (L,)      mean of a line's segments, or the usual one of the layer [ohm]
+====== ========= ===========================================================================
+
+A far end carries no current, so its potential shows what all segments of the line lose: u = A r. On
+an untouched skin, a line draws current at all its crossings alike; a touch draws it at its own.
+
+A depends on the cells. The cells follow from the port resistances without their wires, and the
+wires follow from u and A. So the cells, A and the wires are computed in turn, `ROUNDS` times.
+
+The readings alone do not determine n segments. They are taken to scatter about their mean m:
+
+    cost(r) = |(u - A r) / s|^2 + |(r - m) / (SPREAD m)|^2
+
+With m free, this gives the segments of a sound line. With the usual m of the layer, and one segment
+that may have any resistance, it finds a bad segment. If no r fits, the far end is at fault; also if
+u = k w fits clearly better, with k from 0 to 1: so reads a far end that is not connected. If what
+the circuit says of another line's far end fits, the ends are swapped.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit import skin as circuit
-from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Place
-from ohmskin.doctor.signal import Rest
-from ohmskin.doctor.wires import KNOWN
+from ohmskin.doctor.circuit import LinesAndCells
+from ohmskin.doctor.findings import FEW_STDS, MANY_STDS, Diagnosis, Kind, LineWire, Place, lines_of
+from ohmskin.doctor.signal import ADC_ERROR_LSB, Rest
+from ohmskin.doctor.wires import CHANGED_SHARE, KNOWN_STD
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD
 from ohmskin.link.protocol import ADC_BITS
 
-SPREAD: Final = 2 * SEGMENT_STD  # [1] Segments of a line scatter by up to this share of m.
-MODEL_STD: Final = 0.01  # [1] A, and so A r, is known to this share.
-ROUNDS: Final = 3  # [1] Each makes the error of A smaller by the share of the wires in a port.
-OFFSET_LSB: Final = 4.0  # [LSB] Offset and gain of 2 LSB each: 1 - a has more by it, or b less.
-LOST_CHI2: Final = 25.0  # [1] Five deviations: an end that is connected has less a reading.
-MOST_LINE_OHM: Final = 50e3  # [ohm] A line of 16 segments of 2 kOhm has less.
-CLEAR_STDS: Final = 5.0  # [deviations] Of hundreds of segments, none is so far off by chance.
-ALIKE_COST: Final = 4.0  # [1] Two deviations: faults whose costs differ by less may be either.
-CHANGED: Final = 0.25  # [1] A line that differs by less of its resistance is no fault.
-LINE_STDS: Final = 3.5  # [deviations] It also differs by this.
+# [1] Segments of a line scatter by this share of their mean. Chosen: twice what estimators expect.
+SPREAD: Final = 2 * SEGMENT_STD
+# [1] A, and with it A r, is known to this share. Chosen: what is left after ROUNDS.
+MODEL_STD: Final = 0.01
+# [rounds] Each makes the error of A smaller by the share of the wires in a port. Chosen: 2 kOhm a
+# segment need three.
+ROUNDS: Final = 3
+# [chi-square] Two faults whose costs differ by less may be either. Chosen: two deviations, squared.
+ALIKE_COST: Final = 4.0
+# [ohm] No line has more: a fit that says so is of a far end at fault. Chosen: 16 segments of 2 kOhm
+# have less.
+MOST_LINE_OHM: Final = 50e3
 
 
-class _Skin:
-    """Readings of mode far, and of these the rows and columns that are kept."""
+@dataclass(frozen=True, eq=False)
+class LayerReadings:
+    """What the readings say of the wires of a layer. The table of symbols is that of the module.
+
+    current_share: A, (L, n, n).
+    loss_ohm: u, (L, n) [ohm].
+    std_ohm: s, (L, n) [ohm].
+    floating_ohm: w, (L, n) [ohm].
+    """
+
+    current_share: Float
+    loss_ohm: Float
+    std_ohm: Float
+    floating_ohm: Float
+
+    @cached_property
+    def weighed(self) -> Float:
+        """A^T / s^2, (L, n, n): what makes normal equations of readings."""
+        return (self.current_share / self.std_ohm[..., None] ** 2).swapaxes(1, 2)
+
+
+class FarReadings:
+    """Mean readings of mode far, of the rows and columns that are kept. kept: their numbers.
+
+    shape: number of rows and columns.
+    cell_siemens: the cells, (R, C) [S]: first as if wires had no resistance, then by `layers`.
+    """
 
     def __init__(self, rest: Rest, kept: list[list[int]]) -> None:
-        self.refs, ratio = (rest.board.ref_top_ohm, rest.board.ref_bottom_ohm), rest.ratio
+        self._refs, ratio = (rest.board.ref_top_ohm, rest.board.ref_bottom_ohm), rest.ratio
+        # A scan goes down one column after the other. Readings of the cell that was read before:
         before = np.roll(ratio.swapaxes(0, 1).reshape(-1, 4), 1, axis=0)
         before = before.reshape(ratio.shape[1], -1, 4).swapaxes(0, 1)[np.ix_(*kept)]
-        a, e, b, f = np.moveaxis(ratio[np.ix_(*kept)], -1, 0)
-        near, drop = circuit.as_near(ratio[np.ix_(*kept)], "aebf"), np.stack([a - e, f - b])
-        self.shape = a.shape[0], a.shape[1]
-        self.current = np.maximum(circuit.current_from_ratio(near, *self.refs), 1e-9)
-        std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * drop)
+        ratio = ratio[np.ix_(*kept)]
+        self.shape = ratio.shape[0], ratio.shape[1]
+        near = circuit.as_near(ratio, "aebf")
+        self._current = np.maximum(circuit.current_from_ratio(near, *self._refs), 1e-9)
+        a, e, b, f = np.moveaxis(ratio, -1, 0)
+        loss = np.stack([a - e, f - b])
+        std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * loss)
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
-        self.readings_ohm = np.stack([drop, std, floating], axis=1) / self.current
-        known = SkinKnowledge(*self.shape, *self.refs, rest.board.adc_bits)
+        self._loss_std_floating = np.stack([loss, std, floating], axis=1) / self._current
+        known = SkinKnowledge(*self.shape, *self._refs, rest.board.adc_bits)
         self._matrix = make_estimator("matrix", known)
         self.cell_siemens = self._matrix.estimate(near).cell_siemens
 
-    def layers(self, wire_ohm: Float) -> tuple[list[Float], list[Float]]:
-        """A, u, s and w of the rows, and of the columns, if the segments are so, (2, R, C)."""
-        refs_ohm = sum(self.refs)
-        wired = circuit.PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
-        wired -= circuit.PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
-        port_ohm = np.maximum(1 / self.current - refs_ohm - wired.reshape(self.shape), 1.0)
-        ratio = circuit.ratio_from_current(1 / (port_ohm + refs_ohm), *self.refs)
+    def layers(self, wire_ohm: Float) -> tuple[LayerReadings, LayerReadings]:
+        """Rows and columns, if the segments are `wire_ohm` (2, R, C). Corrects the cells for these.
+
+        `matrix` knows no wires. So it is given the readings of a skin without them: of ports that
+        have less resistance by what the wires add.
+        """
+        refs_ohm = sum(self._refs)
+        of_wires = circuit.PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
+        of_wires -= circuit.PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
+        port_ohm = np.maximum(1 / self._current - refs_ohm - of_wires.reshape(self.shape), 1.0)
+        ratio = circuit.ratio_from_current(1 / (port_ohm + refs_ohm), *self._refs)
         self.cell_siemens = self._matrix.estimate(ratio).cell_siemens
-        wired_skin = circuit.PortCircuit(self.cell_siemens, *wire_ohm)
+        wired = circuit.PortCircuit(self.cell_siemens, *wire_ohm)
+        rows, columns = self._loss_std_floating
         return (
-            [wired_skin.line_current(0), *self.readings_ohm[0]],
-            [wired_skin.line_current(1), *self.readings_ohm[1].swapaxes(1, 2)],
+            LayerReadings(wired.line_current(0), *rows),
+            LayerReadings(wired.line_current(1), *columns.swapaxes(1, 2)),
         )
 
     def ends(self, wire_ohm: Float) -> tuple[Float, Float]:
-        """u of each far end (first axis) at the ports of each line, (R, R, C) and (C, C, R)."""
+        """What u of each line would be with each far end of its layer, by the circuit [ohm].
+
+        Of rows (R, R, C), of columns (C, C, R): far end, line, port of the line.
+        """
         rows, lines = self.shape[0], sum(self.shape)
         admittance = circuit.end_admittance(circuit.Skin(self.cell_siemens, *wire_ohm))
         by_line = circuit.impedance_of(admittance, rows)[0][:lines]
+        # Potential of each end, near and then far, while a unit current goes through each port.
         ends = circuit.port_difference(by_line, rows).T.reshape(-1, *self.shape)
         row, column = np.indices(self.shape)
         at_row, at_column = ends[row, row, column], ends[rows + column, row, column]
-        columns = ends[lines + rows :] - at_column
-        return at_row - ends[lines : lines + rows], columns.swapaxes(1, 2)
+        of_columns = ends[lines + rows :] - at_column
+        return at_row - ends[lines : lines + rows], of_columns.swapaxes(1, 2)
 
 
-def _fit(layer: list[Float], usual_ohm: float | None = None) -> tuple[Float, Float, Float]:
-    """r, its covariance, and the cost, (L, ...), with m free. With the usual m, (n + 1, L, ...):
-    each segment is free by turns, and last none is.
+class Fit(NamedTuple):
+    """Segments of lines, by the cost of the module.
+
+    ohm: the segments, (..., L, n) [ohm].
+    covariance: of these, widened where the readings do not fit, (..., L, n, n) [ohm^2].
+    cost: the least one, (..., L).
     """
-    share, drop_ohm, std_ohm, _ = layer
-    count = share.shape[-1]
-    weighed = (share / std_ohm[..., None] ** 2).swapaxes(1, 2)
-    pull, known = weighed @ drop_ohm[..., None], weighed @ share
-    if usual_ohm is None:
-        mean = (pull.sum(axis=1) / known.sum(axis=(1, 2))[:, None])[..., None]
-        prior = (SPREAD * np.maximum(np.abs(mean), 1.0)) ** -2.0 * (np.eye(count) - 1 / count)
-    else:
-        mean = np.full((1, 1, 1), usual_ohm)
-        prior = (SPREAD * usual_ohm) ** -2.0 * np.eye(count)
-        prior = prior * (1 - np.eye(count + 1, count))[:, None, None]
-    covariance = np.linalg.inv(known + prior)
-    ohm = covariance @ (pull + prior.sum(axis=-1, keepdims=True) * mean)
-    off = (drop_ohm - (share @ ohm)[..., 0]) / std_ohm
-    cost = np.sum(off**2, axis=-1) + np.sum((ohm - mean) * (prior @ (ohm - mean)), axis=(-1, -2))
-    misfit = np.maximum(cost / max(count - 1, 1), 1.0)
-    return ohm[..., 0], covariance * misfit[..., None, None], cost
+
+    ohm: Float
+    covariance: Float
+    cost: Float
+
+
+def _fit(layer: LayerReadings, mean_ohm: Float, prior: Float) -> Fit:
+    """The segments of least cost |(u - A r) / s|^2 + (r - mean)^T prior (r - mean).
+
+    mean_ohm: mean of the segments, (..., 1, 1). prior: (..., n, n) [1 / ohm^2].
+    """
+    covariance = np.linalg.inv(layer.weighed @ layer.current_share + prior)
+    expected = prior.sum(axis=-1, keepdims=True) * mean_ohm
+    ohm = covariance @ (layer.weighed @ layer.loss_ohm[..., None] + expected)
+    off = (layer.loss_ohm - (layer.current_share @ ohm)[..., 0]) / layer.std_ohm
+    away = ohm - mean_ohm
+    cost = np.sum(off**2, axis=-1) + np.sum(away * (prior @ away), axis=(-1, -2))
+    misfit = np.maximum(cost / max(ohm.shape[-2] - 1, 1), 1.0)
+    return Fit(ohm[..., 0], covariance * misfit[..., None, None], cost)
+
+
+def fit_even(layer: LayerReadings) -> Fit:
+    """Segments that scatter about the mean of their line, which may be anything: L lines."""
+    count = layer.loss_ohm.shape[1]
+    # About m, to scale the cost: what each segment has if all are equal.
+    pull = (layer.weighed @ layer.loss_ohm[..., None]).sum(axis=1)
+    precision = (layer.weighed @ layer.current_share).sum(axis=(1, 2))
+    equal_ohm = (pull / precision[:, None])[..., None]
+    scale = (SPREAD * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
+    return _fit(layer, equal_ohm, scale * (np.eye(count) - 1 / count))  # which leaves m free
+
+
+def fit_odd(layer: LayerReadings, usual_ohm: float) -> Fit:
+    """Segments that scatter about the usual one of the layer, but for one that may be anything.
+
+    Each segment is that one by turns, and in the last fit none is: (n + 1, L) fits.
+    """
+    count = layer.loss_ohm.shape[1]
+    bound = (1 - np.eye(count + 1, count))[:, None, None]  # 0: this segment is free
+    prior = (SPREAD * usual_ohm) ** -2.0 * np.eye(count) * bound
+    return _fit(layer, np.full((1, 1, 1), usual_ohm), prior)
 
 
 class _Layer:
-    """The rows (axis 0) or the columns (axis 1) that are kept. joined: those that are shorted.
+    """The rows (axis 0) or the columns (axis 1) that are kept, and what was found of their wires.
 
-    told: the lines whose wire is told. lost: those whose far end is at fault.
+    numbers: the numbers of its lines. across: those of the lines that cross them.
+    measured: which lines have wires that are measured, (L,).
+    lost: which lines have a far end at fault, (L,).
+    fit: segments of all lines.
     """
 
-    def __init__(self, axis: int, kept: list[list[int]], joined: set[int], of: list[Float]) -> None:
-        self.axis, self.numbers, self.across, self.of = axis, kept[axis], kept[1 - axis], of
-        self.told = alone = np.array([number not in joined for number in self.numbers])
-        _, drop_ohm, std_ohm, floating_ohm = of
-        self.ohm, self.covariance, self.cost = _fit(of)
-        least, count = self.cost, len(self.across)
-        if len(alone) > 2:
-            least = np.minimum(least, _fit(of, self.usual_ohm)[2].min(axis=0))
-        weighed = floating_ohm / std_ohm**2
-        k = np.sum(weighed * drop_ohm, 1) / np.maximum(np.sum(weighed * floating_ohm, 1), 1e-30)
-        off = (drop_ohm - np.clip(k, 0, 1)[:, None] * floating_ohm) / std_ohm
-        most = np.minimum(LOST_CHI2 * max(count - 1, 1), LOST_CHI2 + np.sum(off**2, axis=1))
-        wrong = (least > most) | (np.abs(self.ohm.sum(axis=1)) > MOST_LINE_OHM)
-        self.told, self.lost = alone & ~wrong, alone & wrong
+    def __init__(
+        self, axis: int, kept: list[list[int]], shorts: list[list[int]], readings: LayerReadings
+    ) -> None:
+        self.axis, self.numbers, self.across = axis, kept[axis], kept[1 - axis]
+        self.readings, self.shorts = readings, shorts
+        # A shorted line has currents of others in its wire, so that u = A r does not hold.
+        shorted = [n for group in shorts for n in group]
+        self.measured = alone = ~np.isin(self.numbers, shorted)
+        self.fit = fit_even(readings)
+        least_cost = self.fit.cost
+        if len(alone) > 2:  # else no line is usual
+            least_cost = np.minimum(least_cost, fit_odd(readings, self.usual_ohm).cost.min(axis=0))
+        # A connected end costs less than MANY_STDS^2 a reading, and not clearly more than if it
+        # floated.
+        most_of_any = MANY_STDS**2 * max(len(self.across) - 1, 1)
+        most_cost = np.minimum(most_of_any, MANY_STDS**2 + self._floating_cost())
+        too_much = np.abs(self.fit.ohm.sum(axis=1)) > MOST_LINE_OHM
+        at_fault = (least_cost > most_cost) | too_much
+        self.measured, self.lost = alone & ~at_fault, alone & at_fault
+
+    def _floating_cost(self) -> Float:
+        """Cost (L,) of the readings, if the far ends float: |(u - k w) / s|^2, of the best k."""
+        std_ohm = self.readings.std_ohm
+        u, w = self.readings.loss_ohm / std_ohm, self.readings.floating_ohm / std_ohm
+        k = np.sum(w * u, axis=1) / np.maximum(np.sum(w * w, axis=1), 1e-30)
+        return np.asarray(np.sum((u - np.clip(k, 0, 1)[:, None] * w) ** 2, axis=1))
 
     @property
     def usual_ohm(self) -> float:
-        """The usual mean of a line's segments."""
-        told = self.ohm[self.told] if self.told.any() else self.ohm
-        return max(float(np.median(told.mean(axis=1))), 1.0)
+        """The usual mean of a line's segments: the median of the lines, of measured ones if any."""
+        ohm = self.fit.ohm[self.measured] if self.measured.any() else self.fit.ohm
+        return max(float(np.median(ohm.mean(axis=1))), 1.0)
 
     @property
     def wire_ohm(self) -> Float:
-        """Segments (L, n); the usual ones of lines that are not told."""
-        return np.maximum(np.where(self.told[:, None], self.ohm, self.usual_ohm), 0.0)
+        """Segments (L, n); the usual ones where a line is not measured."""
+        return np.maximum(np.where(self.measured[:, None], self.fit.ohm, self.usual_ohm), 0.0)
 
     def place(self, lines: Any) -> Place:
-        """Lines that are kept, by number or mask."""
-        named = tuple(np.array(self.numbers)[lines].tolist())
-        return Place(columns=named) if self.axis else Place(rows=named)
+        """Lines of this layer, by index or mask."""
+        return Place.of_lines(self.axis, np.array(self.numbers)[lines])
 
-    def examine_shorts(self, diagnosis: Diagnosis) -> None:
-        """Say which lines are joined at their far ends: all current of the others' cells goes
-        through all of a line. That of its own cells goes as far as these.
+    def report_shorts(self, diagnosis: Diagnosis) -> None:
+        """Say which shorted lines are joined at their far ends, and not at their near ends.
+
+        Either way, the current of a port divides among the lines. Joined at near ends, a line
+        carries the current of its own cells, up to these. Joined at far ends, it also carries that
+        of the other lines' cells, through all its segments. So it loses more: what it loses is
+        compared with the mean of both.
         """
-        kind = (Kind.SHORT_ROWS, Kind.SHORT_COLUMNS)[self.axis]
-        for short in [each for each in diagnosis.findings if each.kind is kind]:
-            joined = short.place.columns if self.axis else short.place.rows
-            n, others = self.numbers.index(joined[0]), len(joined) - 1
-            least = float(self.of[0][n].sum(axis=1).mean())  # segments, if joined at near ends
-            most = least + others * len(self.across)
-            if self.of[1][n].mean() * len(joined) > self.usual_ohm * (least + most) / 2:
-                diagnosis.findings.remove(short)
-                diagnosis.add(Kind.SHORT_FAR, short.place)
+        for group in self.shorts:
+            line, others = self.numbers.index(group[0]), len(group) - 1
+            near = float(self.readings.current_share[line].sum(axis=1).mean())  # in segments
+            far = near + others * len(self.across)
+            loss_ohm = self.readings.loss_ohm[line].mean() * len(group)
+            if loss_ohm > self.usual_ohm * (near + far) / 2:
+                diagnosis.add(Kind.SHORT_FAR, Place.of_lines(self.axis, group))
 
-    def examine_ends(self, ends_ohm: Float, diagnosis: Diagnosis) -> None:
-        """Add far ends that do not show their lines. ends_ohm: as `_Skin.ends`."""
-        chi2 = np.mean(((self.of[1] - ends_ohm) / self.of[2]) ** 2, axis=2)
+    def report_ends(self, ends_ohm: Float, dead: Bool, diagnosis: Diagnosis) -> None:
+        """Add far ends that do not show their lines.
+
+        ends_ohm: what `FarReadings.ends` gives for this layer. dead: dead cells, (R, C).
+        """
+        self.lost &= [not self.report_broken(n, dead, diagnosis) for n in range(len(self.lost))]
+        off = (self.readings.loss_ohm - ends_ohm) / self.readings.std_ohm
+        chi2 = np.mean(off**2, axis=2)
         np.fill_diagonal(chi2, np.inf)
-        self.lost &= [not self._is_broken(n, diagnosis) for n in range(len(self.lost))]
-        swapped = self.lost & (chi2.min(axis=0) < LOST_CHI2)
-        if swapped.any():
-            diagnosis.add(Kind.SWAPPED_FAR, self.place(swapped))
-        if (self.lost & ~swapped).any():
-            diagnosis.add(Kind.OPEN_FAR, self.place(self.lost & ~swapped))
+        swapped = self.lost & (chi2.min(axis=0) < MANY_STDS**2)
+        for kind, lines in ((Kind.SWAPPED_FAR, swapped), (Kind.OPEN_FAR, self.lost & ~swapped)):
+            if lines.any():
+                diagnosis.add(kind, self.place(lines))
 
-    def _is_broken(self, n: int, diagnosis: Diagnosis) -> bool:
-        """Add a lost line that is dead from some cell on, in place of these dead cells."""
-        [*found] = [each for each in diagnosis.findings if each.kind is Kind.DEAD_CELL]
-        cells = {cell for each in found for cell in each.place.cells}
-        mine = {cell[1 - self.axis]: cell for cell in cells if cell[self.axis] == self.numbers[n]}
-        last = max((each for each in self.across if each not in mine), default=-1)
-        beyond = [each for each in self.across if each > last >= 0]
-        if beyond and self.lost[n]:
-            diagnosis.add(Kind.BROKEN_YARN, self.place([n]), between=(last, beyond[0]))
-            diagnosis.findings.remove(found[0])
-            if rest := cells - {mine[each] for each in beyond}:
-                place = Place(cells=tuple(sorted(rest)))
-                diagnosis.add(Kind.DEAD_CELL, place, **found[0].values)
+    def report_broken(self, line: int, dead: Bool, diagnosis: Diagnosis) -> bool:
+        """Whether all cells of a line are dead from some cell on. If its far end is lost, too, its
+        yarn is broken there: this is added, and explains these dead cells.
+        """
+        in_line = np.take(dead, self.numbers[line], axis=self.axis)[self.across]
+        alive = np.flatnonzero(~in_line)
+        beyond = self.across[alive[-1] + 1 :] if alive.size else []
+        if beyond and self.lost[line]:
+            between, explained = (self.across[alive[-1]], beyond[0]), np.zeros_like(dead)
+            np.moveaxis(explained, self.axis, 0)[self.numbers[line], beyond] = True
+            cells = Place.of_cells(explained)
+            diagnosis.add(Kind.BROKEN_YARN, self.place([line]), cells, between=between)
         return bool(beyond)
 
-    def examine_wires(self, nominal_ohm: float | None, diagnosis: Diagnosis) -> None:
-        """Add the wire of each line, and lines that are clearly not as others, or as nominal."""
-        told, usual_ohm = np.flatnonzero(self.told), self.usual_ohm
-        if nominal_ohm and told.size:
-            self._compare(told, nominal_ohm, diagnosis)
-        ohm, covariance, cost = _fit(self.of, usual_ohm)
-        for n in told if len(self.told) > 2 else ():
-            costs = cost[:-1, n]
-            may_be = np.flatnonzero(costs < costs.min() + ALIKE_COST)
-            k = int(may_be[0])  # contacts fail more often than yarn
-            more_ohm = float(ohm[k, n, k]) - usual_ohm
-            clear = costs[k] < min(self.cost[n] + ALIKE_COST, cost[-1, n] - CLEAR_STDS**2)
-            if not clear or more_ohm < CHANGED * len(self.across) * usual_ohm:
-                self._compare([n], usual_ohm, diagnosis)
-                continue
-            self.ohm[n], self.covariance[n] = ohm[k, n], covariance[k, n]
-            values = {"more_ohm": more_ohm, "std_ohm": float(covariance[k, n, k, k]) ** 0.5}
-            between = self.across[k - 1] if k else -1, self.across[may_be[-1]]
-            kind = Kind.BAD_SEGMENT if k else Kind.BAD_CRIMP
-            diagnosis.add(kind, self.place([n]), between=between, **values)
-        for n in told:
-            std_ohm = self.covariance[n].diagonal() ** 0.5
-            whole = float(self.ohm[n].sum()), float(self.covariance[n].sum()) ** 0.5
-            each = self.ohm[n].tolist(), std_ohm.tolist()
-            diagnosis.lines.append(LineWire(self.place([n]), *whole, *each))
+    def report_wires(self, nominal_ohm: float | None, diagnosis: Diagnosis) -> None:
+        """Add the wire of each measured line, and lines that are clearly not as they should be.
+
+        All lines together are compared with `nominal_ohm`, if it is known. Each line is compared
+        with the usual one, unless one bad segment explains it better. Of two lines, none is usual.
+        """
+        measured: list[int] = np.flatnonzero(self.measured).tolist()
+        if nominal_ohm and measured:
+            self._compare(measured, nominal_ohm, diagnosis)
+        odd, usual_ohm = fit_odd(self.readings, self.usual_ohm), self.usual_ohm
+        for line in measured if len(self.measured) > 2 else ():
+            if not self._report_segment(line, odd, usual_ohm, diagnosis):
+                self._compare([line], usual_ohm, diagnosis)
+        for line in measured:
+            ohm, covariance = self.fit.ohm[line], self.fit.covariance[line]
+            whole = float(ohm.sum()), float(covariance.sum()) ** 0.5
+            segments = ohm.tolist(), (covariance.diagonal() ** 0.5).tolist()
+            diagnosis.lines.append(LineWire(self.place([line]), *whole, *segments))
+
+    def _report_segment(self, line: int, odd: Fit, usual_ohm: float, diagnosis: Diagnosis) -> bool:
+        """Whether one bad segment explains a line clearly better than anything else; adds it then.
+
+        odd: what `fit_odd` gives. The line takes the segments of the fit that explains it.
+        """
+        costs, no_odd_cost = odd.cost[:-1, line], odd.cost[-1, line]
+        # Several segments may explain the line. The nearest one has the crimp in it, or is the
+        # nearest to it: contacts fail more often than yarn.
+        candidates = np.flatnonzero(costs < costs.min() + ALIKE_COST)
+        k = int(candidates[0])
+        more_ohm = float(odd.ohm[k, line, k]) - usual_ohm
+        clear = costs[k] < min(self.fit.cost[line] + ALIKE_COST, no_odd_cost - MANY_STDS**2)
+        if not clear or more_ohm < CHANGED_SHARE * len(self.across) * usual_ohm:
+            return False
+        self.fit.ohm[line], self.fit.covariance[line] = odd.ohm[k, line], odd.covariance[k, line]
+        values = {"more_ohm": more_ohm, "std_ohm": float(odd.covariance[k, line, k, k]) ** 0.5}
+        between = self.across[k - 1] if k else -1, self.across[candidates[-1]]
+        kind = Kind.BAD_SEGMENT if k else Kind.BAD_CRIMP
+        diagnosis.add(kind, self.place([line]), between=between, **values)
+        return True
 
     def _compare(self, lines: Any, segment_ohm: float, diagnosis: Diagnosis) -> None:
-        """Add lines whose resistance is clearly not that of so many such segments."""
-        ohm = float(np.median(self.ohm[lines].sum(axis=1)))
-        std_ohm = float(np.median(self.covariance[lines].sum(axis=(1, 2)) ** 0.5))
+        """Add lines, by index, if their median is clearly not that of segments of `segment_ohm`."""
+        ohm = float(np.median(self.fit.ohm[lines].sum(axis=1)))
+        std_ohm = float(np.median(self.fit.covariance[lines].sum(axis=(1, 2)) ** 0.5))
         usual_ohm = len(self.across) * segment_ohm
+        # Two sound lines differ, since segments scatter; and both were measured, the usual one as a
+        # median of all lines, whose variance is pi / 2 of that of a mean.
         scatter_ohm = (2 / len(self.across)) ** 0.5 * SEGMENT_STD * max(ohm, usual_ohm)
-        both_ohm = (1 + np.pi / 2 / len(self.told)) ** 0.5 * std_ohm  # the usual one is a median
-        doubt_ohm = LINE_STDS * float(np.hypot(both_ohm, scatter_ohm))
-        if abs(ohm - usual_ohm) > CHANGED * usual_ohm + doubt_ohm:
+        both_std_ohm = (1 + np.pi / 2 / len(self.measured)) ** 0.5 * std_ohm
+        doubt_ohm = FEW_STDS * float(np.hypot(both_std_ohm, scatter_ohm))
+        if abs(ohm - usual_ohm) > CHANGED_SHARE * usual_ohm + doubt_ohm:
             values = {"ohm": ohm, "std_ohm": std_ohm, "usual_ohm": usual_ohm}
             diagnosis.add(Kind.LINE_WIRE, self.place(lines), **values)
 
 
 def near_ends(rest: Rest) -> Rest:
-    """What mode near would have read of a skin that was read in mode far: c = 1 - b, d = 1 - a."""
+    """What mode near would have read of a skin that was read in mode far.
+
+    Readings c and d are those of b and a with the drive reversed: c = 1 - b, d = 1 - a. But there
+    the converter's errors would have the other sign, so here they do not cancel: `offset_lsb`.
+    """
     a, _, b, _ = np.moveaxis(rest.codes, -1, 0)
     codes = np.stack([a, b, 2**ADC_BITS - 1 - b, 2**ADC_BITS - 1 - a], axis=-1)
     board = replace(rest.board, mode="near")
-    return replace(rest, board=board, codes=codes, offset_lsb=OFFSET_LSB)
+    return replace(rest, board=board, codes=codes, offset_lsb=2 * ADC_ERROR_LSB)
 
 
 def segments_of(lines: Sequence[LineWire]) -> WireOhm | None:
-    """Segment of each layer [ohm], the median of its lines'. None if the lines do not tell both.
+    """Segment of each layer [ohm]: the median of its lines, so that one bad line does not count.
 
-    The deviation is the mean of both layers': their errors may be the same.
+    None if it is not known of both layers. The deviation is the mean of both layers', and not less,
+    because what is wrong with the model is wrong in both.
     """
     means, stds = [0.0, 0.0], [np.inf, np.inf]
-    for k, axis in enumerate(("rows", "columns")):
-        if layer := [each for each in lines if getattr(each.place, axis)]:
-            ohm, std_ohm = np.median([(each.ohm, each.std_ohm) for each in layer], axis=0).tolist()
-            means[k] = ohm / len(layer[0].segment_ohm)
-            stds[k] = std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5
-    return WireOhm(means[0], means[1], sum(stds) / 2) if max(stds) <= KNOWN else None
+    for axis, name in enumerate(("rows", "columns")):
+        if layer := [line for line in lines if getattr(line.place, name)]:
+            ohm, std_ohm = np.median([(line.ohm, line.std_ohm) for line in layer], axis=0).tolist()
+            means[axis] = ohm / len(layer[0].segment_ohm)
+            stds[axis] = std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5
+    return WireOhm(means[0], means[1], sum(stds) / 2) if max(stds) <= KNOWN_STD else None
 
 
-def examine_far(rest: Rest, nominal_ohm: tuple[float, float] | None, diagnosis: Diagnosis) -> None:
-    """Add the wires of lines that are neither open nor shorted, and what is wrong with far ends.
+def examine_far(
+    rest: Rest,
+    near: LinesAndCells,
+    nominal_ohm: tuple[float, float] | None,
+    diagnosis: Diagnosis,
+) -> None:
+    """Add the wires of all lines, and what is wrong with far ends.
 
-    rest: of mode far. nominal_ohm: a segment of each layer, where told: else lines are compared
-    with each other.
+    rest: readings of mode far.
+    near: what the near ends show. Open lines are left out, and all but one of shorted lines.
+    nominal_ohm: a segment of each layer; None: lines are compared with each other alone.
     """
-    kept, joined = [], []
-    for axis, count in enumerate(rest.codes.shape[:2]):
-        told = ((each.kind.id, each.place) for each in diagnosis.findings)
-        found = [(kind, (place.rows, place.columns)[axis]) for kind, place in told]
-        out = {n for kind, lines in found if kind.startswith("open_") for n in lines}
-        out |= {n for kind, lines in found if kind.startswith("short_") for n in lines[1:]}
-        joined.append({n for kind, lines in found if kind.startswith("short_") for n in lines})
-        kept.append([n for n in range(count) if n not in out])
-    skin = _Skin(rest, kept)
-    wire_ohm: Float = np.zeros((2, *skin.shape))
+    kept = []
+    for is_open, shorts in zip(near.open_lines, near.shorts, strict=True):
+        left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
+        kept.append([n for n in range(len(is_open)) if n not in left_out])
+    readings = FarReadings(rest, kept)
+    wire_ohm: Float = np.zeros((2, *readings.shape))
     for _ in range(ROUNDS):
-        layers = [_Layer(n, kept, joined[n], of) for n, of in enumerate(skin.layers(wire_ohm))]
+        layers = [
+            _Layer(axis, kept, near.shorts[axis], of_layer)
+            for axis, of_layer in enumerate(readings.layers(wire_ohm))
+        ]
         wire_ohm = np.stack([layers[0].wire_ohm, layers[1].wire_ohm.T])
-    ends_ohm = skin.ends(wire_ohm)
+    ends_ohm = readings.ends(wire_ohm)
     for layer, ends, nominal in zip(layers, ends_ohm, nominal_ohm or (None, None), strict=True):
-        layer.examine_shorts(diagnosis)
-        layer.examine_ends(ends, diagnosis)
-        layer.examine_wires(nominal, diagnosis)
+        layer.report_shorts(diagnosis)
+        layer.report_ends(ends, near.dead, diagnosis)
+        layer.report_wires(nominal, diagnosis)

@@ -4,8 +4,8 @@
 Words are made of it elsewhere: `ohmskin.cli.doctor_words`.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
 from enum import Enum, StrEnum
 from typing import Any, Final, Self
 
@@ -24,12 +24,25 @@ class Severity(StrEnum):
     NOTE = "note"  # good to know; nothing is wrong with the skin
 
 
+# How many standard deviations a value must be off before it is a finding. The more values are
+# looked at, the further off one of them is by chance. Shares are those of normal deviations.
+ONE_STDS: Final = 3.0  # One value: of 370 sound boards, one is that far off.
+FEW_STDS: Final = 3.5  # Some ten values, such as lines: one of 2,000 is.
+MANY_STDS: Final = 5.0  # Hundreds of values, such as cells or segments: one of 1.7 million is.
+ALL_STDS: Final = 6.0  # All 1,024 readings of the largest scan: one of 500 million is.
+
 _FAULT, _WARNING, _NOTE = Severity
 _CELLS: Final = "worst cell_ohm plate_ohm off_percent most_percent"  # of resistors of a plate
+_CHANGE: Final = "change_lsb most_lsb settle_us longer_us needed_us pressed"
 
 
 class Kind(Enum):
-    """What can be found: its id, its severity, and the names of the values that describe it.
+    """What can be found.
+
+    id: its name for users. Two kinds may have one, if users need not tell them apart.
+    severity: how bad it is.
+    names: the values that describe it.
+    explains: the kinds that it explains, if it concerns the same lines or cells: see `merged`.
 
     The order is the order in which findings are told: what hides or explains others comes first.
     """
@@ -44,10 +57,10 @@ class Kind(Enum):
     OPEN_COLUMN = "open_column", _FAULT, "line_count cells_per_line"
     SHORT_ROWS = "short_rows", _FAULT, ""
     SHORT_COLUMNS = "short_columns", _FAULT, ""
-    SHORT_FAR = "short_far", _FAULT, ""
+    SHORT_FAR = "short_far", _FAULT, "", "SHORT_ROWS SHORT_COLUMNS"
     SWAPPED_FAR = "swapped_far", _FAULT, ""
     OPEN_FAR = "open_far", _FAULT, ""
-    BROKEN_YARN = "broken_yarn", _FAULT, "between"
+    BROKEN_YARN = "broken_yarn", _FAULT, "between", "DEAD_CELL"
     DEAD_CELL = "dead_cell", _FAULT, "percent_of_usual"
     SATURATED_CELL = "saturated_cell", _FAULT, "cell_ohm rest_megohm"
     SWAPPED_LINES = "swapped_lines", _FAULT, ""
@@ -56,7 +69,8 @@ class Kind(Enum):
     WRONG_RESISTOR = "wrong_resistor", _FAULT, _CELLS
     REFERENCE_VALUE = "reference_value", _FAULT, "ohm nominal_ohm off_percent most_percent"
     REFERENCE_RATIO = "reference_ratio", _FAULT, "ratio off_percent ref_top_ohm ref_bottom_ohm"
-    SETTLING = "settling", _FAULT, "change_lsb most_lsb settle_us longer_us needed_us pressed"
+    SETTLING = "settling", _FAULT, _CHANGE
+    SETTLING_PRESSED = "settling", _FAULT, _CHANGE, "SETTLING"
     LINEARITY = "linearity", _FAULT, "readings lines most"
     RESET_CAUSE = "reset_cause", _WARNING, "cause"
     RESTARTED = "restarted", _WARNING, "restarts causes"
@@ -73,10 +87,11 @@ class Kind(Enum):
     VERSION = "version", _NOTE, "firmware host"
     USB_LATENCY = "usb_latency", _NOTE, "timer_ms file"
 
-    def __init__(self, id: str, severity: Severity, names: str) -> None:
+    def __init__(self, id: str, severity: Severity, names: str, explains: str = "") -> None:
         self.id = id
         self.severity = severity
         self.names = frozenset(names.split())
+        self.explains = frozenset(explains.split())
 
 
 @dataclass(frozen=True)
@@ -92,6 +107,20 @@ class Place:
         """Each cell that is true in `where` (R, C)."""
         return cls(cells=tuple((int(row), int(column)) for row, column in np.argwhere(where)))
 
+    @classmethod
+    def of_lines(cls, axis: int, numbers: Iterable[int]) -> Self:
+        """Rows (axis 0) or columns (axis 1) of these numbers."""
+        lines = tuple(map(int, numbers))
+        return cls(columns=lines) if axis else cls(rows=lines)
+
+    def without(self, other: "Place") -> "Place | None":
+        """The lines and cells that `other` has not; None if nothing is left."""
+        if WHOLE_SKIN in (self, other):
+            return None if other == WHOLE_SKIN else self
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        left = Place(*(tuple(one for one in mine if one not in its) for mine, its in pairs))
+        return None if left == WHOLE_SKIN else left
+
 
 WHOLE_SKIN: Final = Place()
 
@@ -103,22 +132,51 @@ def lines_of(where: Bool) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found. values: what describes it, by the names that `kind` lists, and no others."""
+    """One thing found.
+
+    kind: what it is.
+    place: the lines and cells that it names.
+    values: what describes it, by the names that `kind` lists, and no others.
+    explained: lines and cells at which it explains findings of other kinds; None: at its place.
+    """
 
     kind: Kind
     place: Place
     values: Mapping[str, Any]
+    explained: Place | None = None
 
     def __post_init__(self) -> None:
         if self.values.keys() != self.kind.names:
             raise ValueError(f"{self.kind.id} has {set(self.kind.names)}, not {set(self.values)}")
 
 
+def merged(findings: Sequence[Finding]) -> list[Finding]:
+    """What is told of all that the examiners found, each for itself.
+
+    1. What another finding explains is not told: its lines and cells leave the findings of the
+       kinds that `Kind.explains` lists, and a finding of which nothing is left is dropped. Cells
+       beyond a break in a yarn are dead, but the yarn is what must be mended.
+    2. Findings stand in the order of their kinds; of one kind, as they were found.
+    """
+    kinds, told = list(Kind), []
+    for finding in findings:
+        place: Place | None = finding.place
+        for other in findings:
+            if place is not None and finding.kind.name in other.kind.explains:
+                place = place.without(other.explained or other.place)
+        if place is not None:
+            told.append(replace(finding, place=place))
+    return sorted(told, key=lambda finding: kinds.index(finding.kind))
+
+
 @dataclass(frozen=True)
 class WireShare:
-    """Wire resistance over the nominal one, and its deviation.
+    """Wire resistance over the nominal one, as pressed corners show it.
 
-    place: lines, or the whole layers. known: the deviation is small enough to tell the share.
+    place: the row and the column that were measured, or the whole skin.
+    share: the resistance over the nominal one.
+    std: standard deviation of this share.
+    known: the deviation is small enough to tell the share.
     differs: the wires are clearly not nominal, and no other share tells it already.
     """
 
@@ -131,7 +189,14 @@ class WireShare:
 
 @dataclass(frozen=True)
 class LineWire:
-    """A row or a column from its near end to its far end, each of its segments, and deviations."""
+    """The wire of a row or a column, from its near end to its far end.
+
+    place: the line.
+    ohm: its resistance from end to end [ohm].
+    std_ohm: standard deviation of that [ohm].
+    segment_ohm: each of its segments, the one at the near end first [ohm].
+    segment_std_ohm: their standard deviations [ohm].
+    """
 
     place: Place
     ohm: float
@@ -142,12 +207,14 @@ class LineWire:
 
 @dataclass
 class Diagnosis:
-    """All that was found. Findings stand in the order of their kinds.
+    """What examiners found. Each adds its own; `examine` merges the findings at the end.
 
-    measured: figures by name, None for one that could not be had. nominal_ohm: wires of a segment,
-    top and bottom; None if touches or faults hide the wires. pressed: the share of all wires that
-    presses show, then of each row and column; None if nobody was asked to press. lines: their
-    wires, where far ends show them.
+    findings: all that was found.
+    measured: figures by name, None for one that could not be had.
+    nominal_ohm: nominal wires of a segment, top and bottom; None if touches or faults hide wires.
+    pressed: the share of all wires that presses show, then that of each row and column; None if
+        nobody was asked to press.
+    lines: wires of the lines, where far ends show them.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -156,9 +223,16 @@ class Diagnosis:
     pressed: list[WireShare] | None = None
     lines: list[LineWire] = field(default_factory=list)
 
-    def add(self, kind: Kind, place: Place = WHOLE_SKIN, /, **values: Any) -> None:
-        """Add a finding with these values."""
-        self.findings.append(Finding(kind, place, values))
+    def add(
+        self,
+        kind: Kind,
+        place: Place = WHOLE_SKIN,
+        explained: Place | None = None,
+        /,
+        **values: Any,
+    ) -> None:
+        """Add a finding with these values: see `Finding`."""
+        self.findings.append(Finding(kind, place, values, explained))
 
     @property
     def worse(self) -> list[Finding]:

@@ -15,7 +15,7 @@ from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, second_look
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
-from ohmskin.link.device import Device, scans_for
+from ohmskin.link.device import Device, configuration, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import latency_timer
@@ -125,14 +125,9 @@ def put_back(device: Device) -> Iterator[None]:
 
 def _settings(board: Hello) -> dict[str, Any]:
     """What `Device.configure` must be given for a board to scan as this one does."""
-    return {
-        "rows": board.rows,
-        "columns": board.columns,
-        "rate_hz": board.rate_asked_mhz / 1000,
-        "settle_us": board.settle_asked_us,
-        "adc_prescaler": board.adc_prescaler,
-        "mode": board.mode,
-    }
+    settings: dict[str, Any] = configuration(board)
+    settings["rate_hz"] = settings.pop("rate_mhz") / 1000
+    return settings
 
 
 def _look(device: Device, seconds: float, settings: dict[str, Any]) -> tuple[Hello, list[Scan]]:

@@ -6,20 +6,21 @@ Symbols
 ====== ========= ===========================================================================
 symbol shape     meaning
 ====== ========= ===========================================================================
-p      (R, C)    conductances of the plate, 0 where it has no resistor [S]
-g      (R, C)    what `joint` makes of the mean readings [S]
-s      (R, C, 4) what a reading shows of its current: it, or what it lacks to Vdd [LSB]
+p      (R, C)    plate: conductances of its resistors, 0 where it has none [S]
+g      (R, C)    conductances that `joint` estimates from the mean readings [S]
+s      (R, C, 4) shown: what each reading shows of its current, the reading or what it lacks to Vdd
+                 [LSB]
 rho    (R, C)    port resistances of the plate [ohm]
 ====== ========= ===========================================================================
 
-In this order, and each leaves out what those before it have found:
+The rules, in this order; each takes what those before it have found as it is:
 
-- Lines are swapped if g is like p in another order than theirs.
-- Reference resistors are rho s / (1024 - s_top - s_bottom): the median over the plate's resistors,
-  which a wrong one does not move.
+- Lines are swapped if g is like p with its lines in another order.
+- The reference resistors are rho s / (1024 - s_top - s_bottom), the median over the plate's
+  resistors. A wrong resistor does not move a median.
 - With these references, g differs from p at an open joint, a bridge, a wrong resistor.
-- With these as they are, the circuit predicts s. A line is fitted to the readings of each
-  configuration over their predictions; its residual is what is left over.
+- From p, but for these cells, the circuit predicts s. A straight line is fitted to the readings of
+  each configuration over their predictions. It shows gain, offset and bow of the converter.
 
 A factor common to all resistances changes no reading and cannot be known.
 """
@@ -40,23 +41,35 @@ from ohmskin.circuit.skin import (
     port_resistance_ohm,
     readings,
 )
+from ohmskin.doctor.circuit import DEAD_SHARE
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
-from ohmskin.doctor.signal import NOISY_LSB, RestScans, examine_settling, examine_signal
-from ohmskin.estimate.base import Estimate
+from ohmskin.doctor.signal import (
+    NOISY_LSB,
+    RestScans,
+    examine_settling,
+    find_hum,
+    noise_variance,
+    report_hum,
+)
+from ohmskin.estimate.base import TOUCH_STDS, Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import ADC_BITS
 
-FULL: Final = 1 << ADC_BITS  # [LSB] Vdd
+FULL: Final = 1 << ADC_BITS  # [LSB] Vdd, as a code: the board's converter says so.
 
-OPEN_SHARE: Final = 0.3  # [1] An open joint has less than this share of its resistor's conductance.
-BRIDGE_SIEMENS: Final = 1e-6  # [S] Where no resistor is, what conducts more by 4 deviations is one.
-BRIDGE_STDS: Final = 4.0
-SWAPPED_SHARE: Final = 0.5  # [1] In the right order, lines differ from the plate by less than this.
-LOOP_SHARES: Final = (0.1, 0.95)  # [1] Shares of the loop in which a resistor tells a reference.
-CLIPPED_LSB: Final = 5.0  # [LSB] An offset, or noise, may clip the readings that show less.
-LEAST_SPAN_LSB: Final = 50.0  # [LSB] Readings that span less tell no line.
+# [S] Where the plate has no resistor, a bridge conducts more than this, and than TOUCH_STDS
+# deviations. Chosen: 1 MOhm, far above what a plate's resistors are.
+BRIDGE_SIEMENS: Final = 1e-6
+# [1] In the right order, lines differ from the plate by less than this share of what they differ in
+# the wrong one. Chosen.
+SWAPPED_SHARE: Final = 0.5
+# [1] A resistor tells the references if its share of the loop with them is between these. Chosen:
+# else the references, or the resistor, have too few codes.
+LOOP_SHARES: Final = (0.1, 0.95)
+# [LSB] Readings that span less determine no straight line. Chosen: ten times the offset allowed.
+LEAST_SPAN_LSB: Final = 50.0
 
 
 @dataclass(frozen=True)
@@ -74,14 +87,23 @@ class Tolerance:
 
 @dataclass(eq=False)
 class PlateExam:
-    """What a board reads of a plate p. `examine`, for `doctor.examine.examine`, sets the rest,
-    which is not known (NaN, empty) until then.
+    """What a board reads of a plate. `examine` is for `ohmskin.doctor.examine.examine`.
 
-    cell_ohm (R, C): 1 / g. std_percent (R, C): its stated deviation. error_percent (R, C): of
-    cell_ohm, NaN where no resistor is. wrong (R, C): cells that have a finding. predicted_lsb,
-    shown_lsb (R, C, 4): s by the circuit, and as read. lines: slope, offset and largest residual
-    [LSB] by configuration, where they can be known. settling_lsb (R, C): largest change with a
-    longer settle time, NaN if not known. noise_lsb: of a reading, by ADC clock.
+    plate: p, (R, C) [S].
+    wire_ohm: wires of a segment of the plate, top and bottom.
+    tolerance: what a sound board may have.
+
+    `examine` sets the others. Until then they are not known: NaN, or empty.
+
+    cell_ohm: 1 / g, (R, C) [ohm].
+    std_percent: its stated deviation, (R, C) [%].
+    error_percent: its error, (R, C) [%], NaN where no resistor is.
+    wrong: which cells have a finding, (R, C).
+    shown_lsb: s as read, (R, C, 4) [LSB].
+    predicted_lsb: s by the circuit, (R, C, 4) [LSB].
+    lines: slope, offset and largest residual [LSB] of the straight line, by configuration.
+    settling_lsb: largest change of a cell's readings with a longer settle time, (R, C) [LSB].
+    noise_lsb: noise of a reading, by ADC clock [LSB].
     """
 
     plate: Float
@@ -98,7 +120,7 @@ class PlateExam:
         self.noise_lsb: dict[str, float] = {}
 
     def examine(self, evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
-        """Add what the scans show of the plate."""
+        """Add what the scans show of the plate. usual: the first look."""
         settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
         self._examine_signal(evidence, usual, diagnosis)
         scans = usual
@@ -116,77 +138,77 @@ class PlateExam:
         self._examine_lines(diagnosis)
 
     def _examine_signal(self, evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
-        """Adds hum, and noise by ADC clock, of the readings that nothing clips."""
-        signal = Diagnosis()
-        examine_signal(usual, signal)
-        diagnosis.findings += [each for each in signal.findings if each.kind is Kind.HUM]
-        diagnosis.measured["hum_lsb"] = signal.measured["hum_lsb"]
-        for scans in (usual, *(RestScans.of(*each) for each in evidence.clocks)):
+        """Add hum, and noise by ADC clock, of the readings that nothing clips."""
+        report_hum(find_hum(usual), usual.board.rate_hz, diagnosis)
+        for scans in (usual, *(RestScans.of(*look) for look in evidence.clocks)):
             if scans is not None:
-                lit = np.abs(scans.mean - FULL / 2) < FULL / 2 - CLIPPED_LSB
-                step = np.diff(scans.codes[:, lit], axis=0)
-                noise_lsb = float(np.mean(step**2) / 2) ** 0.5 if step.size else 0.0
+                # An offset may clip readings that are as near to Vdd or ground.
+                lit = np.abs(scans.mean - FULL / 2) < FULL / 2 - self.tolerance.offset_lsb
+                variance = noise_variance(scans.codes)[lit]
+                noise_lsb = float(np.mean(variance)) ** 0.5 if lit.any() else 0.0
                 self.noise_lsb.setdefault(scans.board.adc_prescaler, noise_lsb)
         most_lsb = self.tolerance.noise_lsb
         loud = {clock: lsb for clock, lsb in self.noise_lsb.items() if lsb > most_lsb}
         if loud:
             diagnosis.add(Kind.ADC_NOISE, clocks=loud, most_lsb=most_lsb)
 
-    def _in_order(self, shown: Float, known: SkinKnowledge, diagnosis: Diagnosis) -> Float:
-        """`shown`, with lines that are swapped put right."""
-        # Shares of a loop with the references: an open joint is not infinitely far from a resistor.
-        siemens = (_estimate(shown, known).cell_siemens, self.plate)
-        found, plate = (each / (each + 1 / known.ref_ohm) for each in siemens)
+    def _in_order(self, shown: Float, board: SkinKnowledge, diagnosis: Diagnosis) -> Float:
+        """`shown`, with lines that are swapped put right: at most some rows and some columns."""
+        # Compared are shares of the loop with the references, which are between 0 and 1. So an open
+        # joint does not count for more than a swap.
+        siemens = (_estimate(shown, board).cell_siemens, self.plate)
+        measured, plate = (cell / (cell + 1 / board.ref_ohm) for cell in siemens)
         for _ in range(2):
-            rows, columns = _order(found, plate), _order(found.T, plate.T)
+            rows, columns = _order(measured, plate), _order(measured.T, plate.T)
             axis = int(columns[1] < rows[1])
             order, off = (rows, columns)[axis]
             moved = lines_of(order != np.arange(len(order)))
-            if not moved or off >= SWAPPED_SHARE * np.abs(found - plate).sum():
+            if not moved or off >= SWAPPED_SHARE * np.abs(measured - plate).sum():
                 break
-            diagnosis.add(Kind.SWAPPED_LINES, Place(columns=moved) if axis else Place(moved))
-            shown, found = np.take(shown, order, axis), np.take(found, order, axis)
+            diagnosis.add(Kind.SWAPPED_LINES, Place.of_lines(axis, moved))
+            shown, measured = np.take(shown, order, axis), np.take(measured, order, axis)
         return shown
 
-    def _with_references(self, known: SkinKnowledge, diagnosis: Diagnosis) -> SkinKnowledge:
-        """What is known, with the references that the plate shows."""
-        found = _estimate(self.shown_lsb, known)
-        bad = np.logical_or(*self._open_and_bridged(found))
-        port_ohm = port_resistance_ohm(
-            self._skin(np.where(bad, found.cell_siemens, self.plate), known)
-        )
+    def _with_references(self, board: SkinKnowledge, diagnosis: Diagnosis) -> SkinKnowledge:
+        """`board` with the references that the plate shows. Adds a finding if they are wrong."""
+        estimate = _estimate(self.shown_lsb, board)
+        bad = np.logical_or(*self._open_and_bridged(estimate))
+        siemens = np.where(bad, estimate.cell_siemens, self.plate)
+        port_ohm = port_resistance_ohm(self._skin(siemens, board))
         share = self.shown_lsb / FULL
         top = share[..., READING_SENSES_TOP].mean(axis=2)
         bottom = share[..., ~READING_SENSES_TOP].mean(axis=2)
         of_plate = 1 - top - bottom
         tells = (self.plate > 0) & ~bad & (of_plate > LOOP_SHARES[0]) & (of_plate < LOOP_SHARES[1])
         if not tells.any():
-            return known
+            return board
         ohm = [float(np.median((port_ohm * side / of_plate)[tells])) for side in (top, bottom)]
-        nominal_ohm = known.ref_top_ohm, known.ref_bottom_ohm
-        off = [100 * (each / told - 1) for each, told in zip(ohm, nominal_ohm, strict=True)]
+        nominal_ohm = board.ref_top_ohm, board.ref_bottom_ohm
+        off = [100 * (one / nominal - 1) for one, nominal in zip(ohm, nominal_ohm, strict=True)]
         diagnosis.measured["reference_ohm"] = [round(each) for each in ohm]
         most = self.tolerance.reference_percent
         if max(map(abs, off)) > most:
             values = {"ohm": ohm, "nominal_ohm": nominal_ohm, "off_percent": off}
             diagnosis.add(Kind.REFERENCE_VALUE, most_percent=most, **values)
-        return replace(known, ref_top_ohm=ohm[0], ref_bottom_ohm=ohm[1])
+        return replace(board, ref_top_ohm=ohm[0], ref_bottom_ohm=ohm[1])
 
-    def _skin(self, siemens: Float, known: SkinKnowledge) -> Skin:
+    def _skin(self, siemens: Float, board: SkinKnowledge) -> Skin:
+        """The plate with these cells, at this board."""
         top, bottom = (np.full(siemens.shape, ohm) for ohm in self.wire_ohm.both or (0.0, 0.0))
-        return Skin(siemens, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
+        return Skin(siemens, top, bottom, board.ref_top_ohm, board.ref_bottom_ohm)
 
-    def _open_and_bridged(self, found: Estimate) -> tuple[Bool, Bool]:
-        """Cells where a resistor does not conduct, and those where none is that do."""
-        siemens, most = found.cell_siemens, BRIDGE_SIEMENS + BRIDGE_STDS * found.cell_siemens_std
-        return siemens < OPEN_SHARE * self.plate, (self.plate == 0) & (siemens > most)
+    def _open_and_bridged(self, estimate: Estimate) -> tuple[Bool, Bool]:
+        """Cells whose resistor does not conduct, and cells that conduct without a resistor."""
+        siemens, std = estimate.cell_siemens, estimate.cell_siemens_std
+        bridged = (self.plate == 0) & (siemens > BRIDGE_SIEMENS + TOUCH_STDS * std)
+        return siemens < DEAD_SHARE * self.plate, bridged
 
-    def _examine_cells(self, found: Estimate, diagnosis: Diagnosis) -> Float:
-        """Adds wrong cells. Returns the plate with these as they were measured, (R, C) [S]."""
-        siemens, is_there = found.cell_siemens, self.plate > 0
-        self.cell_ohm, self.std_percent = 1 / siemens, 100 * found.cell_siemens_std / siemens
+    def _examine_cells(self, estimate: Estimate, diagnosis: Diagnosis) -> Float:
+        """Add wrong cells. Returns the plate with these as they were measured, (R, C) [S]."""
+        siemens, is_there = estimate.cell_siemens, self.plate > 0
+        self.cell_ohm, self.std_percent = 1 / siemens, 100 * estimate.cell_siemens_std / siemens
         self.error_percent = np.where(is_there, 100 * (self.plate * self.cell_ohm - 1), np.nan)
-        is_open, bridged = self._open_and_bridged(found)
+        is_open, bridged = self._open_and_bridged(estimate)
         most = self.tolerance.cell_percent
         off = ~is_open & (np.abs(self.error_percent) > most + self.std_percent)
         self.wrong = is_open | bridged | off
@@ -207,7 +229,8 @@ class PlateExam:
                     off_percent=float(self.error_percent[worst]) if there else None,
                     most_percent=most,
                 )
-        hidden = is_there & ~is_open & (self.std_percent > most)  # by others that lie parallel
+        # Smaller resistors in parallel hide these.
+        hidden = is_there & ~is_open & (self.std_percent > most)
         diagnosis.measured["resistors_not_told"] = int(hidden.sum())
         errors = np.abs(self.error_percent[is_there & ~self.wrong])
         if errors.size:
@@ -215,10 +238,10 @@ class PlateExam:
         return np.where(self.wrong, siemens, self.plate)
 
     def _examine_lines(self, diagnosis: Diagnosis) -> None:
-        """Adds readings that are no line of what the circuit predicts."""
+        """Add configurations whose readings are no straight line over what the circuit predicts."""
         most = self.tolerance
         for k, name in enumerate(CONFIGURATIONS):
-            lit = self.predicted_lsb[..., k] > CLIPPED_LSB
+            lit = self.predicted_lsb[..., k] > most.offset_lsb  # an offset may clip others
             x, y = self.predicted_lsb[lit, k], self.shown_lsb[lit, k]
             if x.size and np.ptp(x) > LEAST_SPAN_LSB:
                 slope, offset = map(float, np.polyfit(x, y, 1))
@@ -236,15 +259,15 @@ class PlateExam:
 
 
 def _estimate(shown_lsb: Float, knowledge: SkinKnowledge) -> Estimate:
-    """What `joint` makes of s."""
+    """What `joint` estimates from s."""
     ratio = np.clip(READING_OFFSET + READING_SIGN * shown_lsb / FULL, 0.0, 1.0)
     return make_estimator("joint", knowledge).estimate(ratio)
 
 
-def _order(found: Float, plate: Float) -> tuple[NDArray[np.intp], float]:
-    """Which line of `found` (lines, n) each of `plate` is, and how far off these are in all."""
+def _order(measured: Float, plate: Float) -> tuple[NDArray[np.intp], float]:
+    """Which line of `measured` (lines, n) is like each line of `plate`, and how far off all are."""
     from scipy.optimize import linear_sum_assignment
 
-    cost = np.abs(plate[:, None] - found[None]).sum(axis=2)
+    cost = np.abs(plate[:, None] - measured[None]).sum(axis=2)
     lines, order = linear_sum_assignment(cost)
     return np.asarray(order), float(cost[lines, order].sum())

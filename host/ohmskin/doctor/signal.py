@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
+from ohmskin.doctor.findings import ALL_STDS, WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.link.clock import reading_offsets_s, slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -42,45 +42,84 @@ from ohmskin.link.protocol import CONSTANTS
 
 Complex = NDArray[np.complex128]
 
-REST_S: Final = 2.5  # [s] The first look takes this long: with all else, less than 10 s pass.
-SETTLED_S: Final = 1.6  # [s] The second look takes this long: it need not tell noise.
-FAR_S: Final = 4.0  # [s] In mode far, it tells the wires.
-LEAST_SCANS: Final = 16  # [scans] Noise and hum are not judged by fewer.
+# How long, and how often, the board is looked at.
+# [s] The first look. Chosen: it shows noise, and all looks together take less than 10 s.
+REST_S: Final = 2.5
+# [s] The second look, with a longer settle time. Chosen: it need not show noise.
+SETTLED_S: Final = 1.6
+# [s] The second look in mode far. Chosen: it measures wires, which show as few codes.
+FAR_S: Final = 4.0
+# [scans] Noise and hum are not judged by fewer. Chosen: two a block (BLOCKS).
+LEAST_SCANS: Final = 16
+# [1] The second look has a settle time that is so many times as long. Chosen: four times as many
+# time constants, which no slow node survives.
+LONGER: Final = 4
+# [us] It is at least this long. Chosen: ten time constants of 10 us.
+LEAST_LONGER_US: Final = 100
+# [us] In mode far it is at least this long: wires show as a few codes, so that a tenth counts.
+# Chosen: with less, far nodes keep a part of a code (docs/troubleshooting.md).
+LONGER_FAR_US: Final = 300
+# [1] A settle time that is longer by less than this factor shows nothing new. Chosen.
+NOT_LONGER: Final = 1.2
+# [Hz] The second look is not slower, unless the board is. Chosen: some six scans in SETTLED_S.
+LEAST_LOOK_HZ: Final = 4.0
 
-MAINS_HZ: Final = (50.0, 60.0)  # [Hz] The world has these mains.
-MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)  # [Hz] Resonator and grid are off by 0.5 %.
-HUM_LSB: Final = 0.5  # [LSB] Hum of a smaller amplitude changes a code by one, and is not told.
-# [deviations] P is above that of noise by so many deviations, if all readings were independent. The
-# four readings of a cell round alike, so that it is half as many.
+# Hum.
+# [Hz] The world has these mains (IEC 60038).
+MAINS_HZ: Final = (50.0, 60.0)
+# [Hz] They are looked for so far off: a board's ceramic resonator is off by up to 0.5 %.
+MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)
+# [LSB] Rounding to a code is off by up to half of one. Hum of a smaller amplitude is not reported,
+# and scatter is taken to be at least this, since rounding may hide it.
+ROUNDING_LSB: Final = 0.5
+# [deviations] P of hum is above that of noise by this many, if all readings were independent. The
+# four readings of a cell round alike, so that it is half as many. Chosen: 5 of these.
 HUM_OVER_NOISE: Final = 10.0
-HUM_OVER_BESIDE: Final = 3.0  # [1] P of drift and of other tones is as high beside.
-BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)  # [1 / duration] A Hann window's main lobe ends at 2.
-IN_PHASE: Final = 1.5  # [1] If two mains differ less in phase, they may be one that is seen twice.
-OVERLAP: Final = 0.5  # [1] From this |m|^2 on, a sine and its mirror image cannot be told apart.
-STILL_HZ: Final = 0.5  # [Hz] Mains that are seen below this plus 4 / duration look like drift.
+# [1] P of hum is above that of frequencies beside it by this factor, which drift and other tones
+# are not. Chosen.
+HUM_OVER_BESIDE: Final = 3.0
+# [1 / duration] Frequencies beside a tone. A Hann window's main lobe ends at 2 (Harris 1978).
+BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)
+# [1] If two mains differ by less than this factor in how much of them has one phase, they may be
+# one, which is seen twice. Chosen.
+IN_PHASE: Final = 1.5
+# [1] From this |m|^2 on, a sine and its mirror image cannot be told apart. Chosen.
+OVERLAP: Final = 0.5
+# [Hz] Mains that are seen slower than this, plus 4 / duration, look like drift. Chosen.
+STILL_HZ: Final = 0.5
 
-ADC_NOISE_LSB: Final = 0.3  # [LSB] A sound board's converter has this noise, as the emulated one.
-SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5  # [LSB] This is seen with rounding.
-NOISY_LSB: Final = 0.8  # [LSB] A board whose usual noise is above this, twice that, is noisy.
-NOISY_CELL_LSB: Final = 1.0  # [LSB] A noisy line or cell has more: the worst of many is looked at.
-NOISY_SHARE: Final = 1.7  # [1] It also has this factor over the usual noise: three times the power.
+# Noise.
+# [LSB] Offset of a sound converter, and as much gain error at full scale (ATmega328P data sheet,
+# ADC characteristics: 2 LSB each).
+ADC_ERROR_LSB: Final = 2.0
+# [LSB] Noise of a sound board before rounding. Chosen: as of emulated boards.
+ADC_NOISE_LSB: Final = 0.3
+# [LSB] Rounding adds the deviation of a value that may be anywhere within a code.
+SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5
+# [LSB] A board with more noise in its usual cell is noisy. Chosen: nearly twice SOUND_NOISE_LSB.
+NOISY_LSB: Final = 0.8
+# [LSB] A noisy line or cell has more. Chosen: above NOISY_LSB, as the worst of many is judged.
+NOISY_CELL_LSB: Final = 1.0
+# [1] It also has this factor over the usual noise. Chosen: three times the power.
+NOISY_SHARE: Final = 1.7
 
-BLOCKS: Final = 8  # [parts] Means of so many parts of the scans, 0.3 s each, show what moves.
-MOVED_LSB: Final = 3.0  # [LSB] A touch changes these means by more: the lightest one by 15.
-CLEAR_STDS: Final = 6.0  # [deviations] By chance, none of 1024 readings differs so much.
-
-UNSETTLED_LSB: Final = 1.0  # [LSB] A longer settle time changes settled readings by less: a code.
-SETTLED_NOISE_LSB: Final = 0.5  # [LSB] Scatter is taken for this at least: rounding hides as much.
-LONGER: Final = 4  # [1] The second look settles for so many times as long.
-LEAST_LONGER_US: Final = 100  # [us] It settles at least for this: ten time constants of 10 us.
-LONGER_FAR_US: Final = 300  # [us] Of far ends, even a tenth of a code counts: wires show a few.
-NOT_LONGER: Final = 1.2  # [1] A settle time that is longer by less than this shows nothing new.
-LEAST_LOOK_HZ: Final = 4.0  # [Hz] The second look is not slower, unless the board is.
+# What moves or has not settled.
+# [blocks] Means of so many parts of the scans show what moves. Chosen: 0.3 s each, as touches last.
+BLOCKS: Final = 8
+# [LSB] A touch changes these means by more. Chosen: the lightest touch changes them by 15.
+MOVED_LSB: Final = 3.0
+# [LSB] A longer settle time changes settled readings by less. Chosen: a code.
+UNSETTLED_LSB: Final = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class RestScans:
-    """Scans of one configuration: codes (N, R, C, 4), board time at their starts (N,) [s]."""
+    """A look: scans by one configuration.
+
+    board: what the board said of itself.
+    codes: the readings, (N, R, C, 4) [LSB].
+    time_s: the board's clock at the start of each scan, (N,) [s].
+    """
 
     board: Hello
     codes: Float
@@ -88,12 +127,15 @@ class RestScans:
 
     @classmethod
     def of(cls, board: Hello, scans: Sequence[Scan]) -> Self | None:
-        """The scans that have a board's size; None if there are fewer than two."""
-        fit = [scan for scan in scans if scan.codes.shape[:2] == (board.rows, board.columns)]
-        if len(fit) < 2:
+        """The scans that have the board's size; None if there are fewer than two.
+
+        Others are from before or after a reset.
+        """
+        of_size = [scan for scan in scans if scan.codes.shape[:2] == (board.rows, board.columns)]
+        if len(of_size) < 2:
             return None
-        codes = np.stack([scan.codes for scan in fit]).astype(np.float64)
-        return cls(board, codes, np.array([1e-6 * scan.time_us for scan in fit]))
+        codes = np.stack([scan.codes for scan in of_size]).astype(np.float64)
+        return cls(board, codes, np.array([1e-6 * scan.time_us for scan in of_size]))
 
     @cached_property
     def mean(self) -> Float:
@@ -124,11 +166,15 @@ class RestScans:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """The skin at rest, by the means of scans.
+    """The skin at rest: mean readings of scans.
 
-    codes: means (R, C, 4) of so many scans. noise_lsb: of a reading, without hum. wire_ohm: nominal
-    ones of a segment, top and bottom. moves: something touches the skin and moves, so that the
-    means are of no one skin. offset_lsb: of the converter, where no second drive cancels it.
+    board: what the board said of itself.
+    codes: the means, (R, C, 4) [LSB].
+    scans: number of scans that they are means of.
+    noise_lsb: noise of a single reading, without hum [LSB].
+    wire_ohm: nominal wires of a segment, top and bottom [ohm].
+    moves: something touches the skin and moves, so that the means are those of no one skin.
+    offset_lsb: the converter's, where only one polarity is read: a second one cancels it [LSB].
     """
 
     board: Hello
@@ -141,7 +187,7 @@ class Rest:
 
     @property
     def ratio(self) -> Float:
-        """The same as ratios to Vdd."""
+        """The means as ratios to Vdd."""
         return ratio_from_codes(self.codes, self.board.adc_bits)
 
     @property
@@ -152,9 +198,12 @@ class Rest:
 
 @dataclass(frozen=True, eq=False)
 class Hum:
-    """Mains hum. mains_hz: which mains, or both where they cannot be told apart [Hz].
+    """Mains hum.
 
-    frequency_hz: where it was found. amplitude: c (R, C, 4). lsb: mean amplitude of a reading.
+    mains_hz: which mains, or both where they cannot be told apart [Hz].
+    frequency_hz: where it was found [Hz].
+    amplitude: c of each reading, (R, C, 4) [LSB].
+    lsb: root mean square of the amplitudes of all readings [LSB].
     """
 
     mains_hz: tuple[float, ...]
@@ -166,51 +215,46 @@ class Hum:
 def examine_signal(
     scans: RestScans, diagnosis: Diagnosis, other: RestScans | None = None
 ) -> tuple[float, Bool]:
-    """Adds hum and noise to a diagnosis. Returns the noise of a reading without hum [LSB], and the
-    cells that changed meanwhile, (R, C).
+    """Add hum and noise. Returns the noise of a reading without hum [LSB], and which cells moved.
 
-    other: scans at another rate, which may show a hum that these hide.
+    other: a look at another scan rate. It may show a hum that stands still in the first one.
     """
     hum, hidden_hz = find_hum(scans), scans.hidden_hz
-    rest = scans.codes - scans.mean
+    without_hum = scans.codes - scans.mean
     if hum is not None:
         turn = np.exp(2j * np.pi * hum.frequency_hz * scans.time_s)
-        rest -= np.real(turn[:, None, None, None] * hum.amplitude)
-    # Differences from scan to scan: what moves slowly is no noise.
-    variance = np.mean(np.diff(rest, axis=0) ** 2, axis=0) / 2
+        without_hum -= np.real(turn[:, None, None, None] * hum.amplitude)
+    variance = noise_variance(without_hum)
     noise_lsb = float(np.median(variance.mean(axis=2)) ** 0.5)
-    moved = _moved(rest, variance)
+    diagnosis.measured["noise_lsb"] = round(noise_lsb, 3)
+    moved = _moved(without_hum, variance)
     if other is not None and hidden_hz and hum is None and not moved.any():
         hum = find_hum(other)
         hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
-    if hum is not None:
-        by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
-        # The worst cell is named if it has twice as much as others.
-        worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
-        diagnosis.add(
-            Kind.HUM,
-            Place.of_cells(worst),
-            mains_hz=hum.mains_hz,
-            amplitude_lsb=hum.lsb,
-            most_lsb=HUM_LSB,
-            rate_hz=scans.board.rate_hz,
-            seen_hz=_seen_hz(hum.frequency_hz, scans.board.rate_hz),
-        )
+    report_hum(hum, scans.board.rate_hz, diagnosis)
+    diagnosis.measured["hum_not_visible"] = list(hidden_hz)
     if len(scans.codes) >= LEAST_SCANS and not moved.any():
         _examine_noise(np.sqrt(variance.mean(axis=2)), diagnosis)
-    diagnosis.measured |= {
-        "noise_lsb": round(noise_lsb, 3),
-        "hum_lsb": 0.0 if hum is None else round(hum.lsb, 2),
-        "hum_not_visible": list(hidden_hz),
-    }
     return noise_lsb, moved
 
 
-def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
-    """What rounding leaves in the mean of many codes that scatter like this [LSB].
+def noise_variance(codes: Float) -> Float:
+    """Variance of each reading [LSB^2], from the differences between scans that follow each other.
 
-    Normal scatter of deviation s before rounding leaves a bias of up to exp(-2 pi^2 s^2) / pi, and
-    without scatter that of rounding, 1 / sqrt(12) [Widrow, Kollar: Quantization Noise, 2008].
+    Each difference has the noise of both scans. What moves slowly changes them little: it is no
+    noise.
+    """
+    return np.asarray(np.mean(np.diff(codes, axis=0) ** 2, axis=0) / 2)
+
+
+def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
+    """Deviation that rounding leaves in the mean of many codes [LSB].
+
+    scatter_lsb: deviation of the codes, rounding included.
+
+    Noise makes codes round up and down, and then their mean is better than a code. Normal noise of
+    deviation s before rounding leaves a bias of up to exp(-2 pi^2 s^2) / pi in the mean; without
+    noise, the deviation of rounding stays, 1 / sqrt(12) [Widrow, Kollar: Quantization Noise, 2008].
     """
     before = np.maximum(np.square(scatter_lsb) - 1 / 12, 0.0)
     return np.asarray(np.exp(-2 * np.pi**2 * before) / 12**0.5)
@@ -222,18 +266,19 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 def find_hum(scans: RestScans) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen.
 
-    Of two mains that are found, the one with one phase, or both.
+    If both mains are found, one of them may be an alias of the other. The right one is that whose
+    readings have one phase. If this does not decide, both are named.
     """
     if not np.ptp(scans.codes, axis=0).any():
         return None
-    seen = [_hum_at(mains_hz, scans) for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
-    hums = [hum for hum in seen if hum is not None]
+    visible_hz = [mains_hz for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
+    hums = [hum for hum in (_hum_at(mains_hz, scans) for mains_hz in visible_hz) if hum is not None]
     if len(hums) < 2:
         return hums[0] if hums else None
     offsets_s = reading_offsets_s(scans.board)
 
     def in_phase_lsb(hum: Hum) -> float:
-        """Its amplitude if all readings have one phase, less if they have not."""
+        """The part of its amplitude that has the same phase in all readings."""
         turn = np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
         return float(np.abs(np.mean(scans.amplitude(hum.frequency_hz) * turn)))
 
@@ -243,11 +288,31 @@ def find_hum(scans: RestScans) -> Hum | None:
     return replace(hums[0], mains_hz=MAINS_HZ)
 
 
-def _hum_at(mains_hz: float, scans: RestScans) -> Hum | None:
-    """Hum near one of the mains, if it matters and stands out.
+def report_hum(hum: Hum | None, rate_hz: float, diagnosis: Diagnosis) -> None:
+    """Add a hum, if there is one. rate_hz: at which the board scans."""
+    diagnosis.measured["hum_lsb"] = 0.0 if hum is None else round(hum.lsb, 2)
+    if hum is not None:
+        by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
+        # The worst cell is named if it has twice as much as others.
+        worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
+        diagnosis.add(
+            Kind.HUM,
+            Place.of_cells(worst),
+            mains_hz=hum.mains_hz,
+            amplitude_lsb=hum.lsb,
+            most_lsb=ROUNDING_LSB,
+            rate_hz=rate_hz,
+            seen_hz=_seen_hz(hum.frequency_hz, rate_hz),
+        )
 
-    A sine a is seen as c = a + m conj(a): near half the scan rate, it and its mirror image overlap
-    by m. At half the rate only a part of it is seen, half of its power on average.
+
+def _hum_at(mains_hz: float, scans: RestScans) -> Hum | None:
+    """Hum near one of the mains; None if it is too weak to matter, or does not stand out.
+
+    A sine a is seen as c = a + m conj(a), because near half the scan rate the sine and its mirror
+    image at negative frequency overlap by m. Solved for a, this gives the sine. If m is close to 1,
+    only that part of the sine is seen that happens to be at the scans' times: half of its power on
+    average.
     """
     hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=scans.power)
     power, sine = scans.power(hz), scans.amplitude(hz)
@@ -262,18 +327,21 @@ def _hum_at(mains_hz: float, scans: RestScans) -> Hum | None:
     seconds = np.ptp(scans.time_s)
     beside = np.median([scans.power(hz + far / seconds) for far in BESIDE])
     over_noise = power > of_noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
-    if lsb > HUM_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
+    if lsb > ROUNDING_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
         return Hum((mains_hz,), hz, sine, lsb)
     return None
 
 
 def _seen_hz(mains_hz: float, rate_hz: float) -> float:
-    """What one reading shows of a mains at this scan rate [Hz]."""
+    """The frequency at which one reading shows a mains at this scan rate: its alias [Hz]."""
     return abs(mains_hz - rate_hz * round(mains_hz / rate_hz))
 
 
 def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
-    """Mains that this scan rate shows too slow to tell them from drift [Hz]."""
+    """Mains whose alias at this scan rate is so slow that it looks like drift [Hz].
+
+    seconds: how long the look takes. A longer one tells slower aliases from drift.
+    """
     least_hz = STILL_HZ + 4 / max(seconds, 1e-3)
     return tuple(each for each in MAINS_HZ if _seen_hz(each, rate_hz) < least_hz)
 
@@ -281,17 +349,24 @@ def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
 # --------------------------------------------------------------------------- noise, what moves
 
 
-def _moved(rest: Float, variance: Float) -> Bool:
-    """Cells whose mean over an eighth of the scans changed by more than noise, (R, C), bool."""
-    if len(rest) < 2 * BLOCKS:
-        return np.zeros(rest.shape[1:3], dtype=np.bool_)
-    means = np.stack([block.mean(axis=0) for block in np.array_split(rest, BLOCKS)])
-    of_noise = np.sqrt(variance * BLOCKS / len(rest))
-    return np.asarray((np.ptp(means, axis=0) > MOVED_LSB + CLEAR_STDS * of_noise).any(axis=2))
+def _moved(without_hum: Float, variance: Float) -> Bool:
+    """Cells (R, C) whose mean changes from block to block of the scans by more than noise does.
+
+    without_hum: readings less their means, (N, R, C, 4). variance: of the noise of each.
+    """
+    if len(without_hum) < LEAST_SCANS:
+        return np.zeros(without_hum.shape[1:3], dtype=np.bool_)
+    means = np.stack([block.mean(axis=0) for block in np.array_split(without_hum, BLOCKS)])
+    noise_lsb = np.sqrt(variance * BLOCKS / len(without_hum))
+    return np.asarray((np.ptp(means, axis=0) > MOVED_LSB + ALL_STDS * noise_lsb).any(axis=2))
 
 
 def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
-    """Adds noisy lines, or else cells, or else the skin. cell_lsb: noise of each cell, (R, C)."""
+    """Add noisy lines; if there are none, noisy cells; if neither, a skin that is noisy all over.
+
+    A loose contact makes its whole line noisy, so the line is named and not its cells.
+    cell_lsb: noise of each cell, (R, C).
+    """
     usual = float(np.median(cell_lsb))
     limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
@@ -310,9 +385,11 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
 def second_look(board: Hello) -> dict[str, Any] | None:
     """`settle_us` and `rate_hz` of a second look; None if it could show nothing new.
 
-    The settle time is longer, where it can be; the rate is one at which no mains stands still.
+    The settle time is longer, so that readings change if they have not settled. The rate is one at
+    which no mains stands still, so that a hum shows that the first look hides.
     """
     readings = board.rows * board.columns * board.readings_per_cell
+    # A longer settle time makes slots longer, and scans slower.
     spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
     most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
     least_us = LONGER_FAR_US if board.mode == "far" else LEAST_LONGER_US
@@ -330,30 +407,33 @@ def second_look(board: Hello) -> dict[str, Any] | None:
 def examine_settling(
     usual: RestScans, settled: RestScans, diagnosis: Diagnosis, most_lsb: float = UNSETTLED_LSB
 ) -> bool:
-    """Adds to a diagnosis how means change with a longer settle time, if by more than `most_lsb`.
+    """Whether means change with a longer settle time by more than `most_lsb`, noise apart.
 
-    Returns whether they do.
+    Adds it if they do: then the usual settle time is too short.
     """
-    settle_us, longer_us = usual.board.settle_us, settled.board.settle_us
     diagnosis.measured["settling_lsb"] = 0.0
-    if longer_us <= NOT_LONGER * settle_us:
+    if settled.board.settle_us <= NOT_LONGER * usual.board.settle_us:
         return False
     change = np.abs(usual.mean - settled.mean)
     scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
     in_mean = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
-    clear = change - CLEAR_STDS * np.maximum(scatter, SETTLED_NOISE_LSB) * in_mean
+    clear = change - ALL_STDS * np.maximum(scatter, ROUNDING_LSB) * in_mean
     diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
     cells = (clear > most_lsb).any(axis=2)
     if cells.any():
         place = WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells)
-        values = settling(usual, settled, float(change.max()))
+        values = settling_values(usual, settled, float(change.max()))
         diagnosis.add(Kind.SETTLING, place, most_lsb=most_lsb, pressed=False, **values)
     return bool(cells.any())
 
 
-def settling(usual: RestScans, settled: RestScans, change_lsb: float) -> dict[str, float]:
-    """A change with a longer settle time, both times, and the one that is long enough [us]."""
-    # A node that is left with e of its swing S after a slot t settles with tau = t / ln(S / e).
+def settling_values(usual: RestScans, settled: RestScans, change_lsb: float) -> dict[str, float]:
+    """What describes a change with a longer settle time: change, both times, and the time required.
+
+    A node comes nearer to its final voltage by the factor exp(-t / tau) in each slot t. Within a
+    scan it swings by S from slot to slot, and e of that is left: tau = t / ln(S / e). It is settled
+    when half of what `UNSETTLED_LSB` allows is left, which takes tau ln(2 S / UNSETTLED_LSB).
+    """
     swing = float(np.ptp(settled.mean, axis=2).max())
     remnant = min(change_lsb, 0.9 * swing)
     slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)

@@ -11,7 +11,7 @@ n      (RC,)        deviations of what was read [ohm]
 B      (RC, RC)     slopes of the model by the cells' log resistances [ohm]
 W      (RC, 2RC)    slopes of the model by the segments' log resistances [ohm]
 y      ()           log of the wires over nominal
-u      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
+p      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
 ====== ============ =====================================================================
 
 With three corners of a rectangle pressed, (a, b) the one between the other two, (a, b') and
@@ -25,7 +25,7 @@ of column b up to the nearer of rows a and a'. So only the sum of both layers is
 taken to have changed alike. The untouched cells follow from what was read of them,
 dc = B0^-1 (z0 - W0 dy), so
 
-    r = z1 - B1 B0^-1 z0 = W dy + B1 du + noise ,   W = W1 - B1 B0^-1 W0
+    r = z1 - B1 B0^-1 z0 = W dy + B1 dp + noise ,   W = W1 - B1 B0^-1 W0
 
     S = n1^2 + B1 B0^-1 n0^2 B0^-T B1^T + SEGMENT_STD^2 W W^T + B1 V B1^T
 
@@ -44,51 +44,70 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit, current_std
-from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
-from ohmskin.doctor.signal import Rest, RestScans, rounding_std_lsb, settling
+from ohmskin.doctor.findings import FEW_STDS, WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
+from ohmskin.doctor.signal import Rest, RestScans, rounding_std_lsb, settling_values
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import SEGMENT_STD, UNLIMITED_STD
+from ohmskin.estimate.prior import MAX_ITERATIONS, SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ADC_BITS
 
 Corners = tuple[Cell, Cell, Cell]
 
-# What is told. Shares are over nominal; deviations are those of their logs.
-KNOWN: Final = 0.15  # [share] A deviation above this is too close to a change to tell the share.
-CHANGED: Final = 0.25  # [share] Estimators expect smaller changes of the wires anyway.
-CLEAR_STDS: Final = 3.5  # [deviations] By chance, no share of presses differs by this.
+# What counts as a change. Shares are over nominal; deviations are those of their logs.
+# [share] A larger deviation is too close to CHANGED_SHARE to say what the resistance is. Chosen.
+KNOWN_STD: Final = 0.15
+# [share] Wires that differ by less from what they should be are no fault. Chosen: estimators expect
+# changes of LAYER_STD anyway.
+CHANGED_SHARE: Final = 0.25
 
 # Standard deviations before the readings.
-BEFORE_STD: Final = 2.0  # [log] All wires may have changed by a factor of seven.
-DRIFT_STD: Final = 0.01  # [log] An untouched cell drifts by this in the seconds since it was read.
+# [log] All wires may have changed by a factor of seven. Chosen: readings decide.
+BEFORE_STD: Final = 2.0
+# [log] An untouched cell drifts by this in the seconds since rest was read. Chosen.
+DRIFT_STD: Final = 0.01
 
 # Presses.
-PRESS_S: Final = 1.0  # [s] Corners are held this long, so that scans even the noise out.
-PRESSED_SIEMENS: Final = 2e-5  # [S] A firm press conducts more: 20 times a cell at rest.
-FOURTH_SHARE: Final = 0.5  # [1] No other cell conducts more than this share of the weakest corner.
-HELD_SHARE: Final = 0.5  # [1] Corners with less than this share of the most scans were passed by.
-LEAST_HELD: Final = 5  # [scans] Fewer scans of a look at pressed corners do not count.
-PRESSED_LSB: Final = 4.0  # [LSB] A firm press shows some 400: a change by 1 % of it is no fault.
-MOST_STEPS: Final = 20  # [steps] A fit that converges takes fewer.
-LONGEST_STEP: Final = 1.0  # [log] The slopes do not hold for longer steps.
-CLOSE: Final = 1e-4  # [log] A step that is shorter changes nothing: deviations are longer.
+# [s] Corners are held this long. Chosen: a mean of 90 scans has a tenth of their noise.
+PRESS_S: Final = 1.0
+# [S] A firm press conducts more. Chosen: 20 times a cell at rest.
+PRESSED_SIEMENS: Final = 2e-5
+# [1] No other cell conducts more than this share of the weakest corner: else it is pressed, too.
+# Chosen.
+FOURTH_SHARE: Final = 0.5
+# [1] Corners with less than this share of the most scans were pressed in passing. Chosen.
+HELD_SHARE: Final = 0.5
+# [scans] Fewer scans of a look at pressed corners do not count. Chosen: the hand moved in it.
+LEAST_HELD: Final = 5
+# [LSB] Readings of pressed corners that change by more have not settled. Chosen: a firm press shows
+# some 400, and 1 % of that is no fault.
+PRESSED_LSB: Final = 4.0
+
+# The fit. It takes at most MAX_ITERATIONS steps, as those of estimators.
+# [log] No step is longer: slopes do not hold further away. Chosen.
+LONGEST_STEP: Final = 1.0
+# [log] The step that is shorter is the last. Chosen: far below any deviation.
+CLOSE_STEP: Final = 1e-4
 
 
 def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Float, Float, Float]:
-    """Port resistances of readings (R, C, 4), their deviations, and log resistances of the cells.
+    """Port resistances [ohm], their deviations [ohm], log resistances of the cells; (RC,) each.
 
-    std_lsb: deviation of a port's reading, one for all or (R, C). All (RC,) [ohm]. The currents are
-    those that estimators use: without the converter's offset, and what floating lines draw.
+    ratio: mean readings, (R, C, 4).
+    std_lsb: deviation of a port's reading, one for all or (R, C).
+    matrix: the method by that name, which knows the references.
+
+    The currents are those that estimators use: the converter's offset and what floating lines draw
+    are taken out of them.
     """
-    known = matrix.knowledge
-    loop_ohm = (1 / np.maximum(PortReader(known).read(ratio).current, 1e-9)).ravel()
-    std_siemens = current_std(2.0**-ADC_BITS, known.ref_top_ohm, known.ref_bottom_ohm)
+    skin = matrix.knowledge
+    loop_ohm = (1 / np.maximum(PortReader(skin).read(ratio).current, 1e-9)).ravel()
+    std_siemens = current_std(2.0**-ADC_BITS, skin.ref_top_ohm, skin.ref_bottom_ohm)
     log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
-    return loop_ohm - known.ref_ohm, std_siemens * np.ravel(std_lsb) * loop_ohm**2, log_ohm
+    return loop_ohm - skin.ref_ohm, std_siemens * np.ravel(std_lsb) * loop_ohm**2, log_ohm
 
 
 def suggested_corners(rows: int, columns: int) -> Corners:
@@ -103,7 +122,10 @@ def suggested_corners(rows: int, columns: int) -> Corners:
 
 
 def moved_across(corners: Corners) -> Corners:
-    """The same, with the corner between the others moved to the fourth: it shows other wires."""
+    """The other two with the fourth corner, in place of the one between them.
+
+    The currents then go through other wires.
+    """
     _, beside, below = corners
     return (below[0], beside[1]), below, beside
 
@@ -125,11 +147,13 @@ def pressed_corners(siemens: Float) -> Corners | None:
 
 
 class CornerScans:
-    """Scans of a skin on which somebody presses three corners, and then has moved one across.
+    """Scans while somebody presses three corners of a rectangle, and then moves one across.
 
-    wanted: the corners to press next. pressed: all cells that the last scan shows pressed. hold:
-    these are corners that are to be held still. again: the first corners are done. done: so are the
-    second.
+    wanted: the corners to press next.
+    pressed: all cells that the last scan shows pressed.
+    hold: whether these are three corners, which should be held still until they have been read.
+    again: whether the first three corners have been read.
+    done: whether the second three have been read, too.
 
     :raises ValueError: a skin of one row or column has no rectangle.
     """
@@ -166,9 +190,10 @@ class CornerScans:
     def examine_settling(
         self, looks: Sequence[tuple[Hello, list[Scan]]], diagnosis: Diagnosis
     ) -> None:
-        """Add how readings change with a longer settle time while the same corners are pressed.
+        """Add a finding if readings of pressed corners change with a longer settle time.
 
-        looks: by turns as usual and with the longer time, so that what drifts does not count.
+        looks: by turns as usual and with the longer time. A hand drifts alike in both, and the
+        scatter among looks of one kind shows by how much.
         """
         means: defaultdict[Corners, list[list[Float]]] = defaultdict(lambda: [[], []])
         for turn, (_, scans) in enumerate(looks):
@@ -179,43 +204,48 @@ class CornerScans:
             for corners, held in codes.items():
                 if len(held) >= LEAST_HELD:
                     means[corners][turn % 2].append(np.mean(held, axis=0))
-        both = [each for each in means.values() if min(map(len, each)) >= 2]
-        first = [RestScans.of(*look) for look in looks[:2]]
-        if not both or first[0] is None or first[1] is None:
+        in_both = [of_corners for of_corners in means.values() if min(map(len, of_corners)) >= 2]
+        if not in_both:
+            return
+        usual, settled = (RestScans.of(*look) for look in looks[:2])
+        if usual is None or settled is None:
             return
         changes = []
-        for each in both:
-            before, after = (np.mean(held, axis=0) for held in each)
-            scatter = np.sum([np.var(held, axis=0, ddof=1) / len(held) for held in each], axis=0)
+        for of_corners in in_both:
+            before, after = (np.mean(turns, axis=0) for turns in of_corners)
+            variance = sum(np.var(turns, axis=0, ddof=1) / len(turns) for turns in of_corners)
             change = np.abs(after - before).max()
-            changes.append((change - CLEAR_STDS * scatter.max() ** 0.5, change))
+            changes.append((change - FEW_STDS * np.max(variance) ** 0.5, change))
         clear, most = map(float, max(changes))
         diagnosis.measured["settling_pressed_lsb"] = round(max(clear, 0.0), 2)
         if clear > PRESSED_LSB:
-            others = [each for each in diagnosis.findings if each.kind is not Kind.SETTLING]
-            diagnosis.findings = others
-            values = settling(first[0], first[1], most)
-            diagnosis.add(Kind.SETTLING, most_lsb=PRESSED_LSB, pressed=True, **values)
+            values = settling_values(usual, settled, most)
+            diagnosis.add(Kind.SETTLING_PRESSED, most_lsb=PRESSED_LSB, pressed=True, **values)
 
     def measure(self, rest: Rest) -> list[WireShare]:
-        """The share of both layers, then that of each row and column; none if none was pressed."""
+        """The share of all wires, then that of each row and column; empty if none was pressed."""
         at_rest = _ports(rest.ratio, rest.std_lsb, self._matrix)
         most = max(map(len, self._codes.values()), default=0)
-        found = []
+        measured = []
         for corners, codes in self._codes.items():
             if len(codes) < HELD_SHARE * most:
                 continue
-            # A hand trembles: that evens rounding out, and is no noise, as all readings follow it.
+            # A hand trembles. This evens rounding out. But it is no noise of the mean, because all
+            # readings follow it alike.
             scatter_lsb = np.maximum(np.std(codes, axis=0), rest.noise_lsb)
             variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1)
             std_lsb = np.sqrt(variance + rest.noise_lsb**2 / len(codes))
             ratio = ratio_from_codes(np.mean(codes, axis=0), self._board.adc_bits)
             pressed, free = _ports(ratio, std_lsb, self._matrix), self._free(corners)
-            found.append((corners[0], *_pressed_fit(at_rest, pressed, free, rest.wire_ohm)))
-        return shares_of(found)
+            measured.append((corners[0], *_pressed_fit(at_rest, pressed, free, rest.wire_ohm)))
+        return shares_of(measured)
 
     def _free(self, corners: Corners) -> Bool:
-        """Cells that may be pressed, (R, C): the corners and those around, but for the fourth's."""
+        """Cells that may be pressed, (R, C): three corners with their neighbours.
+
+        The neighbours of the fourth corner are not among them: they may be neighbours of another
+        one, too, but if all four places could be pressed, nothing would tell the wires.
+        """
         rows, columns = np.indices((self._board.rows, self._board.columns))
         *near, near_fourth = (
             np.maximum(np.abs(rows - row), np.abs(columns - column)) <= 1
@@ -226,37 +256,44 @@ class CornerScans:
         return np.asarray(free)
 
 
-def shares_of(found: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
+def shares_of(measured: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
     """The share of all wires that were seen, if any, then that of each row and column.
 
-    found: row and column, y, and its deviation. All wires together are the mean by precision; the
-    others tell a change only where this mean does not explain them.
+    measured: row and column of the corner between the others, y, and the deviation of y.
+
+    All wires together are the mean by precision. If this mean explains each of them, only the mean
+    can be a finding; if not, only single rows and columns can.
     """
-    if not found:
+    if not measured:
         return []
-    y, std = (np.array([each[at] for each in found]) for at in (1, 2))
+    y, std = (np.array([one[at] for one in measured]) for at in (1, 2))
     mean, mean_std = float(np.average(y, weights=std**-2.0)), float(np.sum(std**-2.0) ** -0.5)
-    alike = bool(np.all(np.abs(y - mean) < CLEAR_STDS * std))
+    alike = bool(np.all(np.abs(y - mean) < FEW_STDS * std))
 
-    def share(y: float, std: float, tells: bool, place: Place = WHOLE_SKIN) -> WireShare:
-        clear = abs(y) > max(float(np.log(1 + CHANGED)), CLEAR_STDS * std)
-        known, times = std <= KNOWN, float(np.exp(y))
-        return WireShare(place, times, times * std, known, tells and known and clear)
+    def share(y: float, std: float, may_differ: bool, place: Place = WHOLE_SKIN) -> WireShare:
+        clear = abs(y) > max(float(np.log(1 + CHANGED_SHARE)), FEW_STDS * std)
+        is_known, times = std <= KNOWN_STD, float(np.exp(y))
+        return WireShare(place, times, times * std, is_known, may_differ and is_known and clear)
 
-    each = [share(y, std, not alike, Place((row,), (column,))) for (row, column), y, std in found]
-    return [share(mean, mean_std, alike), *each]
+    lines = [share(y, std, not alike, Place((row,), (col,))) for (row, col), y, std in measured]
+    return [share(mean, mean_std, alike), *lines]
 
 
 def _pressed_fit(
     rest: tuple[Float, ...], pressed: tuple[Float, ...], free: Bool, wire_ohm: tuple[float, float]
 ) -> tuple[float, float]:
-    """y and its deviation. rest, pressed: what `_ports` gives."""
+    """y and its deviation: how the wires differ from nominal ones, by pressed corners.
+
+    rest, pressed: what `_ports` gives of the untouched and of the pressed skin.
+    free: which cells may be pressed, (R, C).
+    wire_ohm: nominal wires of a segment, top and bottom.
+    """
     shape, free = free.shape, free.ravel()
     (rest_ohm, rest_std, untouched), (port_ohm, port_std, touched) = rest, pressed
     log_share = 0.0
     lift = np.where(free, touched - untouched, 0.0)
     variance = np.where(free, UNLIMITED_STD, DRIFT_STD) ** 2
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_ITERATIONS):
         top, bottom = (np.full(shape, ohm * np.exp(log_share)) for ohm in wire_ohm)
         before, now = (
             PortCircuit(np.exp(-cell).reshape(shape), top, bottom)
@@ -274,14 +311,14 @@ def _pressed_fit(
         covariance = spread @ by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
         covariance += (through * rest_std**2) @ through.T + np.diag(port_std**2)
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
-        known = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
+        precision = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
         pull = float(slopes @ weighed[:, 1]) - log_share * BEFORE_STD**-2
-        step = float(np.clip(pull / known, -LONGEST_STEP, LONGEST_STEP))
+        step = float(np.clip(pull / precision, -LONGEST_STEP, LONGEST_STEP))
         log_share += step
         untouched = untouched + at_rest @ (off_rest - step * by_rest_wires.sum(axis=1))
-        more = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
-        lift += np.where(free, np.clip(more, -LONGEST_STEP, LONGEST_STEP), 0.0)
-        if abs(step) < CLOSE:
+        lift_step = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
+        lift += np.where(free, np.clip(lift_step, -LONGEST_STEP, LONGEST_STEP), 0.0)
+        if abs(step) < CLOSE_STEP:
             break
     misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
-    return log_share, (max(misfit, 1.0) / known) ** 0.5
+    return log_share, (max(misfit, 1.0) / precision) ** 0.5
