@@ -60,7 +60,6 @@ from ohmskin.estimate.prior import REST_STD, SEGMENT_STD, UNKNOWN_LAYER_STD
 from ohmskin.link.codes import quantise, ratio_from_codes, ratio_std
 from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.record.readings import Readings, estimate_file
-from studies.far import seen
 from studies.information import PRESSED_STD
 from studies.trials import (
     PRESSED,
@@ -157,7 +156,10 @@ def times() -> dict[str, float]:
         "finger": [finger_trial(8, 8, 150, SEED + n) for n in range(4)],
     }
     for kind, trials in of_kind.items():
-        read = [{mode: seen(trial, mode, 10) for mode in MODES} for trial in trials]
+        read = [
+            {mode: trial.rounded(10, mode=mode, wires_told=False) for mode in MODES}
+            for trial in trials
+        ]
         for method in METHODS:
             passes = [[seconds(each, method) for each in read] for _ in range(PASSES)]
             taken = np.min([np.concatenate(each) for each in passes], axis=0)
@@ -194,7 +196,7 @@ def wires(mode: str, method: str, kinds: Sequence[tuple[float, float]]) -> float
     off = []
     for wire_ohm, number in itertools.product(kinds, range(6)):
         trial = wire_trial(wire_ohm, number)
-        out = estimate_file(seen(trial, mode, 10), method)
+        out = estimate_file(trial.rounded(10, mode=mode, wires_told=False), method)
         truth = trial.rest.top_wire_ohm, trial.rest.bottom_wire_ohm
         for name, ohm in zip(("top_wire_ohm", "bottom_wire_ohm"), truth, strict=True):
             off.append(np.abs(out[name][-1] / ohm - 1).ravel())
@@ -251,7 +253,7 @@ def curves(trial: Trial, mode: str, method: str) -> tuple[Float, Float]:
             pressed.flat[cell] += siemens
             frames.append(replace(rest, cell_siemens=pressed))
         force.append(np.full((rows, columns), np.log(force_n(siemens))))
-    read = seen(trial_of(rest, frames), mode, 10)
+    read = trial_of(rest, frames).rounded(10, mode=mode, wires_told=False)
     found = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
     own = found.reshape(-1, rows * columns, rows * columns).diagonal(axis1=1, axis2=2)
     rise = own.reshape(-1, rows, columns) - rest.cell_siemens
@@ -276,8 +278,8 @@ def bent(mode: str, method: str) -> dict[str, float]:
         curve, rest = curves(trial, mode, method), trial.rest.cell_siemens
         true_n = force_n(trial.cell_siemens - rest)
         for factor, found in off.items():
-            frames = tuple(stretched(skin, factor) for skin in trial.frames)
-            read = seen(replace(trial, frames=frames), mode, 10)
+            frames = [stretched(skin, factor) for skin in trial.frames]
+            read = trial_of(trial.rest, frames).rounded(10, mode=mode, wires_told=False)
             siemens = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
             force = by_curve(siemens - rest, curve)
             found.append(np.abs(force / np.where(trial.pressed, true_n, 1) - 1)[trial.pressed])

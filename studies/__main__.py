@@ -6,8 +6,7 @@ from __future__ import annotations
 import typer
 
 from ohmskin.cli.main import run
-from studies.commands import ablate, chart, far, stability
-from studies.force_commands import experiment
+from studies.commands import ablate, chart, experiment, far, stability
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -13,7 +13,7 @@ error_p90    the same, 90th percentile
 sum_p90      |sum of a frame's rise over the true sum - 1|, 90th percentile
 outside      share of all cells further from the truth than 4 stated deviations
 alarm        share of frames that are not converged
-wrong        share of frames that are wrong and not flagged, see `stability.verdict`
+wrong        share of frames that are wrong and not flagged, see `judge.verdict`
 not_right    share of frames that are not right, likewise
 stated       relative deviation that is stated of pressed cells, median: for information
 ms           time a frame, median [ms]: for information
@@ -28,18 +28,15 @@ a single figure says is to be tried again, on more skins.
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass
 from functools import lru_cache
 from inspect import get_annotations
 from typing import Final
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from rich.table import Table
 from threadpoolctl import threadpool_limits
@@ -47,6 +44,7 @@ from threadpoolctl import threadpool_limits
 from ohmskin.arrays import Float
 from ohmskin.estimate import full_fit, joint, prior, sparse_fit
 from studies.ablate_scenes import SCENES, Plan, Run, Sample, observe
+from studies.rows import Progress, as_csv, field_names, in_processes
 
 MODULES: Final = (prior, full_fit, sparse_fit, joint)
 # What makes a constant do nothing, or, of a deviation, what is all but certain: 0 would divide.
@@ -83,9 +81,14 @@ FIGURES: Final[dict[str, tuple[str, float | None]]] = {
     "ms": ("ms", 0.5),
 }
 INFORMATIVE: Final = ("stated", "ms")
+# How often skins are drawn anew. Chosen: the ends of the middle 95 % are then those of 25 draws.
 RESAMPLES: Final = 1000
+# The least relative change of a figure that is called significant. Chosen: less is not worth a
+# constant.
 LEAST_CHANGE: Final = 0.03
-LEAST_SHARE: Final = 1e-3  # added to shares that are compared: less is as good as none
+# What is added to shares before they are compared. Chosen: one frame in a thousand is as good as
+# none, and a ratio needs a number above 0.
+LEAST_SHARE: Final = 1e-3
 
 # ------------------------------------------------------------------------------------- constants
 
@@ -175,8 +178,14 @@ def resampled(values: Float, skins: NDArray[np.intp], quantile: float | None) ->
 class Row:
     """One figure of one variant: a line of the CSV.
 
-    ratio: of `changed` over `base`, both with `LEAST_SHARE` added if they are shares; low, high:
-    the middle 95 % of it over the resamples.
+    constant, value: its label, and its value as it is.
+    variant, tried: "off", "halved" or "doubled", and the value tried.
+    scene, method: the frames, and what read them.
+    figure: its name, as in the module's table.
+    base, changed: the figure with the constant as it is, and with the variant.
+    ratio: `changed` over `base`, both with `LEAST_SHARE` added if they are shares.
+    low, high: the middle 95 % of the ratio over the resamples.
+    significant: whether the ratio is.
     """
 
     constant: str
@@ -215,11 +224,16 @@ def _figures(sample: Sample) -> dict[str, Float]:
     }
 
 
-def compare(scene: str, method: str, constant: Constant, plan: Plan) -> list[Row]:
+# A scene, a method, a constant, and how many frames there are.
+Task = tuple[str, str, Constant, Plan]
+
+
+def compare(task: Task) -> list[Row]:
     """All figures of all variants of a constant, computed in one thread.
 
-    Figures that do not change have no row, but for the time.
+    Figures that do not change have no row. The time always changes.
     """
+    scene, method, constant, plan = task
     rows = []
     with threadpool_limits(limits=1):
         runs, _, figures = _as_it_is(scene, method, plan)
@@ -260,27 +274,20 @@ def measure(
     *,
     scenes: Iterable[str] = tuple(SCENES),
     jobs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[Row]:
     """Compare all these constants on all scenes: rows in the order of both.
 
-    jobs: processes, -1 for one a core. progress: called with the tasks done and all tasks. The
-    figures, but for the time, depend neither on jobs nor on which constants are tried.
+    jobs: processes, as `in_processes` takes them. progress: called after each task. The figures,
+    but for the time, depend neither on jobs nor on which constants are tried.
     """
-    tasks = [
+    tasks: list[Task] = [
         (scene, method, constant, plan)
         for scene in scenes
         for method in SCENES[scene].methods
         for constant in tried
     ]
-    rows: list[Row] = []
-    parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
-    # Closed on whatever way out, so that no process goes on without a reader.
-    with closing(parallel(delayed(compare)(*task) for task in tasks)) as answers:
-        for done, found in enumerate(answers, start=1):
-            rows += found
-            if progress is not None:
-                progress(done, len(tasks))
+    rows = [row for part in in_processes(compare, tasks, jobs, progress) for row in part]
     labels, names = [constant.label for constant in tried], list(SCENES)
     # Stable: variants and figures stay in their order.
     return sorted(
@@ -293,15 +300,7 @@ def measure(
 
 def csv_text(rows: Iterable[Row]) -> str:
     """A line for each row, numbers with five digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in fields(Row)])
-    for row in rows:
-        each = astuple(row)
-        writer.writerow(
-            [f"{x:.5g}" if isinstance(x, float) else x for x in each[:-1]] + [each[-1] * 1]
-        )
-    return text.getvalue()
+    return as_csv(field_names(Row), map(astuple, rows), digits=5)
 
 
 def _extremes(rows: Iterable[Row], constant: str, variant: str) -> str:
@@ -315,18 +314,19 @@ def _extremes(rows: Iterable[Row], constant: str, variant: str) -> str:
 
 def summary(rows: Sequence[Row], tried: Iterable[Constant]) -> Table:
     """A row a constant, and what each variant of it does most, for a terminal."""
+    variants = ("off", "halved", "doubled")
     table = Table(box=None, title="worst loss, best gain: significant ones")
-    for heading in ("constant", "value", "off", "halved", "doubled"):
+    for heading in ("constant", "value", *variants):
         table.add_column(heading)
     for constant in tried:
-        words = [_extremes(rows, constant.label, each) for each in ("off", "halved", "doubled")]
+        words = [_extremes(rows, constant.label, variant) for variant in variants]
         table.add_row(constant.label, f"{constant.value:.4g}", *words)
     return table
 
 
 def moved(rows: Iterable[Row], tried: Iterable[Constant]) -> dict[str, int]:
     """How many figures each constant changes significantly, over all its variants."""
-    found = {constant.label: 0 for constant in tried}
+    counts = {constant.label: 0 for constant in tried}
     for row in rows:
-        found[row.constant] += row.significant
-    return found
+        counts[row.constant] += row.significant
+    return counts

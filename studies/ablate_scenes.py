@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 from typing import Final
 
@@ -25,21 +24,36 @@ from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import ADC_BITS
-from ohmskin.record.readings import Readings, load_readings
+from ohmskin.record.readings import Readings
 from studies.conditions import SWEEPS, Frame, converted
-from studies.stability import STATED_STDS, Verdict, verdict
-from studies.trials import PRESSED, Trial, finger_trial, jump_trial, random_trial
+from studies.judge import STATED_STDS, Verdict, answers_of, judge, verdict
+from studies.trials import (
+    NOISE_LSB,
+    Trial,
+    finger_trial,
+    jump_trial,
+    random_trial,
+    reference_trial,
+    rounded,
+    without_wires,
+)
 
-DATA: Final = Path(__file__).parents[1] / "tests" / "data"
-NOISE_LSB: Final = 0.3  # before the converter
-PIECES: Final = 10  # of a file's frames
-MOST_ERROR: Final = 1e3  # relative: no answer, or one without a limit, counts as so much
+# A file has one skin. Its frames are cut into so many pieces, which stand for skins when figures
+# are resampled. Chosen: a file has as few as eight frames.
+PIECES: Final = 10
+# The relative error that counts for no answer, or for one without a limit. Chosen: far above all
+# others, and finite, because medians of it are compared.
+MOST_ERROR: Final = 1e3
 BOTH: Final = ("joint", "touch")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Simulated skins of 8x8, frames of each; fewer of larger ones, and under each condition."""
+    """How much is read of 8x8 skins; there is less of larger ones, and under each condition.
+
+    skins: simulated skins of each kind.
+    frames: of each skin.
+    """
 
     skins: int = 12
     frames: int = 8
@@ -47,10 +61,12 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Frames in order, and what is told of their skin.
+    """Frames of one skin.
 
-    rest_siemens: (R, C) [S]; None: only the verdict is of interest. pieces: how many parts the
-    frames have that count as a skin each.
+    knowledge: what the estimator is told.
+    frames: in the order in which they are read.
+    rest_siemens: the untouched cells, (R, C) [S]; None: only the verdict is of interest.
+    pieces: how many parts the frames have that count as a skin each.
     """
 
     knowledge: SkinKnowledge
@@ -68,50 +84,47 @@ def _of_readings(
 
 def _file(name: str, plan: Plan) -> list[Run]:
     """All of a file's frames, or as many as all skins of a small plan have, evenly spaced."""
-    readings = load_readings(DATA / f"{name}.npz")
-    assert readings.rest_ratio is not None
-    most = min(plan.skins * plan.frames, len(readings.ratio))
-    picked = np.linspace(0, len(readings.ratio) - 1, most).round().astype(int)
-    with np.load(DATA / f"{name}.npz") as truth:
-        cells, rest = 1 / truth["cell_ohm"][picked], 1 / truth["rest_ohm"]
-    ratio, rest_ratio = converted(readings.ratio[picked]), converted(readings.rest_ratio)
-    readings = replace(readings, ratio=ratio, rest_ratio=rest_ratio, adc_bits=ADC_BITS)
+    trial = reference_trial(name)
+    most = min(plan.skins * plan.frames, len(trial.frames))
+    picked = np.linspace(0, len(trial.frames) - 1, most).round().astype(int)
+    readings = rounded(replace(trial.readings, ratio=trial.readings.ratio[picked]))
+    cells, rest = trial.cell_siemens[picked], trial.rest.cell_siemens
     return [_of_readings(readings, cells, rest, min(PIECES, most))]
 
 
 def _simulated(
     make: Callable[[int, int], Trial],
     plan: Plan,
-    told: bool = True,
-    rested: bool = True,
+    wires_told: bool = True,
+    rest_told: bool = True,
     fewer: int = 1,
 ) -> list[Run]:
-    """make: a trial from a number of frames and a seed. told, rested: of wires, rest readings."""
-    found = []
+    """make: a trial from a number of frames and a seed. fewer: a part of the skins and frames."""
+    runs = []
     for seed in range(max(2, plan.skins // fewer)):
         trial = make(max(2, plan.frames // fewer), seed)
         random = np.random.default_rng([seed, 1])
-        exact = trial.readings
+        exact = trial.readings if wires_told else without_wires(trial.readings)
         assert exact.rest_ratio is not None
         rest_ratio = converted(exact.rest_ratio, random, NOISE_LSB)
-        ratio = converted(exact.ratio, random, NOISE_LSB)
         readings = replace(
-            exact, ratio=ratio, rest_ratio=rest_ratio if rested else None, adc_bits=ADC_BITS
+            exact,
+            ratio=converted(exact.ratio, random, NOISE_LSB),
+            rest_ratio=rest_ratio if rest_told else None,
+            adc_bits=ADC_BITS,
         )
-        if not told:
-            readings = replace(readings, nominal_top_wire_ohm=None, nominal_bottom_wire_ohm=None)
-        found.append(_of_readings(readings, trial.cell_siemens, trial.rest.cell_siemens))
-    return found
+        runs.append(_of_readings(readings, trial.cell_siemens, trial.rest.cell_siemens))
+    return runs
 
 
 def _conditions(conditions: Sequence[tuple[str, float | str]], plan: Plan) -> list[Run]:
-    found = []
+    runs = []
     for sweep, x in conditions:
         for skin in range(max(2, plan.skins // 4)):
             random = np.random.default_rng([zlib.crc32(f"{sweep} {x}".encode()), skin])
             case = SWEEPS[sweep].build(x, (8, 8), max(2, plan.frames // 2), random)
-            found.append(Run(case.knowledge, case.frames))
-    return found
+            runs.append(Run(case.knowledge, case.frames))
+    return runs
 
 
 # Conditions under which frames were wrong and not flagged, and neighbours of these.
@@ -139,9 +152,9 @@ SCENES: Final = {
     "16x16": Scene(partial(_simulated, partial(random_trial, 16, 16, 10), fewer=2)),
     "extremes": Scene(partial(_conditions, EXTREMES)),
     "faults": Scene(partial(_conditions, FAULTS)),
-    "no_rest": Scene(partial(_simulated, partial(random_trial, 8, 8, 10), rested=False)),
+    "no_rest": Scene(partial(_simulated, partial(random_trial, 8, 8, 10), rest_told=False)),
     "fingers": Scene(partial(_simulated, partial(finger_trial, 8, 8))),
-    "fingers_untold": Scene(partial(_simulated, partial(finger_trial, 8, 8), told=False)),
+    "fingers_untold": Scene(partial(_simulated, partial(finger_trial, 8, 8), wires_told=False)),
     "random": Scene(partial(_simulated, partial(random_trial, 8, 8, 10))),
     "jump": Scene(partial(_simulated, partial(jump_trial, 8, 8, 10))),
     **{
@@ -156,7 +169,11 @@ SCENES: Final = {
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What one method did: values (n,) of each kind, and the number of the skin of each, (n,)."""
+    """What one method did.
+
+    values: (n,) of each kind.
+    skins: the number of the skin that each value is of, (n,).
+    """
 
     values: dict[str, Float]
     skins: dict[str, NDArray[np.intp]]
@@ -172,15 +189,15 @@ def observe(runs: Iterable[Run], method: str) -> Sample:
         for number, frame in enumerate(run.frames):
             if frame.afresh:
                 estimator.reset()
-            found, started_s = None, perf_counter()
+            estimate, started_s = None, perf_counter()
             # A variant may raise whatever it likes: `_judged` counts it.
             with suppress(Exception), np.errstate(all="ignore"):
-                found = estimator.estimate(frame.ratio)
+                estimate = estimator.estimate(frame.ratio)
             taken_ms = 1e3 * (perf_counter() - started_s)
             if frame.cell_siemens is None:
                 continue
             skin = first_skin + number * run.pieces // len(run.frames)
-            judged = _judged(found, frame.cell_siemens, run.rest_siemens)
+            judged = _judged(estimate, frame.cell_siemens, run.rest_siemens)
             for kind, of_frame in {**judged, "ms": np.array([taken_ms])}.items():
                 values[kind].append(of_frame)
                 skins[kind] += [skin] * of_frame.size
@@ -191,27 +208,29 @@ def observe(runs: Iterable[Run], method: str) -> Sample:
     )
 
 
-def _judged(found: Estimate | None, true: Float, rest: Float | None) -> dict[str, Float]:
-    """Values of one frame, by kind. true, rest: (R, C) [S]."""
-    if rest is None:
-        said = Verdict.FLAGGED
-        if found is not None:
-            said = verdict(found.cell_siemens, found.cell_siemens_std, found.converged, true)
-        is_wrong = said is Verdict.WRONG_UNFLAGGED
-        return {"wrong": np.array([is_wrong * 1.0]), "not_right": np.array([said != "right"]) * 1.0}
-    cells, std, alarm = rest, np.zeros_like(rest), True
-    if found is not None:
-        cells, std, alarm = found.cell_siemens, found.cell_siemens_std, not found.converged
-    pressed = true > PRESSED * rest
-    off = np.abs(cells - true)
-    sums = [(cells - rest).sum() / (true - rest).sum() - 1] if pressed.any() else []
+def _judged(
+    estimate: Estimate | None, true_siemens: Float, rest_siemens: Float | None
+) -> dict[str, Float]:
+    """Values of one frame, by kind. None: the variant has raised, or only the verdict matters."""
+    if rest_siemens is None:
+        said = verdict(estimate, true_siemens)
+        of_frame = {"wrong": said is Verdict.WRONG_UNFLAGGED, "not_right": said != Verdict.RIGHT}
+        return {kind: np.array([1.0 * value]) for kind, value in of_frame.items()}
+    answers = {
+        "cell_siemens": rest_siemens[None],
+        "cell_siemens_std": np.zeros((1, *rest_siemens.shape)),
+    }
+    if estimate is not None:
+        answers = dict(answers_of([estimate]))
+    judged = judge(answers, true_siemens[None], rest_siemens)
+    is_pressed = judged.relative.size > 0
     return {
-        "error": _bounded((off / true)[pressed]),
-        "sum": _bounded(np.abs(sums)),
+        "error": _bounded(judged.relative),
+        "sum": _bounded(np.abs(judged.rise_share - 1)[: int(is_pressed)]),
         # Written so that NaN is outside.
-        "outside": ~(off <= STATED_STDS * std).ravel() * 1.0,
-        "alarm": np.array([alarm * 1.0]),
-        "stated": _bounded((std / true)[pressed]),
+        "outside": (~(judged.deviations <= STATED_STDS)).astype(np.float64),
+        "alarm": (~judged.converged).astype(np.float64),
+        "stated": _bounded(judged.stated),
     }
 
 

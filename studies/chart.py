@@ -3,44 +3,42 @@
 
 Simulation, all of it. Every method gets the same frames of the same random skins (`trials`), in
 order, each started from the one before; the first few of each skin are not counted. The paper's two
-sweeps are added, each frame from a cold start, and what decided for NumPy against CasADi in
-`joint` (`casadi_circuit`). With one thread, whatever the libraries would take.
+sweeps are added, each frame from a cold start. With one thread, whatever the libraries would take.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.methods import METHODS
 from ohmskin.record.readings import estimate_file
-from studies import casadi_circuit, published
-from studies.far import seen
+from studies import published
 from studies.information import information_limit
+from studies.judge import Judged, judge_trial, pooled
+from studies.rows import Progress, as_csv, field_names, text_table
 from studies.trials import PAPER_METHODS, Trial, random_trial, trial_of
 
-# The paper's methods take 0.1 s a frame with 9 cells, up to 16 s with 16 and a minute with 64.
+# The paper's methods read skins of so many cells at most: a frame of 9 takes them 0.1 s, one of 16
+# up to 16 s, one of 64 a minute.
 PAPER_CELLS: Final = 9
-TAIL: Final = 0.9  # the quantile beside each median
+TAIL: Final = 0.9  # the quantile beside each median. Chosen: the worst frame of ten.
 RANDOM: Final = "random"
 FAR: Final = "random, far ends"  # both ends of all lines are sensed: another board
 FAR_METHODS: Final = ("joint", "touch")
 BOARD: Final = "board"  # the paper's own skin
-LINEARISATION: Final = "linearisation"
 MEASURED: Final = "measured"
 PAPER: Final = "Su2024"
 # |z| of a normal z, in equal steps of probability.
 _NORMAL: Final[Float] = np.abs([NormalDist().inv_cdf((k + 0.5) / 400) for k in range(400)])
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -61,9 +59,13 @@ class Size:
 class Plan:
     """What is measured.
 
-    bits: of the readings, None: exact. skins: of each size; frames: of each skin, of which the
-    first `warm_up` are not counted. repeats: of each frame of the paper's sweeps, one more is not
-    counted.
+    skins: of each size.
+    frames: of each skin, those of the warm-up among them.
+    warm_up: how many frames of each skin are not counted.
+    repeats: of each frame of the paper's sweeps; one more is not counted.
+    sizes: of the random skins.
+    bits: of the readings; None: exact.
+    methods: all that are measured.
     """
 
     skins: int
@@ -99,20 +101,24 @@ QUICK: Final = Plan(skins=2, frames=11, repeats=2)
 class Row:
     """One method on one kind of frames; a line of the CSV. None: there is no such number.
 
-    scene: "random"; "random, far ends", the same frames on a board that senses both ends of all
-    lines, told no wires, and on no front; the paper's "cell_sweep" or "wire_sweep"; "board", the
-    paper's own skin; or "linearisation", no frame, but port resistances and all their derivatives
-    once, as `joint` needs them several times a frame: method is "numpy", "casadi" (its virtual
-    machine) or "casadi_c" (the C that it generates; no row without a compiler), and all but the
-    times is None.
-    source: "measured", or "Su2024" for what the paper printed. ms: of a frame, median and 90th
-    percentile. error_percent: of the conductance of pressed cells, over the true one, likewise.
-    rmse_megohm: over all cells of a frame, likewise over the frames. on_front: no other method of
-    this scene, size and resolution is as fast and as accurate (error_percent; in the sweeps
-    rmse_megohm). limit_std_percent: median over the pressed cells of the posterior's relative
-    deviation at the truth (`information`); limit_percent: the median error that goes with these
-    deviations, were it normal (about 0.67 of it); limit_told_percent: the same where the mean
-    wire of each layer and the cells at rest are known exactly.
+    scene: what is read: "random"; "random, far ends", the same frames on a board that senses both
+    ends of all lines and is told no wires, which is on no front; the paper's "cell_sweep" or
+    "wire_sweep"; or "board", the paper's own skin.
+    source: "measured", or "Su2024" for what the paper printed.
+    rows, columns, bits, method: the skin, its readings, and what reads them.
+    frames, pressed_cells: how many there were.
+    ms, ms_p90: time of a frame, median and 90th percentile.
+    error_percent, error_p90_percent: of the conductance of pressed cells, over the true one.
+    rmse_megohm, rmse_p90_megohm: over all cells of a frame, median and 90th percentile of frames.
+    converged_share: of the frames.
+    on_front: whether no other method of this scene, size and resolution is as fast and as accurate
+    (by error_percent; in the sweeps by rmse_megohm).
+    limit_std_percent: the posterior's relative deviation at the truth (`information`), median over
+    the pressed cells.
+    limit_percent: the median error that goes with these deviations, were it normal (about 0.67 of
+    that).
+    limit_told_percent: the same where the mean wire of each layer and the cells at rest are known
+    exactly.
     """
 
     scene: str
@@ -157,8 +163,7 @@ class Row:
 def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
     """Run every method of the plan. `progress(done, frames)` is called after each frame.
 
-    Rows are in the order of the plan's sizes, bits and methods, then the paper's sweeps, then
-    linearisations by size.
+    Rows are in the order of the plan's sizes, bits and methods, then the paper's sweeps.
     """
     count = _Count(progress, _frames(plan))
     with threadpool_limits(limits=1):
@@ -170,8 +175,6 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
         ]
         for name in published.RMSE_MEGOHM:
             rows += _sweep_rows(name, plan, count)
-        for size in plan.sizes:
-            rows += _linearisation_rows(size)
     return [*_with_front(rows), *_published_rows()]
 
 
@@ -198,41 +201,25 @@ class _Count:
                 self._progress(self._done, self._frames)
 
 
-@dataclass
-class _Tally:
-    """What one method did, frame by frame; errors cell by cell."""
-
-    seconds: list[float] = field(default_factory=list)
-    error: list[float] = field(default_factory=list)
-    rmse_megohm: list[float] = field(default_factory=list)
-    converged: list[bool] = field(default_factory=list)
-
-    def add(self, answers: dict[str, NDArray[Any]], trial: Trial, skip: int) -> None:
-        truth, pressed = trial.cell_siemens[skip:], trial.pressed[skip:]
-        error = np.abs(answers["cell_siemens"][skip:] / truth - 1)
-        away_ohm = answers["cell_ohm"][skip:] - 1 / truth
-        self.seconds += answers["seconds"][skip:].tolist()
-        self.error += error[pressed].tolist()
-        self.rmse_megohm += (1e-6 * np.sqrt(np.mean(away_ohm**2, axis=(1, 2)))).tolist()
-        self.converged += answers["converged"][skip:].tolist()
-
-    def row(self, **what: Any) -> Row:
-        ms, ms_p90 = _middle_and_tail(1e3 * np.array(self.seconds))
-        error, error_p90 = _middle_and_tail(1e2 * np.array(self.error))
-        rmse, rmse_p90 = _middle_and_tail(np.array(self.rmse_megohm))
-        return Row(
-            source=MEASURED,
-            frames=len(self.seconds),
-            pressed_cells=len(self.error),
-            ms=ms,
-            ms_p90=ms_p90,
-            error_percent=error,
-            error_p90_percent=error_p90,
-            rmse_megohm=rmse,
-            rmse_p90_megohm=rmse_p90,
-            converged_share=float(np.mean(self.converged)),
-            **what,
-        )
+def _row(parts: Iterable[Judged], **what: Any) -> Row:
+    """The row of a method that has read these skins."""
+    judged = pooled(parts)
+    ms, ms_p90 = _middle_and_tail(1e3 * judged.seconds)
+    error, error_p90 = _middle_and_tail(1e2 * judged.relative)
+    rmse, rmse_p90 = _middle_and_tail(judged.rmse_megohm)
+    return Row(
+        source=MEASURED,
+        frames=judged.seconds.size,
+        pressed_cells=judged.relative.size,
+        ms=ms,
+        ms_p90=ms_p90,
+        error_percent=error,
+        error_p90_percent=error_p90,
+        rmse_megohm=rmse,
+        rmse_p90_megohm=rmse_p90,
+        converged_share=float(np.mean(judged.converged)),
+        **what,
+    )
 
 
 def _middle_and_tail(values: Float) -> tuple[float, float] | tuple[None, None]:
@@ -253,26 +240,27 @@ def _of_each_resolution(size: Size, plan: Plan) -> Iterator[tuple[int | None, li
 def _random_rows(
     size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, count: _Count
 ) -> list[Row]:
-    tallies: dict[str, _Tally] = defaultdict(_Tally)
-    of_far: dict[str, _Tally] = defaultdict(_Tally)
+    near: dict[str, list[Judged]] = defaultdict(list)
+    far: dict[str, list[Judged]] = defaultdict(list)
+    counted = slice(plan.warm_up, None)
     # Method by method within a skin, so that a slow minute of the machine hits all alike.
     for trial in trials:
         readings = trial.rounded(bits)
         for method in plan.methods_for(size):
             answers = estimate_file(readings, method, watch=count.watch)
-            tallies[method].add(answers, trial, plan.warm_up)
-        readings = seen(trial, "far", bits)
+            near[method].append(judge_trial(answers, trial, counted))
+        readings = trial.rounded(bits, mode="far", wires_told=False)
         for method in plan.far_methods:
             answers = estimate_file(readings, method, watch=count.watch)
-            of_far[method].add(answers, trial, plan.warm_up)
+            far[method].append(judge_trial(answers, trial, counted))
     limits = _limits(trials, bits, plan.warm_up)
     place: dict[str, Any] = {"rows": size.rows, "columns": size.columns, "bits": bits}
     return [
         *(
-            tally.row(scene=RANDOM, method=name, **place, **limits)
-            for name, tally in tallies.items()
+            _row(parts, scene=RANDOM, method=name, **place, **limits)
+            for name, parts in near.items()
         ),
-        *(tally.row(scene=FAR, method=name, **place) for name, tally in of_far.items()),
+        *(_row(parts, scene=FAR, method=name, **place) for name, parts in far.items()),
     ]
 
 
@@ -282,48 +270,39 @@ def _limits(trials: Sequence[Trial], bits: int | None, skip: int) -> dict[str, f
     for trial in trials:
         knowledge = trial.rounded(bits).knowledge(0)
         for skin, pressed in zip(trial.frames[skip:], trial.pressed[skip:], strict=True):
-            for told, found in percent.items():
+            for told, stds in percent.items():
                 known_std = 0.0 if told else None
                 std = information_limit(
                     skin, knowledge, pressed, rest_std=known_std, layer_std=known_std
                 )
-                found += (1e2 * std[pressed]).tolist()
+                stds += (1e2 * std[pressed]).tolist()
     if not percent[False]:
         return {}
     return {
         "limit_std_percent": float(np.median(percent[False])),
-        "limit_percent": _median_error(percent[False]),
-        "limit_told_percent": _median_error(percent[True]),
+        "limit_percent": median_error(percent[False]),
+        "limit_told_percent": median_error(percent[True]),
     }
 
 
-def _median_error(stds: Iterable[float]) -> float:
+def median_error(stds: Iterable[float]) -> float:
     """Median of |e|, with e from normal distributions of these deviations in equal parts."""
     return float(np.median(np.outer(list(stds), _NORMAL)))
 
 
 def _sweep_rows(name: str, plan: Plan, count: _Count) -> list[Row]:
     """The paper's simulation with exact readings; rest readings and true wires are told."""
-    tallies: dict[str, _Tally] = defaultdict(_Tally)
+    by_method: dict[str, list[Judged]] = defaultdict(list)
     for pressed, rest in published.sweep(name):
         wire_ohm = (float(rest.top_wire_ohm[0, 0]), float(rest.bottom_wire_ohm[0, 0]))
         trial = trial_of(rest, [pressed] * (plan.repeats + 1), wire_ohm)
         for method in plan.methods:
             answers = estimate_file(trial.readings, method, cold=True, watch=count.watch)
-            tallies[method].add(answers, trial, 1)
+            by_method[method].append(judge_trial(answers, trial, slice(1, None)))
     return [
-        tally.row(scene=name, rows=3, columns=3, bits=None, method=method)
-        for method, tally in tallies.items()
+        _row(parts, scene=name, rows=3, columns=3, bits=None, method=method)
+        for method, parts in by_method.items()
     ]
-
-
-def _linearisation_rows(size: Size) -> list[Row]:
-    rows = []
-    for name, times_ms in casadi_circuit.times_ms(size.rows, size.columns).items():
-        ms, ms_p90 = _middle_and_tail(times_ms)
-        row = Row(LINEARISATION, MEASURED, size.rows, size.columns, None, name)
-        rows.append(replace(row, ms=ms, ms_p90=ms_p90))
-    return rows
 
 
 def _published_rows() -> list[Row]:
@@ -372,3 +351,49 @@ def _with_front(rows: Sequence[Row]) -> list[Row]:
 def or_nan(value: float | None) -> float:
     """The number, or NaN where there is none."""
     return np.nan if value is None else value
+
+
+# --------------------------------------------------------------------------------------- answers
+
+
+def csv_text(rows: Iterable[Row]) -> str:
+    """The rows as CSV, columns named after the fields of `Row`; bits may be "exact"."""
+    lines = ({**vars(row), "bits": row.bits or "exact"} for row in rows)
+    return as_csv(field_names(Row), (line.values() for line in lines))
+
+
+def fronts(rows: Iterable[Row]) -> dict[str, list[str]]:
+    """The methods on each front, fastest first, by scene, size and resolution."""
+    by_place: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        if row.on_front:
+            by_place[f"{row.scene} {row.rows}x{row.columns} {row.resolution}"].append(row)
+    return {
+        place: [row.method for row in sorted(on_front, key=lambda row: or_nan(row.ms))]
+        for place, on_front in by_place.items()
+    }
+
+
+def summary(rows: Iterable[Row]) -> Table:
+    """What was measured, for a terminal."""
+    numbers = ("ms", "error %", "90th", "RMSE MΩ", "conv. %")
+    caption = "*: no method is as fast and as accurate"
+    table = text_table(("skin", "method"), numbers, caption=caption)
+    before: object = None
+    for row in rows:
+        if row.source != MEASURED:
+            continue
+        names = {RANDOM: row.resolution, FAR: f"{row.resolution} far"}
+        size = f"{row.rows}x{row.columns} {names.get(row.scene, row.scene)}"
+        share = row.converged_share
+        table.add_row(
+            size if row.place != before else "",
+            f"{row.method} *" if row.on_front else row.method,
+            *(
+                "" if number is None else f"{number:#.3g}"
+                for number in (row.ms, row.error_percent, row.error_p90_percent, row.rmse_megohm)
+            ),
+            "" if share is None else f"{100 * share:.0f}",
+        )
+        before = row.place
+    return table

@@ -1,42 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of `chart`: a panel for each size and resolution, and the paper's two sweeps; beside
-them a small one, NumPy against CasADi."""
+"""The picture of `chart`: a panel for each size and resolution, and the paper's two sweeps."""
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from ohmskin.errors import OhmskinError
+from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.estimate.methods import METHODS
-from studies.casadi_circuit import EVALUATIONS, GENERATED_C, MACHINE, NUMPY
-from studies.chart import BOARD, FAR, LINEARISATION, MEASURED, PAPER, RANDOM, Row, or_nan
+from studies.chart import BOARD, FAR, MEASURED, PAPER, RANDOM, Row
+from studies.drawing import (
+    INK,
+    method_style,
+    new_figure,
+    png_of,
+    prepare,
+    write_plain_numbers,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DEADLINE_MS: Final = 1e3 / 90  # a scan of the board at its usual rate
-INK: Final = "#333333"
-_COLOURS: Final = ("#666666", "#0072b2", "#e69f00", "#d55e00", "#009e73", "#aa3fb4", "#000000")
-_MARKERS: Final = ("s", "D", "^", "v", "o", "P", "X")
+DEADLINE_MS: Final = 1e3 / DEFAULT_RATE_HZ  # a scan of the board takes so long at its usual rate
 _FAINT: Final = "#777777"
 _BAND: Final = "#f5e3ad"
-_SMALL: Final = 8.0  # points
-_PRINTED: Final = (0, (5, 2))  # dashes: what the paper printed
+_SMALL_POINTS: Final = 8.0  # size of the smallest letters
+_PRINTED: Final = (0, (5, 2))  # dashes of lines that show what the paper printed
 _SWEEPS: Final = {
     "cell_sweep": "the paper's cell sweep, 3x3",
     "wire_sweep": "the paper's wire sweep, 3x3",
 }
-_EVALUATIONS: Final[dict[str, dict[str, Any]]] = {
-    NUMPY: {"label": "NumPy", "color": INK, "marker": "o"},
-    MACHINE: {"label": "CasADi", "color": _FAINT, "marker": "o", "markerfacecolor": "white"},
-    GENERATED_C: {"label": "CasADi's C", "color": _FAINT, "marker": "x", "linestyle": ":"},
-}
 _STAR: Final[dict[str, Any]] = {"marker": "*", "markersize": 12, "linestyle": ""}
-_PANELS_FOR_NOTES: Final = 2
+_PANELS_FOR_NOTES: Final = 3  # widths of panels beside the sweeps
 _NOTES: Final = (
     "Upper rows: the same random skins for all methods, 1 to 100 kΩ where touched, each frame "
     "touched anew and started from the one before. A percentage under a marker: so many frames "
@@ -52,20 +49,7 @@ _NOTES: Final = (
     "resistance; of simulated 3x3 skins errors, and no time. Lines: median of its five conditions.",
     "Sweeps: exact readings, each frame cold. All methods are told the true wires and the readings "
     "at rest; 'ohm', 'matrix' and the paper's two use neither.",
-    "One evaluation: port resistances and all their derivatives, as 'joint' needs them several "
-    "times a frame, computed in NumPy as it does, or as CasADi expressions.",
 )
-
-
-def require_matplotlib() -> None:
-    """Nobody should wait for a picture that cannot be drawn.
-
-    :raises OhmskinError: matplotlib is not installed.
-    """
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError as exc:
-        raise OhmskinError("pictures need matplotlib: pip install '.[plot]'") from exc
 
 
 def picture(rows: Sequence[Row], machine: str) -> bytes:
@@ -73,15 +57,12 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
 
     :raises OhmskinError: matplotlib is not installed.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
     random = [row for row in rows if row.scene == RANDOM]
     sizes = list(dict.fromkeys((row.rows, row.columns) for row in random))
     resolutions = list(dict.fromkeys(row.bits for row in random))
-    width = max(len(sizes), len(_SWEEPS) + 1 + _PANELS_FOR_NOTES)
+    width = max(len(sizes), len(_SWEEPS) + _PANELS_FOR_NOTES)
     lines = len(resolutions) + 1
-    figure = Figure(figsize=(3.1 * width, 2.95 * lines + 1.1), layout="constrained")
+    figure = new_figure(3.1 * width, 2.95 * lines + 1.1)
     grid = figure.add_gridspec(lines, width, hspace=0.06)
     first: Axes | None = None
     for line, bits in enumerate(resolutions):
@@ -111,42 +92,11 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
         if column == 0:
             axes.set_ylabel("exact readings\nRMSE of all cells [MΩ]", color=INK)
     for axes in figure.axes:
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    _evaluation_panel(
-        figure.add_subplot(grid[-1, len(_SWEEPS)]),
-        [row for row in rows if row.scene == LINEARISATION],
-    )
+        write_plain_numbers(axes.xaxis, axes.yaxis)
     title = f"Time a frame against error: simulated skins, one thread on {machine}"
     _explain(figure, title, {row.method for row in rows})
-    _write_notes(figure.add_subplot(grid[-1, len(_SWEEPS) + 1 :]))
+    _write_notes(figure.add_subplot(grid[-1, len(_SWEEPS) :]))
     return png_of(figure, dpi=120)
-
-
-def method_style(method: str) -> dict[str, Any]:
-    """Colour and marker, the same in all panels: by the method's place in `METHODS`."""
-    number = list(METHODS).index(method)
-    return {
-        "color": _COLOURS[number % len(_COLOURS)],
-        "marker": _MARKERS[number % len(_MARKERS)],
-        "markersize": 8.5,
-        "markeredgewidth": 1.5,
-        "linestyle": "",
-    }
-
-
-def prepare(axes: Axes, *, colour: str = "#e4e4e4", **grid: Any) -> None:
-    """A faint grid below all else, and no frame."""
-    axes.set_axisbelow(True)
-    axes.grid(color=colour, linewidth=0.7, **grid)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def png_of(figure: Figure, dpi: int = 110) -> bytes:
-    """The picture as a file."""
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=dpi)
-    return png.getvalue()
 
 
 # --------------------------------------------------------------------------------------- panels
@@ -165,7 +115,7 @@ def _random_panel(axes: Axes, rows: Sequence[Row]) -> None:
             0.02,
             f"not run: {', '.join(absent)}",
             transform=axes.transAxes,
-            fontsize=_SMALL,
+            fontsize=_SMALL_POINTS,
             color=_FAINT,
         )
 
@@ -189,39 +139,6 @@ def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
         if row.source == PAPER and row.rmse_megohm is not None:
             colour = method_style(row.method)["color"]
             axes.axhline(row.rmse_megohm, color=colour, linestyle=_PRINTED, linewidth=1.3, zorder=1)
-
-
-def _evaluation_panel(axes: Axes, rows: Sequence[Row]) -> None:
-    """Time by size, quietly: it is no method's result."""
-    axes.set_title("one evaluation in 'joint', by size", fontsize=10.5, color=INK)
-    axes.set_xlabel("time [ms]", color=INK)
-    axes.set_xscale("log")
-    prepare(axes, axis="x")
-    sizes = list(dict.fromkeys((row.rows, row.columns) for row in rows))
-    for name in EVALUATIONS:
-        of_name = [row for row in rows if row.method == name]
-        places = [sizes.index((row.rows, row.columns)) for row in of_name]
-        style = {"linewidth": 1.0, "markersize": 5.5, **_EVALUATIONS[name]}
-        if not of_name:
-            style["label"] += ": no compiler"
-        axes.plot([or_nan(row.ms) for row in of_name], places, **style)
-    for place, size in enumerate(sizes):
-        slowest = max(or_nan(row.ms) for row in rows if (row.rows, row.columns) == size)
-        # Not at the axis, where it would push the panels apart.
-        axes.annotate(
-            f"{size[0]}x{size[1]}",
-            (slowest, place),
-            xytext=(8, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=_SMALL,
-            color=INK,
-        )
-    axes.set_yticks([])
-    axes.set_xlim(right=5 * axes.get_xlim()[1])  # for the last of these words
-    axes.invert_yaxis()
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.legend(loc="lower left", frameon=False, fontsize=_SMALL, labelcolor=INK, handlelength=1.5)
 
 
 def _prepare_panel(axes: Axes) -> None:
@@ -262,7 +179,7 @@ def _points(axes: Axes, points: Sequence[tuple[Row, float | None, float | None]]
                 textcoords="offset points",
                 ha="center",
                 va="top",
-                fontsize=_SMALL,
+                fontsize=_SMALL_POINTS,
                 color=style["color"],
                 zorder=5,
             )
@@ -287,7 +204,7 @@ def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
         f"paper: {' and '.join(f'{time_ms:g}' for time_ms in times.values())} ms",
         transform=at_axis,
         ha="right",
-        fontsize=_SMALL,
+        fontsize=_SMALL_POINTS,
         color=INK,
         backgroundcolor="white",
     )
@@ -335,11 +252,11 @@ def _write_notes(axes: Axes) -> None:
     notes = axes.text(
         0.02,
         1.05,
-        "\n".join(textwrap.fill(note, 84) for note in _NOTES),
+        "\n".join(textwrap.fill(note, 108) for note in _NOTES),
         transform=axes.transAxes,
         va="top",
-        fontsize=_SMALL,
+        fontsize=9.5,
         color=INK,
-        linespacing=1.35,
+        linespacing=1.45,
     )
     notes.set_in_layout(False)  # its length is not the panels' business

@@ -6,10 +6,11 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
@@ -18,15 +19,28 @@ from rich.progress import Progress
 from ohmskin.files import whole_file
 from studies import ablate as constants_tried
 from studies import chart as speed_accuracy
-from studies import chart_figure, chart_table, far_figure, stability_figure
+from studies import chart_figure, force_experiment, force_figure, force_limits
 from studies import far as far_ends
 from studies import stability as verdicts
 from studies.ablate_scenes import Plan
+from studies.drawing import require_matplotlib
+from studies.rows import Progress as ShowProgress
 
 Out = Annotated[
     Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
 ]
 Jobs = Annotated[int, typer.Option(min=0, help="processes; 0: one a core")]
+QuickExperiment = Annotated[
+    bool, typer.Option("--quick", help="fewer skins and frames: rough, in seconds")
+]
+Json = Annotated[bool, typer.Option("--json", help="no tables and no progress bar: JSON alone")]
+# Where stderr is a file, tables of forces are cut to so many columns, not to 80: they need that.
+_TABLE_WIDTH: Final = 128
+QUICK_DETECTION: Final = force_limits.Detection(seeds=1, empty_frames=100, frames=40, forces=8)
+
+experiment = typer.Typer(
+    help="The paper's experiments with force, on simulated skins.", no_args_is_help=True
+)
 
 
 def _machine() -> str:
@@ -56,14 +70,15 @@ def save_whole(contents: Mapping[Path, bytes]) -> None:
 class StudyRun:
     """One command: where it writes, what it says on stderr, and its answer.
 
-    is_quiet: neither a progress bar nor `messages`. least_width: of these, where stderr is a file.
+    is_quiet: whether it shows neither a progress bar nor `messages`.
+    least_width: columns of the messages, where stderr is a file.
     """
 
     def __init__(
         self, out: Path | None, *, draws: bool = True, is_quiet: bool = False, least_width: int = 0
     ) -> None:
         if draws:
-            chart_figure.require_matplotlib()
+            require_matplotlib()
         self._folder = default_folder() if out is None else out
         self._folder.mkdir(parents=True, exist_ok=True)
         self._started_s = time.monotonic()
@@ -72,7 +87,7 @@ class StudyRun:
         self.messages.width = max(self.messages.width, least_width)
 
     @contextmanager
-    def progress(self, what: str, redraws_hz: float = 10.0) -> Iterator[Callable[[int, int], None]]:
+    def progress(self, what: str, redraws_hz: float = 10.0) -> Iterator[ShowProgress]:
         """A function that shows how many are done, and how many there are."""
         hidden = self.messages.quiet or not self.messages.is_terminal
         with Progress(
@@ -88,10 +103,10 @@ class StudyRun:
         kinds = {".png": "picture", ".csv": "table"}
         self._written = {kinds[path.suffix]: str(path) for path in paths}
 
-    def answer(self, asked: dict[str, Any], **found: Any) -> None:
-        """Print the answer: what was written, asked and found."""
+    def answer(self, asked: dict[str, Any], **figures: Any) -> None:
+        """Print the answer: what was written, what was asked, and the figures."""
         seconds = round(time.monotonic() - self._started_s, 1)
-        answer = {**self._written, **asked, "seconds": seconds, **found}
+        answer = {**self._written, **asked, "seconds": seconds, **figures}
         print(json.dumps(answer, allow_nan=False))  # noqa: T201
 
 
@@ -113,11 +128,11 @@ def chart(
     run.write(
         {
             "speed-accuracy.png": chart_figure.picture(rows, _machine()),
-            "speed-accuracy.csv": chart_table.csv_text(rows).encode(),
+            "speed-accuracy.csv": speed_accuracy.csv_text(rows).encode(),
         }
     )
-    run.messages.print(chart_table.summary(rows))
-    run.answer({"quick": quick}, fronts=chart_table.fronts(rows))
+    run.messages.print(speed_accuracy.summary(rows))
+    run.answer({"quick": quick}, fronts=speed_accuracy.fronts(rows))
 
 
 def stability(
@@ -138,7 +153,7 @@ def stability(
         rows = verdicts.measure(tasks, jobs=jobs or -1, progress=show)
     run.write(
         {
-            "stability.png": stability_figure.picture(rows),
+            "stability.png": verdicts.picture(rows),
             "stability.csv": verdicts.csv_text(rows).encode(),
         }
     )
@@ -163,10 +178,10 @@ def ablate(
     tried = constants_tried.constants()
     if only:
         names = set(only.split(","))
-        known = {name for each in tried for name in (each.name, each.label)}
-        if names - known:
-            raise typer.BadParameter(f"no constant {', '.join(sorted(names - known))}")
-        tried = [each for each in tried if names & {each.name, each.label}]
+        unknown = names - {name for constant in tried for name in (constant.name, constant.label)}
+        if unknown:
+            raise typer.BadParameter(f"no constant {', '.join(sorted(unknown))}")
+        tried = [constant for constant in tried if names & {constant.name, constant.label}]
     run = StudyRun(out, draws=False)
     with run.progress("constants on sets of frames") as show:
         plan = Plan(skins, frames)
@@ -191,9 +206,78 @@ def far(
         rows = far_ends.measure(far_ends.QUICK if quick else far_ends.FULL, show)
     run.write(
         {
-            "far-ends.png": far_figure.picture(rows),
+            "far-ends.png": far_ends.picture(rows),
             "far-ends.csv": far_ends.csv_text(rows).encode(),
         }
     )
     run.messages.print(far_ends.tables(rows), markup=False, highlight=False, soft_wrap=True)
     run.answer({"quick": quick})
+
+
+# ------------------------------------------------------------------------ experiments with force
+
+
+@experiment.command()
+def flat(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+    """Calibrate with single touches, test with several: a PNG. About two minutes.
+
+    Errors of force of all methods on a flat skin. The last line printed is one JSON object.
+    """
+    _surface(_run(out, only_json), "flat", quick)
+
+
+@experiment.command()
+def curved(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+    """The same, but the wires of the skin change between calibration and test: a PNG.
+
+    About two minutes. The last line printed is one JSON object.
+    """
+    _surface(_run(out, only_json), "curved", quick)
+
+
+@experiment.command()
+def timeseries(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+    """Four seconds of one press, and what the other cells show meanwhile: a PNG.
+
+    About two minutes. The last line printed is one JSON object.
+    """
+    run = _run(out, only_json)
+    with run.progress("steps") as show:
+        trial, rows = force_limits.cross_talk(1 if quick else 8, 0 if quick else 2, show)
+    run.write({"force-timeseries.png": force_figure.series_picture(trial)})
+    run.messages.print(force_limits.talk_table(rows))
+    run.answer(_asked(quick), cross_talk=[asdict(row) for row in rows])
+
+
+@experiment.command()
+def minimum(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+    """The smallest force told from none, alone and beside two touches of 1 N: a PNG.
+
+    About two minutes. The last line printed is one JSON object.
+    """
+    run = _run(out, only_json)
+    with run.progress("steps") as show:
+        plan = QUICK_DETECTION if quick else force_limits.Detection()
+        rows = force_limits.smallest_forces(plan, show)
+    run.write({"force-minimum.png": force_figure.smallest_picture(rows)})
+    run.messages.print(force_limits.smallest_table(rows))
+    run.answer(_asked(quick), smallest_forces=[asdict(row) for row in rows])
+
+
+def _run(out: Path | None, only_json: bool) -> StudyRun:
+    return StudyRun(out, is_quiet=only_json, least_width=_TABLE_WIDTH)
+
+
+def _asked(quick: bool) -> dict[str, Any]:
+    return {"simulated": True, "quick": quick}
+
+
+def _surface(run: StudyRun, surface: str, quick: bool) -> None:
+    plan = force_experiment.QUICK if quick else force_experiment.FULL
+    with run.progress("steps") as show:
+        rows = force_experiment.measure(plan, curved=surface == "curved", progress=show)
+    run.write({f"force-{surface}.png": force_figure.surface_picture(rows)})
+    for table in force_experiment.surface_tables(rows):
+        run.messages.print(table)
+    best = force_experiment.best_of_ours(rows)
+    run.answer(_asked(quick), best=best, rows=[asdict(row) for row in rows])

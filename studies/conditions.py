@@ -30,22 +30,28 @@ from ohmskin.emulate.faults import OPEN_OHM, joined_readings
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
-from studies.trials import BOTTOM_WIRE_OHM, SPREAD, TOP_WIRE_OHM, knowledge_of, skin_at_rest, touch
+from studies.trials import NOMINAL_WIRE_OHM, SPREAD, knowledge_of, skin_at_rest, touch
 
 Random = np.random.Generator
 Shape = tuple[int, int]
 
-TOUCHED_SHARE: Final = 10 / 64  # of the cells, at most, where touches are not what is swept
-PRESSED_OHM: Final = 5e3  # where wires are swept
-STUCK_SHARE: Final = 10 / 256  # of the readings
+# The largest share of cells that is touched, where touches are not swept. Chosen: 10 cells of 8x8,
+# all fingers of two hands.
+TOUCHED_SHARE: Final = 10 / 64
+# A touched cell, where wires are swept against it [ohm]. Chosen: a firm touch.
+PRESSED_OHM: Final = 5e3
+# The share of readings that is stuck at random places. Chosen: 10 of the 256 of 8x8 cells.
+STUCK_SHARE: Final = 10 / 256
 _SINCE_REST: Final = " since rest"
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Readings (R, C, 4) and the cells behind them (R, C) [S], None: this frame is not judged.
+    """One frame, and the truth behind it.
 
-    afresh: the estimator forgets the frame before it.
+    ratio: readings (R, C, 4).
+    cell_siemens: the cells (R, C) [S]; None: this frame is not judged.
+    afresh: whether the estimator forgets the frame before it.
     """
 
     ratio: Float
@@ -63,9 +69,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Conditions x, numbers or labels; `axis` names them, `logarithmic` says how they are drawn.
+    """A row of conditions that differ in one thing, x.
 
+    name, title: in tables, and above its picture.
+    axis: what x is.
+    values: of x, numbers or labels.
     build: a case from x, the skin's shape, how many frames are judged, a source of randomness.
+    logarithmic: whether x has a logarithmic axis.
     """
 
     name: str
@@ -107,7 +117,7 @@ def cut(skin: Skin, layer: str, line: int, place: int = 0) -> Skin:
 def _case(
     frames: Iterable[Frame],
     rest_ratio: Float,
-    wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
 ) -> Case:
     return Case(knowledge_of(rest_ratio, wire_ohm), tuple(frames))
 
@@ -161,8 +171,8 @@ def _nominal(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     rest = skin_at_rest(*shape, random)
     skins = _touched_frames(rest, frames, random)
     judged = (Frame(converted(readings(skin)), skin.cell_siemens) for skin in skins)
-    told_ohm = (float(x) * TOP_WIRE_OHM, float(x) * BOTTOM_WIRE_OHM)
-    return _case(judged, converted(readings(rest)), told_ohm)
+    top_ohm, bottom_ohm = NOMINAL_WIRE_OHM
+    return _case(judged, converted(readings(rest)), (float(x) * top_ohm, float(x) * bottom_ohm))
 
 
 # --------------------------------------------------------------------------- the frame before
@@ -262,15 +272,15 @@ def _lines(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     but for faults since rest. A fault does not come and go with frames: each is read afresh."""
     rest = skin_at_rest(*shape, random)
     fixed = _place(shape, random) if _since_rest(x) else None
-    rest_ratio = _with_line_fault(rest, str(x), fixed) if fixed else readings(rest)
+    rest_ratio = with_line_fault(rest, str(x), fixed) if fixed else readings(rest)
     judged = []
     for skin in _touched_frames(rest, frames, random):
-        ratio = _with_line_fault(skin, str(x), fixed or _place(shape, random))
+        ratio = with_line_fault(skin, str(x), fixed or _place(shape, random))
         judged.append(Frame(converted(ratio), skin.cell_siemens, afresh=fixed is None))
     return _case(judged, converted(rest_ratio))
 
 
-def _with_line_fault(skin: Skin, fault: str, place: tuple[int, int]) -> Float:
+def with_line_fault(skin: Skin, fault: str, place: tuple[int, int]) -> Float:
     """Readings with a fault in the row, or the column, of `place`, or between it and the next."""
     rows, columns = skin.shape
     row, column = place

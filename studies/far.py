@@ -21,24 +21,24 @@ and of the nominal wires.
 
 from __future__ import annotations
 
-import csv
-import io
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields, replace
-from typing import Final
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple, dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ohmskin.arrays import Float
-from ohmskin.circuit.skin import all_readings, end_admittance
-from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.link.protocol import ENUMS, MODES
-from ohmskin.record.readings import Readings, estimate_file
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
+from ohmskin.record.readings import estimate_file
 from studies import zero_potential
-from studies.trials import Trial, finger_trial, skin_at_rest, stretched, touch, trial_of
+from studies.drawing import INK, new_figure, png_of, prepare, write_plain_numbers
+from studies.judge import Answers, Judged, judge_trial, pooled
+from studies.rows import Progress, as_csv, field_names
+from studies.trials import BEND, Trial, finger_trial, skin_at_rest, stretched, touch, trial_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NEAR, NEAR_TOLD, FAR = "near", "near, told", "far"
 ZERO, ZERO_BEST = "zero", "zero, best scale"
@@ -46,23 +46,31 @@ ZERO_PATH, ZERO_SOLVED = "zero, less path", "zero, solved"
 READOUTS: Final = (NEAR, NEAR_TOLD, FAR, ZERO, ZERO_BEST, ZERO_PATH, ZERO_SOLVED)
 METHOD: Final = "joint"
 SCENES: Final = ("one touch", "eight touches", "fingertip")
-WIRES, BEND = "wires", "bend"
-SIZE: Final = 8
-BITS: Final = (10, 12)
+BY_WIRES, BY_BEND = "wires", "bend"  # the sweeps
+SIZE: Final = 8  # rows, and columns
+BITS: Final = (10, 12)  # of the converter: the board's, and a better one
+# A wire segment of a row [ohm], in the sweep by wires. Chosen: from a good conductive yarn to what
+# near ends do not see through.
 WIRE_OHM: Final = (20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
-BENDS: Final = (1.0, 1.1, 1.2, 1.35, 1.5)
-BENT_OHM: Final = 100.0
-COLUMN_OVER_ROW: Final = 2.0
+# Wires over those of the flat skin, in the sweep by bends. Chosen: up to more than the usual bend.
+BENDS: Final = (1.0, 1.1, 1.2, BEND, 1.5)
+# A wire segment of a row [ohm] in that sweep.
+BENT_OHM: Final = TOP_WIRE_OHM
+# A wire segment of a column over one of a row, in both sweeps.
+COLUMN_OVER_ROW: Final = BOTTOM_WIRE_OHM / TOP_WIRE_OHM
+# A fingertip's pressure, least and most: standard deviation [cells], and peak [S]. Both are those
+# of tests/data/far.
 FINGER_CELLS: Final = (0.75, 0.9)
 FINGER_SIEMENS: Final = (3e-5, 1.5e-4)
-_NAMES: Final = list(ENUMS["reading"].values)
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How many skins of each condition, and how many frames of each."""
+    """How much is measured.
+
+    skins: of each condition.
+    frames: of each skin.
+    """
 
     skins: int
     frames: int
@@ -76,12 +84,16 @@ QUICK: Final = Plan(skins=1, frames=8)
 class Row:
     """One readout under one condition; a line of the CSV.
 
-    sweep: "wires" or "bend". wire_ohm: a segment of a row [ohm], before the bend. bend: factor of
-    all wires since the rest readings. error_percent, error_p90_percent: of the conductance of
-    pressed cells, median and 90th percentile. ghost_us: largest conductance above the true one of
-    cells that are not pressed [uS], 95th percentile of the frames. within_4_percent: pressed cells
-    within 4 stated deviations; trusted_percent: frames that the method calls converged; None where
-    nothing is stated.
+    sweep: "wires" or "bend".
+    scene, bits, readout: what is read, in so many bits, and how.
+    wire_ohm: a segment of a row before the bend [ohm].
+    bend: factor of all wires since the rest readings.
+    pressed_cells: how many there were in all frames.
+    error_percent, error_p90_percent: of their conductance, median and 90th percentile.
+    ghost_us: largest conductance above the true one of cells that are not pressed [uS], 95th
+    percentile of the frames.
+    within_4_percent: pressed cells within 4 stated deviations; None where nothing is stated.
+    trusted_percent: frames that the method calls converged; None where nothing is stated.
     """
 
     sweep: str
@@ -112,10 +124,10 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
             ]
             for bits in BITS:
                 for readout in READOUTS:
-                    judged = _Judged()
-                    for trial in trials:
-                        judged.add(trial, *_read(readout, trial, bits))
-                    rows.append(judged.row(sweep, scene, wire_ohm, bend, bits, readout))
+                    judged = pooled(
+                        judge_trial(_read(readout, trial, bits), trial) for trial in trials
+                    )
+                    rows.append(_row(judged, sweep, scene, wire_ohm, bend, bits, readout))
             if progress is not None:
                 progress(done, len(conditions))
     return rows
@@ -124,31 +136,9 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
 def _conditions() -> Iterator[tuple[str, str, float, float]]:
     for scene in SCENES:
         for wire_ohm in WIRE_OHM:
-            yield WIRES, scene, wire_ohm, 1.0
+            yield BY_WIRES, scene, wire_ohm, 1.0
     for bend in BENDS:
-        yield BEND, SCENES[1], BENT_OHM, bend
-
-
-def seen(trial: Trial, mode: str, bits: int | None, *, told: bool = False) -> Readings:
-    """The trial's readings in a mode; its nominal wires only if they are told. bits None: exact."""
-    chosen = [_NAMES.index(name) for name in MODES[mode]]
-    exact = [
-        all_readings(skin, end_admittance(skin))[..., chosen]
-        for skin in (trial.rest, *trial.frames)
-    ]
-    if bits is not None:
-        exact = [ratio_from_codes(quantise(each, bits), bits) for each in exact]
-    rest, *frames = exact
-    readings = replace(
-        trial.readings,
-        ratio=np.array(frames),
-        rest_ratio=rest,
-        adc_bits=bits,
-        reading_names=MODES[mode],
-    )
-    if told:
-        return readings
-    return replace(readings, nominal_top_wire_ohm=None, nominal_bottom_wire_ohm=None)
+        yield BY_BEND, SCENES[1], BENT_OHM, bend
 
 
 def _trial(scene: str, wire_ohm: float, bend: float, frames: int, seed: int) -> Trial:
@@ -170,16 +160,11 @@ def _trial(scene: str, wire_ohm: float, bend: float, frames: int, seed: int) -> 
     return trial_of(rest, [stretched(skin, bend) for skin in skins], wires)
 
 
-_Answer = tuple[Float, Float | None, NDArray[np.bool_] | None]
-
-
-def _read(readout: str, trial: Trial, bits: int) -> _Answer:
-    """Conductances (F, R, C) [S], their stated deviations, whether each frame converged (F,)."""
+def _read(readout: str, trial: Trial, bits: int) -> Answers:
     if readout in (NEAR, NEAR_TOLD, FAR):
         mode = "far" if readout == FAR else "near"
-        readings = seen(trial, mode, bits, told=readout == NEAR_TOLD)
-        out = estimate_file(readings, METHOD, cold=True)
-        return out["cell_siemens"], out["cell_siemens_std"], out["converged"]
+        readings = trial.rounded(bits, mode=mode, wires_told=readout == NEAR_TOLD)
+        return estimate_file(readings, METHOD, cold=True)
     exact = np.array([zero_potential.currents(skin) for skin in trial.frames])
     scale = zero_potential.USUAL_SIEMENS if readout == ZERO else float(exact.max()) * (1 + 1e-9)
     siemens = zero_potential.converted(exact, scale, bits)
@@ -191,56 +176,29 @@ def _read(readout: str, trial: Trial, bits: int) -> _Answer:
         siemens = zero_potential.less_path(siemens, wires)
     if readout == ZERO_SOLVED:
         siemens = np.array([zero_potential.solved(frame, wires) for frame in siemens])
-    return siemens, None, None
+    return {"cell_siemens": siemens}
 
 
-class _Judged:
-    """Answers about several skins, against the truth."""
-
-    def __init__(self) -> None:
-        self._all: dict[str, list[Float]] = defaultdict(list)
-
-    def add(
-        self, trial: Trial, siemens: Float, std: Float | None, trusted: NDArray[np.bool_] | None
-    ) -> None:
-        truth, pressed, found = trial.cell_siemens, trial.pressed, self._all
-        error = siemens - truth
-        found["error"].append(np.abs(error / truth)[pressed])
-        found["ghost"].append(np.where(pressed, 0.0, error).max(axis=(1, 2)))
-        if std is not None and trusted is not None:
-            found["within"].append((np.abs(error) < 4 * std)[pressed].astype(float))
-            found["trusted"].append(trusted.astype(float))
-
-    def row(
-        self, sweep: str, scene: str, wire_ohm: float, bend: float, bits: int, readout: str
-    ) -> Row:
-        found = {name: np.concatenate(parts) for name, parts in self._all.items()}
-        shares = [
-            100 * float(found[name].mean()) if name in found else None
-            for name in ("within", "trusted")
-        ]
-        median, p90 = np.quantile(found["error"], [0.5, 0.9])
-        return Row(
-            *(sweep, scene, wire_ohm, bend, bits, readout, found["error"].size),
-            100 * float(median),
-            100 * float(p90),
-            1e6 * float(np.quantile(found["ghost"], 0.95)),
-            *shares,
-        )
+def _row(
+    judged: Judged, sweep: str, scene: str, wire_ohm: float, bend: float, bits: int, readout: str
+) -> Row:
+    states = readout in (NEAR, NEAR_TOLD, FAR)
+    return Row(
+        *(sweep, scene, wire_ohm, bend, bits, readout, judged.relative.size),
+        error_percent=judged.error_percent(),
+        error_p90_percent=judged.error_percent(0.9),
+        ghost_us=judged.ghost_us(),
+        within_4_percent=judged.pressed_within_percent() if states else None,
+        trusted_percent=judged.converged_percent() if states else None,
+    )
 
 
 # ---------------------------------------------------------------------------------------- words
 
 
 def csv_text(rows: Iterable[Row]) -> str:
-    """The rows as CSV, columns named after the fields of `Row`; None is empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([column.name for column in fields(Row)])
-    for row in rows:
-        cells = vars(row).values()
-        writer.writerow(f"{cell:.4g}" if isinstance(cell, float) else cell for cell in cells)
-    return text.getvalue()
+    """The rows as CSV, columns named after the fields of `Row`."""
+    return as_csv(field_names(Row), map(astuple, rows))
 
 
 def tables(rows: Iterable[Row]) -> str:
@@ -249,11 +207,12 @@ def tables(rows: Iterable[Row]) -> str:
     blocks = []
     for bits in BITS:
         places = [
-            (f"{scene}, {wire:g}/{COLUMN_OVER_ROW * wire:g} ohm", WIRES, scene, wire, 1.0)
+            (f"{scene}, {wire:g}/{COLUMN_OVER_ROW * wire:g} ohm", BY_WIRES, scene, wire, 1.0)
             for scene in SCENES
             for wire in (100.0, 1000.0)
         ]
-        places.append(("eight touches, 100/200 ohm, bent by 1.35", BEND, SCENES[1], BENT_OHM, 1.35))
+        bent = f"eight touches, 100/200 ohm, bent by {BEND}"
+        places.append((bent, BY_BEND, SCENES[1], BENT_OHM, BEND))
         lines = [
             f"| {bits} bit: error of a pressed cell [%] | " + " | ".join(READOUTS) + " |",
             "|---" * (len(READOUTS) + 1) + "|",
@@ -271,3 +230,74 @@ def tables(rows: Iterable[Row]) -> str:
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         blocks.append("\n".join(lines))
     return "\n\n".join(blocks)
+
+
+# -------------------------------------------------------------------------------------- picture
+
+_STYLES: Final[dict[str, dict[str, Any]]] = {
+    FAR: {"color": "#009e73", "marker": "o", "linewidth": 2.2, "label": "far ends, nothing told"},
+    NEAR: {"color": "#d55e00", "marker": "v", "label": "near ends, nothing told"},
+    NEAR_TOLD: {"color": "#e69f00", "marker": "^", "label": "near ends, wires told"},
+    ZERO_BEST: {"color": "#666666", "marker": "s", "label": "zero potential, as read"},
+    ZERO_PATH: {"color": "#56b4e9", "marker": "D", "label": "…, less the wires told"},
+    ZERO_SOLVED: {"color": "#0072b2", "marker": "P", "label": "…, solved with the wires told"},
+}
+# Readouts are drawn beside each other, at places that differ by this factor: else bars hide bars.
+_APART: Final = {BY_WIRES: 1.06, BY_BEND: 1.006}
+_LIMITS_PERCENT: Final = (0.03, 200.0)  # of the axis of errors: all medians are inside
+_NOTE: Final = (
+    "Simulation: 8x8 cells, 1 MΩ at rest, touches of 1 to 100 kΩ at random places, or a fingertip "
+    "over some 20 cells; wire segments spread by 10 %. Told: the middle of the segments of each "
+    "layer, of the unbent skin. Estimator: 'joint', each frame anew. Zero potential: ideal "
+    "amplifiers, and the least full scale that holds all frames of the skin. Markers: median; pale "
+    "bars: up to the 90th percentile."
+)
+
+
+def picture(rows: Sequence[Row]) -> bytes:
+    """The rows of `far.measure` as a PNG.
+
+    :raises OhmskinError: matplotlib is not installed.
+    """
+    figure = new_figure(15.0, 7.6)
+    grid = figure.subplots(len(BITS), len(SCENES) + 1, sharey=True, squeeze=False)
+    for bits, line in zip(BITS, grid, strict=True):
+        for axes, scene in zip(line, SCENES, strict=False):
+            chosen = [
+                row for row in rows if (row.sweep, row.scene, row.bits) == (BY_WIRES, scene, bits)
+            ]
+            _panel(axes, chosen, BY_WIRES)
+        _panel(line[-1], [row for row in rows if (row.sweep, row.bits) == (BY_BEND, bits)], BY_BEND)
+        line[0].set_ylabel(f"{bits} bit\nerror of a pressed cell [%]", color=INK)
+    for axes, title in zip(grid[0], (*SCENES, f"{SCENES[1]}, the skin bent"), strict=True):
+        axes.set_title(title, fontsize=11.5, color=INK)
+    for axes in grid[-1, :-1]:
+        axes.set_xlabel(f"row segment [Ω]; column: x {COLUMN_OVER_ROW:g}", color=INK)
+    grid[-1, -1].set_xlabel(
+        f"all wires over those at rest ({BENT_OHM:g} and {COLUMN_OVER_ROW * BENT_OHM:g} Ω)",
+        color=INK,
+    )
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    figure.supxlabel(textwrap.fill(_NOTE, 190), fontsize=8, color=INK)
+    return png_of(figure)
+
+
+def _panel(axes: Axes, rows: Sequence[Row], sweep: str) -> None:
+    """Medians as lines, and bars up to the 90th percentiles."""
+    axes.set_yscale("log")
+    axes.set_ylim(*_LIMITS_PERCENT)
+    if sweep == BY_WIRES:
+        axes.set_xscale("log")
+    prepare(axes)
+    for number, (readout, style) in enumerate(_STYLES.items()):
+        of_readout = [row for row in rows if row.readout == readout]
+        shift = _APART[sweep] ** (number - (len(_STYLES) - 1) / 2)
+        places = [shift * (row.wire_ohm if sweep == BY_WIRES else row.bend) for row in of_readout]
+        medians = [row.error_percent for row in of_readout]
+        tails = [row.error_p90_percent for row in of_readout]
+        axes.plot(places, medians, **{"linewidth": 1.2, "markersize": 5.0, **style})
+        axes.vlines(places, medians, tails, color=style["color"], alpha=0.3, linewidth=3.5)
+    write_plain_numbers(axes.xaxis, axes.yaxis)
+    if sweep == BY_BEND:
+        axes.set_xticks(sorted({row.bend for row in rows}))

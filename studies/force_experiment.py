@@ -19,11 +19,12 @@ the cells' memory and their noise leave to the best readout there can be.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
@@ -34,9 +35,9 @@ from ohmskin.force.regression import ForceRegression, fit_power
 from ohmskin.link.protocol import MODES
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 from studies.press import PressModel
+from studies.published import FORCE_RMSE_N
+from studies.rows import Progress, field_names, text_table
 from studies.trials import PAPER_METHODS
-
-Progress = Callable[[int, int], None]
 
 TRUTH: Final = "truth"
 UNTOLD: Final = "joint, wires not told"
@@ -45,9 +46,10 @@ LINE: Final = "line"
 SQUARES: Final = "squares"
 CHOICE: Final = "choice"
 REGRESSIONS: Final = (LINE, SQUARES, CHOICE)
+# Exponents that "squares" tries. Chosen: so far apart that the best one is met to 4 %.
 _EXPONENTS: Final = np.geomspace(0.1, 50, 81)
 EVERY_GROUP: Final = "mean"
-# A frame takes a tenth of a second.
+# A frame takes these a tenth of a second.
 SLOW: Final = PAPER_METHODS
 FAST: Final = (VOLTAGE, *(name for name in METHODS if name not in SLOW), TRUTH)
 ALL: Final = (VOLTAGE, *METHODS, TRUTH)
@@ -61,7 +63,13 @@ CELLS: Final = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """Methods on the same frames: the skin, how much is pressed and read, and cells of `CELLS`."""
+    """Methods on the same frames.
+
+    rows, columns: the skin.
+    plan: how much is pressed and read.
+    methods: what reads.
+    cells: names of `CELLS`: how the skin's cells answer to force.
+    """
 
     rows: int
     columns: int
@@ -70,7 +78,7 @@ class Comparison:
     cells: tuple[str, ...]
 
 
-# The second: so few frames that the paper's methods can be run on them as well.
+# The second has so few frames that the paper's methods can be run on them as well.
 FULL: Final = (
     Comparison(2, 2, Plan(), (*FAST, UNTOLD, FAR), tuple(CELLS)),
     Comparison(2, 2, Plan(4, 5, 4, 1), ALL, ("whole",)),
@@ -87,12 +95,18 @@ QUICK: Final = (
 class Row:
     """One method's errors [N], mean over skins.
 
-    cells: "whole", "no memory" (no hysteresis, no creep), "ideal" (no noise either). frames: read
-    of each skin. group: see `surface_trial`; "mean": the mean over groups. calibration_n: of the
-    pressed cell, over the calibration's own frames (2x2: of the group's cell). pressed_n: of the
-    robot's cell in the test. every_cell_n: of all cells in the test, be they pressed, under a
-    weight or free. pressed_below_percent, every_cell_below_percent: how much less than "voltage"
-    by the same regression; ..._below_best_percent: by the regression with which it errs least.
+    surface, rows, columns: the skin, "flat" or "curved".
+    cells: "whole", "no memory" (no hysteresis, no creep), "ideal" (no noise either).
+    skins, frames: how many there were, and how many frames of each.
+    regression, method: what gave the forces.
+    group: see `surface_trial`; "mean": the mean over groups.
+    calibration_n: of the pressed cell, in the calibration's own frames (2x2: of the group's cell).
+    pressed_n: of the robot's cell in the test.
+    every_cell_n: of all cells in the test, be they pressed, under a weight or free.
+    pressed_below_percent, every_cell_below_percent: how much less than "voltage" by the same
+    regression.
+    pressed_below_best_percent, every_cell_below_best_percent: how much less than "voltage" by the
+    regression with which it errs least.
     """
 
     surface: str
@@ -256,3 +270,77 @@ def _rows(
                 )
             )
     return rows
+
+
+# --------------------------------------------------------------------------------------- answers
+
+
+def surface_tables(rows: Sequence[Row]) -> list[Table]:
+    """RMSE in newton by method: in the calibration, and in the test by group.
+
+    "below": less than `voltage` by the same regression; "best": than `voltage` by whichever
+    regression suits it best.
+    """
+    tables = []
+    for places in dict.fromkeys(
+        (row.rows, row.columns, row.frames, row.regression) for row in rows
+    ):
+        of_table = [
+            row for row in rows if (row.rows, row.columns, row.frames, row.regression) == places
+        ]
+        first = of_table[0]
+        groups = list(dict.fromkeys(row.group for row in of_table))
+        skin = f"{first.surface} {places[0]}x{places[1]}, {places[3]}, simulated"
+        title = f"{skin}: RMSE [N], {first.skins} skins, {first.frames} frames each"
+        numbers = ("calibr.", *groups, "below", "best", "every cell", "below", "best")
+        table = text_table(("cells", "method"), numbers, title=title, title_justify="left")
+        before = ""
+        for cells, method in dict.fromkeys((row.cells, row.method) for row in of_table):
+            by_group = {
+                row.group: row for row in of_table if (row.cells, row.method) == (cells, method)
+            }
+            mean = by_group[EVERY_GROUP]
+            table.add_row(
+                cells if cells != before else "",
+                method,
+                f"{mean.calibration_n:.2f}",
+                *(f"{by_group[group].pressed_n:.2f}" for group in groups),
+                f"{mean.pressed_below_percent:.0f} %",
+                f"{mean.pressed_below_best_percent:.0f} %",
+                f"{mean.every_cell_n:.2f}",
+                f"{mean.every_cell_below_percent:.0f} %",
+                f"{mean.every_cell_below_best_percent:.0f} %",
+            )
+            before = cells
+        if places[:2] == (2, 2):
+            _add_published(table, first.surface)
+        tables.append(table)
+    return tables
+
+
+def _add_published(table: Table, surface: str) -> None:
+    printed = FORCE_RMSE_N[surface]
+    naive_n = np.mean(printed["naive", "estimation"])
+    for method in ("naive", "solved"):
+        by_cell = printed[method, "estimation"]
+        below = 100 * (1 - np.mean(by_cell) / naive_n)
+        table.add_row(
+            "paper" if method == "naive" else "",
+            method,
+            f"{np.mean(printed[method, 'calibration']):.2f}",
+            *(f"{error_n:.2f}" for error_n in (*by_cell, np.mean(by_cell))),
+            f"{below:.0f} %",
+        )
+
+
+def best_of_ours(rows: Iterable[Row]) -> list[dict[str, Any]]:
+    """The better of `joint` and `touch` with the regression chosen, against "voltage"."""
+    best: dict[tuple[int, int, str, int], Row] = {}
+    for row in rows:
+        if (row.group, row.regression) == (EVERY_GROUP, CHOICE) and row.method in OURS:
+            place = (row.rows, row.columns, row.cells, row.frames)
+            if place not in best or row.pressed_n < best[place].pressed_n:
+                best[place] = row
+    names = ["rows", "columns", "cells", "frames", "method", "pressed_n", "every_cell_n"]
+    names += [name for name in field_names(Row) if name.endswith("_percent")]
+    return [{name: getattr(row, name) for name in names} for row in best.values()]

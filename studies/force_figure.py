@@ -10,10 +10,17 @@ import numpy as np
 
 from ohmskin.estimate.methods import METHODS, VOLTAGE
 from ohmskin.estimate.ohm import voltage_level
-from studies.chart_figure import INK, method_style, png_of, prepare, require_matplotlib
+from studies.drawing import (
+    INK,
+    method_style,
+    new_figure,
+    png_of,
+    prepare,
+    write_plain_numbers,
+)
 from studies.force_experiment import CHOICE, EVERY_GROUP, FAR, TRUTH, UNTOLD, Row, learn, rises
 from studies.force_limits import ALONE, BESIDE, PRESSED_CELL, SmallestForce
-from studies.force_trial import ForceTrial
+from studies.force_trial import ForceTrial, groups_of
 from studies.published import FORCE_RMSE_N
 
 if TYPE_CHECKING:
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CELL_COLOURS: Final = ("#0072b2", "#000000", "#d55e00", "#8a8a8a")  # as in the paper's figure
-_CELL_NAMES: Final = ("(1, 1)", "(1, 2)", "(2, 1)", "(2, 2)")
+_CELL_NAMES: Final = groups_of(2, 2)
 _PAPER: Final = {"naive": "x", "solved": "+"}
 _PAPER_MARK: Final[dict[str, Any]] = {
     "color": INK,
@@ -33,16 +40,13 @@ _PAPER_MARK: Final[dict[str, Any]] = {
 
 def surface_picture(rows: Sequence[Row]) -> bytes:
     """The rows of `force_experiment.measure` as a PNG: the regression chosen, cells as measured."""
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
     shown = [
         row
         for row in rows
         if (row.regression, row.cells) == (CHOICE, "whole") and row.method != UNTOLD
     ]
     places = list(dict.fromkeys((row.rows, row.columns, row.frames) for row in shown))
-    figure = Figure(figsize=(15.5, 8.2), layout="constrained")
+    figure = new_figure(15.5, 8.2)
     surface = shown[0].surface
     bent = "" if surface == "flat" else ", wires 35 % longer since the calibration"
     figure.suptitle(
@@ -133,12 +137,9 @@ def _explain(figure: Figure, methods: Sequence[str]) -> None:
 
 def series_picture(trial: ForceTrial) -> bytes:
     """Force, readings, conductances and false forces of `force_limits.press_series`, as a PNG."""
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
     window = trial.group == 0
     time_s = trial.time_s[window] - trial.time_s[window][0]
-    figure = Figure(figsize=(9.5, 11.5), layout="constrained")
+    figure = new_figure(9.5, 11.5)
     figure.suptitle(
         "One press of cell (2, 2) of a 2x2 skin, 90 Hz, 10 bit: simulated", fontsize=14, color=INK
     )
@@ -180,10 +181,7 @@ def series_picture(trial: ForceTrial) -> bytes:
 
 def smallest_picture(rows: Sequence[SmallestForce]) -> bytes:
     """The rows of `force_limits.smallest_forces` as a PNG."""
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.5, 4.6), layout="constrained")
+    figure = new_figure(8.5, 4.6)
     figure.suptitle(
         "Smallest force told from none by one frame of a 2x2 skin: simulated",
         fontsize=13,
@@ -222,7 +220,7 @@ def smallest_picture(rows: Sequence[SmallestForce]) -> bytes:
     axes.set_xticks(range(len(methods)), methods)
     axes.set_xlim(-0.6, len(methods) - 0.3)
     axes.set_ylabel("force [N], 99 % detected at 1 % false alarms", color=INK)
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    write_plain_numbers(axes.yaxis)
     prepare(axes, axis="y")
     axes.legend(loc="upper right", frameon=False, fontsize=9.5)
     return png_of(figure)

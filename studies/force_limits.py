@@ -6,10 +6,12 @@ Sections V.C and V.D of [Su2024] (see `published`), 2x2.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
@@ -17,18 +19,33 @@ from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.link import protocol
-from studies.force_experiment import FAST, REGRESSIONS, SLOW, TRUTH, Progress, learn, rises
-from studies.force_trial import REST_FRAMES, Choreography, ForceTrial, OneFrameBoard, Plan
+from studies.force_experiment import FAST, REGRESSIONS, SLOW, TRUTH, learn, rises
+from studies.force_trial import (
+    REST_FRAMES,
+    Choreography,
+    ForceTrial,
+    OneFrameBoard,
+    Plan,
+    groups_of,
+)
 from studies.press import PressModel
+from studies.rows import Progress, text_table
 from studies.trials import knowledge_of, skin_at_rest
 
-SHAPE: Final = (2, 2)
-PRESSED_CELL: Final = 3  # (2, 2), as in the paper's figure
+SHAPE: Final = (2, 2)  # the paper's skin
+PRESSED_CELL: Final = 3  # number of the cell (2, 2), as in the paper's figure
+# The series lasts so long [s], and its press is so hard [N]: as in the paper's figure.
 SERIES_S: Final = 4.0
 SERIES_N: Final = 5.0
-# The paper's methods see every so many frames of the series.
+# The paper's methods see one frame of the series in so many. Chosen: a frame takes them 0.1 s.
 _SLOW_EVERY: Final = 10
+# Force of the touches beside [N], and the largest force that is tried. Chosen: the weight of 100 g,
+# about.
 TOUCH_N: Final = 1.0
+# The least force that is tried [N]. Chosen: below what any method tells from none.
+_LEAST_N: Final = 0.005
+# Share of the frames without a force that count as touched, and share of those with a force that
+# must. Chosen.
 FALSE_ALARMS: Final = 0.01
 DETECTED: Final = 0.99
 ALONE: Final = "alone"
@@ -37,9 +54,11 @@ BESIDE: Final = "beside two touches"
 
 @dataclass(frozen=True)
 class CrossTalk:
-    """Largest false force on an unpressed cell over the largest force on the pressed one [%].
+    """Largest false force on an unpressed cell over the largest force on the pressed one.
 
-    Mean over skins, and the worst of them.
+    regression, method: what gave the forces.
+    skins: how many there were.
+    percent, worst_percent: mean over them, and the worst of them.
     """
 
     regression: str
@@ -67,25 +86,25 @@ def cross_talk(
 ) -> tuple[ForceTrial, list[CrossTalk]]:
     """The first skin's series, and what all of them show; the paper's methods on fewer skins."""
     total, done = seeds * len(FAST) + slow_seeds * len(SLOW), 0
-    found: dict[tuple[str, str], list[float]] = {}
+    percents: dict[tuple[str, str], list[float]] = {}
     trials = [press_series(seed) for seed in range(seeds)]
     with threadpool_limits(limits=1):
         for method in (*FAST, *SLOW):
             for trial in trials if method not in SLOW else trials[:slow_seeds]:
-                seen = _thinned(trial) if method in SLOW else trial
-                rise = rises(method, seen)
+                shown = _thinned(trial) if method in SLOW else trial
+                rise = rises(method, shown)
                 for regression in REGRESSIONS:
-                    force_n = learn(seen, rise, regression)(rise)[seen.group == 0]
+                    force_n = learn(shown, rise, regression)(rise)[shown.group == 0]
                     false_n = np.delete(force_n.reshape(len(force_n), -1), PRESSED_CELL, axis=1)
-                    found.setdefault((regression, method), []).append(
+                    percents.setdefault((regression, method), []).append(
                         100 * float(np.abs(false_n).max()) / SERIES_N
                     )
                 done += 1
                 if progress is not None:
                     progress(done, total)
     return trials[0], [
-        CrossTalk(*key, len(each), round(float(np.mean(each)), 3), round(max(each), 3))
-        for key, each in found.items()
+        CrossTalk(*key, len(of_skins), round(float(np.mean(of_skins)), 3), round(max(of_skins), 3))
+        for key, of_skins in percents.items()
     ]
 
 
@@ -108,8 +127,9 @@ def _thinned(trial: ForceTrial) -> ForceTrial:
 class SmallestForce:
     """Smallest force on a cell that one frame tells from none [N]; None: none up to 1 N.
 
-    scene: `ALONE` or `BESIDE`. by_cell_n: the median over skins, cells row by row. median_n,
-    worst_n: over cells and skins.
+    method, scene: what reads; `ALONE` or `BESIDE`.
+    by_cell_n: the median over skins, cells row by row.
+    median_n, worst_n: over cells and skins.
     """
 
     method: str
@@ -121,7 +141,14 @@ class SmallestForce:
 
 @dataclass(frozen=True)
 class Detection:
-    """Skins, frames without force, and frames at each of so many forces up to 1 N."""
+    """How much is read.
+
+    seeds: skins.
+    empty_frames: frames without force.
+    frames: frames at each force.
+    forces: how many forces are tried, up to 1 N.
+    methods: what reads.
+    """
 
     seeds: int = 4
     empty_frames: int = 400
@@ -137,8 +164,8 @@ def smallest_forces(plan: Detection, progress: Progress | None = None) -> list[S
     1 % of the frames without force on it exceed, in the same scene; a force is told from none when
     99 % of its frames are. Forces are held still; contacts are as noisy as in `PressModel`.
     """
-    forces_n = np.geomspace(0.005, 1.0, plan.forces)
-    found: dict[tuple[str, str], Float] = {
+    forces_n = np.geomspace(_LEAST_N, TOUCH_N, plan.forces)
+    least_n: dict[tuple[str, str], Float] = {
         (method, scene): np.empty((plan.seeds, 4))
         for method in plan.methods
         for scene in (ALONE, BESIDE)
@@ -154,7 +181,8 @@ def smallest_forces(plan: Detection, progress: Progress | None = None) -> list[S
                         weakest = np.quantile(
                             touched.reshape(plan.forces, -1), 1 - DETECTED, axis=1
                         )
-                        found[method, scene][seed, cell] = _crossing(forces_n, weakest - threshold)
+                        margin = weakest - threshold
+                        least_n[method, scene][seed, cell] = crossing_n(forces_n, margin)
                     done += 1
                     if progress is not None:
                         progress(done, total)
@@ -162,11 +190,11 @@ def smallest_forces(plan: Detection, progress: Progress | None = None) -> list[S
         SmallestForce(
             method,
             scene,
-            tuple(_number(value) for value in np.median(each_n, axis=0)),
-            _number(np.median(each_n)),
-            _number(each_n.max()),
+            tuple(_number(value) for value in np.median(by_skin_n, axis=0)),
+            _number(np.median(by_skin_n)),
+            _number(by_skin_n.max()),
         )
-        for (method, scene), each_n in found.items()
+        for (method, scene), by_skin_n in least_n.items()
     ]
 
 
@@ -207,8 +235,8 @@ def _levels(plan: Detection, forces_n: Float, seed: int, scene: str, cell: int) 
     return levels
 
 
-def _crossing(forces_n: Float, margin: Float) -> float:
-    """The force from which on the margin stays above 0; inf if it does not."""
+def crossing_n(forces_n: Float, margin: Float) -> float:
+    """The force [N] from which on the margin stays above 0; inf if it does not."""
     below = np.flatnonzero(margin <= 0)
     if not below.size:
         return float(forces_n[0])
@@ -222,3 +250,32 @@ def _crossing(forces_n: Float, margin: Float) -> float:
 
 def _number(force_n: float) -> float | None:
     return round(float(force_n), 4) if np.isfinite(force_n) else None
+
+
+# --------------------------------------------------------------------------------------- answers
+
+
+def talk_table(rows: Iterable[CrossTalk]) -> Table:
+    """Cross-talk by method."""
+    title = "largest false force on an unpressed cell over the largest on the pressed, simulated"
+    numbers = ("skins", "mean %", "worst %")
+    table = text_table(("regression", "method"), numbers, title=title, title_justify="left")
+    for row in rows:
+        percents = (f"{row.percent:.2f}", f"{row.worst_percent:.2f}")
+        table.add_row(row.regression, row.method, str(row.skins), *percents)
+    return table
+
+
+def smallest_table(rows: Iterable[SmallestForce]) -> Table:
+    """The smallest force told from none, by method and scene."""
+    title = "smallest force told from none by one frame [N], simulated"
+    numbers = ("median", "worst", *groups_of(*SHAPE))
+    table = text_table(("scene", "method"), numbers, title=title, title_justify="left")
+    for row in sorted(rows, key=lambda row: row.scene):
+        forces_n = (row.median_n, row.worst_n, *row.by_cell_n)
+        table.add_row(
+            row.scene,
+            row.method,
+            *("above 1" if number is None else f"{number:.3f}" for number in forces_n),
+        )
+    return table

@@ -2,77 +2,51 @@
 """What each method does where methods fail: is it right, does it say that it is not, or neither?
 
 Simulation, all of it. Every frame of every condition (`conditions`) gets one of three verdicts, see
-`verdict`. Methods get the same 8x8 skins; those of the paper, which take a second a frame where
-they fail, fewer and smaller ones. A skin follows from its condition and number alone: the results
-do not depend on how many processes there are.
+`judge.verdict`. Methods get the same 8x8 skins; those of the paper, which take a second a frame
+where they fail, fewer and smaller ones. A skin follows from its condition and number alone: the
+results do not depend on how many processes there are.
 """
 
 from __future__ import annotations
 
-import csv
-import io
+import textwrap
 import zlib
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
-from dataclasses import astuple, dataclass, fields, replace
-from enum import StrEnum
-from typing import Final
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from joblib import Parallel, delayed
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.methods import METHODS, make_estimator
-from studies.conditions import SWEEPS, Case, Shape
+from studies.conditions import SWEEPS, Case, Shape, Sweep
+from studies.drawing import (
+    INK,
+    method_style,
+    new_figure,
+    png_of,
+    prepare,
+    write_plain_numbers,
+)
+from studies.judge import Verdict, verdict
+from studies.rows import Progress, as_csv, field_names, in_processes, text_table
 from studies.trials import PAPER_METHODS
 
-# An error within either counts as none: a share of the truth, the least rise called a touch.
-CLOSE_SHARE: Final = 0.05
-CLOSE_SIEMENS: Final = 0.5e-6
-STATED_STDS: Final = 4.0
-
-
-class Verdict(StrEnum):
-    """Of one frame; see `verdict`."""
-
-    RIGHT = "right"
-    FLAGGED = "flagged"
-    WRONG_UNFLAGGED = "wrong_unflagged"
-
-
-def verdict(
-    cell_siemens: Float, cell_siemens_std: Float, converged: bool, true_siemens: Float
-) -> Verdict:
-    """Judge a frame's answer against the true cells, all (R, C) [S].
-
-    A cell is off when |g - g_true| > max(5 % of g_true, 0.5e-6 S), or when g is NaN; it is stated
-    when |g - g_true| <= 4 of its standard deviations (NaN counts as 0).
-
-    - right: converged, and no cell is off.
-    - wrong_unflagged: converged, and a cell is off and not stated. The reader is misled.
-    - flagged: the rest. Not converged, or all that is off is stated.
-
-    A fault excuses nothing: the truth is the cell's conductance, whether or not readings tell it.
-    """
-    if not converged:
-        return Verdict.FLAGGED
-    error = np.abs(cell_siemens - true_siemens)
-    # Written so that NaN is off and not stated.
-    off = ~(error <= np.maximum(CLOSE_SHARE * true_siemens, CLOSE_SIEMENS))
-    stated = error <= STATED_STDS * np.where(np.isnan(cell_siemens_std), 0.0, cell_siemens_std)
-    if not off.any():
-        return Verdict.RIGHT
-    return Verdict.WRONG_UNFLAGGED if (off & ~stated).any() else Verdict.FLAGGED
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
 class Row:
-    """Frames of one method under one condition, by verdict: these add up to `frames`.
+    """Frames of one method under one condition, by verdict.
 
-    raised: those of the flagged ones at which the method raised an exception instead of answering.
+    sweep, x: the condition, see `conditions.Sweep`.
+    frames: how many there were: the sum of the next three.
+    right, flagged, wrong_unflagged: how many got this `Verdict`.
+    raised: how many of the flagged ones made the method raise an exception instead of answering.
     """
 
     sweep: str
@@ -86,8 +60,9 @@ class Row:
 
     def plus(self, other: Row) -> Row:
         """Both rows' frames."""
-        names = [field.name for field in fields(Row)[3:]]
-        return replace(self, **{name: getattr(self, name) + getattr(other, name) for name in names})
+        counts = field_names(Row)[3:]
+        sums = {name: getattr(self, name) + getattr(other, name) for name in counts}
+        return replace(self, **sums)
 
     def counting(self, said: Verdict, raised: bool) -> Row:
         """One frame more."""
@@ -100,7 +75,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Plan:
-    """How many skins a condition, frames a skin, of what shape; paper_...: for its two methods."""
+    """How much is measured; the paper's two methods have numbers of their own.
+
+    skins, paper_skins: of each condition.
+    frames, paper_frames: of each skin.
+    shape, paper_shape: of the skins.
+    """
 
     skins: int
     frames: int
@@ -133,7 +113,7 @@ def tasks_of(plan: Plan, methods: Iterable[str] = METHODS) -> list[Task]:
     for method in methods:
         (papers if method in PAPER_METHODS else others).append(method)
     conditions = [(sweep.name, x) for sweep in SWEEPS.values() for x in sweep.values]
-    # The paper's two apart, too: each takes seconds.
+    # Each of the paper's two is a task of its own, too, because a frame takes it seconds.
     longest = [
         Task(*condition, (method,), plan.paper_shape, skin, plan.paper_frames)
         for condition in conditions
@@ -147,7 +127,7 @@ def tasks_of(plan: Plan, methods: Iterable[str] = METHODS) -> list[Task]:
     ]
 
 
-def judge(task: Task) -> list[Row]:
+def verdicts_of(task: Task) -> list[Row]:
     """The verdicts of one task, a row a method, computed in one thread."""
     with threadpool_limits(limits=1):
         condition = zlib.crc32(f"{task.sweep} {task.x}".encode())
@@ -166,15 +146,10 @@ def _judge_method(task: Task, method: str, case: Case) -> Row:
     for frame in case.frames:
         if frame.afresh:
             estimator.reset()
-        found = _answer(estimator, frame.ratio)
-        if frame.cell_siemens is None:
-            continue
-        said = Verdict.FLAGGED
-        if found is not None:
-            said = verdict(
-                found.cell_siemens, found.cell_siemens_std, found.converged, frame.cell_siemens
-            )
-        row = row.counting(said, raised=found is None)
+        estimate = _answer(estimator, frame.ratio)
+        if frame.cell_siemens is not None:
+            said = verdict(estimate, frame.cell_siemens)
+            row = row.counting(said, raised=estimate is None)
     return row
 
 
@@ -182,33 +157,24 @@ def _answer(estimator: Estimator, ratio: Float) -> Estimate | None:
     try:
         return estimator.estimate(ratio)
     except Exception:
-        # Of whatever kind: it misleads nobody, but has a count of its own.
+        # An exception of whatever kind misleads nobody, but it is counted.
         return None
 
 
 def measure(
-    tasks: Sequence[Task],
-    *,
-    jobs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    tasks: Sequence[Task], *, jobs: int | None = None, progress: Progress | None = None
 ) -> list[Row]:
     """Do all tasks: a row a condition and method, in the order of `SWEEPS` and `METHODS`.
 
-    jobs: processes, -1 for one a core; None for what a `joblib.parallel_backend` around this call
-    says, which may be a cluster, else one. progress: called with the tasks done and all tasks.
+    jobs: processes, as `in_processes` takes them. progress: called after each task.
     """
-    found: dict[tuple[str, float | str, str], Row] = {}
-    parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
-    # Closed on whatever way out, so that no process goes on without a reader.
-    with closing(parallel(delayed(judge)(task) for task in tasks)) as answers:
-        for done, rows in enumerate(answers, start=1):
-            for row in rows:
-                key = (row.sweep, row.x, row.method)
-                found[key] = found[key].plus(row) if key in found else row
-            if progress is not None:
-                progress(done, len(tasks))
+    by_place: dict[tuple[str, float | str, str], Row] = {}
+    for rows in in_processes(verdicts_of, tasks, jobs, progress):
+        for row in rows:
+            place = (row.sweep, row.x, row.method)
+            by_place[place] = by_place[place].plus(row) if place in by_place else row
     order = [(s.name, x, method) for s in SWEEPS.values() for x in s.values for method in METHODS]
-    return [found[key] for key in order if key in found]
+    return [by_place[place] for place in order if place in by_place]
 
 
 # --------------------------------------------------------------------------------------- answers
@@ -216,21 +182,15 @@ def measure(
 
 def csv_text(rows: Iterable[Row]) -> str:
     """sweep, x, method, and how many frames there were, by verdict."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in fields(Row)[:-1]])
-    for row in rows:
-        x = row.x if isinstance(row.x, str) else f"{row.x:.4g}"
-        writer.writerow([row.sweep, x, *astuple(row)[2:-1]])
-    return text.getvalue()
+    return as_csv(field_names(Row)[:-1], (astuple(row)[:-1] for row in rows))
 
 
 def totals(rows: Iterable[Row]) -> dict[str, Row]:
     """All frames of each method."""
-    found: dict[str, Row] = {}
+    by_method: dict[str, Row] = {}
     for row in rows:
-        found[row.method] = found.get(row.method, Row("", "", row.method)).plus(row)
-    return found
+        by_method[row.method] = by_method.get(row.method, Row("", "", row.method)).plus(row)
+    return by_method
 
 
 def shares(rows: Iterable[Row]) -> dict[str, dict[str, float]]:
@@ -247,10 +207,8 @@ def shares(rows: Iterable[Row]) -> dict[str, dict[str, float]]:
 
 def summary(rows: Sequence[Row]) -> Table:
     """Two of the three shares per sweep and method, for a terminal."""
-    table = Table(box=None, title="right / wrong and not flagged [% of frames]")
     methods = list(totals(rows))
-    for heading in ("sweep", *methods):
-        table.add_column(heading, justify="left" if heading == "sweep" else "right")
+    table = text_table(["sweep"], methods, title="right / wrong and not flagged [% of frames]")
     parts = {name: [row for row in rows if row.sweep == name] for name in SWEEPS}
     for name, part in {**parts, "all": rows}.items():
         by_method = totals(part)
@@ -261,3 +219,158 @@ def summary(rows: Sequence[Row]) -> Table:
 def _percent(row: Row) -> str:
     right, wrong = (100 * count / row.frames for count in (row.right, row.wrong_unflagged))
     return f"{right:.0f} / {wrong:.{0 if wrong >= 10 else 1}f}"
+
+
+# -------------------------------------------------------------------------------------- picture
+
+# More frames than this that are wrong and not flagged are red. Chosen: one frame in a hundred.
+BAR_PERCENT: Final = 1.0
+_RED: Final = "#b3001b"
+_RED_TINT: Final = "#fdeae8"
+_GROUP_WIDTH: Final = 0.8  # share of the distance between two labels that bars take
+_FEW_FRAMES: Final = 10  # with fewer frames of a condition, the line is dotted
+# A logarithmic axis whose ends differ by less than this factor has ticks at its conditions, because
+# powers of ten would be too few.
+_DECADES: Final = 100.0
+_NOTES: Final = (
+    "Right: converged, and every cell of the frame within 5 % of the truth, or 0.5 µS. "
+    "Wrong and not flagged: converged, and a cell is neither that close nor within 4 of its stated "
+    "standard deviations; a method that states none has no excuse. "
+    "The rest is flagged: not converged, or uncertain by the method's own word. "
+    "Dotted: fewer than 10 frames a condition, of smaller skins.",
+    "Simulation. Readings of 10 bits, as are those at rest. What a panel does not vary: wire "
+    "segments of 100 and 200 Ω, told; to 10 of 64 cells touched, with 1 to 100 kΩ, anew in each "
+    "frame; each frame started from the one before. Truth is the cell's, whatever the fault.",
+)
+
+
+def picture(rows: Sequence[Row]) -> bytes:
+    """The rows of `stability.measure` as a PNG.
+
+    :raises OhmskinError: matplotlib is not installed.
+    """
+    measured = {row.sweep for row in rows}
+    figure = new_figure(17.0, 12.6)
+    figure.suptitle("Where methods fail, and whether they say so", fontsize=17, color=INK)
+    # Labels need more room than numbers: to the right, and below.
+    lines = figure.add_gridspec(3, 1, height_ratios=(5.0, 5.6, 1.3))
+    for line, labelled in enumerate((False, True)):
+        sweeps = [s for s in SWEEPS.values() if s.name in measured and s.labelled == labelled]
+        if not sweeps:
+            continue
+        widths = [len(sweep.values) if labelled else 1 for sweep in sweeps]
+        places = lines[line].subgridspec(2, len(sweeps), width_ratios=widths, height_ratios=(3, 2))
+        for column, sweep in enumerate(sweeps):
+            upper = figure.add_subplot(places[0, column])
+            lower = figure.add_subplot(places[1, column], sharex=upper)
+            _prepare(upper, lower, sweep, leftmost=column == 0)
+            _draw(upper, lower, sweep, rows)
+    _explain(figure.add_subplot(lines[2]), rows)
+    return png_of(figure)
+
+
+def _draw(upper: Axes, lower: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
+    """Lines over numbers, and bars over labels."""
+    methods = list(totals(rows))
+    width = _GROUP_WIDTH / len(methods)
+    for number, method in enumerate(methods):
+        found = {row.x: row for row in rows if (row.sweep, row.method) == (sweep.name, method)}
+        style = method_style(method)
+        for axes, said in ((upper, Verdict.RIGHT), (lower, Verdict.WRONG_UNFLAGGED)):
+            percent = [
+                100 * getattr(found[x], str(said)) / found[x].frames if x in found else np.nan
+                for x in sweep.values
+            ]
+            if sweep.labelled:
+                shift = (number + 0.5) * width - _GROUP_WIDTH / 2
+                at = shift + np.arange(len(percent))
+                axes.bar(at, percent, width, color=style["color"], zorder=3)
+            else:
+                few = max((row.frames for row in found.values()), default=0) < _FEW_FRAMES
+                style |= {"linestyle": ":" if few else "-", "linewidth": 1.8, "markersize": 5.5}
+                at = np.array(sweep.values, dtype=float)
+                axes.plot(at, percent, clip_on=False, zorder=3 + number / 10, **style)
+
+
+def _prepare(upper: Axes, lower: Axes, sweep: Sweep, leftmost: bool) -> None:
+    upper.set_title(sweep.title, fontsize=13, fontweight="bold", color=INK, pad=9)
+    upper.set_ylim(0, 100)
+    # Linear to the bar, logarithmic from there on: both 0.2 % and 60 % can be read.
+    lower.set_yscale("symlog", linthresh=BAR_PERCENT, linscale=0.5)
+    lower.set_ylim(0, 100)
+    lower.set_yticks([0, BAR_PERCENT, 10, 100])
+    lower.set_yticks([], minor=True)
+    write_plain_numbers(lower.yaxis)
+    lower.set_facecolor(_RED_TINT)
+    lower.axhspan(0, BAR_PERCENT, color="white", zorder=0.6, linewidth=0)
+    lower.axhline(BAR_PERCENT, color=_RED, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3.9)
+    for axes, grey in ((upper, "#e4e4e4"), (lower, "#f0cfcb")):
+        prepare(axes, colour=grey, axis="y")
+        axes.tick_params(labelleft=leftmost)
+    upper.tick_params(labelbottom=False)
+    if leftmost:
+        upper.set_ylabel("right [% of frames]", color=INK)
+        lower.set_ylabel("wrong and\nnot flagged [%]", color=_RED)
+    if sweep.labelled:
+        _prepare_labels(upper, lower, sweep)
+        return
+    lower.set_xlabel(sweep.axis, color=INK)
+    values = [float(x) for x in sweep.values]
+    if sweep.logarithmic:
+        upper.set_xscale("log")
+        if max(values) / min(values) < _DECADES:
+            lower.set_xticks(values[::2])
+            lower.set_xticks([], minor=True)
+    write_plain_numbers(lower.xaxis)
+    upper.set_xlim(min(values), max(values))
+
+
+def _prepare_labels(upper: Axes, lower: Axes, sweep: Sweep) -> None:
+    places = range(len(sweep.values))
+    upper.set_xlim(-0.5, len(places) - 0.5)
+    lower.set_xticks(places, [str(x) for x in sweep.values], rotation=32, ha="right")
+    for label in lower.get_xticklabels():
+        label.set_rotation_mode("anchor")
+    for axes in (upper, lower):
+        axes.tick_params(axis="x", length=0)
+        for place in places[1:]:
+            axes.axvline(place - 0.5, color="#d5d5d5", linewidth=0.7, zorder=0.7)
+
+
+def _explain(axes: Axes, rows: Sequence[Row]) -> None:
+    """Legend with totals, and notes."""
+    from matplotlib.lines import Line2D
+
+    axes.set_axis_off()
+    all_frames = totals(rows)
+    handles = [
+        Line2D([], [], label=f"{method}\n{_share(all_frames[method])}", **method_style(method))
+        for method in METHODS
+        if method in all_frames
+    ]
+    axes.legend(
+        handles=handles,
+        title="wrong and not flagged, in all panels together",
+        title_fontproperties={"size": 11, "weight": "bold"},
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1.05),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=11,
+        columnspacing=3.0,
+    ).get_title().set_color(_RED)
+    axes.text(
+        0.5,
+        0.2,
+        "\n".join(textwrap.fill(note, 200) for note in _NOTES),
+        transform=axes.transAxes,
+        va="top",
+        ha="center",
+        fontsize=9,
+        color=INK,
+        linespacing=1.4,
+    )
+
+
+def _share(row: Row) -> str:
+    return f"{100 * row.wrong_unflagged / row.frames:.2g} % of {row.frames} frames"

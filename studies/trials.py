@@ -1,46 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated skins whose truth is known: what methods are measured on. Simulation, all of it.
+"""Skins whose truth is known: what methods are measured on.
 
-A trial is one skin and frames of touches, drawn from a seed: cells of about 1 MOhm at rest, touches
-of 1 to 100 kOhm (log-uniform) at random places, wires that vary by 10 % around 100 and 200 Ohm.
+A trial is one skin and frames of it. Most are simulated, drawn from a seed: cells of about 1 MOhm
+at rest, touches of 1 to 100 kOhm (log-uniform) at random places, wires that vary by 10 % around 100
+and 200 Ohm. `reference_trial` gives the skins of tests/data, which ngspice has solved.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, readings
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, REST_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.link.protocol import ADC_BITS
-from ohmskin.record.readings import Readings
+from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES
+from ohmskin.record.readings import Readings, load_readings
 
-REST_OHM: Final = 1e6
-TOP_WIRE_OHM: Final = 100.0
-BOTTOM_WIRE_OHM: Final = 200.0
-SPREAD: Final = 0.1  # of the log of rest resistances and wires
+DATA: Final = Path(__file__).parents[1] / "tests" / "data"
+NOMINAL_WIRE_OHM: Final = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+# Standard deviation of the log of cells at rest and of wire segments. Chosen: as the emulator's
+# scenes have it.
+SPREAD: Final = 0.1
+# The hardest touch and the lightest one [ohm]. Chosen: the two decades from one below a cell at
+# rest.
 TOUCH_OHM: Final = (1e3, 1e5)
-# A cell counts as pressed from here on, as a multiple of its conductance at rest.
+# A cell counts as pressed if it conducts so many times as much as at rest. Chosen: cells at rest
+# vary by less, and the lightest touch conducts ten times as much.
 PRESSED: Final = 1.5
 # The paper's programmes: they take minutes for a frame of 8x8 cells.
 PAPER_METHODS: Final = ("lsq", "regularized")
-# A fingertip: radius of its pressure, range of its peaks, frames of its way round a circle.
+# Standard deviation of the noise before the converter [LSB], where readings have any. It is that of
+# emulator:// boards.
+NOISE_LSB: Final = 0.3
+# Wires of a bent skin over those of the flat one. Chosen: a bit more than the 30 % by which `joint`
+# expects a layer of wires to be off.
+BEND: Final = 1.35
+# Wires after a sudden change over those before. Chosen: harder than a bend.
+JUMP: Final = 1.5
+# A fingertip: standard deviation of its pressure [cells], range of its peaks [S], and how long its
+# way round a circle takes [frames]. Chosen: it covers some 15 cells, and moves on in each frame.
 FINGER_CELLS: Final = 0.7
 FINGER_SIEMENS: Final = (5e-5, 5e-4)
 FINGER_FRAMES: Final = 40
-JUMP: Final = 1.5  # of all wires
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Readings, what is told with them, and the truth behind them.
+    """One skin: its readings, what is told with them, and the truth behind them.
 
-    readings: exact, of F frames. frames: the skin in each of them. rest: the untouched skin.
+    readings: exact, of F frames, with the rest readings and the nominal wires that are told.
+    frames: the skin in each frame.
+    rest: the untouched skin.
     """
 
     readings: Readings
@@ -57,24 +74,58 @@ class Trial:
         """Cells that conduct half as much again as at rest, or more, (F, R, C)."""
         return np.asarray(self.cell_siemens > PRESSED * self.rest.cell_siemens)
 
-    def rounded(self, bits: int | None) -> Readings:
-        """The readings as a converter of so many bits gives them; None: exact."""
-        exact = self.readings
-        if bits is None:
-            return exact
-        rest = exact.rest_ratio
+    def rounded(self, bits: int | None, *, mode: str = "near", wires_told: bool = True) -> Readings:
+        """The readings as a board with a converter of so many bits gives them; None: exact.
+
+        mode: the board's, "near" or "far". Without `wires_told`, nobody knows the nominal wires.
+        """
+        exact = self._exact(mode)
+        if not wires_told:
+            exact = without_wires(exact)
+        return exact if bits is None else rounded(exact, bits)
+
+    def _exact(self, mode: str) -> Readings:
+        given, names = self.readings, MODES[mode]
+        if given.reading_names == names:
+            return given
+        if set(names) <= set(given.reading_names):
+            of_all, ratio, rest_ratio = given.reading_names, given.ratio, given.rest_ratio
+            assert rest_ratio is not None
+        else:
+            of_all = tuple(ENUMS["reading"].values)
+            rest_ratio, *frames = (
+                all_readings(skin, end_admittance(skin)) for skin in (self.rest, *self.frames)
+            )
+            ratio = np.array(frames)
+        chosen = [of_all.index(name) for name in names]
         return replace(
-            exact,
-            ratio=ratio_from_codes(quantise(exact.ratio, bits), bits),
-            rest_ratio=None if rest is None else ratio_from_codes(quantise(rest, bits), bits),
-            adc_bits=bits,
+            given,
+            ratio=ratio[..., chosen],
+            rest_ratio=rest_ratio[..., chosen],
+            reading_names=names,
         )
+
+
+def rounded(exact: Readings, bits: int = ADC_BITS) -> Readings:
+    """Exact readings as a converter of so many bits gives them, those at rest as well."""
+    rest = exact.rest_ratio
+    return replace(
+        exact,
+        ratio=ratio_from_codes(quantise(exact.ratio, bits), bits),
+        rest_ratio=None if rest is None else ratio_from_codes(quantise(rest, bits), bits),
+        adc_bits=bits,
+    )
+
+
+def without_wires(given: Readings) -> Readings:
+    """These readings, where nobody knows the nominal wires."""
+    return replace(given, nominal_top_wire_ohm=None, nominal_bottom_wire_ohm=None)
 
 
 def uniform_skin(
     shape: tuple[int, int],
     cell_siemens: float = 1 / REST_OHM,
-    wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
 ) -> Skin:
     """A skin whose cells are all alike, and so are the segments of a layer."""
     cell, top, bottom = (np.full(shape, each) for each in (cell_siemens, *wire_ohm))
@@ -86,7 +137,7 @@ def skin_at_rest(
     columns: int,
     random: np.random.Generator,
     *,
-    wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
     spread: float = SPREAD,
 ) -> Skin:
     """An untouched skin; every resistance is log-normal with this spread."""
@@ -116,7 +167,7 @@ def stretched(skin: Skin, factor: float) -> Skin:
 
 
 def knowledge_of(
-    rest_ratio: Float, nominal_wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    rest_ratio: Float, nominal_wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM
 ) -> SkinKnowledge:
     """What estimators of 10-bit readings are told: rest (R, C, 4), nominal wires, no more."""
     rows, columns, _ = rest_ratio.shape
@@ -132,7 +183,7 @@ def knowledge_of(
 def trial_of(
     rest: Skin,
     frames: list[Skin],
-    nominal_wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    nominal_wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
 ) -> Trial:
     """A trial whose estimators are told the rest readings and the nominal wires."""
     told = Readings(
@@ -146,21 +197,47 @@ def trial_of(
     return Trial(told, tuple(frames), rest)
 
 
-def random_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
-    """Frames of 0 to `touches` touches, each frame touched anew: the hardest for a warm start."""
+def reference_trial(name: str) -> Trial:
+    """The skin of a file of tests/data, solved by ngspice; `tests/data/README.md` describes them.
+
+    The wires of a sweep change from frame to frame: then `rest` has those of the first frame.
+    """
+    path = DATA / f"{name}.npz"
+    given = load_readings(path)
+    with np.load(path, allow_pickle=False) as file:
+        cell_siemens, rest_siemens = 1 / file["cell_ohm"], 1 / file["rest_ohm"]
+        top, bottom = (
+            np.broadcast_to(file[f"{layer}_wire_ohm"], cell_siemens.shape)
+            for layer in ("top", "bottom")
+        )
+    references = given.ref_top_ohm, given.ref_bottom_ohm
+    frames = (Skin(*layers, *references) for layers in zip(cell_siemens, top, bottom, strict=True))
+    return Trial(given, tuple(frames), Skin(rest_siemens, top[0], bottom[0], *references))
+
+
+def random_trial(
+    rows: int,
+    columns: int,
+    touches: int,
+    frames: int,
+    seed: int,
+    *,
+    wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
+) -> Trial:
+    """Frames of 0 to `touches` touches, each frame touched anew: the hardest for a warm start.
+
+    wire_ohm: the middle of the segments of each layer; these nominal wires are told.
+    """
     random = np.random.default_rng(seed)
-    rest = skin_at_rest(rows, columns, random)
+    rest = skin_at_rest(rows, columns, random, wire_ohm=wire_ohm)
     counts = random.integers(0, touches + 1, frames)
-    return trial_of(rest, [touch(rest, int(count), random) for count in counts])
+    return trial_of(rest, [touch(rest, int(count), random) for count in counts], wire_ohm)
 
 
 def bent_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
     """As `random_trial`, on a skin bent since its rest readings: wires 35 % above nominal."""
-    random = np.random.default_rng(seed)
-    rest = skin_at_rest(rows, columns, random)
-    now = stretched(rest, 1.35)
-    counts = random.integers(0, touches + 1, frames)
-    return trial_of(rest, [touch(now, int(count), random) for count in counts])
+    trial = random_trial(rows, columns, touches, frames, seed)
+    return trial_of(trial.rest, [stretched(skin, BEND) for skin in trial.frames])
 
 
 def jump_trial(rows: int, columns: int, touches: int, frames: int, seed: int) -> Trial:
@@ -178,7 +255,7 @@ def finger_trial(
     *,
     sigma_cells: tuple[float, float] = (FINGER_CELLS, FINGER_CELLS),
     peak_siemens: tuple[float, float] = FINGER_SIEMENS,
-    wire_ohm: tuple[float, float] = (TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
+    wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
 ) -> Trial:
     """Soft fingertips that move in circles: one on skins of an even seed, else two.
 

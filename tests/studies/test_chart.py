@@ -3,7 +3,6 @@
 
 import csv
 import io
-import shutil
 import signal
 import time
 from dataclasses import fields, replace
@@ -11,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from command_line import Command, finish
-from network import laplacian_readings
-from ohmskin.circuit.skin import Skin, readings
+from ohmskin.circuit.skin import readings
 from ohmskin.estimate.methods import METHODS
 from skins import reference
-from studies import casadi_circuit, chart, chart_figure, chart_table, published
+from studies import chart, chart_figure, published
 from studies.chart import Plan, Row, Size, pareto_front
 from waiting import until
 
@@ -85,7 +82,7 @@ def test_far_ends_read_the_same_frames(rows: list[Row]) -> None:
         assert (far.frames, far.pressed_cells) == (near.frames, near.pressed_cells)
         assert 0 < far.ms <= far.ms_p90
         assert 0 <= far.error_percent < 2  # per cent; measured: 0.3 at 10 bits
-    assert "2x2 10 bit far" in {*chart_table.summary(rows).columns[0].cells}
+    assert "2x2 10 bit far" in {*chart.summary(rows).columns[0].cells}
 
 
 def test_progress_counts_every_frame() -> None:
@@ -105,11 +102,11 @@ def test_limits_are_ordered(rows: list[Row]) -> None:
 
 
 def test_median_error_of_normal_deviations() -> None:
-    assert chart._median_error([1.0]) == pytest.approx(0.6745, abs=2e-3)
+    assert chart.median_error([1.0]) == pytest.approx(0.6745, abs=2e-3)
     random = np.random.default_rng(2)
     stds = np.exp(random.standard_normal(40))
     drawn = np.abs(stds * random.standard_normal((20_000, 40)))
-    assert chart._median_error(stds) == pytest.approx(np.median(drawn), rel=1e-2)
+    assert chart.median_error(stds) == pytest.approx(np.median(drawn), rel=1e-2)
 
 
 def test_the_papers_methods_run_on_small_skins_alone() -> None:
@@ -128,65 +125,9 @@ def test_sweeps_are_the_papers(name: str) -> None:
     np.testing.assert_allclose(rest, expected.rest_ratio, atol=1e-7)
 
 
-needs_compiler = pytest.mark.skipif(
-    shutil.which(casadi_circuit.COMPILER) is None, reason="needs a C compiler"
-)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 4)])
-@pytest.mark.parametrize(
-    "name", ["numpy", "casadi", pytest.param("casadi_c", marks=needs_compiler)]
-)
-def test_each_evaluation_is_that_of_the_node_laplacian(shape: tuple[int, int], name: str) -> None:
-    """Its port resistances, and their differences, at two states: the second call is new."""
-    evaluate = casadi_circuit.evaluations(*shape)[name]
-    random = np.random.default_rng(3)
-    cells = shape[0] * shape[1]
-
-    def port_ohm(log_ohm: np.ndarray) -> np.ndarray:
-        cell, top, bottom = np.exp(log_ohm).reshape(3, *shape)
-        skin = Skin(1 / cell, top, bottom)
-        current = (1 - laplacian_readings(skin)[..., 0]) / skin.ref_top_ohm
-        return (1 / current - skin.ref_top_ohm - skin.ref_bottom_ohm).ravel()
-
-    for _ in range(2):
-        log_ohm = np.log(random.uniform([[1e4], [1e2], [2e2]], [[1e5], [1e3], [2e3]], (3, cells)))
-        found, *slopes = evaluate(log_ohm.ravel())
-        np.testing.assert_allclose(found, port_ohm(log_ohm), rtol=1e-9)
-        direction = random.standard_normal((3, cells))
-        ahead, behind = (port_ohm(log_ohm + step * direction) for step in (1e-4, -1e-4))
-        np.testing.assert_allclose(
-            np.hstack(slopes) @ direction.ravel(), (ahead - behind) / 2e-4, rtol=1e-5, atol=1e-1
-        )
-
-
-@needs_compiler
-def test_evaluations_of_numpy_and_casadi_are_in_the_table(rows: list[Row]) -> None:
-    measured = of(rows, scene="linearisation")
-    assert [row.method for row in measured] == ["numpy", "casadi", "casadi_c"]
-    for row in measured:
-        assert (row.rows, row.columns, row.source, row.on_front) == (2, 2, "measured", False)
-        assert 0 < row.ms <= row.ms_p90
-
-
-def test_without_a_compiler_there_is_no_generated_c_and_that_is_said(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(casadi_circuit, "COMPILER", "no-such-compiler")
-    rows = chart._linearisation_rows(Size(2, 2, 0))
-    assert [row.method for row in rows] == ["numpy", "casadi"]
-    assert "no C compiler" in str(chart_table.summary(rows).caption)
-    axes = Figure().add_subplot()
-    chart_figure._evaluation_panel(axes, rows)
-    said = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert said == ["NumPy", "CasADi", "CasADi's C: no compiler"]
-
-
 def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
-    table = list(csv.DictReader(io.StringIO(chart_table.csv_text(rows))))
-    evaluations = len(of(rows, scene="linearisation"))
-    assert evaluations >= 2
-    assert len(table) == len(rows) == 2 * (3 + 1) + 2 * 3 + evaluations + 2 + 6
+    table = list(csv.DictReader(io.StringIO(chart.csv_text(rows))))
+    assert len(table) == len(rows) == 2 * (3 + 1) + 2 * 3 + 2 + 6
     assert list(table[0]) == [column.name for column in fields(Row)]
     assert list(table[0])[:6] == ["scene", "source", "rows", "columns", "bits", "method"]
     for line, row in zip(table, rows, strict=True):
@@ -205,7 +146,7 @@ def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
 
 
 def test_fronts_name_the_fastest_first(rows: list[Row]) -> None:
-    fronts = chart_table.fronts(rows)
+    fronts = chart.fronts(rows)
     assert list(fronts) == [
         *("random 2x2 exact", "random 2x2 10 bit"),
         *("cell_sweep 3x3 exact", "wire_sweep 3x3 exact"),

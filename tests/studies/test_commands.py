@@ -14,7 +14,7 @@ import pytest
 
 from command_line import Run
 from places import ROOT
-from studies import ablate, chart, commands, far, force_commands, force_experiment, stability
+from studies import ablate, chart, commands, far, force_experiment, stability
 from studies.conditions import SWEEPS
 from studies.force_experiment import Comparison
 from studies.force_limits import Detection
@@ -43,7 +43,7 @@ def study(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
     monkeypatch.setattr(far, "WIRE_OHM", (100.0, 1000.0))
     monkeypatch.setattr(ablate, "measure", partial(ablate.measure, scenes=["ngspice_random"]))
     monkeypatch.setattr(force_experiment, "QUICK", SURFACES)
-    monkeypatch.setattr(force_commands, "QUICK_DETECTION", DETECTION)
+    monkeypatch.setattr(commands, "QUICK_DETECTION", DETECTION)
     return partial(run, program="studies")
 
 

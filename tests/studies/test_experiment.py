@@ -190,7 +190,7 @@ def test_a_smallest_force_follows_from_the_noise_of_readings() -> None:
 )
 def test_the_margin_must_stay_above_zero(margin: list[float], expected: float) -> None:
     forces_n = np.array([1.0, np.sqrt(2), 2 * np.sqrt(2), 4 * np.sqrt(2)])
-    assert force_limits._crossing(forces_n, np.array(margin)) == pytest.approx(expected)
+    assert force_limits.crossing_n(forces_n, np.array(margin)) == pytest.approx(expected)
 
 
 def only(rows: list[Row], **what: object) -> Row:

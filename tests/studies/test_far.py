@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from network import laplacian_readings
-from studies import far, far_figure
+from studies import far
 from studies.far import Plan, Row
 from studies.trials import random_trial
 
@@ -31,7 +31,7 @@ def of(rows: list[Row], **what: object) -> list[Row]:
 @pytest.mark.parametrize(("mode", "names"), [("near", "abcd"), ("far", "aebf")])
 def test_readings_of_a_mode_agree_with_the_laplacian(mode: str, names: str) -> None:
     trial = random_trial(3, 4, 3, 2, seed=1)
-    found = far.seen(trial, mode, 10)
+    found = trial.rounded(10, mode=mode, wires_told=False)
     for skin, ratio in zip(
         (trial.rest, *trial.frames), (found.rest_ratio, *found.ratio), strict=True
     ):
@@ -41,7 +41,7 @@ def test_readings_of_a_mode_agree_with_the_laplacian(mode: str, names: str) -> N
         assert np.abs(ratio - exact).max() <= 0.5 / 1024 + 1e-9
     assert found.reading_names == tuple(names)
     assert found.nominal_top_wire_ohm is None
-    assert far.seen(trial, mode, 10, told=True).nominal_top_wire_ohm == 100.0
+    assert trial.rounded(10, mode=mode).nominal_top_wire_ohm == 100.0
 
 
 def test_every_readout_has_a_row_under_every_condition(rows: list[Row]) -> None:
@@ -86,6 +86,6 @@ def test_the_tables_say_what_the_rows_say(rows: list[Row]) -> None:
 
 
 def test_picture(rows: list[Row]) -> None:
-    octets = far_figure.picture(rows)
+    octets = far.picture(rows)
     assert octets.startswith(b"\x89PNG\r\n\x1a\n")
     assert len(octets) > 30_000
