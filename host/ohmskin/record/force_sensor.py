@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A force sensor at a serial port, which prints one number a line, as sketches for the HX711 do."""
+"""A force sensor at a serial port, which prints one number a line, as sketches for the HX711 do.
+
+The HX711 is the usual converter of load cells. A sample's time is that of its arrival here, on the
+same clock as the scans, so that both can be recorded side by side (`recorder.record`).
+"""
 
 import math
 import re
@@ -13,34 +17,40 @@ from ohmskin.files import Closing
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.record.recording import ForceSample
 
-# Speed of the sensor's line, unless told: that of most sketches.
+# Speed of the sensor's line, unless the user says another. Chosen: that of most sketches.
 DEFAULT_BAUD: Final = 115_200
-# A sensor without a number for so long counts as lost [s]. The opening of its port resets an
-# Arduino: it is 2 s in its bootloader, and then the sketch zeroes the sensor.
+# A sensor without a number for so long counts as lost. Chosen: opening the port resets an Arduino,
+# which is in its boot loader for 2 s, and then the sketch zeroes the sensor.
 SILENCE_S: Final = 5.0
-# Samples that are kept for a slow reader: 20 s of the fastest sensor.
+# Samples that are kept for a slow reader. Chosen: 25 s of an HX711, which makes 80 a second at most
+# (its data sheet).
 QUEUE_SAMPLES: Final = 2000
-# Lines that arrive together were printed one after another. No sensor takes longer for one [s].
+# Lines that arrive together were printed one after another, with at most so much between them: the
+# HX711 makes at least 10 samples a second (its data sheet).
 _LONGEST_STEP_S: Final = 0.1
-# Times rise by so much [s] where the clock's steps are longer than those of the samples.
+# Times of samples rise by so much at least, even where the clock has the same time for two of them.
+# Chosen: shorter than the steps of any sensor.
 _SHORTEST_STEP_S: Final = 1e-6
+# A number, perhaps with the unit N. "nan" and "inf" are none.
 _NUMBER: Final = re.compile(rb"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*N?\s*")
 
 
 class ForceLineDecoder:
     """Forces from what a serial sensor prints: one number a line, perhaps with the unit N.
 
-    What comes before the first end of a line is part of a line, and is dropped. damaged: how many
-    lines since then were not blank and no such number. Holds at most `LARGEST_LINE` bytes.
+    What comes before the first end of a line is perhaps the end of a number: it is dropped. No more
+    than `LARGEST_LINE_BYTES` are held, whatever comes.
+
+    damaged: how many lines were no such number, blank ones apart.
     """
 
-    LARGEST_LINE: Final = 64
+    LARGEST_LINE_BYTES: Final = 64
 
     def __init__(self, newtons_per_unit: float = 1.0) -> None:
         self.damaged = 0
         self._newtons_per_unit = newtons_per_unit
         self._partial = b""
-        self._skips = True  # the rest of this line: of the first one, or of one that is too long
+        self._skips = True  # to the end of this line: it is the first one, or too long
 
     def feed(self, octets: bytes) -> list[float]:
         """The forces [N] of the lines that these bytes complete, in order."""
@@ -48,14 +58,14 @@ class ForceLineDecoder:
         *lines, self._partial = re.split(rb"[\r\n]", self._partial + octets)
         for line in lines:
             if line.strip() and not self._skips:
-                number = _NUMBER.fullmatch(line) if len(line) <= self.LARGEST_LINE else None
+                number = _NUMBER.fullmatch(line) if len(line) <= self.LARGEST_LINE_BYTES else None
                 force_n = self._newtons_per_unit * float(number[1]) if number else math.inf
                 if math.isfinite(force_n):
                     forces_n.append(force_n)
                 else:
                     self.damaged += 1
             self._skips = False
-        if len(self._partial) > self.LARGEST_LINE:
+        if len(self._partial) > self.LARGEST_LINE_BYTES:
             self._partial = b""
             self.damaged += not self._skips
             self._skips = True
@@ -65,8 +75,10 @@ class ForceLineDecoder:
 class ForceSensor(Closing):
     """Reads forces in a thread of its own, from opening to closing. `take` gives them.
 
-    path: serial port. newtons_per_unit: force of one unit of the printed number [N]; below 0 where
-    the sensor is mounted upside down.
+    path: serial port.
+    baud: speed of its line.
+    newtons_per_unit: force of one unit of the printed number [N]; below 0 where the sensor is
+        mounted upside down.
 
     :raises PortError: as `SerialLink`.
     :raises ValueError: newtons_per_unit is 0 or not finite.
@@ -114,6 +126,7 @@ class ForceSensor(Closing):
                 self._changed.wait(0.1)
 
     def _check(self) -> None:
+        """Raise DeviceLost if no sample is to be expected any more."""
         if self._is_gone:
             raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_S:
@@ -132,14 +145,20 @@ class ForceSensor(Closing):
             self._is_gone = True
 
     def _keep(self, octets: bytes, now_s: float) -> None:
+        """Keep the samples that these bytes complete, which were read at `now_s`.
+
+        The system may give several lines at once. Their times are spread over the time since the
+        last sample, because the sensor printed them at equal steps.
+        """
         with self._changed:
             forces_n = self._decoder.feed(octets)
             if not forces_n:
                 return
             self.dropped += max(len(self._waiting) + len(forces_n) - QUEUE_SAMPLES, 0)
             step_s = min((now_s - self._last_s) / len(forces_n), _LONGEST_STEP_S)
-            for later, force_n in zip(reversed(range(len(forces_n))), forces_n, strict=True):
-                self._last_s = max(now_s - later * step_s, self._last_s + _SHORTEST_STEP_S)
+            for number, force_n in enumerate(forces_n, start=1):
+                time_s = now_s - (len(forces_n) - number) * step_s
+                self._last_s = max(time_s, self._last_s + _SHORTEST_STEP_S)
                 self._waiting.append(ForceSample(force_n, self._last_s, source=self.path))
             self._changed.notify_all()
 

@@ -16,11 +16,20 @@ adc_bits                scalar                       absent: the readings are ex
 reading_names           4, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
 
-Out: cell_ohm, cell_siemens, cell_siemens_std, top_wire_ohm, bottom_wire_ohm, top_wire_ohm_std,
-bottom_wire_ohm_std (F, R, C; NaN where the method does not estimate them), touched (F, R, C, bool),
-converged (F, bool), message (F, text: why a frame is not converged, or what is wrong with its
-readings), chi2 (F, per reading),
-iterations (F), seconds (F).
+Out: attributes of `Estimate` by the same names, NaN where the method does not estimate them.
+
+============================================= ======= ============================================
+arrays                                        shape   meaning
+============================================= ======= ============================================
+cell_ohm, cell_siemens, cell_siemens_std      F, R, C each cell
+touched                                       F, R, C whether something presses it
+top_wire_ohm, top_wire_ohm_std                F, R, C each segment of the rows' wires
+bottom_wire_ohm, bottom_wire_ohm_std          F, R, C each segment of the columns' wires
+converged                                     F       whether the method came to an end
+message                                       F, text why it did not, or what is wrong with readings
+chi2                                          F       misfit per reading
+iterations, seconds                           F       how long it took
+============================================= ======= ============================================
 """
 
 import zipfile
@@ -39,21 +48,20 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import PathName, naming, whole_file
 from ohmskin.link.protocol import ENUMS
 
+# Largest array that is read or written. Chosen: it fits into the memory of any machine several
+# times, and is 18 minutes of a 16x16 skin.
 MAX_ARRAY_BYTES: Final = 200_000_000
-# The estimators' matrices grow with the square: 4096 cells make 134 MB.
+# Cells of the largest skin. The estimators' matrices grow with the square: 4096 cells make 134 MB.
 MAX_CELLS: Final = 4096
 _NAMES: Final = tuple(ENUMS["reading"].values)
-# What is told of each frame, in this order.
-_OUT: Final = (
-    *("cell_ohm", "cell_siemens", "cell_siemens_std", "touched", "top_wire_ohm", "bottom_wire_ohm"),
-    *("top_wire_ohm_std", "bottom_wire_ohm_std", "converged", "message", "chi2", "iterations"),
-    *("seconds",),
-)
+_OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
+_OF_WIRES: Final = ("top_wire_ohm", "bottom_wire_ohm", "top_wire_ohm_std", "bottom_wire_ohm_std")
+_OF_FRAMES: Final = ("converged", "message", "chi2", "iterations", "seconds")
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """The contents of a readings file, checked. Shapes and units as in the module's table."""
+    """The contents of a readings file, checked. Meanings, shapes and units: the module's table."""
 
     ratio: Float
     rest_ratio: Float | None = None
@@ -65,15 +73,16 @@ class Readings:
     reading_names: tuple[str, ...] = NEAR
 
     def __post_init__(self) -> None:
-        names, n = self.reading_names, len(self.reading_names)
-        if len({*names} & {*_NAMES}) != n:
+        names, count = self.reading_names, len(self.reading_names)
+        if len({*names} & {*_NAMES}) != count:
             raise ValueError(f"reading_names are {' '.join(names):.80}, not some of {_NAMES}")
-        if self.ratio.ndim != 4 or self.ratio.shape[-1] != n:
-            raise ValueError(f"ratio has shape {self.ratio.shape}, not (F, rows, columns, {n})")
+        if self.ratio.ndim != 4 or self.ratio.shape[-1] != count:
+            raise ValueError(f"ratio has shape {self.ratio.shape}, not (F, rows, columns, {count})")
         frames, rows, columns, _ = self.ratio.shape
         if frames < 1 or not 1 <= rows * columns <= MAX_CELLS:
             given = f"{frames} frames of {rows}x{columns} cells"
             raise ValueError(f"ratio has {given}: at least 1 frame and 1 to {MAX_CELLS} cells")
+        # All at once, because a check of each frame takes a minute for a file of a million.
         good = ((self.ratio >= 0) & (self.ratio <= 1)).all(axis=(1, 2, 3))
         for frame in np.flatnonzero(~good).tolist():
             check_ratio(self.ratio[frame], rows, columns, name=f"ratio, frame {frame},", of=names)
@@ -85,11 +94,11 @@ class Readings:
             if wire_ohm is not None and wire_ohm.shape not in ((), (frames,)):
                 raise ValueError(f"{name} has shape {wire_ohm.shape}, not () or ({frames},)")
         for frame in range(frames if self.one_skin_per_frame else 1):
-            self.knowledge(frame)
+            self.knowledge(frame)  # checks itself
 
     @property
     def one_skin_per_frame(self) -> bool:
-        """Whether rest or wires are given per frame: then frames are not one skin in time."""
+        """Whether rest or wires are given per frame: then each frame is of a skin of its own."""
         wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
         given = [(self.rest_ratio, 3), *((wire_ohm, 0) for wire_ohm in wires)]
         return any(array is not None and array.ndim > ndim for array, ndim in given)
@@ -147,7 +156,11 @@ def load_readings(path: PathName) -> Readings:
 
 
 def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    # zipfile never yields more than the size it declares, so this bounds what is unpacked.
+    """An array of the archive, as float64 or as text.
+
+    zipfile never yields more than the size that the archive states, so the first check bounds what
+    is unpacked.
+    """
     if info.file_size > MAX_ARRAY_BYTES:
         raise ValueError(f"{info.file_size} bytes, more than {MAX_ARRAY_BYTES}")
     with archive.open(info) as member:
@@ -182,7 +195,8 @@ def estimate_file(
         elif cold:
             estimator.reset()
         estimates.append(estimator.estimate(ratio))
-    return {name: np.array([getattr(each, name) for each in estimates]) for name in _OUT}
+    names = (*_OF_CELLS, *_OF_WIRES, *_OF_FRAMES)
+    return {name: np.array([getattr(one, name) for one in estimates]) for name in names}
 
 
 def save_arrays(path: PathName, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -2,10 +2,11 @@
 """A recording as a source of scans: ``replay://FILE.mcap?speed=1``.
 
 Scans come as they were recorded, with the same codes, numbers, board times and gaps. Each carries
-the tare that was in force (``rest_ratio``), if one of its mode was recorded before it. ``speed``: 1
-as they came, 2 twice as fast, 0 as fast as they are taken: then nothing is lost however slow the
-reader is, and `latest` gives each scan in turn. Nothing comes before somebody first asks for scans.
-A pause longer than `LONGEST_PAUSE_S` is shortened.
+the tare that was in force (``rest_ratio``), if one of its mode was recorded before it. With speed 1
+they come at the pace at which they were recorded, with 2 twice as fast. With speed 0 they come as
+fast as they are taken: then nothing is lost however slow the reader is, and `latest` gives each in
+turn. Nothing comes before somebody first asks for scans. A pause longer than `LONGEST_PAUSE_S` is
+shortened.
 
 At the recording's end iterators end, and `latest` raises `RecordingEnded`. Commands other than
 start and stop, which let the replay run and pause, raise `CommandRefused`.
@@ -23,12 +24,12 @@ from ohmskin.errors import CommandRefused, RecordingEnded
 from ohmskin.link import protocol
 from ohmskin.link.device import QUEUE_SCANS, Device
 from ohmskin.link.messages import BoardStats, Hello, Scan
+from ohmskin.link.serial_port import READ_TIMEOUT_S
 from ohmskin.record.recording import Tare, messages
 
-# Longest time between two scans of a replay [s]: shorter than the silence of a lost board.
+# Longest time between two scans of a replay. Chosen: shorter than `SILENCE_TIMEOUT_S`, after which
+# readers would take the board for lost.
 LONGEST_PAUSE_S: Final = 2.0
-# A replay that waits for its readers looks so often whether it was closed [s].
-_LOOK_EVERY_S: Final = 0.2
 
 
 class Replay(Device):
@@ -50,7 +51,8 @@ class Replay(Device):
         assert isinstance(hello, Hello)
         self._hello = hello
         self._running = self._closing = False
-        self._last: tuple[float, float] | None = None  # when a scan was due, and was recorded [s]
+        # Of the scan before: when it was due here, and when it had been recorded [s].
+        self._last: tuple[float, float] | None = None
         work, named = (self._play,), f"play {path}"
         self._thread = threading.Thread(target=self._run, args=work, name=named, daemon=True)
         self._thread.start()
@@ -79,6 +81,7 @@ class Replay(Device):
         super().close()
 
     def _play(self) -> None:
+        """The work of the replay's thread: publish one message after the other, each when due."""
         tare: Tare | None = None
         for message in self._messages:
             if isinstance(message, Hello | Scan) and not self._wait_for(message):
@@ -103,22 +106,31 @@ class Replay(Device):
         """Wait until somebody reads, and until a scan is due: False if the replay was closed."""
         with self._changed:
             while not self._closing:
-                now_s = due_s = time.monotonic()
-                waits = self._speed == 0 and self._readers_are_behind()
-                if waits or not (self._running and self._asked):
-                    due_s = float("inf")
-                elif isinstance(message, Scan) and self._speed and self._last is not None:
-                    pause_s = (message.host_time_s - self._last[1]) / self._speed
-                    due_s = self._last[0] + min(max(pause_s, 0.0), LONGEST_PAUSE_S)
-                if now_s >= due_s:
+                now_s = time.monotonic()
+                due_s = self._due_s(message, now_s)
+                if due_s <= now_s:
                     if isinstance(message, Scan):
                         self._last = (due_s, message.host_time_s)
                     return True
-                self._changed.wait(min(due_s - now_s, _LOOK_EVERY_S))
+                # Readers notify when they take a scan. One that goes away says nothing, so the
+                # replay looks again now and then.
+                self._changed.wait(min(due_s - now_s, READ_TIMEOUT_S))
         return False
 
+    def _due_s(self, message: Hello | Scan, now_s: float) -> float:
+        """When a message is due on the host's clock [s]; infinite while nobody wants it."""
+        if not (self._running and self._asked) or (self._speed == 0 and self._readers_are_behind()):
+            return float("inf")
+        if isinstance(message, Hello) or self._speed == 0 or self._last is None:
+            return now_s
+        pause_s = (message.host_time_s - self._last[1]) / self._speed
+        return self._last[0] + min(max(pause_s, 0.0), LONGEST_PAUSE_S)
+
     def _readers_are_behind(self) -> bool:
-        """Whether they have not yet taken what was published."""
+        """Whether they have not yet taken what was published.
+
+        Iterators have queues: half a queue lets them and the replay run side by side.
+        """
         if self._queues:
             return any(len(queue) >= QUEUE_SCANS // 2 for queue in self._queues.values())
         return self._newest is not None
