@@ -133,9 +133,9 @@ def test_files_that_are_not_there_or_too_large(
     with pytest.raises(ValueError, match="cannot be read"):
         load_force_log(tmp_path)
     path = written(tmp_path, log_text(ROWS))
-    monkeypatch.setattr(tables, "MAX_FILE_BYTES", path.stat().st_size)
+    monkeypatch.setattr(tables, "MAX_TABLE_BYTES", path.stat().st_size)
     load_force_log(path)
-    monkeypatch.setattr(tables, "MAX_FILE_BYTES", path.stat().st_size - 1)
+    monkeypatch.setattr(tables, "MAX_TABLE_BYTES", path.stat().st_size - 1)
     with pytest.raises(ValueError, match=r"more than [0-9]+ bytes"):
         load_force_log(path)
 

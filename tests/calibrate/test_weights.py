@@ -182,14 +182,17 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
         ({"--grams": "50,no"}, ["--grams '50,no': give weights above 0"]),
         ({"--grams": "50,-1"}, ["give weights above 0"]),
         ({"--grams": "50,50"}, ["stands twice: say --repeats"]),
-        ({"--grams": "50", "--repeats": "9"}, ["give two or more in --grams"]),
+        (
+            {"--grams": "50", "--repeats": "9"},
+            ["--grams, --repeats, --cells: all 18 forces are"],
+        ),
         ({"--repeats": "0"}, ["--repeats"]),
         ({"--indenter-mm2": "0"}, ["--indenter-mm2 is 0"]),
         ({"--wires": "-1,2"}, ["top_wire_ohm is -1"]),
         ({"--cells": "0;1"}, ["'0;1' is no cell: write row,column"]),
         ({"--cells": "0,0 1,0"}, ["cell (1, 0) is not on this 1x2 skin"]),
-        ({"--cells": "0,0"}, ["one cell does not tell how much cells differ"]),
-        ({"--cells": "0,0", "--repeats": "1"}, ["3 presses are too few: 5 are needed"]),
+        ({"--cells": "0,0"}, ["--cells: all presses are on cell (0, 0): press at least one more"]),
+        ({"--cells": "0,0", "--repeats": "1"}, ["too few presses: 3, 5 are needed"]),
         ({"--redo": "0,2"}, ["cell (0, 2) is not on this 1x2 skin"]),
     ):
         arguments = [word for pair in (good | options).items() for word in pair]

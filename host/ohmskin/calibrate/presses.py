@@ -2,9 +2,9 @@
 """From presses of single cells, in scans or in a table, to the calibration of a skin.
 
 A scan belongs to the cell that rises most above rest, if that cell is touched. Consecutive scans of
-one cell, `MIN_SCANS` at least, are a press; where the rise falls to a fifth in between, several.
-Scans in which another cell rises by more than `SECOND_SHARE` of the first are left out, for nothing
-tells how two cells share a force.
+one cell are a press, if there are `MIN_PRESS_SCANS` at least. Where the rise falls to a fifth in
+between, they are several presses. Scans in which another cell rises by more than `SECOND_SHARE` of
+the first are left out, because nothing tells how two cells share a force.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,35 +23,43 @@ from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.reader import now
 from ohmskin.force.regression import ForceRegression
+from ohmskin.force.rules import check_cell, check_cells_differ
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
 
-# So many scans without touch may interrupt a press: a light touch flickers about its threshold.
+# So many scans without touch may interrupt a press. Chosen: a light touch flickers about its
+# threshold, and nobody lifts a finger for less than 30 ms.
 FLICKER_SCANS: Final = 3
-# Fewer scans in a row are a bounce, not a press.
-MIN_SCANS: Final = 5
-# A cell that rises by more than this share of the strongest one is pressed, too; a neighbour of
-# one pressed cell rises by less.
+# Fewer scans in a row are a bounce, not a press. Chosen: 50 ms at 90 Hz.
+MIN_PRESS_SCANS: Final = 5
+# A cell that rises by more than this share of the strongest one is pressed, too. Chosen: what the
+# estimate leaves in the neighbours of one pressed cell is less.
 SECOND_SHARE: Final = 0.25
-# Fewer scans without touch do not tell the zero of a force sensor.
+# Fewer scans without touch do not tell the zero of a force sensor. Chosen: the median of so many
+# has less than half the noise of one.
 MIN_ZERO_SCANS: Final = 10
 # Creep keeps a cell touched for a while, so that quick presses meet in a valley: two presses are
-# told apart if the logarithm of the rise falls by so much between them.
+# told apart if the logarithm of the rise falls by so much between them. Chosen: to a fifth.
 VALLEY_LOG: Final = np.log(5.0)
-# What rises by less than this share of the strongest rise is noise to that logarithm.
-_NOISE_FLOOR: Final = 1e-3
+# What rises by less than this share of the strongest rise is noise, whose logarithm would have
+# valleys without end. Chosen: far below what a light touch shows.
+_NOISE_SHARE: Final = 1e-3
 # Stands for a cell, or a press, where a scan has none.
 _NOTHING: Final = -1
 
 
 @dataclass(frozen=True, eq=False)
 class Presses:
-    """What `ForceRegression.fit` learns from, n rows: arrays (n,).
+    """What `ForceRegression.fit` learns from: n rows, each a scan of one pressed cell.
 
-    cells: flat indices, row * columns + column. rise, rise_std: of that cell [S, or 1 for
-    `voltage`]. force_n [N]. press: number of the press that a row is of. shape: (R, C). shared:
-    scans left out because two cells were pressed. zero_n: what the force sensor showed without
-    touch, already taken off [N].
+    cells: the cell's flat index, row * columns + column, (n,).
+    rise: of that cell above rest, (n,) [S, or 1 for `voltage`].
+    rise_std: standard deviation of `rise`, (n,).
+    force_n: on that cell, (n,) [N].
+    press: number of the press that the row is of, (n,).
+    shape: (R, C) of the skin.
+    shared: how many scans were left out because two cells were pressed.
+    zero_n: what the force sensor showed without touch, already taken off [N].
     """
 
     cells: NDArray[np.intp]
@@ -73,10 +81,12 @@ class Presses:
 
 @dataclass(frozen=True, eq=False)
 class LevelHistory:
-    """What n scans showed, by the times (n,) of their middles [s].
+    """What n scans showed of every cell.
 
-    rise, rise_std (n, R, C): levels above rest and their standard deviations [S, or 1 for
-    `voltage`]. touched (n, R, C).
+    time_s: of the middle of each scan, (n,) [s].
+    rise: levels above rest, (n, R, C) [S, or 1 for `voltage`].
+    rise_std: standard deviations of `rise`.
+    touched: whether something presses the cell, (n, R, C).
     """
 
     time_s: Float
@@ -97,21 +107,22 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     """
     scans, rows, columns = history.rise.shape
     force_n = log.at(history.time_s - offset_s)
-    known = np.isfinite(force_n)
-    untouched = known & ~history.touched.any(axis=(1, 2))
-    # The median of many scans, because the force begins before a touch is certain.
+    has_force = np.isfinite(force_n)
+    untouched = has_force & ~history.touched.any(axis=(1, 2))
+    # The median, because the force begins to rise in scans that do not show a touch yet.
     enough = np.count_nonzero(untouched) >= MIN_ZERO_SCANS
     zero_n = float(np.median(force_n[untouched])) if enough else 0.0
 
     rise = history.rise.reshape(scans, -1)
     pressed = _pressed(rise, history.touched.reshape(scans, -1))
+    # Scans without a pressed cell get some value here. They are of no press, and left out below.
     every = np.arange(scans)
     top = rise[every, pressed]
     press = _numbered(pressed, top)
     others = rise.copy()
     others[every, pressed] = -np.inf
     shared = (press != _NOTHING) & (others.max(axis=1) > SECOND_SHARE * top)
-    good = (press != _NOTHING) & ~shared & known
+    good = (press != _NOTHING) & ~shared & has_force
     if not good.any():
         raise ValueError("no cell is pressed alone while the force is known")
     return Presses(
@@ -128,13 +139,17 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
 
 
 def _pressed(rise: Float, touched: Bool) -> NDArray[np.intp]:
-    """Index of the cell that each scan belongs to, or `_NOTHING`. Arrays (n, R * C)."""
+    """Index of the cell that each scan belongs to, or `_NOTHING`. Arrays (n, R * C).
+
+    Scans between two of one cell belong to it as well, if they are `FLICKER_SCANS` at most.
+    """
     from scipy.ndimage import binary_closing
 
     top = rise.argmax(axis=1)
     pressed = np.full(top.size, _NOTHING, dtype=np.intp)
     for cell in np.unique(top):
         of_cell = (top == cell) & touched[:, cell]
+        # Closing fills short gaps. Without the padding, it would empty the first and last scans.
         padded = np.pad(of_cell, FLICKER_SCANS + 1)
         closed = binary_closing(padded, np.ones(FLICKER_SCANS + 1))
         pressed[closed[FLICKER_SCANS + 1 : -FLICKER_SCANS - 1] & (pressed == _NOTHING)] = cell
@@ -148,7 +163,7 @@ def _numbered(pressed: NDArray[np.intp], top: Float) -> NDArray[np.intp]:
     number = 0
     changes = np.flatnonzero(np.diff(pressed)) + 1
     for run in np.split(np.arange(pressed.size), changes):
-        if pressed[run[0]] == _NOTHING or run.size < MIN_SCANS:
+        if pressed[run[0]] == _NOTHING or run.size < MIN_PRESS_SCANS:
             continue
         for part in np.split(run, _valleys(top[run])):
             press[part] = number
@@ -157,31 +172,31 @@ def _numbered(pressed: NDArray[np.intp], top: Float) -> NDArray[np.intp]:
 
 
 def _valleys(rise: Float) -> list[int]:
-    """Where the presses of a run (n,) meet: the least rise between peaks that stand out of it."""
+    """Where the presses of a run (n,) meet: at the least rise between two peaks.
+
+    Only peaks count on whose sides the rise falls by `VALLEY_LOG` before it is as high again.
+    """
     from scipy.signal import find_peaks
 
-    floor = _NOISE_FLOOR * float(rise.max())
+    floor = _NOISE_SHARE * float(rise.max())
     height = np.log(np.maximum(rise, floor))
     peaks, _ = find_peaks(np.pad(height, 1, constant_values=np.log(floor)), prominence=VALLEY_LOG)
     peaks -= 1
     return [int(before + height[before:after].argmin()) for before, after in pairwise(peaks)]
 
 
-def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]:
-    """The cell. Raises ValueError if it is not on a skin of this shape."""
-    if row >= shape[0] or column >= shape[1]:
-        skin = f"{shape[0]}x{shape[1]} skin, whose first is (0, 0)"
-        raise ValueError(f"cell ({row}, {column}) is not on this {skin}")
-    return row, column
-
-
 @dataclass(eq=False)
 class Calibrator:
     """Makes the calibration of one skin.
 
-    board: that scans it. rest_ratio: readings (R, C, 4) of the untouched skin. method: that of
-    `estimator`. indenter_area_m2: area that it is pressed with [m^2]. rest_level (R, C): what the
-    estimator shows of the untouched skin [S, or 1 for `voltage`].
+    board: the one that scans it.
+    rest_ratio: readings (R, C, 4) of the untouched skin.
+    method: the one by which forces will be read.
+    indenter_area_m2: area that the skin is pressed with [m^2].
+    nominal_wire_ohm: what is known of its wires.
+
+    estimator: of this method, for this skin.
+    rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
     """
 
     board: Hello
@@ -204,8 +219,8 @@ class Calibrator:
         """
         levels = []
         for scan in progress(scans):
-            found = self.estimator.estimate(scan.ratio)
-            levels.append((found.level - self.rest_level, found.level_std, found.touched))
+            answer = self.estimator.estimate(scan.ratio)
+            levels.append((answer.level - self.rest_level, answer.level_std, answer.touched))
         return LevelHistory(scan_times_s(scans), *map(np.array, zip(*levels, strict=True)))
 
     def presses_in_table(self, table: PressTable) -> Presses:
@@ -230,28 +245,26 @@ class Calibrator:
     def calibration(self, presses: Presses) -> tuple[Calibration, str]:
         """The calibration, and which cells have no curve of their own.
 
-        Raises ValueError where the presses do not tell the curves: too few, all on one cell, of one
-        force, or such that the force does not grow with what the skin shows.
+        Raises ValueError where the presses do not tell the curves: by the rules of `force.rules`,
+        or because the force does not grow with what the skin shows.
         """
-        found = ForceRegression().fit(
+        regression = ForceRegression().fit(
             *(presses.cells, presses.rise, presses.force_n),
             shape=presses.shape,
             rise_std=presses.rise_std,
             press=presses.press,
         )
         pressed = np.argwhere(presses.counts).tolist()
-        if len(pressed) == 1 and presses.counts.size > 1:
-            remedy = "press at least one more, which tells how much cells differ"
-            raise ValueError(f"all presses are on cell {tuple(pressed[0])}: {remedy}")
+        check_cells_differ({(row, column) for row, column in pressed}, presses.shape)
         date = now()
         calibration = Calibration(
             unit_id=self.board.unit_id,
             date=date,
             method=self.method,
             rest=Rest.of(self.method, self._knowledge, date),
-            model=found.model_,
+            model=regression.model_,
             indenter_area_m2=self.indenter_area_m2,
             nominal_wire_ohm=self.estimator.wires(),
             mode=self.board.mode,
         )
-        return calibration, found.message_
+        return calibration, regression.message_

@@ -16,8 +16,9 @@ conductance_std standard deviation of that [S]; the column may be absent: 0
 =============== ============================================================
 
 Columns stand in any order under a header, with commas between them and points in their numbers.
-Nothing is guessed: a file that is not plainly so raises a ValueError of one line, which names the
-file, the row (the header is row 1) and the column, and says what to do.
+Nothing is guessed, because a wrong guess would make a calibration that is wrong and looks right. A
+file that is not plainly so raises a ValueError of one line, which names the file, the row (the
+header is row 1) and the column, and says what to do.
 """
 
 import codecs
@@ -35,25 +36,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.files import PathName, naming, read_bounded, save_table
-from ohmskin.force.curve import require_rows
+from ohmskin.force.rules import MAX_NUMBER, require_forces, require_rows
 from ohmskin.record.readings import MAX_CELLS
 
-# An hour of a sensor at 1 kHz, with columns of other things.
-MAX_FILE_BYTES: Final = 100_000_000
-# No force, time or conductance in any unit is larger, and sums of squares do not overflow.
-MAX_NUMBER: Final = 1e60
-# A cell of 1 ohm has less resistance than its wires [S]: more is a number in another unit.
-MAX_CONDUCTANCE: Final = 1.0
-# A message shows so many characters of what stands in the file.
+# A larger file is not read. Chosen: an hour of a sensor at 1 kHz, with columns of other things.
+MAX_TABLE_BYTES: Final = 100_000_000
+# A larger conductance is a number in another unit: a cell of 1 ohm has less than its wires.
+MAX_SIEMENS: Final = 1.0
+# A message shows so many characters of what stands in the file. Chosen: one line of a terminal.
 _SHOWN: Final = 60
 
-# Fewer samples of a force are no session of presses.
+# Fewer samples of a force are no session of presses. Chosen: a fast sensor makes more in a press.
 MIN_SAMPLES: Final = 10
-# A step between two samples is a gap if it is longer than this [s], and than so many median steps:
-# slow sensors have long steps, fast ones have short hiccups.
+# A step between two samples is a gap, in which the force is not known, if it is longer than `GAP_S`
+# and than `GAP_STEPS` median steps. Chosen: slow sensors have long steps, fast ones short hiccups.
 GAP_S: Final = 0.5
 GAP_STEPS: Final = 10.0
-# Noise about zero goes below it by so much [N], or by this share of the largest force.
+# A sensor's noise about zero goes below it by `NEGATIVE_N`, or by `NEGATIVE_SHARE` of the largest
+# force. Chosen: a load cell that was zeroed stays within.
 NEGATIVE_N: Final = 0.05
 NEGATIVE_SHARE: Final = 0.02
 
@@ -74,12 +74,14 @@ _UNITS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class ForceLog:
-    """Forces by the sensor's clock: time_s (n,) [s], increasing; force_n (n,) [N].
+    """Forces by the sensor's clock.
 
-    Raises ValueError for fewer than 10 samples, for times that do not increase, for a force that
-    never changes, and for presses that are negative. Sensor noise about zero may be negative: down
-    to 0.05 N, or 2 % of the largest force. rows: where in a file each sample stands, for the texts
-    of errors.
+    time_s: of each sample, (n,) [s], increasing.
+    force_n: (n,) [N]. Noise about zero may be negative: see `NEGATIVE_N`.
+    rows: where in a file each sample stands, (n,), for the texts of errors; None: not in a file.
+
+    Raises ValueError for fewer than `MIN_SAMPLES`, for times that do not increase, for a force that
+    never changes, and for presses that are negative.
     """
 
     time_s: Float
@@ -95,6 +97,7 @@ class ForceLog:
         if np.ptp(force_n) == 0:
             raise ValueError(f"force_n is {force_n[0]:g} throughout: does the sensor measure?")
         limit = max(NEGATIVE_N, NEGATIVE_SHARE * float(force_n.max()))
+        # A sensor mounted upside down has more samples below zero than above it.
         if np.count_nonzero(force_n < -limit) > np.count_nonzero(force_n > limit):
             least = float(force_n.min())
             raise ValueError(f"forces go down to {least:g} N, a press is negative: turn the sign")
@@ -114,19 +117,19 @@ def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
 
     NaN outside of `time_s`, and inside its gaps: steps above `GAP_S` and `GAP_STEPS` median steps.
     """
-    wanted = np.asarray(at_s, dtype=np.float64)
-    found = np.asarray(np.interp(wanted, time_s, values, left=np.nan, right=np.nan))
-    steps = np.diff(time_s)
-    is_gap = (steps > GAP_S) & (steps > GAP_STEPS * np.median(steps))
-    after = np.searchsorted(time_s, wanted).clip(1, time_s.size - 1)
-    inside = (wanted > time_s[after - 1]) & (wanted < time_s[after])
-    return np.where(inside & is_gap[after - 1], np.nan, found)
+    at_s = np.asarray(at_s, dtype=np.float64)
+    interpolated = np.asarray(np.interp(at_s, time_s, values, left=np.nan, right=np.nan))
+    steps_s = np.diff(time_s)
+    is_gap = (steps_s > GAP_S) & (steps_s > GAP_STEPS * np.median(steps_s))
+    after = np.searchsorted(time_s, at_s).clip(1, time_s.size - 1)
+    inside = (at_s > time_s[after - 1]) & (at_s < time_s[after])
+    return np.where(inside & is_gap[after - 1], np.nan, interpolated)
 
 
 def load_force_log(path: PathName) -> ForceLog:
     """Read a force log. Raises ValueError: see the module."""
     with naming(path):
-        columns, rows = _read(path, ("time_s", "force_n"))
+        columns, rows = _read(path, ("time_s", "force_n"), None)
         return ForceLog(**columns, rows=rows)
 
 
@@ -138,14 +141,16 @@ def load_press_table(path: PathName) -> PressTable:
             raise ValueError("no press is in it")
         table = np.zeros(rows.size, PRESS)
         for name, values in columns.items():
-            most, must = MAX_CONDUCTANCE, "0 to 1 S: of microsiemens, write 1e-6 times as much"
-            if name in _CELL:
-                most, must = MAX_CELLS - 1, f"a whole number from 0 to {MAX_CELLS - 1}"
-            elif name == "force_n":
-                most, must = MAX_NUMBER, "0 or more: zero the force sensor, or leave the row out"
-            good = (values >= 0) & (values <= most)
-            good &= (name not in _CELL) | (values == np.floor(values))
-            require_rows(name, values, good, must, rows)
+            if name == "force_n":
+                require_forces(values, rows)
+            elif name in _CELL:  # which cells there are, the skin knows: see `check_cell`
+                whole = (values >= 0) & (values < MAX_CELLS) & (values == np.floor(values))
+                must = f"a whole number from 0 to {MAX_CELLS - 1}"
+                require_rows(name, values, whole, must, rows)
+            else:
+                of_cell = (values >= 0) & (values <= MAX_SIEMENS)
+                must = "0 to 1 S: of microsiemens, write 1e-6 times as much"
+                require_rows(name, values, of_cell, must, rows)
             table[name] = values
         return table
 
@@ -159,21 +164,23 @@ def save_press_table(path: PathName, table: PressTable) -> None:
 
 
 def _read(
-    path: PathName, needed: Sequence[str], optional: Sequence[str] | None = None
+    path: PathName, needed: Sequence[str], optional: Sequence[str] | None
 ) -> tuple[dict[str, Float], NDArray[np.int64]]:
     """Columns (n,) by name, and the number (n,) in the file of each row.
 
-    needed, optional: names, matched whatever their case. Further columns are refused; where no
-    optional ones are told they are ignored, and may hold what is no UTF-8. Empty rows count, but
-    hold nothing.
+    Empty rows count, but hold nothing. Names of columns are matched whatever their case.
+
+    needed: names of columns that must be there.
+    optional: names of columns that may be there, while others are refused; None: all others may,
+        and are ignored. Then they may hold what is no UTF-8.
     """
-    octets = read_bounded(path, MAX_FILE_BYTES)
+    octets = read_bounded(path, MAX_TABLE_BYTES)
     if octets.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise ValueError("it is UTF-16: save it as UTF-8")
     lines = _rows(io.TextIOWrapper(io.BytesIO(octets), "utf-8-sig", errors="replace", newline=""))
     _, header = next(lines, (1, []))
     places = _places(header, needed, optional)
-    columns = {name: array("d") for name in places}
+    columns = {name: array("d") for name in places}  # an array takes a fifth of a list's memory
     rows = array("q")
     for row, cells in lines:
         if len(cells) != len(header):
@@ -184,7 +191,7 @@ def _read(
         rows.append(row)
         for name, place in places.items():
             columns[name].append(_number(cells[place], name, row))
-    return {name: np.array(each) for name, each in columns.items()}, np.array(rows, np.int64)
+    return {name: np.array(column) for name, column in columns.items()}, np.array(rows, np.int64)
 
 
 def _rows(text: io.TextIOWrapper) -> Iterator[tuple[int, list[str]]]:
@@ -213,8 +220,8 @@ def _places(
             raise ValueError(f"no column {name}{_UNITS.get(name, '')}: {must}")
     for title, name in zip(header, names, strict=True):
         if name not in ours and optional is not None:
-            known = ", ".join(ours)
-            raise ValueError(f"unknown column {title[:_SHOWN]!r}: leave it out; known are {known}")
+            named = f"unknown column {title[:_SHOWN]!r}"
+            raise ValueError(f"{named}: leave it out; known are {', '.join(ours)}")
         if name in ours and names.count(name) > 1:
             raise ValueError(f"column {name} stands twice")
     return {name: names.index(name) for name in ours if name in names}

@@ -16,7 +16,7 @@ import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
 from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step, still_wanted
-from ohmskin.calibrate.presses import Calibrator, Presses, check_cell, find_presses
+from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.tables import (
     PRESS,
     ForceLog,
@@ -33,7 +33,7 @@ from ohmskin.errors import RecordingError
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
-from ohmskin.force.regression import MIN_PRESSES
+from ohmskin.force.rules import check_cell, check_cells_differ, check_enough
 from ohmskin.link.device import Device, mean_ratio
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
@@ -86,7 +86,10 @@ def weights(
         ]
         read = [press for press in kept.presses if press.cell not in again]
         missing = still_wanted(wanted, read)
-        _check_enough([*read, *missing], shape)
+        with naming("--grams, --repeats, --cells"):  # before anybody makes the presses
+            every = [*read, *missing]
+            check_enough(len(every), [press.force_n for press in every])
+            check_cells_differ({press.cell for press in every}, shape)
         _out.print(f"take everything off the skin: its rest is measured, {TARE_S:g} s")
         calibrator = calibrator_of(skin.info, skin.mean_ratio(TARE_S))
         with naming(kept.path):
@@ -373,13 +376,3 @@ def _cells(text: str, shape: tuple[int, int]) -> Cells:
             raise ValueError(f"'{part:.40}' is no cell: write row,column, such as 0,1")
         cells.append(check_cell(int(row), int(column), shape))
     return tuple(dict.fromkeys(cells))
-
-
-def _check_enough(presses: list[Press], shape: tuple[int, int]) -> None:
-    """Raise ValueError if all of these could tell no curve: before anybody makes them."""
-    if len(presses) < MIN_PRESSES:
-        raise ValueError(f"{len(presses)} presses are too few: {MIN_PRESSES} are needed")
-    if len({press.force_n for press in presses}) == 1:
-        raise ValueError("one weight tells no curve: give two or more in --grams")
-    if len({press.cell for press in presses}) == 1 and math.prod(shape) > 1:
-        raise ValueError("one cell does not tell how much cells differ: give two or more")

@@ -44,7 +44,8 @@ from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
-from ohmskin.force.curve import ForceModel, require
+from ohmskin.force.curve import ForceModel
+from ohmskin.force.rules import MAX_NUMBER, require
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import FRAMES, MODES
 from ohmskin.record.readings import MAX_CELLS
@@ -55,9 +56,6 @@ SCHEMA: Final = 1
 MAX_FILE_BYTES: Final = 4_000_000
 # There are so many unit ids: the link has an integer for them.
 UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
-# No number of a file is larger. Chosen: far beyond the slope of any power law in siemens, and its
-# square does not overflow in predictions.
-MAX_NUMBER: Final = 1e60
 # The fields of the file, by where their values are kept: in the calibration itself, with their
 # types; in its rests; in its `WireOhm`; in its model, of which some may be null.
 _OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str, "indenter_area_m2": float}

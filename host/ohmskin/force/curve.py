@@ -27,12 +27,13 @@ For x^b with b < 1 the differential is infinite at rest, the difference is not.
 """
 
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
+from ohmskin.force.rules import require
 
 LINEAR: Final = "linear"
 POWER: Final = "power"
@@ -148,23 +149,3 @@ def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
     """d of the module [N]: how far the force is off if x is off by dx."""
     here = force_by(curve, x)
     return np.maximum(force_by(curve, x + dx) - here, here - force_by(curve, x - dx))
-
-
-def require(name: str, good: Bool, what: str) -> None:
-    """Raise ValueError, naming the first cell, unless all are good, (R, C). what: a bad cell is."""
-    if not good.all():
-        row, column = (int(index) for index in np.argwhere(~good)[0])
-        raise ValueError(f"{name} of cell ({row}, {column}) is {what}")
-
-
-def require_rows(
-    name: str, values: NDArray[Any], good: Bool, must: str, rows: NDArray[np.int64] | None = None
-) -> None:
-    """Raise ValueError, naming the first row that is not good and its value. Arrays (n,).
-
-    must: what the value has to be. rows: by which number each row is named; None: its index.
-    """
-    if not good.all():
-        at = int(np.argmin(good))
-        row = at if rows is None else rows[at]
-        raise ValueError(f"row {row}: {name} is {values[at]:.12g}, it must be {must}")

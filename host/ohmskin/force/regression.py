@@ -58,13 +58,10 @@ from ohmskin.force.curve import (
     Curve,
     ForceModel,
     force_by,
-    require_rows,
     spread,
 )
+from ohmskin.force.rules import MIN_PRESSES, check_enough, require_forces, require_rows
 
-# A cell with fewer presses has no curve of its own. A curve has 2 coefficients, and 4 presses would
-# leave 2 degrees of freedom, for which Student's t has no finite variance.
-MIN_PRESSES: Final = 5
 # The presses of a cell are split into so many parts, each held out once: none of them is empty.
 PRESS_FOLDS: Final = MIN_PRESSES
 # Cells are held out in at most so many parts. Chosen: the usual ten, so that a large skin takes no
@@ -348,16 +345,11 @@ def _rms(values: Float) -> float:
 
 def _check(rows: _Rows, shape: tuple[int, int]) -> None:
     """Raise ValueError as `ForceRegression.fit`."""
-    require_rows("force_n", rows.force, rows.force >= 0, "0 or more: zero the force sensor")
+    require_forces(rows.force)
     require_rows("rise_std", rows.dx, rows.dx >= 0, "0 or more")
     on_skin = (rows.cell >= 0) & (rows.cell < shape[0] * shape[1])
     require_rows("cells", rows.cell, on_skin, f"one of a {shape[0]}x{shape[1]} skin")
-    number = np.unique(rows.press).size
-    if number < MIN_PRESSES:
-        raise ValueError(f"too few presses: {number}, {MIN_PRESSES} are needed")
-    if np.ptp(rows.force) == 0:
-        forces = f"all {rows.force.size} forces are {rows.force[0]:g} N"
-        raise ValueError(f"{forces}: press with different forces")
+    check_enough(np.unique(rows.press).size, rows.force)
 
 
 def _array(name: str, values: ArrayLike, size: int, dtype: Any = np.float64) -> Any:
