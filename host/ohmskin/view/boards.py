@@ -32,21 +32,24 @@ from ohmskin.link.device import LOG, Device
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
 
-# The paper's programmes take minutes for a frame of 8x8.
+# The methods that the page offers. Those of the paper take minutes for a frame of 8x8.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
-# Boards of one page at most: each is a thread that may use a good part of a core.
+# A page has at most so many boards. Chosen: each is a thread that may use a good part of a core.
 MOST_BOARDS: Final = 16
-# Time until a port that is not there is tried again [s].
+# A port that is not there is tried again after this time [s]. Chosen: somebody who plugs a board in
+# does not wait for long, and a system looks for its ports without effort.
 AGAIN_S: Final = 1.0
-# `close` waits so long for the thread: a port that never answers must not hold it up [s].
+# `close` waits so long for a board's thread [s]. Chosen: it ends in a tenth of that, unless its
+# port never answers, and such a port must not hold up the end of the program.
 _CLOSE_S: Final = 1.0
-# Characters of a mark at most.
-_LONGEST_MARK: Final = 1000
+# A text that is typed at the page, a port or a mark, has at most so many characters. Chosen: far
+# longer than anybody types, and short enough for a line of an error.
+LONGEST_TEXT_CHARS: Final = 1000
 # What the page says of a board.
 _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
 # What it says of a contact.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
-# What makes boards the same skin: methods, rest and tare of one are good for the other.
+# Boards that agree in all of these read the same skin: method, rest and tare stay good.
 _skin_of: Final = attrgetter(
     *("unit_id", "rows", "columns", "mode", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
 )
@@ -67,7 +70,11 @@ class Shown(NamedTuple):
 
 
 def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, **more: Any) -> Shown:
-    """raw: by the method `ohm`, what the near electrodes read, with ghosts. more: of the header."""
+    """What the page is sent of a scan.
+
+    raw: what `ohm` makes of the near electrodes' readings: it has ghosts, which the page compares
+    with the scan's own estimate. more: further fields of the header.
+    """
     estimate = scan.estimate
     planes: dict[str, Float | Bool] = {
         "raw": raw.cell_siemens,
@@ -87,10 +94,10 @@ def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, **more: Any) -> Sho
         "chi2": _number(estimate.chi2),
         "estimate_s": estimate.seconds,
         "text": estimate.message,
-        "contacts": [list(map(_number, _numbers_of(each))) for each in scan.contacts],
+        "contacts": [list(map(_number, _numbers_of(contact))) for contact in scan.contacts],
     }
     header = json.dumps(content, allow_nan=False).encode()
-    header += b" " * (-len(header) % 4)
+    header += b" " * (-len(header) % 4)  # a page can read planes only from a multiple of 4 bytes
     values = np.stack(list(planes.values())).astype("<f4")
     return Shown(scan.number, struct.pack("<I", len(header)) + header + values.tobytes())
 
@@ -133,9 +140,10 @@ class _Recording(Closing):
 
 
 class ViewedBoard(Closing):
-    """The board at `port`, whether it is there or not. All but `shown` and `state` may wait.
+    """The board at `port`, whether it is there or not.
 
-    calibrations: the one of its unit is taken; with `force`, that of any. folder: of recordings.
+    All methods but `state` may wait for the board. calibrations: the one of its unit is taken; with
+    `force`, that of any unit. folder: where recordings go.
     """
 
     def __init__(
@@ -233,8 +241,8 @@ class ViewedBoard(Closing):
     def mark(self, text: str) -> str:
         """Set a mark in the recording."""
         text = text.strip()
-        if not 0 < len(text) <= _LONGEST_MARK:
-            raise OhmskinError(f"a mark is a text of 1 to {_LONGEST_MARK} characters")
+        if not 0 < len(text) <= LONGEST_TEXT_CHARS:
+            raise OhmskinError(f"a mark is a text of 1 to {LONGEST_TEXT_CHARS} characters")
         if not self._add(Mark(text, time.monotonic())):
             raise OhmskinError("a mark goes into a recording: start one first")
         return f"marked: {text}"
@@ -333,17 +341,20 @@ class ViewedBoard(Closing):
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""
         self.closing.set()
-        for each in (self._skin, self._recording):
-            if each is not None:
-                each.close()
+        for open_one in (self._skin, self._recording):
+            if open_one is not None:
+                open_one.close()
         self._thread.join(_CLOSE_S)
         self._changed()
 
 
 def _methods(reader: SkinReader) -> tuple[str, ...]:
-    """The methods that the page offers: those that take what the board reads."""
-    own, is_near = reader.force_method, reader.board.mode == "near"
-    live = LIVE_METHODS if own is None or own in LIVE_METHODS else (*LIVE_METHODS, own)
+    """The methods that the page offers: those that take what the board reads.
+
+    The method of the calibration is one of them, because no other gives newtons.
+    """
+    of_forces, is_near = reader.force_method, reader.board.mode == "near"
+    live = dict.fromkeys([*LIVE_METHODS, *filter(None, [of_forces])])
     return tuple(name for name in live if is_near or kind_of(name).takes_far)
 
 

@@ -21,8 +21,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDiscon
 from ohmskin.errors import OhmskinError, TareRefused
 from ohmskin.view.boards import Shown, ViewedBoard
 
-_GONE: Final = 4001  # close code: the board was closed, by this page or another
-_MOST_MS: Final = 1e15  # of a page's clock
+# The close code of a websocket whose board was closed, by this page or another. Chosen from 4000 to
+# 4999, which RFC 6455 leaves to programs; page/wire.js knows it.
+_GONE: Final = 4001
+# No page's clock shows more [ms]. A page counts from its begin, and 1e15 ms are 30,000 years; a
+# number that JavaScript reads as infinite must not be sent back.
+_MOST_MS: Final = 1e15
 _Command = Callable[[], str]
 
 

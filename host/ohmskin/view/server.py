@@ -25,20 +25,23 @@ from starlette.datastructures import MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from ohmskin.errors import OhmskinError
 from ohmskin.link.serial_port import serial_ports
-from ohmskin.view.boards import ViewedBoards
+from ohmskin.view.boards import LONGEST_TEXT_CHARS, ViewedBoards
 from ohmskin.view.panel import Panel
 
 _PAGE: Final = Path(__file__).parent / "page"
-_LONGEST_PORT: Final = 500
-_LONGEST_MESSAGE: Final = 8192  # of the page, in bytes
+# A page's message has at most so many bytes: those of a text of `LONGEST_TEXT_CHARS`, and of names.
+_LONGEST_MESSAGE_BYTES: Final = 8192
+# Connections that are open when the server ends have so long to close [s]. Chosen: a page on this
+# machine takes milliseconds, and nobody likes to wait after Ctrl-C.
 _SHUTDOWN_S: Final = 2
+# What a browser lets the page do: load its own files, talk to its own server, and nothing else.
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -49,48 +52,77 @@ _HEADERS: Final = {
     "referrer-policy": "no-referrer",  # the address may hold the token
     "cache-control": "no-store",  # a page of one version never meets a server of another
 }
+# Names of this machine for itself. A page that was asked for by another name was made to lead here.
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
+# Requests that change nothing. Browsers need not say in ``Origin`` which page sends them.
 _READS: Final = ("GET", "HEAD")
+
+
+class _BoardList:
+    """What the page asks for beside its own files: ports, the list of boards, and their panels."""
+
+    def __init__(self, boards: ViewedBoards) -> None:
+        self._boards = boards
+
+    def routes(self) -> list[BaseRoute]:
+        """Which request is answered by which method."""
+        return [
+            Route("/ports", self.ports),
+            Route("/boards", self.list_boards, methods=["GET"]),
+            Route("/boards", self.add_board, methods=["POST"]),
+            Route("/boards/{number}", self.remove_board, methods=["DELETE"]),
+            WebSocketRoute("/boards/{number}", self.panel),
+        ]
+
+    async def ports(self, _: Request) -> Response:
+        """The serial ports of this machine."""
+        # In a thread, because some systems take long to look for them.
+        ports = await anyio.to_thread.run_sync(serial_ports)
+        return JSONResponse([asdict(port) for port in ports])
+
+    async def list_boards(self, _: Request) -> Response:
+        """Numbers and ports of the boards that are open."""
+        return JSONResponse([{"number": n, "port": b.port} for n, b in self._boards.items()])
+
+    async def add_board(self, request: Request) -> Response:
+        """Open the board at a port, and say its number."""
+        try:
+            asked = json.loads(await _body(request))
+            place = asked["port"].strip()
+            if not 0 < len(place) <= LONGEST_TEXT_CHARS or not place.isprintable():
+                raise ValueError("a port is a serial port's name or a URL")
+            return JSONResponse({"number": self._boards.add(place), "port": place})
+        except (KeyError, TypeError, AttributeError, RecursionError):
+            return JSONResponse({"error": "say which port"}, 400)
+        except ValueError as exc:
+            return JSONResponse({"error": str(exc)}, 400)
+
+    async def remove_board(self, request: Request) -> Response:
+        """Close a board."""
+        await anyio.to_thread.run_sync(self._boards.remove, self._number(request))
+        return Response(status_code=204)
+
+    async def panel(self, socket: WebSocket) -> None:
+        """Show a board until its page goes."""
+        board = self._boards.get(self._number(socket))
+        if board is None:
+            await socket.close()
+        else:
+            await Panel(board, socket).serve()
+
+    def _number(self, asked: HTTPConnection) -> int:
+        """The number of the board that the path names; -1: there is none.
+
+        `int` is not used, because it refuses a text of thousands of digits with an error.
+        """
+        text = asked.path_params["number"]
+        return next((number for number in tuple(self._boards) if str(number) == text), -1)
 
 
 def make_app(
     boards: ViewedBoards, host: str, token: str, started: Callable[[], None] = lambda: None
 ) -> Starlette:
     """The page of `boards`, which closes them at its end. host, token: see `Guard`."""
-
-    async def ports(request: Request) -> Response:
-        found = await anyio.to_thread.run_sync(serial_ports)
-        return JSONResponse([asdict(port) for port in found])
-
-    async def list_boards(request: Request) -> Response:
-        return JSONResponse([{"number": n, "port": each.port} for n, each in boards.items()])
-
-    async def add_board(request: Request) -> Response:
-        try:
-            asked = json.loads(await _body(request))
-            place = asked["port"].strip()
-            if not 0 < len(place) <= _LONGEST_PORT or not place.isprintable():
-                raise ValueError("a port is a serial port's name or a URL")
-            return JSONResponse({"number": boards.add(place), "port": place})
-        except (KeyError, TypeError, AttributeError, RecursionError):
-            return JSONResponse({"error": "say which port"}, 400)
-        except ValueError as exc:
-            return JSONResponse({"error": str(exc)}, 400)
-
-    def number_of(asked: HTTPConnection) -> int:
-        """Not by `int`, which refuses thousands of digits. -1: there is none."""
-        return next((n for n in tuple(boards) if str(n) == asked.path_params["number"]), -1)
-
-    async def remove_board(request: Request) -> Response:
-        await anyio.to_thread.run_sync(boards.remove, number_of(request))
-        return Response(status_code=204)
-
-    async def panel(connection: WebSocket) -> None:
-        board = boards.get(number_of(connection))
-        if board is None:
-            await connection.close()
-        else:
-            await Panel(board, connection).serve()
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
@@ -101,25 +133,20 @@ def make_app(
     # A page asks for its own parts without its token.
     public = [f"/{file.name}" for file in _PAGE.iterdir() if file.name != "index.html"]
     mimetypes.add_type("text/javascript", ".js")  # some systems know it by another name
+    files = Route("/{path:path}", StaticFiles(directory=_PAGE, html=True))
     return Starlette(
-        routes=[
-            Route("/ports", ports),
-            Route("/boards", list_boards, methods=["GET"]),
-            Route("/boards", add_board, methods=["POST"]),
-            Route("/boards/{number}", remove_board, methods=["DELETE"]),
-            WebSocketRoute("/boards/{number}", panel),
-            Route("/{path:path}", StaticFiles(directory=_PAGE, html=True)),
-        ],
+        routes=[*_BoardList(boards).routes(), files],
         middleware=[Middleware(Guard, host=host, token=token, public=public)],
         lifespan=lifespan,
     )
 
 
 async def _body(request: Request) -> bytes:
+    """The body of a request. Raises ValueError, and reads no further, if it is too long."""
     octets = b""
     async for chunk in request.stream():
         octets += chunk
-        if len(octets) > _LONGEST_MESSAGE:
+        if len(octets) > _LONGEST_MESSAGE_BYTES:
             raise ValueError("that is too long for a port")
     return octets
 
@@ -147,7 +174,7 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
             config = uvicorn.Config(
                 make_app(boards, host, token, lambda: started(url)),
                 ws="wsproto",
-                ws_max_size=_LONGEST_MESSAGE,
+                ws_max_size=_LONGEST_MESSAGE_BYTES,
                 log_config=None,
                 access_log=False,
                 server_header=False,
