@@ -16,6 +16,6 @@ def demo(
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
     print(f"scanning {port} for {seconds:g} s", flush=True)  # noqa: T201
-    from ohmskin.cli.emulate import compare  # loads for a second
+    from ohmskin.cli.compare import compare  # loads for a second
 
     compare(port, seconds, picture)
