@@ -71,7 +71,8 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 
-# Where a name is from. Its module is imported when the name is first asked for.
+# Public names by the module that has them. A module is imported when one of its names is first
+# asked for: a program that only reads a board need not wait for scipy.
 _MODULES = {
     "estimate.base": ("Estimate", "Estimator"),
     "estimate.knowledge": ("SkinKnowledge", "WireOhm"),
@@ -89,8 +90,9 @@ _MODULES = {
 def __getattr__(name: str) -> Any:
     for module, names in _MODULES.items():
         if name in names:
-            globals()[name] = found = getattr(import_module(f"ohmskin.{module}"), name)
-            return found
+            # Kept here, so that the name is looked up once.
+            globals()[name] = public = getattr(import_module(f"ohmskin.{module}"), name)
+            return public
     raise AttributeError(f"module 'ohmskin' has no attribute '{name}'")
 
 

@@ -15,9 +15,12 @@ from ohmskin.arrays import Float
 from ohmskin.files import PathName, naming, read_bounded
 from ohmskin.link.protocol import CONSTANTS
 
-MAX_FILE_BYTES: Final = 100_000  # 16 x 16 numbers are 5 kB.
-# [ohm] Readings differ by less than a code beyond: it is a number in another unit.
+# Largest file that is read. Chosen: 16 x 16 numbers are 5 kB, so a larger file is no plate.
+MAX_FILE_BYTES: Final = 100_000
+# Least resistor of a plate. Chosen: beside references of 30 kOhm, it differs from a short by less
+# than a code of 10 bits. So a lower number is in another unit.
 LEAST_OHM: Final = 100.0
+# Highest resistor of a plate. Chosen: it differs from an open crossing by one code.
 MOST_OHM: Final = 30e6
 
 
@@ -42,6 +45,7 @@ def load_plate(path: PathName) -> Float:
 
 
 def _siemens(field: str) -> float:
+    """The conductance that a field of the file says [S]; 0 where it says that there is none."""
     if field.lower() in ("", "open"):
         return 0.0
     with suppress(ValueError):

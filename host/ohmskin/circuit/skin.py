@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The skin's circuit: from resistances to the four readings of every cell, and back to a current.
+"""The circuit of a skin: from resistances to the readings of every cell, and back to a current.
 
 Symbols
 
 ====== ============ ==================================================================== =========
 symbol shape        meaning                                                              unit
 ====== ============ ==================================================================== =========
-R, C                row stripes (top layer), column stripes (bottom layer)
+R, C                number of rows (stripes of the top layer) and of columns (bottom layer)
 g      (R, C)       cell conductance, joins top node T[i,j] and bottom node B[i,j]       S
 Rt     (R, C)       top wire segment that ends at T[i,j], from T[i,j-1] or the electrode  ohm
 Rb     (R, C)       bottom segment that ends at B[i,j], from B[i-1,j] or the electrode    ohm
@@ -17,6 +17,8 @@ Z      (R+C, R+C)   inverse of Y, one electrode of each connected part grounded 
 rho    (R, C)       port resistance between row electrode i and column electrode j       ohm
 I      (R, C)       current through a selected port, per volt of Vdd                     S
 y      (R, C, 4)    sense-node voltage / Vdd, in the order of `CONFIGURATIONS`           1
+F      (RC, R+C)    voltage in a cell's path per current into a line's far end           ohm
+Q      (R+C, R+C)   E (diag(1/g) + K)^-1 F: currents of electrodes that F drives         1
 ====== ============ ==================================================================== =========
 
 Equations. With x the cell currents and V the electrode potentials,
@@ -24,9 +26,10 @@ Equations. With x the cell currents and V the electrode potentials,
     (diag(1/g) + K) x = E^T V ,     Y = E (diag(1/g) + K)^-1 E^T ,
     rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] ,     I = 1 / (rho + R_top + R_bottom) .
 
-This is Kirchhoff's law on the network of 2RC nodes with the wire nodes eliminated: along a chain,
-cells j and k share the wire up to the nearer of them, so K is a sum of segments. Open cells (g = 0)
-and wires of zero ohm need no special value. What is factorised is 1 + sqrt(g) K sqrt(g).
+This is Kirchhoff's law on the network of 2RC nodes, with the nodes of wires eliminated: along a
+line, cells j and k share the wire up to the nearer of them, so K is a sum of segments. What is
+factorised is 1 + sqrt(g) K sqrt(g), because that needs no special value for open cells (g = 0) and
+for wires of zero ohm.
 """
 
 from collections.abc import Sequence
@@ -37,32 +40,40 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.small import cholesky, one_blas_thread, solve, solve_lower
 from ohmskin.link.protocol import MODES
 
-Wire = float | Float  # segments of a layer: one number for all of them, or (R, C)
+# Wire segments of a layer [ohm]: one number if all are alike, which is faster, or (R, C).
+Wire = float | Float
 
 NEAR: Final = MODES["near"]
 CONFIGURATIONS: Final = tuple(name.upper() for name in NEAR)
 READINGS_PER_CELL: Final = len(NEAR)
-# Every configuration reads y = offset + sign * R * I, R the reference resistor of the sensed layer.
+# Configurations A to D read y = offset + sign * R * I, R the reference resistor that they sense.
 READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
 READING_SIGN: Final[Float] = np.array([-1.0, 1.0, -1.0, 1.0])
-READING_SENSES_TOP: Final[NDArray[np.bool_]] = np.array([True, False, False, True])
+READING_SENSES_TOP: Final[Bool] = np.array([True, False, False, True])
 
-# Readings of the same node with the supplies exchanged: near and far row, near and far column.
+# A node's reading with the top pin high, and that with the bottom pin high: the near ends of row
+# and column, then their far ends.
 EXCHANGED: Final = {"a": "d", "b": "c", "e": "h", "f": "g"}
 
+# A reference resistor, if nothing else is told: that of the wiring in README.md.
 DEFAULT_REF_OHM: Final = 30_000.0
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Every resistance of the circuit: cells (R, C) [S], wire segments (R, C) [ohm], references.
+    """Every resistance of the circuit. Arrays are copied and read-only.
 
-    `top_wire_ohm[i, j]` ends at T[i, j], `bottom_wire_ohm[i, j]` at B[i, j]; index 0 along the
-    stripe is the segment from the electrode. Zeros are exact. Arrays are copied and read-only.
+    cell_siemens: conductance of each cell (R, C) [S]; 0 is an open cell.
+    top_wire_ohm: segments of the top layer (R, C) [ohm]; [i, j] ends at T[i, j], and [i, 0] comes
+        from the electrode of row i. Zeros are exact.
+    bottom_wire_ohm: segments of the bottom layer (R, C) [ohm]; [i, j] ends at B[i, j], and [0, j]
+        comes from the electrode of column j.
+    ref_top_ohm, ref_bottom_ohm: reference resistors [ohm].
+
     Raises ValueError for other shapes, values that are negative or not finite, references not > 0.
     """
 
@@ -107,7 +118,8 @@ def _incidence(rows: int, columns: int) -> Float:
     return np.hstack([by_row, -np.tile(np.eye(columns), (rows, 1))])
 
 
-_triangle = lru_cache(maxsize=8)(np.tri)  # ones: which cells are behind a segment
+# Ones on and below the diagonal, (n, n): which cells k of a line are behind segment j, k >= j.
+_triangle = lru_cache(maxsize=8)(np.tri)
 
 
 @lru_cache(maxsize=8)
@@ -134,9 +146,10 @@ def wire_coupling_ohm(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[in
 def factorised(
     root: Float, top_wire_ohm: Wire, bottom_wire_ohm: Wire, to_sense: Float | None = None
 ) -> tuple[Float, Float]:
-    """L and L^-1 sqrt(g) [E^T F] with L L^T = 1 + sqrt(g) K sqrt(g): `root` is sqrt(g), (R, C).
+    """L of L L^T = 1 + sqrt(g) K sqrt(g), (RC, RC), and "half", L^-1 sqrt(g) [E^T F].
 
-    The second, without F, gives Y = half^T half.
+    root: sqrt(g), (R, C). to_sense: F (RC, R+C); None: near ends are sensed, and half has no part
+    of F. The part of E^T gives Y = half^T half.
     """
     system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm, root.shape)
     system *= root.reshape(-1, 1)
@@ -149,8 +162,8 @@ def factorised(
 
 
 def admittance_of(half: Float) -> Float:
-    """Y = half^T half. No current leaves the skin: a diagonal made from its row keeps small
-    conductances that rounding of the large ones would drown.
+    """Y = half^T half. No current leaves the skin, so the sum of each row is zero. A diagonal that
+    is made so keeps small conductances, which rounding of the large ones would drown.
     """
     admittance: Float = half.T @ half
     diagonal = np.einsum("ii->i", admittance)
@@ -176,9 +189,11 @@ def port_resistance_ohm(skin: Skin) -> Float:
 def impedance_of(
     admittance: Float, rows: int, part: NDArray[np.intp] | None = None
 ) -> tuple[Float, Float]:
-    """Z and rho (R, C) of Y, which is overwritten. part: each electrode's; None: all are connected.
+    """Z (R+C, R+C) and rho (R, C) of Y, which is overwritten.
 
-    Grounding any one electrode of a connected part changes no resistance within it. The best
+    part: the number of the connected part that each electrode is in; None: all are connected.
+    Y is singular, as potentials have no zero, so one electrode of each part is grounded, by a
+    conductance as large as its own. Which one changes no resistance within the part. The best
     connected one costs the least precision.
     """
     diagonal = admittance.diagonal()
@@ -196,8 +211,8 @@ def impedance_of(
 def _path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
     """Wire from each cell to the near end of its row, and of its column [ohm], (RC, R+C)."""
     if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
-        each = np.repeat([top_wire_ohm, bottom_wire_ohm], shape)
-        return np.asarray(_unit_path(*shape) * each)
+        segment_ohm = np.repeat([top_wire_ohm, bottom_wire_ohm], shape)
+        return np.asarray(_unit_path(*shape) * segment_ohm)
     rows, columns = shape
     to_cell = np.zeros((rows, columns, rows + columns))
     np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(top_wire_ohm, 1)
@@ -207,7 +222,7 @@ def _path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, 
 
 @lru_cache(maxsize=8)
 def _unit_path(rows: int, columns: int) -> Float:
-    """The same of wires of 1 ohm a segment."""
+    """`_path_of_lines` of wires of 1 ohm a segment."""
     ones = np.ones((rows, columns))
     return _path_of_lines(ones, ones, ones.shape)
 
@@ -216,8 +231,8 @@ def _unit_path(rows: int, columns: int) -> Float:
 def end_admittance(skin: Skin) -> Float:
     """Y [S] of both ends of all lines, (2(R+C), 2(R+C)): near ends, rows first, then far ends.
 
-    A far end is behind 1 ohm, a multiplexer's, at T[i, C-1] or B[R-1, j]: one more cell of its
-    line, which shares wires with the others.
+    A far end is behind 1 ohm, for its multiplexer, at T[i, C-1] or B[R-1, j]. So it is computed as
+    one more cell of its line, at the end of the line's wire, to an electrode of its own.
     """
     rows, columns = skin.shape
     cells, lines = rows * columns, rows + columns
@@ -232,14 +247,15 @@ def end_admittance(skin: Skin) -> Float:
 
 
 def port_difference(lines: Float, rows: int) -> Float:
-    """What a port's row has less what its column has, (RC, n), from all lines, (R+C, n)."""
+    """For each port, what its row has less what its column has: (RC, n), of lines (R+C, n)."""
     return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
 
 
 def wire_current(cell_current: Float) -> Float:
     """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
 
-    A wire segment carries what the cells behind it draw: sums as products, which is faster.
+    A wire segment carries what the cells behind it draw. These sums are made as products with a
+    triangle of ones, which is faster.
     """
     _, rows, columns = cell_current.shape
     current = np.empty((len(cell_current), 2, rows, columns))
@@ -250,20 +266,29 @@ def wire_current(cell_current: Float) -> Float:
 
 
 class PortCircuit:
-    """Ports of a skin whose cells conduct (g > 0), in row-major order, and what moves them.
+    """What the ports of a skin show, and its slopes by all resistances. All cells conduct (g > 0).
 
-    A port is driven at its near ends, and sensed there or at far ends, where no current flows.
-    port_ohm: voltage between the sensed ends per current through the port (RC,): rho, or at far
-    ends the cell without its wires. drop_ohm (2, RC): what wires lose up to the sensed ends, of
-    row and column. The others are slopes, d port_ohm / d log r_e = r_e i_e j_e [ohm]: i_e is the
-    current through resistance e, j_e that of a current through the sensed ends (Tellegen). So the
-    currents that give port_ohm give all RC x 3RC derivatives. A port's currents are those of its
-    row less those of its column. Cells (R, C) [S], wires (R, C) [ohm], or one number where all
-    segments of their layer are alike. far: whether rows, and columns, are sensed at their far ends.
+    Ports (RC,) are in row-major order. A port is driven at its near ends. It is sensed there, or at
+    far ends, where no current flows out.
 
-    F (RC, R+C) is the voltage that current into the sensed end of a line inserts in the paths of
-    its cells: the wire that they share. With Q = E (diag(1/g) + K)^-1 F, the sensed ends have the
-    potentials (Z (1 - Q))^T per current into the near ends.
+    shape, rows: (R, C), and R.
+    wire_ohm: segments of the top and of the bottom layer, as they were given.
+    far: whether rows, and whether columns, are sensed at their far ends.
+    factor: L of `factorised` (RC, RC).
+    port_ohm: voltage between the sensed ends per current through the port (RC,) [ohm]: rho, or at
+        far ends that without the wires up to them.
+    drop_ohm: what the wires of row and of column lose up to the sensed ends, per current of the
+        port (2, RC) [ohm]; 0 for lines that are sensed at near ends. It exists if any is not.
+
+    **Slopes.** d port_ohm / d log r_e = r_e i_e j_e [ohm], by Tellegen's theorem: i_e is the
+    current through resistance e while the port is driven with a current of one, j_e that if this
+    current flowed into the sensed ends. So the currents that give port_ohm give all its RC x 3RC
+    slopes. A port's currents are those of its row less those of its column: R+C solutions are
+    enough.
+
+    **Far ends.** A current into the far end of a line flows through all of the line's wire. It adds
+    a voltage to the path of each cell of this line: by the wire that both share, F. By reciprocity,
+    the sensed ends have the potentials (Z (1 - Q))^T per current into the near ends.
     """
 
     def __init__(
@@ -274,6 +299,7 @@ class PortCircuit:
         *,
         far: tuple[bool, bool] = (False, False),
     ) -> None:
+        """Cells (R, C) [S], all > 0; wire segments [ohm]; far: as the attribute."""
         self.shape, self.rows = cell_siemens.shape, len(cell_siemens)
         self.wire_ohm, self.far = (top_wire_ohm, bottom_wire_ohm), far
         self._root, to_sense = np.sqrt(cell_siemens), None
@@ -294,7 +320,9 @@ class PortCircuit:
 
     @cached_property
     def _currents(self) -> Float:
-        """Currents through all cells per potential of each electrode, and those that F drives."""
+        """Currents through all cells (RC, ...) per potential of each electrode, and those that F
+        drives, if far ends are sensed.
+        """
         currents = solve_lower(self.factor, self._half, transposed=True)
         currents *= self._root.reshape(-1, 1)
         return currents
@@ -311,7 +339,7 @@ class PortCircuit:
 
     @cached_property
     def sense_current(self) -> Float:
-        """The same per current into each sensed end."""
+        """Currents through all cells per current into each sensed end, (R+C, R, C)."""
         if not any(self.far):
             return self.cell_current
         driven = self._currents[:, sum(self.shape) :].T
@@ -324,7 +352,10 @@ class PortCircuit:
 
     @cached_property
     def _wire_sense_current(self) -> Float:
-        """The same per current into each sensed end: it flows back through the whole far line."""
+        """Currents through all wires per current into each sensed end, (R+C, 2, R, C).
+
+        A current into a far end flows back to the near end, through the whole line.
+        """
         if not any(self.far):
             return self._wire_current
         current = wire_current(self.sense_current)
@@ -335,15 +366,18 @@ class PortCircuit:
         return current
 
     def line_current(self, layer: int) -> Float:
-        """Currents through a port's own row (layer 0), or column, (lines, ports, segments)."""
+        """Currents through the segments of a port's row (layer 0), or of its column (layer 1), per
+        current of the port: (lines, ports of the line, segments).
+        """
         rows, current = self.rows, self._wire_current[:, layer]
         if layer == 0:
-            own = np.einsum("iik->ik", current[:rows])[:, None]
-            return np.asarray(own - current[rows:].transpose(1, 0, 2))
-        own = np.einsum("jkj->jk", current[rows:])[:, None]
-        return np.asarray(current[:rows].transpose(2, 0, 1) - own)
+            by_row = np.einsum("iik->ik", current[:rows])[:, None]
+            return np.asarray(by_row - current[rows:].transpose(1, 0, 2))
+        by_column = np.einsum("jkj->jk", current[rows:])[:, None]
+        return np.asarray(current[:rows].transpose(2, 0, 1) - by_column)
 
     def _slopes(self, current: Float, sensed: Float, ohm: Float) -> Float:
+        """r_e i_e j_e of all ports, (RC, resistances), from currents of lines (R+C, ...)."""
         slopes = port_difference(current.reshape(len(current), -1), self.rows)
         if sensed is current:
             slopes *= slopes
@@ -363,20 +397,28 @@ class PortCircuit:
         return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
-        """Their sums over each layer, (RC, 2): a product of lines instead of squares of ports."""
-        found, lines = [], len(self._impedance)
+        """Slopes by the log of each layer, all segments together, (RC, 2).
+
+        They are the sums of `by_wires` over each layer. A product of the currents of lines makes
+        them without the slopes by all segments, which takes less time.
+        """
+        slopes, lines = [], len(self._impedance)
         for layer, ohm in enumerate(self.wire_ohm):
             current = self._wire_current[:, layer].reshape(lines, -1)
             sensed = self._wire_sense_current[:, layer].reshape(lines, -1)
             row, column = _ends_of_ports((current * np.ravel(ohm)) @ sensed.T, self.rows)
-            found.append((row - column).ravel())
-        return np.transpose(found)
+            slopes.append((row - column).ravel())
+        return np.transpose(slopes)
 
 
 def _ends_of_ports(lines: Float, rows: int) -> Float:
-    """At row and at column, (2, R, C), of what each line's current makes at lines, (R+C, R+C)."""
-    own, by_row, by_column = lines.diagonal(), lines[:rows, rows:], lines[rows:, :rows]
-    return np.stack([own[:rows, None] - by_column.T, by_row - own[rows:]])
+    """What a port's current makes at its row and at its column, (2, R, C).
+
+    lines[i, j] (R+C, R+C): what a current into line j makes at line i, or the other way round. The
+    current of a port flows into its row and out of its column.
+    """
+    at_itself, by_row, by_column = lines.diagonal(), lines[:rows, rows:], lines[rows:, :rows]
+    return np.stack([at_itself[:rows, None] - by_column.T, by_row - at_itself[rows:]])
 
 
 def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:
@@ -410,10 +452,10 @@ def ratio_from_current(
 
 
 def node_ratio(ratio: Float, reading_names: Sequence[str], node: str) -> Float:
-    """Potential over Vdd, top pin high, where reading `node` (a, b, e, f) is taken, (...).
+    """Potential over Vdd of the node of reading a, b, e or f while the top pin is high, (...).
 
-    Mean of what readings (..., n) of these names have of it: with the supplies exchanged, each is 1
-    less. Raises ValueError if none of them is of this node.
+    It is the mean of the readings (..., n), of these names, that are taken at this node. A reading
+    with the supplies exchanged is 1 less the potential. Raises ValueError if there is none.
     """
     high = [ratio[..., k] for k, name in enumerate(reading_names) if name == node]
     low = [1 - ratio[..., k] for k, name in enumerate(reading_names) if name == EXCHANGED[node]]
@@ -425,7 +467,7 @@ def node_ratio(ratio: Float, reading_names: Sequence[str], node: str) -> Float:
 
 
 def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
-    """Readings a to d, from (..., n) of these names, which have both near ends."""
+    """Readings a to d (..., 4), of readings (..., n) of these names, which have both near ends."""
     if tuple(reading_names) == NEAR:
         return ratio
     a, b = (node_ratio(ratio, reading_names, node) for node in "ab")
@@ -435,8 +477,8 @@ def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
 def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
     """I = sum_k R_k s_k (y_k - offset_k) / sum_k R_k^2, per Vdd [S], shape (...,) from (..., 4).
 
-    Each reading alone gives I_k = s_k (y_k - offset_k) / R_k; weights R_k^2 are the combination of
-    least variance when all readings are equally noisy.
+    Each reading alone gives I_k = s_k (y_k - offset_k) / R_k. Weights R_k^2 give the mean of least
+    variance, if all readings are equally noisy.
     """
     reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
     weight = READING_SIGN * reference / (reference @ reference)
@@ -446,8 +488,8 @@ def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) 
 def current_std(ratio_std: float, ref_top_ohm: float, ref_bottom_ohm: float) -> float:
     """Standard deviation of `current_from_ratio` [S]: ratio_std * sum_k R_k / sum_k R_k^2.
 
-    The sum is linear, not quadratic, because without other noise all four readings round alike. For
-    other noise this is an upper bound (too large by 2 at most).
+    Deviations add up, and not variances, because without other noise all four readings round alike.
+    For independent noise, this is too large by 2 at most.
     """
     reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
     return float(ratio_std * np.sum(reference) / np.sum(reference**2))
@@ -461,11 +503,11 @@ def readings(skin: Skin) -> Float:
 
 @one_blas_thread
 def all_readings(skin: Skin, admittance: Float) -> Float:
-    """Readings a to h, shape (R, C, 8). admittance: of the ends, as `end_admittance`; overwritten.
+    """Readings a to h, shape (R, C, 8). admittance: `end_admittance` of the skin; overwritten.
 
     v_k = Z[k, i] - Z[k, j] is the potential of end k per current of the port of row i and column j.
-    A far end's differs from its near end's by the wire between them, as far as it carries current.
-    Both supplies exchanged turn each reading y into 1 - y.
+    A far end differs from its near end by what the wire between them loses. With both supplies
+    exchanged, each reading y becomes 1 - y.
     """
     rows, lines = skin.shape[0], sum(skin.shape)
     part = _connected_parts(skin.cell_siemens)

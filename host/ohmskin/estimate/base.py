@@ -11,15 +11,19 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import NEAR, ratio_from_current
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 
+# The conductance of a touched cell has risen by more than this. Chosen: half of what a cell of one
+# megohm conducts at rest, so that a drift by some percent is no touch.
 TOUCH_SIEMENS: Final = 0.5e-6
+# It has also risen by more than so many of its standard deviations. Chosen: by chance, one normal
+# error of 32,000 is larger.
 TOUCH_STDS: Final = 4.0
 
 
@@ -27,23 +31,30 @@ TOUCH_STDS: Final = 4.0
 class Estimate:
     """The answer for one frame, with its evidence.
 
-    cell_siemens, cell_siemens_std (R, C) [S]: the deviation covers the readings' noise, not what
-    the method neglects: about 58 % of cells lie within one, 98 % within two, because rounding is
-    uniform. It is NaN where the method gives none.
-    level, level_std (R, C): what a force is read from: the same, but for `voltage` [1].
-    touched (R, C). top_wire_ohm, bottom_wire_ohm (R, C), and their deviations: of each segment, NaN
-    where the method estimates no wires.
-    chi2: mean of the squared residuals of all readings over the variance of one (at far ends: of
-    the ports' currents). It is about 1 or less when the model holds.
-    message: empty if the method converged and the readings can be trusted, else why not.
-    seconds: wall time of this frame.
+    cell_siemens: conductance of each cell (R, C) [S].
+    cell_siemens_std: its standard deviation (R, C) [S], NaN where the method gives none. It covers
+        the noise of the readings, not what the method neglects. About 58 % of cells lie within one,
+        98 % within two, because rounding is uniform.
+    level: what a force is read from (R, C): cell_siemens; for `voltage`, a voltage over Vdd [1].
+    level_std: its standard deviation (R, C).
+    touched: which cells are touched (R, C); `Estimator.estimate` says by which rule.
+    top_wire_ohm: each segment of the top layer (R, C) [ohm], NaN where wires are not estimated.
+    bottom_wire_ohm: the same of the bottom layer.
+    top_wire_ohm_std: standard deviation of top_wire_ohm (R, C) [ohm].
+    bottom_wire_ohm_std: standard deviation of bottom_wire_ohm (R, C) [ohm].
+    chi2: mean square of the readings' residuals, over the variance of a reading; at far ends, of
+        the ports' currents, over theirs. It is about 1 or less if the model holds.
+    iterations: steps of the method, 1 where it has none.
+    converged: whether the method converged and the readings can be trusted: message is empty.
+    message: why not, in words.
+    seconds: wall time of this frame [s].
     """
 
     cell_siemens: Float
     cell_siemens_std: Float
     level: Float
     level_std: Float
-    touched: NDArray[np.bool_]
+    touched: Bool
     top_wire_ohm: Float
     bottom_wire_ohm: Float
     top_wire_ohm_std: Float
@@ -63,10 +74,15 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a method finds; `Estimator.estimate` adds the rest.
+    """What a method finds in one frame. `Estimator.estimate` makes an `Estimate` of it.
 
-    wire_ohm, wire_ohm_std (2, R, C): top, bottom; None: not estimated.
-    cell_siemens_std_down: where an error downwards is not as likely as upwards.
+    cell_siemens: conductance of each cell (R, C) [S].
+    cell_siemens_std: its standard deviation (R, C) [S]; where errors upwards are larger than errors
+        downwards, that of errors upwards. NaN: not known.
+    chi2, iterations, message: as in `Estimate`; message is empty if the method converged.
+    wire_ohm: segments of top and bottom layer (2, R, C) [ohm]; None: not estimated.
+    wire_ohm_std: their standard deviation (2, R, C) [ohm]; None: not known.
+    cell_siemens_std_down: standard deviation of errors downwards (R, C) [S]; None: as upwards.
     """
 
     cell_siemens: Float
@@ -80,10 +96,13 @@ class Solution:
 
 
 class Estimator(ABC):
-    """One method for one skin, frame after frame. Raises ValueError for readings it cannot take."""
+    """One method for one skin, frame after frame. Raises ValueError for readings it cannot take.
+
+    name: what the method is called. takes_far: whether it takes readings at far ends.
+    """
 
     name: ClassVar[str]
-    takes_far: ClassVar[bool] = False  # readings at far ends
+    takes_far: ClassVar[bool] = False
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         if knowledge.reading_names != NEAR and not self.takes_far:
@@ -130,27 +149,37 @@ class Estimator(ABC):
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
-        A cell is touched when g - g_rest > max(0.5e-6 S, 4 sqrt(std^2 + std_rest^2)), std the one
-        downwards, NaN as 0. g_rest is this method's own answer to `rest_ratio`; without one it is
-        the median of this frame, which supposes that less than half of the cells are touched.
+        A cell is touched if its conductance g has risen by more than noise,
+
+            g - g_rest > max(0.5e-6 S, 4 sqrt(std^2 + std_rest^2)) ,
+
+        std that of errors downwards, and 0 where it is not known. g_rest is this method's own
+        answer to the rest readings that it was told. It never follows the frames: a cell that stays
+        pressed stays touched.
+
+        Without rest readings, g_rest is one number for all cells, and taken anew from each frame:
+        the median of its cells, with std_rest = 0. This supposes that less than half of the cells
+        are touched, and that they conduct alike at rest.
+
         Raises ValueError for another shape, or for a reading that is no number in 0..1.
         """
-        known = self.knowledge
-        readings = check_ratio(ratio, known.rows, known.columns, of=known.reading_names)
+        knowledge = self.knowledge
+        shape = knowledge.rows, knowledge.columns
+        readings = check_ratio(ratio, *shape, of=knowledge.reading_names)
         self.rest()
         started = time.perf_counter()
         with one_blas_thread:
             ports = self._reader.read(readings, in_order=True)
-            found = self._solve(ports)
-        message = "; ".join(filter(None, (ports.fault, found.message)))
-        touched = self._touched(found)
-        level, level_std = self._level(readings, found)
-        unknown = np.full((2, known.rows, known.columns), np.nan)
-        wires = unknown if found.wire_ohm is None else found.wire_ohm
-        wires_std = unknown if found.wire_ohm_std is None else found.wire_ohm_std
+            solution = self._solve(ports)
+        message = "; ".join(filter(None, (ports.fault, solution.message)))
+        touched = self._touched(solution)
+        level, level_std = self._level(readings, solution)
+        unknown = np.full((2, *shape), np.nan)
+        wires = unknown if solution.wire_ohm is None else solution.wire_ohm
+        wires_std = unknown if solution.wire_ohm_std is None else solution.wire_ohm_std
         return Estimate(
-            cell_siemens=found.cell_siemens,
-            cell_siemens_std=found.cell_siemens_std,
+            cell_siemens=solution.cell_siemens,
+            cell_siemens_std=solution.cell_siemens_std,
             level=level,
             level_std=level_std,
             touched=touched,
@@ -158,32 +187,38 @@ class Estimator(ABC):
             bottom_wire_ohm=wires[1],
             top_wire_ohm_std=wires_std[0],
             bottom_wire_ohm_std=wires_std[1],
-            chi2=found.chi2,
-            iterations=found.iterations,
+            chi2=solution.chi2,
+            iterations=solution.iterations,
             converged=not message,
             message=message,
             seconds=time.perf_counter() - started,
         )
 
-    def _level(self, ratio: Float, found: Solution) -> tuple[Float, Float]:
+    def _level(self, ratio: Float, solution: Solution) -> tuple[Float, Float]:
         """`Estimate.level` of readings (R, C, 4) that gave this solution, and its deviation."""
-        return found.cell_siemens, found.cell_siemens_std
+        return solution.cell_siemens, solution.cell_siemens_std
 
-    def _touched(self, found: Solution) -> NDArray[np.bool_]:
-        down = found.cell_siemens_std_down
-        rise_std = found.cell_siemens_std if down is None else down
+    def _touched(self, solution: Solution) -> Bool:
+        """Which cells are touched, by the rule of `estimate`.
+
+        Errors downwards decide: the question is whether the cell may as well be as low as at rest.
+        """
+        down = solution.cell_siemens_std_down
+        rise_std = solution.cell_siemens_std if down is None else down
         if self._rest is None:
-            rise = found.cell_siemens - np.median(found.cell_siemens)
+            rise = solution.cell_siemens - np.median(solution.cell_siemens)
         else:
-            rise = found.cell_siemens - self._rest.cell_siemens
+            rise = solution.cell_siemens - self._rest.cell_siemens
             rise_std = np.hypot(rise_std, self._rest.cell_siemens_std)
+        # np.fmax passes over a deviation that is NaN.
         return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
 
     def _chi2(self, ports: PortReadings, current_siemens: Float) -> float:
-        """chi2 per reading, or at far ends per port, of a model of these currents (R, C) [S]."""
-        known, ratio = self.knowledge, ports.ratio
-        if known.reading_names != NEAR:
+        """`Estimate.chi2` of a model that gives these currents of ports (R, C) [S]."""
+        knowledge = self.knowledge
+        if knowledge.reading_names != NEAR:
             return float(np.mean(((ports.current - current_siemens) / ports.current_std) ** 2))
-        model = ratio_from_current(current_siemens, known.ref_top_ohm, known.ref_bottom_ohm)
-        residual = (ratio - model).ravel() / known.ratio_std
+        references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
+        model = ratio_from_current(current_siemens, *references)
+        residual = (ports.ratio - model).ravel() / knowledge.ratio_std
         return float(residual @ residual) / residual.size

@@ -17,14 +17,17 @@ from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
 
-# No cell, pressed or open, is believed to lie outside; answers stay finite whatever is read.
+# An open cell counts as so much. Chosen: no converter sees a gigohm, and logs of it stay finite.
 MIN_CELL_SIEMENS: Final = 1e-9
+# A shorted cell counts as so much. Chosen: beside references of 30 kOhm, an ohm is nothing.
 MAX_CELL_SIEMENS: Final = 1.0
 
 
 class WireOhm(NamedTuple):
-    """Nominal resistance of one wire segment of each layer [ohm]; None where it is not known.
+    """What is told of the wires of a skin. None: not known.
 
+    top: nominal resistance of one segment of the top layer [ohm].
+    bottom: the same of the bottom layer [ohm].
     log_std: standard deviation of the log of both together, where they were measured.
     """
 
@@ -51,12 +54,14 @@ NO_WIRES: Final = WireOhm()
 
 @dataclass(frozen=True, eq=False)
 class SkinKnowledge:
-    """What is known of a skin before a frame is read.
+    """What is known of a skin before a frame is read. Raises ValueError for a value that cannot be.
 
-    rows, columns: its size. ref_top_ohm, ref_bottom_ohm [ohm]. adc_bits: resolution of the
-    readings, None when they are exact. rest_ratio: readings (R, C, 4) of the untouched skin.
-    nominal_wire_ohm: a wire segment of each layer [ohm], where known. reading_names: of each cell.
-    Raises ValueError for a value that cannot be.
+    rows, columns: the size of the skin, R and C.
+    ref_top_ohm, ref_bottom_ohm: reference resistors at the sense nodes [ohm].
+    adc_bits: resolution of the readings; None: they are exact.
+    rest_ratio: readings of the untouched skin (R, C, 4) [V/Vdd]; None: not known.
+    nominal_wire_ohm: what is known of the wires.
+    reading_names: the names of the readings of each cell, in their order.
     """
 
     rows: int
@@ -92,12 +97,12 @@ class SkinKnowledge:
 
     @property
     def ratio_std(self) -> float:
-        """Standard deviation of one reading, as a ratio to Vdd."""
+        """Standard deviation of one reading, by its rounding alone [V/Vdd]."""
         return ratio_std(self.adc_bits)
 
     @property
     def current_std(self) -> float:
-        """Standard deviation of a cell's port current per Vdd [S]."""
+        """Standard deviation of a port's current per Vdd, by rounding alone [S]."""
         return current_std(self.ratio_std, self.ref_top_ohm, self.ref_bottom_ohm)
 
     @property

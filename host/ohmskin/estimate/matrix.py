@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Method `matrix`: all cells at once, wires neglected (the resistance-matrix approach).
+"""Method `matrix`: all cells at once, without wires (the resistance-matrix approach).
 
 Symbols
 
@@ -16,25 +16,27 @@ r      (RC,)        residual (I_read - I(g)) / s                                
 J      (RC, RC)     -dr/dg in units of the scale of g                              1
 ====== ============ ============================================================== =========
 
-Each stripe is one node, so g is a bipartite network of R+C nodes and RC unknowns, with as many port
-resistances. Minimised is |r|^2, that is the chi-square of the readings, over the bounds of g.
-With d rho_p / d g_e = -v_pe^2 [Tellegen's theorem],
+Without wires, each stripe is one node. So g is a network of R+C nodes, with RC unknowns and as many
+port resistances. Minimised is |r|^2, the chi-square of the readings, with g within its bounds. With
+d rho_p / d g_e = -v_pe^2 (Tellegen's theorem), the slopes are
 
-    dI_p / dg_e = I_p^2 v_pe^2 ,
+    dI_p / dg_e = I_p^2 v_pe^2 .
 
-exact, and all of it follows from one inverse of size R+C. Steps are Levenberg-Marquardt on the
-cells that no bound holds, scaled by max(g, 1e-7 S). Far from the solution r is replaced by
+They are exact, and all of them follow from one inverse of size R+C. Steps are those of
+Levenberg-Marquardt, on the cells that no bound holds, scaled by max(g, 1e-7 S).
 
-    r (1 + G_read R) / (1 + G R) ,   G = 1 / rho ,   R = R_top + R_bottom ,
+I is far from linear in g: the reference resistors limit it. The port conductance G = 1 / rho is
+nearly linear in g. So far from the solution, r is the residual of G, carried over to the current,
 
-the residual of the port conductance G carried over to the current: G is nearly linear in g, I
-saturates, and a lone cell is then solved in one step.
+    r (1 + G_read R) / (1 + G R) ,   R = R_top + R_bottom ,
+
+and a lone cell is solved in one step.
 
 Source: the network and its Jacobian are the resistance-matrix approach of Shu et al., IEEE Sensors
 Journal 15(1), 2015; the weights, bounds and standard deviations are ours.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -46,23 +48,33 @@ from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinK
 from ohmskin.estimate.ohm import conductance_from_current, port_current
 from ohmskin.estimate.port_readings import PortReadings
 
+# Most steps in a frame. Chosen: twice what the hardest frame of the reference takes; a frame that
+# does not converge must end, too.
 MAX_ITERATIONS: Final = 40
-# Converged when an undamped step would lower the chi-square (summed, not per reading) by less:
-# no cell then moves by more than 1/100 of its standard deviation.
+# Converged if an undamped step would lower the chi-square, summed over all ports, by less. Chosen:
+# no cell then moves by more than 1/100, the root of this, of its standard deviation.
 CHI2_TOLERANCE: Final = 1e-4
-# Steps are relative to the conductance, but an open cell must be able to come back in one step.
+# Steps are in shares of the conductance, or of this where it is less. Chosen: a tenth of a cell at
+# rest, so that one step can bring back an open cell.
 SCALE_FLOOR_SIEMENS: Final = 1e-7
-# Prior precision in scaled units: a cell the readings say nothing of gets std 1000 times its scale.
+# Precision that a prior adds to each cell, in shares of its scale. Chosen: a cell that the readings
+# say nothing of has a deviation of 1000 scales, and the system stays definite.
 _RIDGE: Final = 1e-6
-# Below this chi-square per port r itself is used: it leads to the minimum, the other to near it.
+# Above this chi-square per port, the residual of G is used, which leads near the minimum. Below, r
+# itself is used, which leads to it. Chosen: ten deviations of each port.
 _FAR_CHI2: Final = 100.0
+# Damping up to this share of the diagonal leaves a step nearly that of Gauss-Newton. Chosen: such a
+# step may still tell that the fit has converged.
 _LIGHT_DAMPING: Final = 1e-3
+# A fit whose steps need more damping than this has failed. Chosen: such a step moves no number.
 _LARGEST_DAMPING: Final = 1e12
+# How often a step is solved again, with the cells held that it took over a bound. Chosen: later
+# rounds hardly find any, and the next step tries again.
 _BOUND_ROUNDS: Final = 5
 
 
 def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
-    """rho (R, C) [ohm] and Z of cells (R, C), all > 0 [S], whose stripes have no resistance."""
+    """rho (R, C) [ohm], and Z, of cells (R, C) [S], all > 0, whose stripes have no resistance."""
     rows, columns = cell_siemens.shape
     laplacian = np.zeros((rows + columns, rows + columns))
     laplacian[:rows, rows:] = -cell_siemens
@@ -74,9 +86,9 @@ def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
 
 
 def voltage_squared(impedance: Float, rows: int) -> Float:
-    """v^2, shape (RC, RC): row p = (i, j), column e = (k, l), -d rho_p / d g_e [ohm^2].
+    """v^2 = -d rho_p / d g_e, shape (RC, RC) [ohm^2], for the port p = (i, j) and cell e = (k, l).
 
-    v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]) with j, l the nodes of the columns.
+    v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]), j and l the nodes of the columns.
     """
     voltage = port_difference(port_difference(impedance, rows).T, rows)
     voltage *= voltage
@@ -86,9 +98,9 @@ def voltage_squared(impedance: Float, rows: int) -> Float:
 class MatrixEstimator(Estimator):
     """No wires, all cells at once. Starts from the previous frame, or from `ohm` if that is nearer.
 
-    Converged: within 40 iterations the chi-square cannot fall by more than `CHI2_TOLERANCE`.
+    It has converged if, within 40 iterations, no step lowers the chi-square by `CHI2_TOLERANCE`.
     Standard deviations are the roots of the diagonal of (J^T J)^-1 at the solution, also for a
-    cell that ends on a bound, times the root of |r|^2 / RC where that exceeds 1.
+    cell that ends on a bound. They are wider by the root of |r|^2 / RC where that exceeds 1.
     """
 
     name = "matrix"
@@ -115,11 +127,28 @@ class MatrixEstimator(Estimator):
         )
 
 
-class CellFit:
-    """One frame's minimisation. cell (R, C) [S]; message: why it did not converge, or empty.
+class _Trial(NamedTuple):
+    """Cells, and how they explain the frame.
 
-    It starts from the cells of the frame `before`, or from those of `ohm` if they are nearer, and
-    ends where a step lowers the chi-square by less than `tolerance`.
+    cell: g (R, C) [S].
+    impedance: Z (R+C, R+C) [ohm].
+    current: I of the model (RC,) [S].
+    residual: r (RC,) [1].
+    chi2: |r|^2, summed over all ports.
+    """
+
+    cell: Float
+    impedance: Float
+    current: Float
+    residual: Float
+    chi2: float
+
+
+class CellFit:
+    """One frame's minimisation. It starts from the cells of the frame before, or from those of
+    `ohm` if they are nearer, and ends where no step lowers the chi-square by `tolerance`.
+
+    iterations: how many steps it took. message: why it did not converge, or empty.
     """
 
     def __init__(
@@ -132,77 +161,81 @@ class CellFit:
         self._target = ports.current.ravel()
         self._current_std = ports.current_std.ravel()
         self._ref_ohm, self._tolerance = ref_ohm, tolerance
-        self._far_cost = _FAR_CHI2 * self._target.size
+        self._far_chi2 = _FAR_CHI2 * self._target.size
         # 1 / (1 + G_read R), of a current that the most conductive cell allows.
         feasible = np.minimum(self._target, port_current(MAX_CELL_SIEMENS, ref_ohm))
         self._target_share = 1.0 - feasible * ref_ohm
         self.iterations = 0
         afresh = conductance_from_current(ports.current, ref_ohm)
-        cell = afresh if before is None else before
-        trial = self._evaluate(cell)
+        trial = self._try(afresh if before is None else before)
         # A scene that jumped is nearer to the plain estimate than to the frame before it.
-        if before is not None and trial[-1] > self._far_cost:
-            other_trial = self._evaluate(afresh)
-            if other_trial[-1] < trial[-1]:
-                cell, trial = afresh, other_trial
-        self._move_to(cell, *trial)
+        if before is not None and trial.chi2 > self._far_chi2:
+            trial = min(trial, self._try(afresh), key=lambda one: one.chi2)
+        self._move_to(trial)
         self.message = self._run()
 
-    def _evaluate(self, cell: Float) -> tuple[Float, Float, Float, float]:
-        """Z, currents and residuals of these cells, and the chi-square."""
+    @property
+    def cell(self) -> Float:
+        """g (R, C) [S]."""
+        return self._at.cell
+
+    @property
+    def current(self) -> Float:
+        """I of the model (RC,) [S]."""
+        return self._at.current
+
+    def _try(self, cell: Float) -> _Trial:
         port_ohm, impedance = solve_ports(cell)
         current = 1.0 / (port_ohm.ravel() + self._ref_ohm)
         residual = (self._target - current) / self._current_std
-        return impedance, current, residual, float(residual @ residual)
+        return _Trial(cell, impedance, current, residual, float(residual @ residual))
 
-    def _move_to(
-        self, cell: Float, impedance: Float, current: Float, residual: Float, cost: float
-    ) -> None:
-        self.cell, self.current, self.cost = cell, current, cost
-        self.scale = np.maximum(cell.ravel(), SCALE_FLOOR_SIEMENS)
-        self._impedance, self._residual, self._is_linearised = impedance, residual, False
+    def _move_to(self, trial: _Trial) -> None:
+        self._at, self._is_linearised = trial, False
+        self._scale = np.maximum(trial.cell.ravel(), SCALE_FLOOR_SIEMENS)
 
     def _linearise(self) -> None:
-        """Slopes at these cells."""
+        """Slopes at the present cells, if they have not been made there already."""
         if self._is_linearised:
             return
         self._is_linearised = True
-        jacobian = voltage_squared(self._impedance, len(self.cell))
-        jacobian *= (self.current**2 / self._current_std)[:, None]
-        jacobian *= self.scale[None, :]
-        self.gradient: Float = self._residual @ jacobian
-        stretch = (1.0 - self.current * self._ref_ohm) / self._target_share
-        self.far_gradient: Float = (self._residual * stretch) @ jacobian
-        self.normal: Float = jacobian.T @ jacobian
-        self.diagonal = np.diagonal(self.normal).copy()
+        current, residual = self._at.current, self._at.residual
+        jacobian = voltage_squared(self._at.impedance, len(self.cell))
+        jacobian *= (current**2 / self._current_std)[:, None]
+        jacobian *= self._scale[None, :]
+        self._gradient: Float = residual @ jacobian
+        stretch = (1.0 - current * self._ref_ohm) / self._target_share
+        self._far_gradient: Float = (residual * stretch) @ jacobian
+        self._normal: Float = jacobian.T @ jacobian
+        self._diagonal = np.diagonal(self._normal).copy()
 
     def _run(self) -> str:
         """Minimise; returns why not converged, or an empty string."""
         damping = 0.0
-        far = self.cost > self._far_cost
+        is_far = self._at.chi2 > self._far_chi2
         while self.iterations < MAX_ITERATIONS:
-            if self.cost < self._tolerance:  # no step lowers it by more
+            if self._at.chi2 < self._tolerance:  # no step can lower it by more
                 return ""
             self.iterations += 1
             self._linearise()
-            gradient = self.far_gradient if far else self.gradient
-            # Which bounds hold is worth finding out near the solution only.
-            cell = self._stepped(gradient, damping, 1 if far else _BOUND_ROUNDS)
+            gradient = self._far_gradient if is_far else self._gradient
+            # Which cells a bound holds is worth finding out near the solution only.
+            cell = self._stepped(gradient, damping, 1 if is_far else _BOUND_ROUNDS)
             if cell is not None:
-                promised = float((cell - self.cell).ravel() / self.scale @ self.gradient)
-                # Rounding of the chi-square counts where no cells explain the readings.
-                tolerance = max(self._tolerance, 1e-9 * self.cost)
-                settled = abs(promised) < tolerance and damping <= _LIGHT_DAMPING
-                if settled and not far:
+                gain = float((cell - self.cell).ravel() / self._scale @ self._gradient)
+                # Where no cells explain the readings, rounding of a large chi-square counts.
+                tolerance = max(self._tolerance, 1e-9 * self._at.chi2)
+                if abs(gain) < tolerance and damping <= _LIGHT_DAMPING and not is_far:
                     return ""
-                trial = self._evaluate(cell)
-                if trial[-1] < self.cost:
-                    self._move_to(cell, *trial)
+                trial = self._try(cell)
+                if trial.chi2 < self._at.chi2:
+                    self._move_to(trial)
                     damping = 0.0 if damping <= _LIGHT_DAMPING else damping / 10
-                    far = far and self.cost > self._far_cost
+                    is_far = is_far and trial.chi2 > self._far_chi2
                     continue
-            if far:
-                far = False
+            # A step that did not help is tried again: first with r itself, then with more damping.
+            if is_far:
+                is_far = False
             else:
                 damping = max(10 * _LIGHT_DAMPING, damping * 10)
                 if damping > _LARGEST_DAMPING:
@@ -210,22 +243,24 @@ class CellFit:
         return f"not converged after {MAX_ITERATIONS} iterations"
 
     def _stepped(self, gradient: Float, damping: float, rounds: int) -> Float | None:
-        """Minimum of the quadratic model within the bounds, shape (R, C) [S].
+        """The cells (R, C) [S] at the minimum of the quadratic model, within their bounds.
 
         (J^T J + damping diag(J^T J) + ridge) step = J^T r, scaled. Cells that the step takes over
-        a bound are held there and the step is solved again for the others, in so many rounds.
-        None if the system is not positive definite to working precision.
+        a bound are held there, and the step is solved again for the others, in so many rounds.
+        None: the system is not positive definite to working precision.
         """
         cell = self.cell.ravel()
-        lowest = (MIN_CELL_SIEMENS - cell) / self.scale
-        highest = (MAX_CELL_SIEMENS - cell) / self.scale
-        normal = self.normal.copy()
-        normal.ravel()[:: len(cell) + 1] += damping * self.diagonal + self._ridge()
+        lowest = (MIN_CELL_SIEMENS - cell) / self._scale
+        highest = (MAX_CELL_SIEMENS - cell) / self._scale
+        normal = self._normal.copy()
+        normal.ravel()[:: len(cell) + 1] += damping * self._diagonal + self._ridge()
         held = ((lowest >= 0) & (gradient <= 0)) | ((highest <= 0) & (gradient >= 0))
         step = np.zeros_like(cell)
         for _ in range(rounds):
             system, target = normal, gradient
             if held.any():
+                # A held cell has the equation "step = what it has stepped", and the others lose
+                # what that step explains.
                 system = normal.copy()
                 target = gradient - system @ (step * held)
                 system[held, :] = 0.0
@@ -240,23 +275,23 @@ class CellFit:
             if not crossing.any():
                 break
             held |= crossing
-        stepped = np.clip(cell + step * self.scale, MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
+        stepped = np.clip(cell + step * self._scale, MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
         return np.asarray(stepped.reshape(self.cell.shape), dtype=np.float64)
 
     def _ridge(self) -> float:
         # Rounding of J^T J is relative to its largest element.
-        return max(_RIDGE, 1e-14 * float(self.diagonal.max()))
+        return max(_RIDGE, 1e-14 * float(self._diagonal.max()))
 
     def cell_std(self) -> Float:
         """Root of the diagonal of (J^T J + ridge)^-1 [S], shape (R, C)."""
         self._linearise()
-        system = self.normal.copy()
-        system.ravel()[:: len(self.diagonal) + 1] += self._ridge()
+        system = self._normal.copy()
+        system.ravel()[:: len(self._diagonal) + 1] += self._ridge()
         factor, failed = lapack.dpotrf(system, lower=1, overwrite_a=1)
         if failed:
-            return np.full(self.cell.shape, MAX_CELL_SIEMENS)
+            return np.full(self.cell.shape, MAX_CELL_SIEMENS)  # nothing is known
         inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
         # A residual above the noise says that the model is wrong by that much.
-        misfit = max(1.0, self.cost / len(self.scale)) ** 0.5
-        std = misfit * self.scale * np.sqrt(np.diagonal(inverse))
+        misfit = max(1.0, self._at.chi2 / len(self._scale)) ** 0.5
+        std = misfit * self._scale * np.sqrt(np.diagonal(inverse))
         return np.asarray(std.reshape(self.cell.shape), dtype=np.float64)

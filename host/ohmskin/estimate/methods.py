@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimators by name. A method's module is imported when one is made."""
+"""The estimators by name.
+
+The module of a method is imported when an estimator of it is made: CasADi alone, which `paper`
+needs, takes longer to import than all others.
+"""
 
 from importlib import import_module
 from typing import Final
@@ -7,6 +11,7 @@ from typing import Final
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 
+# Module and class of each method.
 _WHERE: Final = {
     "ohm": ("ohm", "OhmEstimator"),
     "matrix": ("matrix", "MatrixEstimator"),
@@ -16,9 +21,11 @@ _WHERE: Final = {
     "touch": ("joint", "TouchEstimator"),
     "voltage": ("ohm", "VoltageEstimator"),
 }
-VOLTAGE: Final = "voltage"  # its levels are no conductances
-LEVEL_METHODS: Final = tuple(_WHERE)  # all that a force can be read by
-# All that estimate conductances of their own.
+# The method whose levels are voltages, not conductances.
+VOLTAGE: Final = "voltage"
+# All methods that a force can be read by.
+LEVEL_METHODS: Final = tuple(_WHERE)
+# All methods that estimate conductances of their own. `voltage` takes those of `ohm`.
 METHODS: Final = tuple(name for name in LEVEL_METHODS if name != VOLTAGE)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Methods `ohm` and `voltage`: a port's resistance is that of its cell.
+"""Methods `ohm` and `voltage`: a port's resistance is taken for that of its cell.
 
-Neither another path through the skin nor a wire is thought of.
+This neglects all other paths through the skin, and all wires.
 
 Symbols: I (R, C) port current per Vdd [S], R = R_top + R_bottom [ohm], g (R, C) cells [S].
 
@@ -9,7 +9,7 @@ Symbols: I (R, C) port current per Vdd [S], R = R_top + R_bottom [ohm], g (R, C)
 
 This is the paper's naive estimate. It sees ghosts: three pressed corners of a rectangle make the
 fourth look pressed. `voltage` is the paper's baseline for forces: it reads a force from the mean
-voltage over the reference resistors, and for all else it is `ohm`.
+voltage over the reference resistors. In all else it is `ohm`.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ from ohmskin.estimate.port_readings import PortReadings
 
 
 def conductance_from_current(current_siemens: Float, ref_ohm: float) -> Float:
-    """g = I / (1 - I R) [S], I first clipped to what cells of 1e-9 S to 1 S draw."""
+    """g = I / (1 - I R) [S], (R, C). I is first clipped to what cells within their bounds draw."""
     least, most = port_current(MIN_CELL_SIEMENS, ref_ohm), port_current(MAX_CELL_SIEMENS, ref_ohm)
     current = np.clip(current_siemens, least, most)
     return np.clip(current / (1.0 - current * ref_ohm), MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
@@ -35,18 +35,20 @@ def port_current(cell_siemens: float, ref_ohm: float) -> float:
 
 
 class OhmEstimator(Estimator):
-    """rho = Rc. A port that reads shorter than its reference resistors gets the conductance bound
-    of 1 S with the large standard deviation that belongs there; beyond 5 standard deviations past
-    the bound the frame is not converged."""
+    """Each cell by Ohm's law.
+
+    A port may read more current than a short of its cell allows. Then the cell has the bound of
+    1 S, and the large standard deviation that belongs there. If the current is more than noise
+    explains, the frame has not converged.
+    """
 
     name = "ohm"
 
     def _solve(self, ports: PortReadings) -> Solution:
         ref_ohm = self.knowledge.ref_ohm
-        current = ports.current
-        cell = conductance_from_current(current, ref_ohm)
+        cell = conductance_from_current(ports.current, ref_ohm)
         allowed = port_current(MAX_CELL_SIEMENS, ref_ohm) + FAULT_STDS * self.knowledge.current_std
-        excess = current - allowed
+        excess = ports.current - allowed
         message = ""
         if (excess > 0).any():
             message = f"{cell_of(excess.argmax(), excess)} has more current than a short allows"
@@ -59,11 +61,11 @@ class OhmEstimator(Estimator):
 
 
 class VoltageEstimator(OhmEstimator):
-    """`ohm`, but `Estimate.level` is `voltage_level` of the readings [1]."""
+    """As `ohm`, but `Estimate.level` is the `voltage_level` of the readings [1]."""
 
     name = "voltage"
 
-    def _level(self, ratio: Float, found: Solution) -> tuple[Float, Float]:
+    def _level(self, ratio: Float, solution: Solution) -> tuple[Float, Float]:
         level = voltage_level(ratio)
         return level, np.full_like(level, self.knowledge.ratio_std)
 

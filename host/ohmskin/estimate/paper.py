@@ -24,12 +24,14 @@ Each state has 2N + 1 equality constraints: Kirchhoff's current law at 2N nodes,
 
     A:  (y - V^t[i,0]) / R^t[i,0] = (1 - y) / R_top ,
 
-B, C and D alike with the electrode and the supply exchanged. The other selected electrode is
-reached through R^b[0,j] + R_bottom. All are multiplied by the reference resistor: they are ratios.
+B, C and D likewise, with the electrode and the supply exchanged. The other selected electrode is
+reached through R^b[0,j] + R_bottom. All constraints are multiplied by the reference resistor, so
+that they are ratios to Vdd.
 
-The costs are in megohm; only the variables are logarithms. Reported is the mean of the resistances
-over all 4N states. Source: section IV.D to IV.G of the paper. docs/paper.md defines the costs, and
-says how the text is interpreted and what can be expected of the answers.
+The costs are in megohm. Only the variables are logarithms, so that no resistance can be negative.
+The answer is the mean of the resistances over all 4N states. Source: sections IV.D to IV.G of the
+paper. docs/paper.md defines the costs, and says how the text is interpreted and what can be
+expected of the answers.
 """
 
 from __future__ import annotations
@@ -60,40 +62,59 @@ from ohmskin.estimate.matrix import CellFit, solve_ports
 from ohmskin.estimate.port_faults import FAULT_STDS, cell_of
 from ohmskin.estimate.port_readings import PortReadings
 
+# The costs of the paper are in megohm (docs/paper.md says why).
 OHM_PER_MEGOHM: Final = 1e6
-# The top pin is high where the sensed electrode is the top one and on the source side, or neither.
+# In which configurations the top pin is high. Where no current flows, a reading is 1 if its node is
+# at the pin that is high. So the top pin is high if the top node reads 1, or the bottom node 0.
 TOP_IS_HIGH: Final = (READING_OFFSET > 0) == READING_SENSES_TOP
 
-MAX_CELLS: Final = 64  # 20 N^2 variables: 64 cells take 1.9 GB and 25 s a step
-MIN_MEGOHM: Final = 1e-6  # of any resistance, and the highest: what is believed
+# Most cells. Chosen: there are 20 N^2 variables, and 64 cells take 1.9 GB and 25 s a step
+# (docs/paper.md).
+MAX_CELLS: Final = 64
+# Least and highest of any resistance. Chosen: an ohm, as `knowledge.MAX_CELL_SIEMENS`, and twenty
+# cells at rest in series.
+MIN_MEGOHM: Final = 1e-6
 MAX_MEGOHM: Final = 20.0
+# Most iterations of Ipopt in a step. Chosen: the frames of docs/paper.md that converge take fewer.
 MAX_ITERATIONS: Final = 300
-TOLERANCE: Final = 1e-6  # of the optimality error
-CIRCUIT_TOLERANCE: Final = 1e-9  # of Kirchhoff's and Ohm's laws, as a ratio to Vdd
-_START_CELL_MEGOHM: Final = (2e-6, 15.0)  # the least and the highest cell of step 2
-# Ports of less resistance, or of cells with more, have no solution within the bounds, or on them.
+# Ipopt's `tol`, of the optimality error. Chosen: what Ipopt calls acceptable by default.
+_TOLERANCE: Final = 1e-6
+# How well Kirchhoff's and Ohm's laws hold, over Vdd. Chosen: a millionth of a code of 10 bits.
+_CIRCUIT_TOLERANCE: Final = 1e-9
+# Least and highest cell that step 2 starts from. Chosen: inside the bounds, because an interior
+# point method begins poorly on a bound.
+_START_CELL_MEGOHM: Final = (2e-6, 15.0)
+# A port of less resistance has no solution inside the bounds. Chosen: a few times the least
+# resistance, because it is that of several resistances in series.
 _LEAST_PORT_MEGOHM: Final = 1e-5
+# Ports of cells of more resistance have no solution inside the bounds, either. Chosen: a tenth less
+# than the highest resistance.
 _MOST_CELL_MEGOHM: Final = 18.0
-# The states' mean must give back the readings to this (root mean square, of Vdd): if not, the
-# states are different circuits, and their mean is none of them.
+# The mean of the states must give the readings to this root mean square, over Vdd. Else the states
+# are different circuits, and their mean is none of them. Chosen: a code of 10 bits.
 MISFIT_RATIO: Final = 1e-3
-_POOR_START_MEGOHM: Final = 10.0  # nearer to its bound, a solution is a poor start for the next
-_JUMP_RATIO: Final = 0.02  # change of a reading, of Vdd: above it a frame starts afresh
+# A solution that has a higher resistance is a poor start for the next frame. Chosen: half of the
+# highest resistance, because Ipopt leaves a bound slowly.
+_POOR_START_MEGOHM: Final = 10.0
+# If a reading has changed by more, over Vdd, a frame starts afresh. Chosen: 20 codes of 10 bits,
+# which is far above noise.
+_JUMP_RATIO: Final = 0.02
 
+# Ipopt's options in all steps; its documentation explains each.
 _IPOPT: Final[dict[str, Any]] = {
     "print_level": 0,
     "sb": "yes",
-    "max_iter": MAX_ITERATIONS,
-    "tol": TOLERANCE,
-    "constr_viol_tol": CIRCUIT_TOLERANCE,
+    "tol": _TOLERANCE,
+    "constr_viol_tol": _CIRCUIT_TOLERANCE,
     "mu_strategy": "adaptive",
     "mu_oracle": "probing",
     # The constraints are ratios and the costs as weighted by the paper: nothing to rescale.
     "nlp_scaling_method": "none",
 }
-# More options, by where a solution starts from: near a simulated circuit, the barrier is weak. From
-# the solution of the frame before, with its multipliers, those of bounds that do not hold stay as
-# weak as they were, or the states drift.
+# More options, by where a solution starts from. "circuit": a simulated circuit; the barrier of the
+# bounds is weak, so that the answer stays near this circuit. "step": the solution of the step
+# before. "before": the solution of the frame before, with its multipliers; those of bounds that do
+# not hold stay as weak as they were there, because else the states drift.
 _STARTS: Final[dict[str, dict[str, Any]]] = {
     "circuit": {"bound_mult_init_val": 1e-6},
     "step": {},
@@ -102,7 +123,12 @@ _STARTS: Final[dict[str, dict[str, Any]]] = {
 
 
 class Step(NamedTuple):
-    """One step of Algorithm 1. weights: of Cost_f, Cost_c and Cost_r. start: see `_STARTS`."""
+    """One step of Algorithm 1.
+
+    number: as in the paper.
+    weights: of Cost_f, Cost_c and Cost_r.
+    start: where it starts from if no frame was before: "circuit" or "step", see `_STARTS`.
+    """
 
     number: int
     weights: tuple[float, float, float]
@@ -115,7 +141,13 @@ STEP_4: Final = Step(4, (1.0, 1.0, 1e9), "step")
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
-    """One frame solved: its readings, each step's optimum, the mean circuit and its readings."""
+    """One frame, solved.
+
+    ratio: its readings (R, C, 4) [V/Vdd].
+    optima: what each step ended in.
+    skin: the mean circuit of all states of the last step.
+    model_ratio: the readings of this mean circuit (R, C, 4) [V/Vdd].
+    """
 
     ratio: Float
     optima: Sequence[Optimum]
@@ -124,25 +156,30 @@ class _Answer:
 
     @property
     def misfit_ratio(self) -> float:
+        """How far the mean circuit misses the readings, root of the mean square [V/Vdd]."""
         return float(np.sqrt(np.mean((self.ratio - self.model_ratio) ** 2)))
 
     @property
     def is_good_start(self) -> bool:
+        """Whether the next frame may start from this one."""
         return self.misfit_ratio < MISFIT_RATIO and all(
             optimum.success and optimum.megohm.max() < _POOR_START_MEGOHM for optimum in self.optima
         )
 
 
 class PaperEstimator(Estimator):
-    """Algorithm 1 through `steps`.
+    """Algorithm 1, in these `steps`.
 
-    Each step starts from its own solution of the frame before, where that was good and no reading
-    changed by more than 0.02 since, and otherwise as Algorithm 1 says. Good: converged, and all
-    resistances are below 10 megohm. A frame whose warm start ends otherwise is solved again from
-    step 2, and where that fails too, from the cells that `matrix` finds.
-    Converged: Ipopt succeeded in the last step, some circuit of the allowed resistances gives the
-    readings, and the reported mean circuit gives them to 1e-3 of Vdd. `iterations`: of all that was
-    solved. Standard deviations are NaN. Raises ValueError for more than 64 cells.
+    Each step starts from its own solution of the frame before, if that was good and no reading has
+    changed by more than 0.02 of Vdd since. Otherwise it starts as Algorithm 1 says. A solution is
+    good if it converged and all its resistances are below 10 megohm. If a warm start does not end
+    in a good solution, the frame is solved again from step 2, and if that fails too, from the cells
+    that `matrix` finds.
+
+    A frame has converged if Ipopt succeeded in the last step, some circuit of the allowed
+    resistances gives the readings, and the reported mean circuit gives them to 1e-3 of Vdd.
+    `iterations` counts those of all attempts. Standard deviations are NaN. Raises ValueError for
+    more than 64 cells.
     """
 
     steps: ClassVar[tuple[Step, ...]]
@@ -168,21 +205,21 @@ class PaperEstimator(Estimator):
         self._previous = None
 
     def _solve(self, ports: PortReadings) -> Solution:
-        known = self.knowledge
+        knowledge = self.knowledge
         current, message = self._feasible(ports.current)
-        # The four readings of a cell as its one current gives them. The paper's states have no
-        # noise: where four readings disagree, by a fraction of a code, no circuit gives them all.
-        ratio = ratio_from_current(current, known.ref_top_ohm, known.ref_bottom_ohm)
+        # The four readings of a cell are taken as its one current gives them. The paper's states
+        # have no noise: if four readings disagree by a fraction of a code, no circuit gives them.
+        ratio = ratio_from_current(current, knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
         before, answers = self._previous, []
         if before is not None and np.abs(ratio - before.ratio).max() < _JUMP_RATIO:
             answers.append(self._answer(ratio, before.optima[0].x, before.optima))
         if not answers or not answers[0].is_good_start:
-            answers.append(self._afresh(ratio, 1.0 / current - known.ref_ohm))
+            answers.append(self._afresh(ratio, 1.0 / current - knowledge.ref_ohm))
             if not answers[-1].is_good_start:
-                fit = CellFit(replace(ports, current=current), known.ref_ohm, None)
+                fit = CellFit(replace(ports, current=current), knowledge.ref_ohm, None)
                 answers.append(self._afresh(ratio, 1.0 / fit.cell))
         # A good one if there is any; of several, the one that gives the readings best.
-        answer = min(answers, key=lambda each: (not each.is_good_start, each.misfit_ratio))
+        answer = min(answers, key=lambda one: (not one.is_good_start, one.misfit_ratio))
         self._previous = answer if answer.is_good_start else None
         last = answer.optima[-1]
         if not last.success:
@@ -192,15 +229,15 @@ class PaperEstimator(Estimator):
                 f"Ipopt ends with {last.status}, but in states of different circuits: their mean "
                 f"misses the readings by {answer.misfit_ratio:.2g} of Vdd"
             )
-        residual = (ports.ratio - answer.model_ratio) / known.ratio_std
-        found = answer.skin
+        residual = (ports.ratio - answer.model_ratio) / knowledge.ratio_std
+        skin = answer.skin
         return Solution(
-            cell_siemens=found.cell_siemens,
-            cell_siemens_std=np.full(found.shape, np.nan),
+            cell_siemens=skin.cell_siemens,
+            cell_siemens_std=np.full(skin.shape, np.nan),
             chi2=float(np.mean(residual**2)),
-            iterations=sum(optimum.iterations for each in answers for optimum in each.optima),
+            iterations=sum(optimum.iterations for one in answers for optimum in one.optima),
             message=message,
-            wire_ohm=np.stack([found.top_wire_ohm, found.bottom_wire_ohm]),
+            wire_ohm=np.stack([skin.top_wire_ohm, skin.bottom_wire_ohm]),
         )
 
     def _afresh(self, ratio: Float, cell_ohm: Float) -> _Answer:
@@ -210,30 +247,34 @@ class PaperEstimator(Estimator):
         return self._answer(ratio, x)
 
     def _answer(self, ratio: Float, x: Float, before: Sequence[Optimum] = ()) -> _Answer:
-        """Each step from the states x of the one before it, or of its own in the frame before."""
+        """Solve each step, from its own optimum in the frame before, or else from where the step
+        before it ended. x: the states that the first step then starts from.
+        """
         optima: list[Optimum] = []
-        for step, own in zip_longest(self.steps, before):
-            x = x if own is None else own.x
-            optima.append(self._program.solve(ratio, self._reference_megohm, step, x, own))
+        for step, previous in zip_longest(self.steps, before):
+            x = x if previous is None else previous.x
+            optima.append(self._program.solve(ratio, self._reference_megohm, step, x, previous))
             x = optima[-1].x
-        known = self.knowledge
-        layers = optima[-1].megohm.mean(axis=0).reshape(3, known.columns, known.rows)
+        knowledge = self.knowledge
+        layers = optima[-1].megohm.mean(axis=0).reshape(3, knowledge.columns, knowledge.rows)
         top, bottom, cell = (OHM_PER_MEGOHM * layer.T for layer in layers)
-        skin = Skin(1.0 / cell, top, bottom, known.ref_top_ohm, known.ref_bottom_ohm)
+        skin = Skin(1.0 / cell, top, bottom, knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
         return _Answer(ratio, optima, skin, readings(skin))
 
     def _feasible(self, current: Float) -> tuple[Float, str]:
-        """The currents (R, C) [S] within what some circuit allows; which one was not, if any."""
-        known = self.knowledge
-        # The port of a skin whose cells are all alike and whose wires are zero.
-        share = (known.rows + known.columns - 1) / (known.rows * known.columns)
+        """The currents (R, C) [S], within what some circuit allows, and in words which was not."""
+        knowledge = self.knowledge
+        rows, columns = knowledge.rows, knowledge.columns
+        # The port of a skin without wires, whose cells are all alike, in shares of a cell.
+        share = (rows + columns - 1) / (rows * columns)
         ports_ohm = OHM_PER_MEGOHM * np.array([_MOST_CELL_MEGOHM * share, _LEAST_PORT_MEGOHM])
-        feasible = np.clip(current, *1.0 / (ports_ohm + known.ref_ohm))
+        feasible = np.clip(current, *1.0 / (ports_ohm + knowledge.ref_ohm))
         excess = np.abs(current - feasible)
-        if excess.max() <= FAULT_STDS * known.current_std:
+        if excess.max() <= FAULT_STDS * knowledge.current_std:
             return feasible, ""
-        said = f"is none of a port from {ports_ohm[1]:.0f} to {ports_ohm[0]:.3g} ohm"
-        return feasible, f"the current of {cell_of(excess.argmax(), excess)} {said}"
+        allowed = f"from {ports_ohm[1]:.0f} to {ports_ohm[0]:.3g} ohm"
+        cell = cell_of(excess.argmax(), excess)
+        return feasible, f"the current of {cell} is none of a port {allowed}"
 
 
 class LsqEstimator(PaperEstimator):
@@ -253,9 +294,9 @@ class RegularizedEstimator(PaperEstimator):
 def initial_states(
     cell_megohm: Float, reference_megohm: tuple[float, float], wire_megohm: float
 ) -> Float:
-    """Step 2: the states (4N, 5N) of wires all alike and these cells (R, C), simulated.
+    """Step 2: the states (4N, 5N) of these cells (R, C), all wires alike, by a simulation.
 
-    Without wires, the nodes of a stripe have the potential of its electrode.
+    The simulation has no wires, so all nodes of a stripe have the potential of its electrode.
     """
     cell = np.clip(cell_megohm, *_START_CELL_MEGOHM)
     rows, columns = cell.shape
@@ -279,7 +320,14 @@ def initial_states(
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """What Ipopt returned. x: shape (4N, 5N), a state per row. Multipliers serve a warm start."""
+    """What Ipopt returned.
+
+    x: the states (4N, 5N), one a row.
+    bound_multipliers, constraint_multipliers: for a warm start of the next frame.
+    iterations: how many Ipopt took.
+    status: how it ended, in Ipopt's words.
+    success: whether Ipopt calls that a success, and all numbers are finite.
+    """
 
     x: Float
     bound_multipliers: Float
@@ -296,10 +344,14 @@ class Optimum:
 
 
 class Program:
-    """The program for one size of skin; readings, references and weights are its parameters."""
+    """The nonlinear program for one size of skin.
+
+    Readings, references and weights are its parameters, so it is built once for all frames.
+    """
 
     @ctrl_c_kept()
-    def __init__(self, rows: int, columns: int) -> None:
+    def __init__(self, rows: int, columns: int, max_iterations: int = MAX_ITERATIONS) -> None:
+        """max_iterations: after so many, Ipopt gives up."""
         cells = rows * columns
         y = casadi.SX.sym("y", READINGS_PER_CELL * cells)
         references = casadi.SX.sym("ref", 2)
@@ -324,7 +376,10 @@ class Program:
             "g": casadi.vertcat(*(state.laws for state in states)),
             "p": casadi.vertcat(y, references, weights),
         }
-        self._solvers = {start: _make_solver(problem, more) for start, more in _STARTS.items()}
+        self._solvers = {
+            start: _make_solver(problem, more | {"max_iter": max_iterations})
+            for start, more in _STARTS.items()
+        }
         is_resistance = np.arange(5 * cells) < 3 * cells
         least = np.where(is_resistance, np.log(MIN_MEGOHM), -np.inf)
         most = np.where(is_resistance, np.log(MAX_MEGOHM), np.inf)
@@ -344,10 +399,10 @@ class Program:
         x: Float,
         previous: Optimum | None = None,
     ) -> Optimum:
-        """Minimise from the states x (4N, 5N), which are the answer if Ipopt's has no numbers.
+        """Minimise, from the states x (4N, 5N). They are also the answer if Ipopt finds no numbers.
 
-        ratio: (R, C, 4); reference_megohm: top, bottom. previous: where x is from, if x is from the
-        frame before.
+        ratio: readings (R, C, 4) [V/Vdd]. reference_megohm: top, bottom. previous: the optimum that
+        x is from, if it is of the frame before.
         """
         arguments = dict(self._bounds)
         if previous is not None:
@@ -356,16 +411,16 @@ class Program:
         solver = self._solvers[step.start if previous is None else "before"]
         # Column-major: rows run fastest, then columns.
         y = ratio.transpose(1, 0, 2).ravel()
-        found = solver(
+        result = solver(
             x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
         )
         report = solver.stats()
-        states = np.array(found["x"]).reshape(x.shape)
+        states = np.array(result["x"]).reshape(x.shape)
         is_finite = bool(np.isfinite(states).all())
         return Optimum(
             x=states if is_finite else x,
-            bound_multipliers=np.array(found["lam_x"]).ravel(),
-            constraint_multipliers=np.array(found["lam_g"]).ravel(),
+            bound_multipliers=np.array(result["lam_x"]).ravel(),
+            constraint_multipliers=np.array(result["lam_g"]).ravel(),
             iterations=int(report["iter_count"]),
             status=str(report["return_status"]) or "Invalid_Number_Detected",
             success=bool(report["success"]) and is_finite,
@@ -387,7 +442,13 @@ def _make_solver(problem: dict[str, Any], more: dict[str, Any]) -> Any:
 
 
 class _State:
-    """One measurement's circuit: its variables, its resistances [megohm] and its laws."""
+    """The circuit of one measurement.
+
+    variables: what Ipopt changes (5N,): logs of resistances, then potentials.
+    resistances: R^t, R^b, R^c (3N,) [megohm]. potentials: V^t, V^b (2N,) [Vdd].
+    wires: R^t, R^b (2N,) [megohm].
+    laws: 2N + 1 expressions that are zero where Kirchhoff's and Ohm's laws hold.
+    """
 
     def __init__(self, rows: int, columns: int, number: int, y: Any, references: Any) -> None:
         cells = rows * columns
@@ -406,7 +467,8 @@ class _State:
         by_top, by_bottom, by_cell = layers(casadi.exp(-logarithms))
         top, bottom = layers(self.potentials)
         of_top, of_bottom, _ = layers(self.resistances)
-        # Of the row and of the column: the first wire segment, the potential behind it, the supply.
+        # Each pair is that of the row and that of the column: the first wire segment, the potential
+        # behind it, and the supply.
         first, inner = (of_top[row, 0], of_bottom[0, column]), (top[row, 0], bottom[0, column])
         supply = (1.0, 0.0) if TOP_IS_HIGH[k] else (0.0, 1.0)
         sensed, other = (0, 1) if READING_SENSES_TOP[k] else (1, 0)
@@ -414,8 +476,8 @@ class _State:
         into[sensed] = (y - inner[sensed]) / first[sensed]
         into[other] = (supply[other] - inner[other]) / (first[other] + references[other])
         measured = into[sensed] - (supply[sensed] - y) / references[sensed]
-        # Kirchhoff: the currents into each node, zero in a circuit. `lsq` ends elsewhere if their
-        # terms come in another order, because its answer depends on rounding.
+        # Kirchhoff's law: the currents into each node are zero together. Their terms must stay in
+        # this order: `lsq` has no unique answer, and rounding decides where it ends.
         through = by_cell * (top - bottom)
         into_top, into_bottom = -through, casadi.SX(through)
         into_top[row, 0] += into[0]
