@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
+from ohmskin.circuit.small import cholesky, gram, inverse, solve, solve_lower, solve_positive
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -16,7 +16,9 @@ def test_factors_solve_what_numpy_solves(order: str) -> None:
     kept = system.copy()
     factor = cholesky(system)
     np.testing.assert_array_equal(system, kept)
-    np.testing.assert_allclose(solve(factor, right), np.linalg.solve(kept, right))
+    for solution in (solve(factor, right), solve_positive(system, right)):
+        np.testing.assert_allclose(solution, np.linalg.solve(kept, right))
+    np.testing.assert_allclose(inverse(factor), np.linalg.inv(kept))
     lower = np.linalg.cholesky(kept)
     np.testing.assert_allclose(solve_lower(factor, right), np.linalg.solve(lower, right))
     transposed = solve_lower(factor, right, transposed=True)
@@ -36,8 +38,21 @@ def test_a_matrix_that_rounding_made_indefinite_is_mended() -> None:
     system[1, 1] -= 1e5
     factor = np.tril(cholesky(system))
     np.testing.assert_allclose(factor @ factor.T, system, rtol=1e-6)
+    right = system @ [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(system @ solve_positive(system, right), right, rtol=1e-6)
 
 
 def test_an_indefinite_matrix_is_refused() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         cholesky(-np.eye(2))
+    with pytest.raises(np.linalg.LinAlgError):
+        solve_positive(-np.eye(2), np.ones(2))
+
+
+def test_a_factor_with_a_zero_on_its_diagonal_is_refused() -> None:
+    """LAPACK leaves the right side as it is, and says so by a code."""
+    factor = np.diag([1.0, 0.0])
+    with pytest.raises(np.linalg.LinAlgError):
+        solve_lower(factor, np.ones(2))
+    with pytest.raises(np.linalg.LinAlgError):
+        inverse(factor)

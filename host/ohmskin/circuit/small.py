@@ -39,21 +39,44 @@ def cholesky(system: Float) -> Float:
         np.einsum("ii->i", mended)[:] += share * np.diagonal(lower).max()
         factor, failed = lapack.dpotrf(mended, lower=1, clean=0)
         share *= 100
-    if failed:
-        raise np.linalg.LinAlgError("matrix is not positive definite")
+    _check(failed)
     return np.asarray(factor)
 
 
 def solve(factor: Float, right: Float) -> Float:
     """x of L L^T x = right, for one or several columns."""
-    solution, _ = lapack.dpotrs(factor, right, lower=1)
+    solution, failed = lapack.dpotrs(factor, right, lower=1)
+    _check(failed)
     return np.asarray(solution)
+
+
+def solve_positive(system: Float, right: Float) -> Float:
+    """x of system x = right, for a system that nothing else is solved with: faster than both above.
+
+    One that rounding has made indefinite is mended as in `cholesky`, with the same error.
+    """
+    _, solution, failed = lapack.dposv(system, right, lower=1)
+    return solve(cholesky(system), right) if failed else np.asarray(solution)
+
+
+def inverse(factor: Float) -> Float:
+    """(L L^T)^-1, both triangles."""
+    lower, failed = lapack.dpotri(factor, lower=1)
+    _check(failed)
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
 def solve_lower(factor: Float, right: Float, *, transposed: bool = False) -> Float:
     """x of L x = right, or of L^T x = right."""
-    solution, _ = lapack.dtrtrs(factor, right, lower=1, trans=int(transposed))
+    solution, failed = lapack.dtrtrs(factor, right, lower=1, trans=int(transposed))
+    _check(failed)
     return np.asarray(solution)
+
+
+def _check(failed: int) -> None:
+    """Raise LinAlgError for LAPACK's code of failure: what it returns with it is no solution."""
+    if failed:
+        raise np.linalg.LinAlgError("matrix is not positive definite")
 
 
 class _OneBlasThread(ContextDecorator):
