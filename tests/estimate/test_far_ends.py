@@ -10,7 +10,7 @@ from network import laplacian_readings  # tests/helpers
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, Skin, all_readings, end_admittance
 from ohmskin.estimate.base import Estimate
-from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.protocol import MODES
@@ -236,6 +236,15 @@ def test_a_far_end_that_floats_is_named() -> None:
     ratio[3, :, 1] = 0.95  # the far end of row 3, above its near end
     found = make_estimator("joint", knowledge(ten_bits(seen(rest)))).estimate(ratio)
     assert found.message.startswith("row 3: its far end does not follow it, is it open?")
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_exact_nonsense_is_answered(method: str) -> None:
+    """Without noise to weigh it, wires that are measured from nonsense cannot be solved for."""
+    known = SkinKnowledge(1, 1, nominal_wire_ohm=WireOhm(1e9, 1e9), reading_names=tuple("aebf"))
+    found = make_estimator(method, known).estimate(np.full((1, 1, 4), 0.5))
+    assert np.isfinite([found.cell_siemens, found.cell_siemens_std]).all()
+    assert found.message.endswith("the circuit that these readings lead to cannot be solved")
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])

@@ -18,7 +18,8 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, CellPrior, WireBelief
+from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, CellPrior
+from ohmskin.estimate.wire_belief import LearnedWires
 from skins import reference, ten_bits, told
 from studies.trials import skin_at_rest, touch
 
@@ -158,10 +159,10 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
         of_cells = np.where(square < 1, square, 1 + np.log(square))
         return float(np.sum(residual**2) + of_cells.sum() + off @ inverse @ off)
 
-    belief = WireBelief(3, 4, WireOhm(100.0, 200.0))
+    belief = LearnedWires((3, 4), WireOhm(100.0, 200.0))
     found = FullFit(prior, belief, 6e4, ports, prior.expected)
     assert not found.message
-    best = np.concatenate([found.cell, found.wires])
+    best = np.concatenate([found.log_cells, found.log_wires])
     lowest = cost(best)
     for resistor in range(36):
         for step in (-0.03, -0.003, 0.003, 0.03):

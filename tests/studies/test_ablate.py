@@ -4,29 +4,44 @@
 import numpy as np
 import pytest
 
-from ohmskin.estimate import full_fit, joint, port_faults, port_noise, prior, sparse_fit
+from ohmskin.estimate import (
+    far_wires,
+    full_fit,
+    joint,
+    port_faults,
+    port_noise,
+    prior,
+    sparse_fit,
+    wire_belief,
+)
 from studies import ablate
 from studies.ablate import OFF, Constant, Row
 from studies.ablate_scenes import Plan
 
 TINY = Plan(skins=3, frames=4)
 SCENE = "ngspice_random"
-MODULES = (full_fit, joint, port_faults, port_noise, prior, sparse_fit)
+MODULES = (far_wires, full_fit, joint, port_faults, port_noise, prior, sparse_fit, wire_belief)
 BY_LABEL = {constant.label: constant for constant in ablate.constants()}
-TRIED = [BY_LABEL["prior.SEGMENT_STD"], BY_LABEL["sparse_fit.SHARE"]]
+TRIED = [BY_LABEL["prior.SEGMENT_STD"], BY_LABEL["sparse_fit.RIVAL_SHARE"]]
 
 
 def test_every_number_is_tried() -> None:
     """Each once, where it stands; what is private or another's is none."""
-    assert BY_LABEL["prior.CLOSE"].variants == {"off": 1e-3, "halved": 0.25, "doubled": 1.0}
+    assert BY_LABEL["prior.CLOSE_STDS"].variants == {"off": 1e-3, "halved": 0.25, "doubled": 1.0}
     assert BY_LABEL["prior.MAX_ITERATIONS"].variants == {"halved": 20, "doubled": 80}
-    assert not {"full_fit.CLOSE", "sparse_fit._HIGHEST_LOG"} & set(BY_LABEL)
+    assert not {"full_fit.CLOSE_STDS", "sparse_fit._HIGHEST_LOG_SIEMENS"} & set(BY_LABEL)
     assert set(OFF) <= set(BY_LABEL)
 
 
 @pytest.mark.parametrize("constant", BY_LABEL.values(), ids=lambda constant: constant.label)
 def test_a_constant_is_changed_wherever_it_is_read_and_put_back(constant: Constant) -> None:
-    before = [dict(vars(module)) for module in MODULES]
+    def constants() -> list[dict[str, object]]:
+        return [
+            {name: vars(module)[name] for name in vars(module) if name.isupper()}
+            for module in MODULES
+        ]
+
+    before = constants()
 
     def fail_inside() -> None:
         with ablate.changed(constant, 1.25):
@@ -37,7 +52,7 @@ def test_a_constant_is_changed_wherever_it_is_read_and_put_back(constant: Consta
 
     with pytest.raises(KeyError, match="from inside"):
         fail_inside()
-    assert [dict(vars(module)) for module in MODULES] == before
+    assert constants() == before
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +65,9 @@ def test_constants_that_matter_move_figures(rows: list[Row]) -> None:
     for constant in TRIED:
         assert any(row.constant == constant.label for row in figures)
     # Without the rule against ghosts, a frame of many touches is one of ghosts.
-    off = [row for row in figures if (row.constant, row.variant) == ("sparse_fit.SHARE", "off")]
+    off = [
+        row for row in figures if (row.constant, row.variant) == ("sparse_fit.RIVAL_SHARE", "off")
+    ]
     assert any(abs(row.ratio - 1) > ablate.LEAST_CHANGE for row in off)
     assert all(row.low <= row.high for row in rows)
 

@@ -31,7 +31,7 @@ METHODS = ("ohm", "matrix", "joint")
 DETECTION = Detection(seeds=1, empty_frames=40, frames=8, forces=4, methods=("voltage", "joint"))
 CHART = chart.Plan(1, 8, warm_up=2, repeats=1, sizes=(chart.Size(2, 2, 3),), methods=METHODS)
 STABILITY = stability.Plan(1, 1, paper_skins=0, paper_shape=(2, 2), shape=(2, 2))
-ABLATED = ("prior.SEGMENT_STD", "sparse_fit.SHARE")
+ABLATED = ("prior.SEGMENT_STD", "sparse_fit.RIVAL_SHARE")
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_far(answered: Any) -> None:
 
 
 def test_ablate(answered: Any, study: Run) -> None:
-    only = "ablate --only SHARE,prior.SEGMENT_STD"
+    only = "ablate --only RIVAL_SHARE,prior.SEGMENT_STD"
     answer, table, err = answered(f"{only} --skins 3 --frames 4 --jobs 1")
     assert tuple(answer["moved"]) == ABLATED
     assert {line["constant"] for line in csv.DictReader(table.splitlines())} == set(ABLATED)

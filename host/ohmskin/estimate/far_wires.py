@@ -3,32 +3,39 @@
 
 Symbols, for a line of n cells with as many ports (a row; columns likewise)
 
-====== ======== ================================================================== ==========
-symbol shape    meaning                                                            unit
-====== ======== ================================================================== ==========
-p, s   (n,)     what the line lost per current of its ports, and its deviation     ohm
-c      (n, n)   current through its segments, per current of these ports           1
-q      (n,)     what segments like the layer's mean, as believed, would lose       ohm
-m      scalar   reference: mean segment of the layer, as first seen                ohm
-z      (n,)     the line's segments, in shares of m; y their mean                  1
-v      scalar   variance of z about y                                              1
-L, l   (n, n)   information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2
-====== ======== ================================================================== ==========
+====== ========= ================================================================== ==========
+symbol shape     meaning                                                            unit
+====== ========= ================================================================== ==========
+p, s   (n,)      what the line lost per current of its ports, and its deviation     ohm
+c      (n, n)    current through its segments, per current of these ports           1
+q      (n,)      what segments like the layer's mean, as believed, would lose       ohm
+t      (2,)      factor by which each layer exceeds what is believed                1
+o      scalar    offset of far ends against near ones, over its deviation           1
+h      (n,)      what an offset of one deviation adds to p: I changes by port       ohm
+m      scalar    reference: mean segment of the layer, as first seen                ohm
+z      (n,)      the line's segments, in shares of m; y their mean                  1
+v      scalar    variance of z about y, and of what a line's segments add to t      1
+L, l   (n, n)    information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2; l is (n,)
+====== ========= ================================================================== ==========
 
 The circuit gives c and q: they depend little on the wires. So p = m c z is linear. A frame shows
-the layers by itself, and an offset o that far ends may have against near ones: rows lose too much
-by it, columns too little (h, per deviation of o, as I changes from port to port). With t the factor
-by which a layer exceeds what is believed, minimised is, over t of both layers and o,
+the layers by itself. An offset of the far ends makes rows seem to lose too much and columns too
+little, so it is found with the layers. Minimised is, over t and o,
 
     sum_lines (p - t q -+ o h)^T (s^2 + v q q^T)^-1 (p - t q -+ o h) + o^2 ,
 
-weighed against what frames before have shown, which fades: a skin bends. What single segments have
-of their own takes many frames. It does not fade, in shares of a reference m, which stays until the
-layer differs from it by more than a segment does:
+weighed against what frames before have shown, which fades: a skin bends. (v: a line may exceed its
+layer by what one segment may, so lines, and not ports, are what is independent.) What single
+segments have of their own takes many frames. It does not fade, in shares of a reference m, which
+stays until the layer differs from it by more than a segment does:
 
     z = y + v (1 + v L)^-1 (l - L y) , y = sum_lines 1^T (1 + v L)^-1 l / sum 1^T (1 + v L)^-1 L 1 ,
 
 of covariance v (1 + v L)^-1.
+
+A calmer frame takes the place of no lesson here, as it does where wires are learned from touches:
+each frame measures the layers anew, so no lesson's error stays in them; and of the segments' sums,
+a noisy frame is a small part, because it is weighed by its noise.
 """
 
 import numpy as np
@@ -36,102 +43,140 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import FADE, LAYER_STD, MAX_STEP, SEGMENT_STD, WireBelief
+from ohmskin.estimate.prior import FADE_SHARE, LAYER_STD, MAX_STEP_LOG, SEGMENT_STD
+from ohmskin.estimate.wire_belief import Fit, WireBelief
 
 
 class MeasuredWires(WireBelief):
-    """What far ends show of the wires of a skin: of layers in a frame, of segments in many."""
+    """Wires at far ends: a frame shows the mean segment of the layers, many show each segment."""
 
     def reset(self) -> None:
         """Back to the wires at rest, or the nominal ones."""
         super().reset()
-        self._before = self._nominal, np.diagonal(self._prior_covariance)
-        self._reference = self._nominal
-        self._segments: Float | None = None
-        self._own_std = np.full((2, *self.shape), SEGMENT_STD)
-        self._known = [
+        # Mean and variance of the layers' logs before this frame: each frame starts from here.
+        self._layers_before = self._nominal, np.diagonal(self._prior_covariance)
+        self._log_reference = self._nominal  # log m of both layers
+        self._segment_ohm: Float | None = None  # (2, R, C) as learned, None before any lesson
+        self._own_std = np.full((2, *self.shape), SEGMENT_STD)  # of z, (2, R, C)
+        # L and l of the lines of each layer, which all lessons add to.
+        self._information = [
             (np.zeros((lines, n, n)), np.zeros((lines, n)))
             for lines, n in (self.shape, self.shape[::-1])
         ]
 
-    def measure(self, circuit: PortCircuit, ports: PortReadings) -> None:
-        """Take the layers' wires from one frame, whose circuit is about this one."""
-        layers, variance = (of.copy() for of in self._before)
+    def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
+        """Take the layers from this frame, weighed against the frames before.
+
+        log_cells: nearly right will do, as c and q depend little on the cells.
+        """
+        self._measure(self.circuit(log_cells), ports)
+
+    def _measure(self, circuit: PortCircuit, ports: PortReadings) -> tuple[float, float]:
+        """The layers of one frame, from an approximate circuit of it; o and the variance of o."""
+        logs, variance = (before.copy() for before in self._layers_before)
+        factors, covariance = self._factors(circuit, ports)
+        for layer in (0, 1):
+            if self.far[layer]:
+                factor = max(factors[layer], np.exp(-MAX_STEP_LOG))
+                # The frame's variance of log t is cov t / t^2. A scalar Kalman step in logs:
+                kept = 1.0 / (1.0 + variance[layer] * factor**2 / covariance[layer, layer])
+                measured = self.log_layers[layer] + np.log(factor)
+                logs[layer] += (1 - kept) * (measured - logs[layer])
+                variance[layer] *= kept
+        self._believe(logs, np.diag(np.sqrt(variance)))
+        return factors[2], covariance[2, 2]
+
+    def _factors(self, circuit: PortCircuit, ports: PortReadings) -> tuple[Float, Float]:
+        """t of both layers and o, (3,), and their covariance: the normal equations of the cost.
+
+        With a b for a^T b / s^2, a sum over the ports of a line, Sherman and Morrison's formula is
+
+            a^T (s^2 + v q q^T)^-1 b = ab - gain qa qb ,   gain = 1 / (1 / v + qq) .
+
+        Raises LinAlgError for readings so exact that nothing is left of these differences.
+        """
         weight = ports.drop_std**-2.0
-        normal, right = np.eye(3), np.zeros(3)  # of t of both layers, and of the shift
+        # The 1 of o is o^2 in the cost. Those of t are next to nothing: with them a frame without
+        # current, or a layer that is not sensed, can still be solved.
+        normal, right = np.eye(3), np.zeros(3)
         for layer, sign in ((0, 1.0), (1, -1.0)):
-            if not ports.far[layer]:
+            if not self.far[layer]:
                 continue
-            model = circuit.drop_ohm[layer].reshape(self.shape)
-            shift = sign * ports.drop_shift
-            # Sums over each line, of which the segments' own deviation is taken out.
-            own, shared, seen, both, read = (
+            q = circuit.drop_ohm[layer].reshape(self.shape)
+            p, h = ports.drop_ohm[layer], sign * ports.drop_shift
+            qq, qh, qp, hh, hp = (
                 (weight * one * other).sum(axis=1 - layer)
-                for one, other in (
-                    *((model, model), (model, shift), (model, ports.drop_ohm[layer])),
-                    *((shift, shift), (shift, ports.drop_ohm[layer])),
-                )
+                for one, other in ((q, q), (q, h), (q, p), (h, h), (h, p))
             )
-            less = 1.0 / (1.0 / SEGMENT_STD**2 + own)
-            normal[layer, layer] = (own - less * own * own).sum()
-            normal[layer, 2] = normal[2, layer] = (shared - less * own * shared).sum()
-            normal[2, 2] += (both - less * shared * shared).sum()
-            right[layer] = (seen - less * own * seen).sum()
-            right[2] += (read - less * shared * seen).sum()
-        covariance = np.linalg.inv(normal)
-        found = covariance @ right
-        for layer in (0, 1):
-            if ports.far[layer]:
-                times = max(found[layer], np.exp(-MAX_STEP))
-                prior = 1.0 / (1.0 + variance[layer] * times**2 / covariance[layer, layer])
-                seen_log = self.log_layers[layer] + np.log(times)
-                layers[layer] += (1 - prior) * (seen_log - layers[layer])
-                variance[layer] *= prior
-        self.log_layers, self._root = layers, np.diag(np.sqrt(variance))
-        self._shift = found[2], covariance[2, 2]
+            gain = 1.0 / (1.0 / SEGMENT_STD**2 + qq)
+            normal[layer, layer] = (qq - gain * qq * qq).sum()
+            normal[layer, 2] = normal[2, layer] = (qh - gain * qq * qh).sum()
+            normal[2, 2] += (hh - gain * qh * qh).sum()
+            right[layer] = (qp - gain * qq * qp).sum()
+            right[2] += (hp - gain * qh * qp).sum()
+        covariance = np.asarray(np.linalg.inv(normal), np.float64)
+        return covariance @ right, covariance
 
-    def settle(self, far: tuple[bool, bool]) -> None:
-        """These are the wires at rest: later frames are expected about them, but for a bend."""
-        variance = np.where(far, LAYER_STD**2, np.diagonal(self._prior_covariance))
+    def fix_rest_wires(self) -> None:
+        """Later frames are expected about the wires at rest, but for a bend."""
+        variance = np.where(self.far, LAYER_STD**2, np.diagonal(self._prior_covariance))
         self._nominal, self._prior_covariance = self.log_layers, np.diag(variance)
-        self._before = self._nominal, variance
+        self._layers_before = self._nominal, variance
 
-    def keep(self, circuit: PortCircuit, ports: PortReadings) -> None:
-        """Learn from a frame that is news: layers as in `measure`, and single segments."""
-        self.measure(circuit, ports)
-        known = np.diagonal(self._root) ** 2
+    def after_fit(self, fit: Fit, ports: PortReadings) -> None:
+        """Learn from a frame that is news: layers as before the fit, and single segments."""
+        if not self._is_news(fit.log_cells):
+            return
+        self._lesson_cells = fit.log_cells
+        circuit = self.circuit(fit.log_cells)
+        offset = self._measure(circuit, ports)
+        variance = np.diagonal(self._root) ** 2
         most = np.diagonal(self._prior_covariance)
-        self._before = self.log_layers, known + FADE * (most - known)
-        segments, variance = self.layers(self.mean), SEGMENT_STD**2
+        self._layers_before = self.log_layers, variance + FADE_SHARE * (most - variance)
+        segments = self.segment_ohm(self.mean)
         for layer in (0, 1):
-            if not ports.far[layer]:
-                continue
-            if abs(self.log_layers[layer] - self._reference[layer]) > SEGMENT_STD:
-                self._reference = self._reference.copy()
-                self._reference[layer] = self.log_layers[layer]
-            shift = (1 - 2 * layer) * ports.drop_shift
-            drop = ports.drop_ohm[layer] - self._shift[0] * shift
-            weight = 1.0 / (ports.drop_std**2 + self._shift[1] * shift**2)
-            if layer == 1:
-                drop, weight = drop.T, weight.T
-            ohm = np.exp(self._reference[layer])
-            current = ohm * circuit.line_current(layer)
-            heavy = current * weight[..., None]
-            precision, pull = self._known[layer]
-            precision += np.matmul(heavy.transpose(0, 2, 1), current)
-            pull += np.einsum("lpk,lp->lk", heavy, drop)
-            inverse = np.linalg.inv(np.eye(len(precision[0])) + variance * precision)
-            told = np.matmul(inverse, np.stack([pull, precision.sum(axis=2)], axis=2))
-            mean = told[..., 0].sum() / told[..., 1].sum()
-            share = mean + variance * (told[..., 0] - mean * told[..., 1])
-            own_std = np.sqrt(variance * np.einsum("lkk->lk", inverse))
-            segments[layer] = ohm * (share if layer == 0 else share.T)
-            self._own_std[layer] = own_std if layer == 0 else own_std.T
-        self._segments = segments
+            if self.far[layer]:
+                segments[layer] = self._segments_of(layer, circuit, ports, offset)
+        self._segment_ohm = segments
 
-    def layers(self, log_wires: Float) -> Float:
-        """Segments (2, R, C) [ohm], as learned, or these if no frame has been news."""
-        return super().layers(log_wires) if self._segments is None else self._segments.copy()
+    def _segments_of(
+        self, layer: int, circuit: PortCircuit, ports: PortReadings, offset: tuple[float, float]
+    ) -> Float:
+        """Segments of a layer, (R, C) [ohm], from this frame and all lessons before; `_own_std`.
+
+        offset: o and its variance, in this frame.
+        """
+        if abs(self.log_layers[layer] - self._log_reference[layer]) > SEGMENT_STD:
+            self._log_reference = self._log_reference.copy()
+            self._log_reference[layer] = self.log_layers[layer]
+        shift = (1 - 2 * layer) * ports.drop_shift
+        drop = ports.drop_ohm[layer] - offset[0] * shift
+        weight = 1.0 / (ports.drop_std**2 + offset[1] * shift**2)
+        if layer == 1:  # a line first, then its ports
+            drop, weight = drop.T, weight.T
+        reference_ohm = np.exp(self._log_reference[layer])
+        slopes = reference_ohm * circuit.line_current(layer)  # m c, (lines, ports, segments)
+        heavy = slopes * weight[..., None]
+        information, pull = self._information[layer]
+        information += np.matmul(heavy.transpose(0, 2, 1), slopes)
+        pull += np.einsum("lpk,lp->lk", heavy, drop)
+        variance = SEGMENT_STD**2
+        inverse = np.linalg.inv(np.eye(len(information[0])) + variance * information)
+        # (1 + v L)^-1 l, and (1 + v L)^-1 L 1.
+        of_pull, of_ones = np.matmul(
+            inverse, np.stack([pull, information.sum(axis=2)], axis=2)
+        ).transpose(2, 0, 1)
+        mean = of_pull.sum() / of_ones.sum()
+        share = mean + variance * (of_pull - mean * of_ones)
+        own_std = np.sqrt(variance * np.einsum("lkk->lk", inverse))
+        self._own_std[layer] = own_std if layer == 0 else own_std.T
+        return np.asarray(reference_ohm * (share if layer == 0 else share.T))
+
+    def segment_ohm(self, log_wires: Float) -> Float:
+        """Segments (2, R, C) [ohm], as learned; those of the fit if no frame has been news."""
+        if self._segment_ohm is None:
+            return super().segment_ohm(log_wires)
+        return self._segment_ohm.copy()
 
     def segment_std(self) -> Float:
         """As of layers that are known, and what readings leave of each segment's own."""

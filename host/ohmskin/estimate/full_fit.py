@@ -9,11 +9,13 @@ symbol shape        meaning                                                     
 x      (RC + 2,)    log resistances: cells, mean segments of both layers          log ohm
 m      (RC + 2,)    what the prior expects of x                                   log ohm
 P      (RC+2, RC+2) covariance of the prior
-u      (RC + 2,)    what is off: x = m + P^1/2 u                                  1
+u      (RC + 2,)    deviations from the prior: x = m + P^1/2 u                    1
 y, h   (RC,)        measured and modelled port currents per Vdd, over noise       1
 J      (RC, RC + 2) dh / du                                                       1
 W      (RC, 2RC)    dh / dw s, w the log segments, s what each has of its own     1
 N      (RC, RC)     covariance of y: of its noise and of what is not in x         1
+S      (RC, RC)     covariance of y, N + J J^T: of all that is not certain        1
+O      (RC, RC + 2) J whitened: L^-1 J, with L L^T = S                            1
 ====== ============ ============================================================= ==========
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2, P of the cells re-weighted for the tails of their prior
@@ -23,13 +25,14 @@ readings (Tarantola 2005, eq. 3.51),
 
     u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 
-and the posterior covariance of u is 1 - J^T S^-1 J. J, N and S are made anew only where those of
-the step before, used once more, would still move something.
+and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. J, N and S are made anew only where
+those of the step before, used once more, would still move something.
 """
 
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
@@ -37,24 +40,30 @@ from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    CLOSE,
-    CROWDED,
-    HIDDEN,
+    CLOSE_STDS,
+    HIDDEN_LOG,
     MAX_ITERATIONS,
-    MAX_STEP,
+    MAX_STEP_LOG,
     SEGMENT_STD,
-    TOUCHED,
+    TOUCHED_STDS,
     UNLIMITED_STD,
     CellPrior,
-    Lesson,
-    WireBelief,
 )
+from ohmskin.estimate.wire_belief import Lesson, WireBelief
 
-_LEAST_LOG, _MOST_LOG = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)  # of a cell
+# Limits of a cell's log resistance.
+_LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
 
 
 class FullFit:
-    """One frame's fit: log resistances of cell (RC,), their cell_std, and of wires (2RC,)."""
+    """One frame's fit.
+
+    log_cells: log resistances of the cells, (RC,) [log ohm].
+    log_cells_std: their posterior deviation, (RC,).
+    wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
+    iterations: steps taken.
+    message: why it did not converge, or empty.
+    """
 
     def __init__(
         self,
@@ -64,143 +73,191 @@ class FullFit:
         ports: PortReadings,
         start: Float,
     ) -> None:
-        """Minimise from these cells (RC,); `message` says if that did not converge."""
+        """Minimise from these log resistances of the cells, `start` (RC,)."""
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
-        self._far = ports.far
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
-        self.cell: Float = start
-        self._off_layers = np.zeros(2)  # u of the layers
-        self._moved = np.inf  # of a log resistance, since N was made
+        self.log_cells: Float = start
+        self._layer_stds = np.zeros(2)  # u of the layers
+        self._moved_log = np.inf  # the most that a log resistance can have moved since N was made
         self._evaluate()
         self._minimise()
         self._conclude()
 
     def _evaluate(self) -> None:
         """The circuit at the present state."""
-        cell_siemens = np.exp(-self.cell).reshape(self._belief.shape)
-        wires = np.exp(self._belief.away(self._off_layers))
-        self._circuit = PortCircuit(cell_siemens, *wires, far=self._far)
+        cell_siemens = np.exp(-self.log_cells).reshape(self._belief.shape)
+        wires = np.exp(self._belief.log_layers_off(self._layer_stds))
+        self._circuit = PortCircuit(cell_siemens, *wires, far=self._belief.far)
         self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
         self._residual = (self._current - self._modelled) * self._weight
-        self._centre, self._variance = self._prior.normal(self.cell)
+        self._centre, self._variance = self._prior.normal(self.log_cells)
 
-    def _weighted(self, slopes: Float, share: float = 1.0) -> Float:
-        """Slopes of h from those of rho, (RC, ...), which are overwritten."""
-        slopes *= (-share * self._weight * self._modelled**2)[:, None]
+    def _weighted(self, slopes: Float, scale: float = 1.0) -> Float:
+        """Slopes of h from those of rho, (RC, ...), which are overwritten.
+
+        h = weight / (rho + ref), so dh / d rho is -weight times the modelled current squared.
+        """
+        slopes *= (-scale * self._weight * self._modelled**2)[:, None]
         return slopes
 
     def _linearise(self) -> None:
-        """Slopes and S at the present state, and N if that has moved by more than N is about."""
-        if self._moved > SEGMENT_STD:
-            self._moved = 0.0
+        """Make J and S for the present state.
+
+        N is kept until a resistance has moved by more than `SEGMENT_STD`: it says what segments may
+        have of their own, which is not known better than that. W is the dearest of all slopes.
+        """
+        if self._moved_log > SEGMENT_STD:
+            self._moved_log = 0.0
             self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
             self._noise = gram(self._by_segment)
             np.einsum("ii->i", self._noise)[:] += 1.0
         self._by_cell = self._weighted(self._circuit.by_cell())
-        self._by_layers = self._belief.by_layers(self._weighted(self._circuit.by_layers()))
+        by_layer = self._weighted(self._circuit.by_layers())
+        self._per_layer_std = self._belief.per_layer_std(by_layer)
         self._cell_std = np.sqrt(self._variance)
         self._slopes, self._factor = self._factorised(self._cell_std)
 
     def _factorised(self, cell_std: Float) -> tuple[Float, Float]:
-        """J for cells of these deviations, and the factor of S."""
+        """J for cells of these deviations (RC,), and L."""
         slopes = np.empty((len(cell_std), len(cell_std) + 2))
         np.multiply(self._by_cell, cell_std, out=slopes[:, :-2])
-        slopes[:, -2:] = self._by_layers
+        slopes[:, -2:] = self._per_layer_std
         return slopes, cholesky(gram(slopes, onto=self._noise.copy(order="F")))
 
     def _minimise(self) -> None:
+        """Steps until one is small. Each is first tried with the slopes of the one before."""
         self._linearise()
-        step, moved = self._step()
+        step, moved_stds = self._step()
         while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
             self._move(step)
-            if moved < CLOSE:
+            if moved_stds < CLOSE_STDS:
                 return
             self._evaluate()
-            step, moved = self._step()
-            if moved >= 0.5 * CLOSE:
+            step, moved_stds = self._step()
+            # Old slopes are a little wrong, so they may end the fit by a smaller step only.
+            if moved_stds >= 0.5 * CLOSE_STDS:
                 self._linearise()
-                step, moved = self._step()
+                step, moved_stds = self._step()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
 
     def _step(self) -> tuple[Float, float]:
-        """Step of u by the slopes there are; the most that it moves of a reading, or of a cell."""
-        from_rest = (self.cell - self._centre) * self._cell_std / self._variance
-        off = np.concatenate([from_rest, self._off_layers])
-        self._left = solve(self._factor, self._residual + self._slopes @ off)
-        step = self._left @ self._slopes - off
-        read = self._slopes @ step
-        return step, float(max(np.abs(read).max(), np.abs(step[:-2]).max()))
+        """u' - u by the slopes there are, and the most deviations it moves of a reading, or cell.
+
+        J is in deviations of the last linearisation, but the prior of the cells is that of the
+        present state: so a cell's u is its slope of -log p times the old deviation.
+        """
+        cell_stds = (self.log_cells - self._centre) * self._cell_std / self._variance
+        present = np.concatenate([cell_stds, self._layer_stds])
+        self._weighted_residual = solve(self._factor, self._residual + self._slopes @ present)
+        step = self._weighted_residual @ self._slopes - present
+        readings_step = self._slopes @ step
+        return step, float(max(np.abs(readings_step).max(), np.abs(step[:-2]).max()))
 
     def _move(self, step: Float) -> None:
-        # What would leave its limits goes there, and holds up nothing else.
-        cell = self.cell + self._cell_std * step[:-2]
-        cell_step = np.minimum(np.maximum(cell, _LEAST_LOG), _MOST_LOG) - self.cell
-        layers_step = self._belief.away(step[-2:]) - self._belief.log_layers
-        most = max(np.abs(cell_step).max(), np.abs(layers_step).max(), 1e-9)
-        share = min(1.0, MAX_STEP / most)
-        self._moved += share * most
-        self.cell = self.cell + share * cell_step
-        self._off_layers = self._off_layers + share * step[-2:]
+        """Take a step, or so much of it that no log resistance moves by more than MAX_STEP_LOG."""
+        # A cell that would leave its limits goes there. The others take their whole step.
+        log_cells = self.log_cells + self._cell_std * step[:-2]
+        cells_step = np.minimum(np.maximum(log_cells, _LEAST_LOG_OHM), _MOST_LOG_OHM)
+        cells_step -= self.log_cells
+        layers_step = self._belief.log_layers_off(step[-2:]) - self._belief.log_layers
+        most = max(np.abs(cells_step).max(), np.abs(layers_step).max(), 1e-9)
+        share = min(1.0, MAX_STEP_LOG / most)
+        self._moved_log += share * most
+        self.log_cells = self.log_cells + share * cells_step
+        self._layer_stds = self._layer_stds + share * step[-2:]
 
     @cached_property
-    def wires(self) -> Float:
-        """Log resistances of the segments, (2RC,): their layer's, and their own share."""
-        return self._belief.log_wires(self._off_layers, self._left @ self._by_segment)
+    def log_wires(self) -> Float:
+        """Log resistances of the segments, (2RC,): their layer's, and what they have of their own.
+
+        The latter was noise of covariance W W^T. Of a residual whose whole covariance is S, its
+        most probable share is W^T S^-1 times the residual.
+        """
+        segment_stds = self._weighted_residual @ self._by_segment
+        return self._belief.log_wires_off(self._layer_stds, segment_stds)
 
     @property
     def modelled(self) -> Float:
-        """Port currents of the model, (RC,) [S]."""
-        return self._current - self._left / self._weight
+        """Port currents of the model, (RC,) [S], with what segments have of their own.
+
+        By the same rule, the share of the readings' noise, whose covariance is 1, is S^-1 times the
+        residual; the rest of the measured current is the model's.
+        """
+        return self._current - self._weighted_residual / self._weight
 
     @property
     def misfit(self) -> float:
-        """Chi-square per port of what is left."""
-        return float(self._left @ self._left) / self._left.size
+        """Chi-square per port: the mean square of that noise."""
+        return float(self._weighted_residual @ self._weighted_residual) / self._current.size
 
     def _conclude(self) -> None:
-        """cell_std, and what the uncertain layers have in it, by the last S.
+        """log_cells_std, and wires_log_std, by the last J and S.
 
-        A cell is called untouched when the readings ask for less than the prior asks against it.
-        Where that may be a touch all the same, small for the readings but not for the cell, it is
-        counted as uncertain by so much, and so is what depends on it: S grows by those cells, of
-        deviation s' for s, and with L L^T = S, O = L^-1 J, H = O sqrt(s'^2 / s^2 - 1) of these,
+        Without more, a cell's posterior deviation is s (1 - l)^1/2, with s that of its prior here,
+        and l its diagonal element of O^T O: the share of s^2 that the readings have removed. But
+        cells that may be touched unnoticed (`_find_unnoticed`) have a wider deviation s', and what
+        depends on them is less certain too. S grows by these cells: with H the columns of O that
+        are theirs, each times (s'^2 / s^2 - 1)^1/2, S' = L (1 + H H^T) L^T, and (Woodbury)
 
-            J^T S'^-1 J = O^T (1 - H (1 + H^T H)^-1 H^T) O .
+            J^T S'^-1 J = O^T O - O^T H (1 + H^T H)^-1 H^T O .
+
+        The second term is what is corrected. Then J's own columns grow to s' too.
         """
-        prior, cell_std = self._prior, self._cell_std
-        own = solve_lower(self._factor, self._slopes)
-        learned = np.einsum("ij,ij->j", own, own)[:-2]
-        distance = prior.expected - self.cell
-        at_rest = np.abs(distance) < prior.std
-        # What the readings alone say of a cell: rise of its conductance over rest, and deviation.
-        share = np.maximum(learned, 1e-9)
-        rise = distance / share
-        rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
-        hidden = at_rest & (rise + 2 * rise_std > HIDDEN) & (rise > rise_std)
-        if prior.touches(self.cell) > CROWDED * rise.size:
-            hidden, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
-        self._hidden = hidden = hidden & (rise + rise_std > cell_std)
-        by_layers = own[:, :-2].T @ own[:, -2:]
-        if hidden.any():
-            wider = np.where(hidden, (rise + rise_std) / cell_std, 1.0)
-            more = np.sqrt(wider[hidden] ** 2 - 1.0)
-            seen = (own[:, :-2][:, hidden] * more).T @ own
-            system = np.eye(len(more)) + seen[:, :-2][:, hidden] * more
-            less = solve_lower(cholesky(system), seen)
-            learned = wider**2 * (learned - np.einsum("ij,ij->j", less, less)[:-2])
-            by_layers -= less[:, :-2].T @ less[:, -2:]
-            by_layers *= wider[:, None]
+        cell_std = self._cell_std
+        whitened = solve_lower(self._factor, self._slopes)
+        learned = np.einsum("ij,ij->j", whitened, whitened)[:-2]
+        with_layers = whitened[:, :-2].T @ whitened[:, -2:]  # O^T O of cells and layers
+        self._unnoticed, unnoticed_std = self._find_unnoticed(learned)
+        if self._unnoticed.any():
+            wider = np.where(self._unnoticed, unnoticed_std / cell_std, 1.0)
+            added = np.sqrt(wider[self._unnoticed] ** 2 - 1.0)
+            coupling = (whitened[:, :-2][:, self._unnoticed] * added).T @ whitened  # H^T O
+            system = np.eye(len(added)) + coupling[:, :-2][:, self._unnoticed] * added
+            correction = solve_lower(cholesky(system), coupling)
+            learned = learned - np.einsum("ij,ij->j", correction, correction)[:-2]
+            with_layers -= correction[:, :-2].T @ correction[:, -2:]
+            learned = wider**2 * learned
+            with_layers *= wider[:, None]
             cell_std = wider * cell_std
-        self.by_layers: Float = cell_std * np.linalg.norm(by_layers, axis=1)
-        self.cell_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
+        self.wires_log_std: Float = cell_std * np.linalg.norm(with_layers, axis=1)
+        self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
+
+    def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:
+        """Cells that the prior holds at rest and that may be touched; their deviation s' (RC,).
+
+        A cell stays at rest when the readings ask for less than the prior asks against it. That may
+        be a touch all the same: small for the readings, because much else conducts there, but not
+        small for the cell.
+
+        learned: l, the share of the prior's variance that the readings have removed, (RC,).
+        """
+        prior = self._prior
+        rise = prior.expected - self.log_cells
+        at_rest = np.abs(rise) < prior.std
+        # What the readings alone say. The fit is the product of two normals, the prior and theirs.
+        # So it has moved the cell by l times the rise that they show, of variance s^2 (1 - l) / l.
+        share = np.maximum(learned, 1e-9)
+        rise = rise / share
+        rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
+        if prior.is_crowded(self.log_cells):
+            # Between many touched cells hardly any current is that of one at rest. That it is at
+            # rest is then the prior's opinion alone, and it may have any force.
+            unnoticed, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
+        else:
+            # The rise is more than noise, and within two deviations it may be one that matters.
+            unnoticed = at_rest & (rise + 2 * rise_std > HIDDEN_LOG) & (rise > rise_std)
+        unnoticed_std = rise + rise_std
+        return unnoticed & (unnoticed_std > self._cell_std), unnoticed_std
 
     @property
     def lesson(self) -> Lesson:
         """What the readings say of the layers."""
-        residual = self._residual + self._by_layers @ self._off_layers
+        # At the mean of the belief, not at the layers that the fit has found.
+        residual = self._residual + self._per_layer_std @ self._layer_stds
         # A touched cell is noise without limit; one at rest is known to its drift.
-        unknown = self._hidden | (np.abs(self._prior.rise(self.cell)) > TOUCHED)
-        _, factor = self._factorised(np.where(unknown, UNLIMITED_STD, self._prior.std))
-        return self._by_layers, residual, factor
+        touched = np.abs(self._prior.rise(self.log_cells)) > TOUCHED_STDS
+        cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
+        _, factor = self._factorised(cell_std)
+        return Lesson(self._per_layer_std, residual, factor)

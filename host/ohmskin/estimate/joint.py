@@ -23,33 +23,32 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import CellFit
+from ohmskin.estimate.ohm import conductance_from_current
 from ohmskin.estimate.port_faults import cell_of
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    CROWDED,
-    HIDDEN,
+    HIDDEN_LOG,
     HIGHEST_TOUCH_SIEMENS,
-    MAX_STEP,
-    MISFIT,
+    MAX_CHI2,
     REST_STD,
     UNKNOWN_REST_STD,
     UNTOUCHED_STD,
     CellPrior,
-    WireBelief,
-    path_ohm,
     rest_level,
     siemens_std,
 )
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
+from ohmskin.estimate.wire_belief import LearnedWires, WireBelief
 
+# Fits of the rest readings, each about the median of the one before: `make ablate` tries fewer.
 REST_FITS: Final = 3
-LOSS: Final = 10.0  # deviations of the prior below rest: a cell that conducts less is at fault
+# A cell that conducts less than at rest by more deviations of its prior is at fault: `make ablate`.
+LOSS_STDS: Final = 10.0
 
 
 class JointEstimator(Estimator):
@@ -61,50 +60,59 @@ class JointEstimator(Estimator):
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)
         self._shape = (knowledge.rows, knowledge.columns)
-        wires = knowledge.nominal_wire_ohm
-        self._measured: MeasuredWires | None = None
-        self._belief = WireBelief(*self._shape, wires)
-        if any(self._reader.far):
-            self._belief = self._measured = MeasuredWires(*self._shape, wires)
+        far = self._reader.far
+        believe = MeasuredWires if any(far) else LearnedWires
+        self._belief: WireBelief = believe(self._shape, knowledge.nominal_wire_ohm, far)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
-        self._rest_by_wires = 0.0
+        self._rest_wires_log_std = 0.0  # the most that wires have in a cell's deviation at rest
         self.reset()
 
     def wires(self) -> WireOhm:
         """As told, until a frame has taught more."""
-        return super().wires() if self._learned_from is None else self._belief.learned()
+        learned = self._belief.learned()
+        return super().wires() if learned is None else learned
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
         super().reset()
-        self._learned_from: Float | None = None
-        self._lesson_noise = 0.0  # of the frame that was learned from
-        # What follows from the wires as they are believed, for `touch`.
-        self._believed: tuple[Float, tuple[Float, Float, Float]] | None = None
-        self._without_wires: Float | None = None
+        self._cells_before: Float | None = None  # what `matrix` found in the last frame it started
         self._touches = 0  # of the last fit
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
 
     def _solve(self, ports: PortReadings) -> Solution:
+        try:
+            return self._answer(ports)
+        except np.linalg.LinAlgError:
+            # Nonsense in exact readings of far ends does this: noise alone keeps `far_wires` from
+            # dividing by 0. No other readings are known to. Each cell is answered as if alone.
+            return Solution(
+                cell_siemens=conductance_from_current(ports.current, self.knowledge.ref_ohm),
+                cell_siemens_std=np.full(self._shape, MAX_CELL_SIEMENS),
+                chi2=self._chi2(ports, ports.current),
+                message="the circuit that these readings lead to cannot be solved",
+            )
+
+    def _answer(self, ports: PortReadings) -> Solution:
+        """The answer for one frame: a few touches for `touch`, else the fit of all resistances."""
         prior = self._prior_of(ports)
         touches = None
         # Under a finger that stays, few touches explain no frame: trying costs time.
         if self._finder is not None and self._touches <= self._finder.most:
             touches = self._finder.find(ports)
-        if touches is not None and (found := self._explained_by(touches, ports)):
-            return self._solution(ports, found)
+        if touches is not None and (touched := self._explained_by(touches, ports)):
+            return self._solution(ports, touched)
         start = self._start(prior, ports, touches)
-        if self._measured is not None:
-            self._measured.measure(self._circuit(start), ports)
-        expected = prior.unsure() if prior.is_soft(start, self._shape) else prior
+        self._belief.before_fit(start, ports)
+        expected = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
-        self._touches = prior.touches(fit.cell)
+        self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
-        if not (ports.fault or message or self._touches > CROWDED * start.size):
-            self._learn(fit, ports)
+        # In a crowded frame, the force of many cells is as little known as the wires behind them.
+        if not (ports.fault or message or prior.is_crowded(fit.log_cells)):
+            self._belief.after_fit(fit, ports)
         return self._solution(ports, fit, message)
 
     def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
@@ -112,48 +120,44 @@ class JointEstimator(Estimator):
         return None
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
-        wires, wires_std, series_ohm = self._wires_of(fit)
-        layer_std, wider = self._belief.std(), max(1.0, fit.misfit) ** 0.5
-        std, down = siemens_std(-fit.cell, fit.cell_std, fit.by_layers, layer_std, series_ohm)
+        belief = self._belief
+        if isinstance(fit, FullFit):
+            wires = belief.wires(fit.log_wires)
+        else:
+            wires = belief.wires_without_fit(fit.log_wires)
+        series_ohm = wires.path_ohm + self.knowledge.ref_ohm
+        std, std_down = siemens_std(
+            -fit.log_cells, fit.log_cells_std, fit.wires_log_std, belief.layer_std(), series_ohm
+        )
+        # A model that misses the readings by more than their noise is wrong by as much more.
+        wider = max(1.0, fit.misfit) ** 0.5
         return Solution(
-            cell_siemens=np.exp(-fit.cell).reshape(self._shape),
+            cell_siemens=np.exp(-fit.log_cells).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
-            cell_siemens_std_down=wider * down.reshape(self._shape),
+            cell_siemens_std_down=wider * std_down.reshape(self._shape),
             chi2=self._chi2(ports, fit.modelled.reshape(self._shape)),
             iterations=fit.iterations,
             message=message,
-            wire_ohm=wires,
-            wire_ohm_std=wires_std,
+            wire_ohm=wires.segment_ohm,
+            wire_ohm_std=wires.segment_std_ohm,
         )
-
-    def _wires_of(self, fit: FullFit | Touched) -> tuple[Float, Float, Float]:
-        """Segments and their deviations (2, R, C), and what is in series with each cell [ohm]."""
-        of = self._belief.log_layers
-        if isinstance(fit, FullFit) or self._believed is None or self._believed[0] is not of:
-            wires = self._belief.layers(fit.wires)
-            series_ohm = path_ohm(*wires, far=self._reader.far) + self.knowledge.ref_ohm
-            found = wires, wires * self._belief.segment_std(), series_ohm
-            if isinstance(fit, FullFit):
-                return found
-            for each in found:
-                each.setflags(write=False)  # they are in more than one estimate
-            self._believed = of, found
-        return self._believed[1]
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:
         """Why this fit cannot be the answer; empty if it can."""
         if fit.message:
             return fit.message
-        if self._rest_by_wires > REST_STD:
+        if self._rest_wires_log_std > REST_STD:
             return "wires resist too much: even cells at rest are uncertain"
-        if fit.misfit > MISFIT:
+        if fit.misfit > MAX_CHI2:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
-        cell = fit.cell.reshape(self._shape)
-        if cell.min() < -np.log(HIGHEST_TOUCH_SIEMENS):
-            return f"{cell_of(cell.argmin(), cell)}: conducts more than any touch, is it a short?"
-        loss = fit.cell - prior.expected - LOSS * prior.std
+        log_cells = fit.log_cells.reshape(self._shape)
+        if log_cells.min() < -np.log(HIGHEST_TOUCH_SIEMENS):
+            cell = cell_of(log_cells.argmin(), log_cells)
+            return f"{cell}: conducts more than any touch, is it a short?"
+        loss = fit.log_cells - prior.expected - LOSS_STDS * prior.std
         if self.knowledge.rest_ratio is not None and loss.max() > 0:
-            return f"{cell_of(loss.argmax(), cell)}: conducts less than at rest, is a line open?"
+            cell = cell_of(loss.argmax(), log_cells)
+            return f"{cell}: conducts less than at rest, is a line open?"
         return ""
 
     def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
@@ -164,32 +168,13 @@ class JointEstimator(Estimator):
         not reach the distant answer of one hard touch behind long wires.
         """
         if touches is not None:
-            return touches.cell
-        near = float(ports.current.size)  # to start from, a deviation of every reading will do
-        fit = CellFit(ports, self.knowledge.ref_ohm, self._without_wires, near)
-        self._without_wires = None if fit.message else fit.cell
+            return touches.log_cells
+        # To start from, cells that miss each reading by one deviation are near enough.
+        tolerance = float(ports.current.size)
+        fit = CellFit(ports, self.knowledge.ref_ohm, self._cells_before, tolerance)
+        self._cells_before = None if fit.message else fit.cell
         siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         return np.minimum(-np.log(siemens), prior.expected)
-
-    def _circuit(self, cell: Float) -> PortCircuit:
-        """Of these log resistances of the cells (RC,), with wires as they are believed."""
-        wires = np.exp(self._belief.log_layers)
-        return PortCircuit(np.exp(-cell).reshape(self._shape), *wires, far=self._reader.far)
-
-    def _learn(self, fit: FullFit | Touched, ports: PortReadings) -> None:
-        """Let the wires learn from a frame that is news: frames alike have errors alike.
-
-        A frame that is alike, but calmer, takes the place of the one that was news.
-        """
-        before, noise = self._learned_from, float(ports.current_std.mean())
-        news = before is None or np.abs(fit.cell - before).max() >= MAX_STEP
-        if not news and (self._measured is not None or noise >= self._lesson_noise):
-            return
-        self._learned_from, self._lesson_noise = fit.cell, noise
-        if self._measured is None:
-            self._belief.learn(*fit.lesson, instead=not news)
-        else:
-            self._measured.keep(self._circuit(fit.cell), ports)
 
     def _prior_of(self, ports: PortReadings) -> CellPrior:
         """From the rest readings; without them from the level of this frame, or of a lower one.
@@ -197,9 +182,10 @@ class JointEstimator(Estimator):
         A level is one number for all cells: what has always been pressed is not taken for rest, as
         it would be cell by cell.
         """
-        known = self.knowledge
-        if known.rest_ratio is None:
-            log_ohm, before = -np.log(rest_level(ports.current, known.ref_ohm)), self._prior
+        rest_ratio, ref_ohm = self.knowledge.rest_ratio, self.knowledge.ref_ohm
+        if rest_ratio is None:
+            log_ohm, before = -np.log(rest_level(ports.current, ref_ohm)), self._prior
+            # Touches only raise a level. So the lowest one that was seen is nearest to rest.
             if before is not None and log_ohm <= before.expected[0]:
                 return before
             cells = ports.current.size
@@ -207,10 +193,11 @@ class JointEstimator(Estimator):
         elif self._prior is not None:
             return self._prior
         else:
-            expected, std = self._at_rest(self._reader.read(known.rest_ratio))
+            expected, std = self._at_rest(self._reader.read(rest_ratio))
         self._prior = CellPrior(expected, std)
-        if self._rest_by_wires <= REST_STD:
-            self._finder = SparseFit(self._prior, self._belief, known.ref_ohm, self._reader.far)
+        # Where wires hide even cells at rest, no few touches are sure: all frames are for `joint`.
+        if self._rest_wires_log_std <= REST_STD:
+            self._finder = SparseFit(self._prior, self._belief, ref_ohm)
         return self._prior
 
     def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
@@ -219,18 +206,16 @@ class JointEstimator(Estimator):
         Made again about their median: many cells a little wrong would weigh more than readings.
         """
         level = rest_level(ports.current, self.knowledge.ref_ohm)
-        cell: Float = np.full(ports.current.size, -np.log(level))
+        log_cells: Float = np.full(ports.current.size, -np.log(level))
         for _ in range(REST_FITS):
-            std = np.full(cell.size, UNTOUCHED_STD)
-            if self._measured is not None:
-                self._measured.measure(self._circuit(cell), ports)
-            wide = CellPrior(np.full(cell.size, np.median(cell)), std)
-            fit = FullFit(wide, self._belief, self.knowledge.ref_ohm, ports, cell)
-            cell = fit.cell
-        if self._measured is not None:
-            self._measured.settle(ports.far)
-        self._rest_by_wires = float(fit.by_layers.max())
-        return cell, np.hypot(np.minimum(fit.cell_std, UNTOUCHED_STD), REST_STD)
+            self._belief.before_fit(log_cells, ports)
+            std = np.full(log_cells.size, UNTOUCHED_STD)
+            alike = CellPrior(np.full(log_cells.size, np.median(log_cells)), std)
+            fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)
+            log_cells = fit.log_cells
+        self._belief.fix_rest_wires()
+        self._rest_wires_log_std = float(fit.wires_log_std.max())
+        return log_cells, np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
 
 
 class TouchEstimator(JointEstimator):
@@ -239,9 +224,12 @@ class TouchEstimator(JointEstimator):
     name: ClassVar[str] = "touch"
 
     def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
-        found = None if self.knowledge.rest_ratio is None else touches.explain()
-        if found is None or found.cell_std[found.cells].max(initial=0.0) > HIDDEN:
+        """The answer of these few touches; None if they leave something open, or one uncertain."""
+        touched = None if self.knowledge.rest_ratio is None else touches.explain()
+        if touched is None:
+            return None
+        if touched.log_cells_std[touched.cells].max(initial=0.0) > HIDDEN_LOG:
             return None
         if not ports.fault:
-            self._learn(found, ports)
-        return found
+            self._belief.after_fit(touched, ports)
+        return touched

@@ -18,21 +18,25 @@ I      (RC,)    port currents per Vdd                                           
 s      (RC,)    their noise: of the readings, of cells at rest and wires           S
 r      (RC,)    residual (I_read - I) / s                                          1
 J      (k, RC)  dI / dx / s                                                        1
-Jw     (m, W)   dI / dw / s P^1/2, w the log wire resistances, at the ports they matter
-N      (m, m)   1 + Jw Jw^T; P is the covariance of w, W = 2RC + 2                           1
+A      (k, k)   J J^T and the precision of the prior of x                          1
+W      (m, n)   dI / dw / s P^1/2, w the log wire resistances, P their covariance, 1
+                at the m ports they matter to; n = 2RC + 2
+S      (m, m)   covariance of r at these ports with wires in it, 1 + W W^T         1
 ====== ======== ================================================================== ==========
 
 The untouched skin is solved once. Added conductances are a change of rank k (Woodbury):
 
     q = (diag(1/d) + M_kk)^-1 H_k ,   rho = rho0 - sum_k H_k q ,   v = H - M_k^T q ,
 
-over the touched cells v_k = q / d. All derivatives follow: d rho / d g_e = -v_e^2 (Tellegen).
+over the touched cells v_k = q / d. All derivatives follow: d rho / d g_e = -v_e^2 (Tellegen). At
+far ends, where a port is driven and sensed at different ends, H, q and v of the sensed ends take
+the place of one factor of each product.
 
 A frame starts from no touched cells. Gauss-Newton steps on x minimise |r|^2 and the prior of the
 cells. Where a reading then shows more current than the model explains, the cells that would explain
 most in their row and column are added, until no reading asks for one; a cell that falls back to
 rest is taken out. The last steps know that wires are known to P only, and weigh the readings by
-N^-1.
+S^-1.
 """
 
 from dataclasses import dataclass
@@ -40,40 +44,56 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, port_difference, wire_current
-from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
+from ohmskin.circuit.small import (
+    cholesky,
+    gram,
+    inverse,
+    solve,
+    solve_lower,
+    solve_positive,
+)
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    CLOSE,
+    CLOSE_STDS,
     HIGHEST_TOUCH_SIEMENS,
     LAYER_STD,
+    MAX_CHI2,
     MAX_ITERATIONS,
-    MAX_STEP,
-    MISFIT,
+    MAX_STEP_LOG,
     SEGMENT_STD,
-    TOUCHED,
+    TOUCHED_STDS,
     UNLIMITED_STD,
     CellPrior,
-    Lesson,
-    WireBelief,
-    path_ohm,
 )
+from ohmskin.estimate.wire_belief import Lesson, WireBelief, path_ohm
 
 Cells = NDArray[np.intp]
 
-MOST_PER_LINE: Final = 0.5  # touches a row and column, on average; a fingertip covers more
-DEMAND: Final = 4.0  # deviations of a residual: a larger one asks for its cell
-SHARE: Final = 0.5  # of the largest rise in its row and column: a cell with less is not added
-HEAVY: Final = 0.1  # share of a reading's noise: wires matter to it if they may move it by more
-_HIGHEST_LOG: Final = float(np.log(MAX_CELL_SIEMENS))
+# `make ablate` tries half, twice and none of each number; docs/estimate.md says what each earns.
+
+# Touches a row and column, on average, that are still few; a fingertip covers more.
+MAX_TOUCHES_PER_LINE: Final = 0.5
+# A reading that shows more current than the model by so many deviations asks for its cell.
+DEMAND_STDS: Final = 4.0
+# A cell that asks for less than this share of the most in its row and column is a ghost of that.
+RIVAL_SHARE: Final = 0.5
+# Wires matter to a reading if they may move it by more than this share of its noise.
+HEAVY_SHARE: Final = 0.1
+_HIGHEST_LOG_SIEMENS: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
 class RestNetwork(PortCircuit):
-    """rho0, H and M of cells (R, C) [S] that all conduct, and wires [ohm], one number a layer."""
+    """rho0, H and M of cells (R, C) [S] that all conduct, and wires [ohm], one number a layer.
+
+    cell_siemens: the cells, (RC,).
+    port_volt, sense_volt: H by the driven and by the sensed ends of the ports, (cells, ports).
+    cell_volt: M, (RC, RC).
+    own_...: their diagonals, each cell at its own port; own_slope: -d rho / d g there, (RC,).
+    """
 
     def __init__(
         self,
@@ -92,10 +112,11 @@ class RestNetwork(PortCircuit):
             self.sense_volt = port_difference(sensed, self.rows).T
         # Currents through cells, by voltages inserted in series with them: with A = sqrt(g) (1 +
         # sqrt(g) K sqrt(g))^-1 sqrt(g) they are A - A E^T Z E A, of which E A is `per_potential`.
-        inverse, _ = lapack.dpotri(self.factor, lower=1)
-        in_series = np.tril(inverse) + np.tril(inverse, -1).T
+        in_series = inverse(self.factor)
         in_series *= np.sqrt(siemens) * np.sqrt(siemens)[:, None]
         in_series -= self.per_potential @ (lines * siemens)
+        # A current forced through cell f acts as 1 / g_f volts per ampere in series with it
+        # (Norton). Over the cell itself that voltage stands as well.
         self.cell_volt = -in_series / siemens / siemens[:, None]
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
         self.own_port_volt = self.port_volt.diagonal()
@@ -103,8 +124,11 @@ class RestNetwork(PortCircuit):
         self.own_slope = self.own_port_volt * self.own_sense_volt
         self.own_cell_volt = self.cell_volt.diagonal()
 
-    def wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
-        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC)."""
+    def by_wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
+        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC).
+
+        cell_current, sense_current: of a current through the driven ends, and the sensed ends.
+        """
         slopes = wire_current(cell_current.reshape(-1, *self.shape))
         if any(self.far):
             sensed = wire_current(sense_current.reshape(-1, *self.shape))
@@ -122,7 +146,8 @@ class RestNetwork(PortCircuit):
 class TouchedNetwork:
     """A `RestNetwork` with conductances `added` (k,) > 0 [S] at `cells` (k,).
 
-    port_ohm: rho (RC,). volt, sense_volt: v and v' of the touched cells (k, RC).
+    port_ohm: rho, (RC,).
+    volt, sense_volt: v of the touched cells by the driven, and by the sensed ends, (k, RC).
     """
 
     def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
@@ -130,51 +155,58 @@ class TouchedNetwork:
         port_volt, sense_volt = rest.port_volt[cells], rest.sense_volt[cells]
         self._system = rest.cell_volt[cells[:, None], cells]
         self._system.ravel()[:: cells.size + 1] += 1.0 / added
-        _, self._current, _ = lapack.dposv(self._system, port_volt, lower=1)
-        self._sensed, self.volt = self._current, self._current / added[:, None]
+        self._drawn = solve_positive(self._system, port_volt)
+        self._sense_drawn, self.volt = self._drawn, self._drawn / added[:, None]
         self.sense_volt = self.volt
         if any(rest.far):
-            _, self._sensed, _ = lapack.dposv(self._system, sense_volt, lower=1)
-            self.sense_volt = self._sensed / added[:, None]
-        self.port_ohm = rest.port_ohm - (sense_volt * self._current).sum(axis=0)
+            self._sense_drawn = solve_positive(self._system, sense_volt)
+            self.sense_volt = self._sense_drawn / added[:, None]
+        self.port_ohm = rest.port_ohm - (sense_volt * self._drawn).sum(axis=0)
 
     def own_slope(self, cells: Cells) -> tuple[Float, Float]:
-        """Of some cells, each at its own port, v v'; and what is diagonal in the touched M."""
+        """-d rho / d g of some cells, each at its own port; and the diagonal of the touched M."""
         rest, coupling = self._rest, self._rest.cell_volt[self._cells[:, None], cells]
-        _, drawn, _ = lapack.dposv(self._system, coupling, lower=1)
-        port = rest.own_port_volt[cells] - (coupling * self._current[:, cells]).sum(axis=0)
+        drawn = solve_positive(self._system, coupling)
+        port = rest.own_port_volt[cells] - (coupling * self._drawn[:, cells]).sum(axis=0)
         slope = port * port
         if any(rest.far):
-            sensed = (coupling * self._sensed[:, cells]).sum(axis=0)
+            sensed = (coupling * self._sense_drawn[:, cells]).sum(axis=0)
             slope = port * (rest.own_sense_volt[cells] - sensed)
         return slope, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
 
     def cell_current(self, ports: Cells) -> tuple[Float, Float]:
-        """Current through all cells per current through some ports, and sensed there, (m, RC)."""
+        """Currents through all cells per current through some ports, (m, RC): driven, sensed."""
         rest, between = self._rest, self._rest.cell_volt[self._cells]
         siemens = rest.cell_siemens.copy()
         siemens[self._cells] += self._added
         current: Float = rest.port_volt.T[ports]
-        current -= self._current.T[ports] @ between
+        current -= self._drawn.T[ports] @ between
         current *= siemens
         if not any(rest.far):
             return current, current
-        return current, (rest.sense_volt.T[ports] - self._sensed.T[ports] @ between) * siemens
+        return current, (rest.sense_volt.T[ports] - self._sense_drawn.T[ports] @ between) * siemens
 
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """What was found: cells (k,), and what a `FullFit` says as well.
+    """What a few touches explain: the answer of `touch`, with what a `FullFit` says as well.
 
-    lesson: what the wires can learn from: slopes of the m ports by the layers, r, and the factor of
-    N, the touched cells in it as noise without limit.
+    cells: which are touched, (k,).
+    log_cells: log resistances of all cells, (RC,) [log ohm].
+    log_cells_std: their deviation, (RC,).
+    wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
+    log_wires: log resistances of the segments, as they were believed, (2RC,) [log ohm].
+    modelled: port currents of the model, (RC,) [S].
+    iterations: steps taken.
+    lesson: what the readings say of the wires.
+    misfit: 0: readings that these touches do not explain are not answered by them.
     """
 
     cells: Cells
-    cell: Float
-    cell_std: Float
-    by_layers: Float
-    wires: Float
+    log_cells: Float
+    log_cells_std: Float
+    wires_log_std: Float
+    log_wires: Float
     modelled: Float
     iterations: int
     lesson: Lesson
@@ -182,18 +214,22 @@ class Touched:
 
 
 class SparseFit:
-    """Fits the frames of a skin (R, C), each by itself."""
+    """Fits the frames of a skin (R, C), each by itself.
 
-    def __init__(
-        self,
-        prior: CellPrior,
-        belief: WireBelief,
-        ref_ohm: float,
-        far: tuple[bool, bool] = (False, False),
-    ) -> None:
-        self.prior, self.belief, self.ref_ohm, self.far = prior, belief, ref_ohm, far
-        self.most = MOST_PER_LINE * sum(belief.shape)  # with more touches, they are not few
-        self.least_log = -prior.expected + TOUCHED * prior.std
+    most: touches that are still few; with more, a frame is not for it.
+    least_log_siemens: log conductances from which cells are touched, (RC,).
+    log_layers: logs of the layers' segments that the untouched skin was solved with, (2,).
+    net: the untouched skin.
+    current: its port currents per Vdd, (RC,) [S].
+    model_variance: of these, by the drift of cells and by what is not known of wires, (RC,) [S^2].
+    path_ohm: wires between each cell and its sensed ends, (RC,).
+    wire_std: deviation of the log of a wire segment.
+    """
+
+    def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
+        self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
+        self.most = MAX_TOUCHES_PER_LINE * sum(belief.shape)
+        self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
         self._solve_rest()
 
     def _solve_rest(self) -> None:
@@ -201,48 +237,56 @@ class SparseFit:
         prior, belief = self.prior, self.belief
         self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), far=self.far)
+        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), far=belief.far)
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         siemens = net.cell_siemens[:, None]
+        # dI / d log r is I^2 times d rho / d log r: of cells v v' g, of wires by Tellegen likewise.
         by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
         currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
-        wires = net.wires_of(np.arange(siemens.size), *currents)
-        # Cells drift and skins bend after their rest readings [S^2].
-        self.slack = prior.std**2 @ (by_cell * by_cell)
-        root = belief.root(wires * (self.current**2)[:, None])
-        self.slack += np.einsum("ij,ij->i", root, root)
-        self.path_ohm = path_ohm(*belief.layers(belief.mean), far=self.far)
-        self.wire_std = float(np.hypot(belief.std(), SEGMENT_STD))
+        by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
+        per_std = belief.per_std(by_wire * (self.current**2)[:, None])
+        self.model_variance = prior.std**2 @ (by_cell * by_cell)
+        self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
+        self.path_ohm = path_ohm(*belief.segment_ohm(belief.mean), far=belief.far)
+        self.wire_std = float(np.hypot(belief.layer_std(), SEGMENT_STD))
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""
-        # Wires up to sensed far ends are not in the readings.
-        most = LAYER_STD if all(self.far) else SEGMENT_STD
-        if np.abs(self.belief.log_layers - self.log_layers).max() > 0.5 * most:
+        # Small changes of the wires are corrected in each frame (`explain`), to first order. Larger
+        # ones need a new solution. Readings of two far ends have no wires of their own lines in
+        # them, so there a change has to be larger before it matters.
+        least_log = 0.5 * (LAYER_STD if all(self.belief.far) else SEGMENT_STD)
+        if np.abs(self.belief.log_layers - self.log_layers).max() > least_log:
             self._solve_rest()
         frame = FewTouches(self, ports)
         # Never from the frame before: that keeps cells in the model that no reading asks for.
-        frame.settle(np.zeros(0, dtype=np.intp), np.zeros(0))
+        frame.converge(np.zeros(0, dtype=np.intp), np.zeros(0))
         for _ in range(MAX_ITERATIONS):
-            asked, rise = frame.asked_for()
+            asked, added_siemens = frame.asked_for()
             if not asked.size:
                 return frame if frame.cells.size <= self.most else None
             cells = np.concatenate([frame.cells, asked])
-            # Ghosts among them may leave again.
+            # Twice as many may be in the model for a while: ghosts among them leave again.
             if cells.size > 2 * self.most:
                 return None
-            added = np.log(self.net.cell_siemens[asked] + rise)
-            frame.settle(cells, np.concatenate([frame.log_siemens, added]))
+            log_siemens = np.log(self.net.cell_siemens[asked] + added_siemens)
+            frame.converge(cells, np.concatenate([frame.log_siemens, log_siemens]))
         return None
 
 
 class FewTouches:
-    """One frame: the cells in the model, and all that follows from them."""
+    """One frame: the cells in the model, and all that follows from them.
+
+    cells: touched cells, (k,).
+    log_siemens: x, (k,).
+    steps: Gauss-Newton steps taken.
+    """
 
     def __init__(self, skin: SparseFit, ports: PortReadings) -> None:
         self._skin = skin
         self._measured, self._reading_std = ports.current.ravel(), ports.current_std.ravel()
-        self._loose_std = np.sqrt(self._reading_std**2 + skin.slack)
+        # s, approximately: cells at rest and wires have moved an untouched skin's currents.
+        self._approximate_std = np.sqrt(self._reading_std**2 + skin.model_variance)
         self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.ref_ohm
         self.steps = 0
 
@@ -251,60 +295,62 @@ class FewTouches:
         skin = self._skin
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
-        self._std = self._loose_std
+        self._std = self._approximate_std
         self._touched: TouchedNetwork | None = None
         self._current = skin.current
         if cells.size:
             added = self._siemens - skin.net.cell_siemens[cells]
             self._touched = TouchedNetwork(skin.net, cells, added)
             self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
-            self._std = self._loose_std.copy()
+            # A touched cell explains its own port, so nothing else has to be noise there.
+            self._std = self._approximate_std.copy()
             self._std[cells] = self._reading_std[cells]
         self._residual = (self._measured - self._current) / self._std
 
-    def settle(self, cells: Cells, log_siemens: Float) -> None:
+    def converge(self, cells: Cells, log_siemens: Float) -> None:
         """Steps from here until none matters; cells that fall back to rest leave."""
-        self._place(cells, np.maximum(log_siemens, self._skin.least_log[cells]))
+        self._place(cells, np.maximum(log_siemens, self._skin.least_log_siemens[cells]))
         for _ in range(MAX_ITERATIONS):
             if not self.cells.size:
                 return
             slopes = self._slopes()
             moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
-            moved = np.minimum(moved, _HIGHEST_LOG)
-            stays = moved > self._skin.least_log[self.cells]
+            moved = np.minimum(moved, _HIGHEST_LOG_SIEMENS)
+            stays = moved > self._skin.least_log_siemens[self.cells]
             self._place(self.cells[stays], moved[stays])
             if is_last and stays.all():
                 return
 
     def _slopes(self) -> Float:
-        """J, (k, RC)."""
+        """J, (k, RC): dI / dx = I^2 v v' g."""
         assert self._touched is not None
         slopes = self._touched.volt * self._touched.sense_volt
         return np.asarray(slopes * self._siemens[:, None] * (self._current**2 / self._std))
 
-    def _stepped(self, normal: Float, pull: Float) -> tuple[Float, bool]:
-        """x after the step of J J^T and J r (k,), and whether that is the last that matters.
+    def _stepped(self, system: Float, pull: Float) -> tuple[Float, bool]:
+        """x after a step, (k,), and whether that is the last that matters.
 
-        The prior about rest is added onto the normal matrix J J^T.
+        system: J J^T, (k, k), onto which the precision of the prior is added: it becomes A.
+        pull: J r, (k,).
         """
         centre, variance = self._skin.prior.normal(-self.log_siemens, self.cells)
-        away, precision = self.log_siemens + centre, 1.0 / variance
-        normal.ravel()[:: self.cells.size + 1] += precision
-        _, step, _ = lapack.dposv(normal, pull - away * precision, lower=1)
+        from_rest, precision = self.log_siemens + centre, 1.0 / variance
+        system.ravel()[:: self.cells.size + 1] += precision
+        step = solve_positive(system, pull - from_rest * precision)
         self.steps += 1
-        is_last = (step * step * normal.diagonal()).max() < CLOSE**2
-        step = np.minimum(np.maximum(step, -MAX_STEP), MAX_STEP)  # faster than np.clip
+        is_last = (step * step * system.diagonal()).max() < CLOSE_STDS**2
+        step = np.minimum(np.maximum(step, -MAX_STEP_LOG), MAX_STEP_LOG)  # faster than np.clip
         return self.log_siemens + step, bool(is_last)
 
     def asked_for(self) -> tuple[Cells, Float]:
-        """Cells that readings ask for, and the conductance that each, alone, would need [S].
+        """Cells that readings ask for, and what each, alone, would have to add [S].
 
-        A current above the model's by `DEMAND` asks for its cell. Of these only such count that
-        need at least `SHARE` of the largest rise in their row and column: a ghost needs less, as
+        A current above the model's by `DEMAND_STDS` asks for its cell. Of these only such count
+        that add at least `RIVAL_SHARE` of the most in their row and column: a ghost adds less, as
         its current passes three touches in series.
         """
         skin, net = self._skin, self._skin.net
-        asks = self._residual > DEMAND
+        asks = self._residual > DEMAND_STDS
         asks[self.cells] = False
         asked = asks.nonzero()[0]
         if not asked.size:
@@ -313,83 +359,104 @@ class FewTouches:
         if self._touched is not None:
             slope, cell_volt = self._touched.own_slope(asked)
             port_ohm = self._touched.port_ohm
-        # From rho = target for one cell more.
-        target = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
-        need = slope / np.maximum(port_ohm[asked] - target, 1e-9) - cell_volt
-        rise = 1.0 / np.maximum(need, 1.0 / HIGHEST_TOUCH_SIEMENS)
-        map_ = np.zeros(net.shape)
-        map_.ravel()[asked] = rise
-        rival = np.maximum(map_.max(axis=1, keepdims=True), map_.max(axis=0)).ravel()[asked]
-        most = rise >= SHARE * rival
-        return asked[most], rise[most]
+        # A port cannot have less than its wires. A reading that shows less by noise, or because
+        # wires are shorter than believed, asks for a very hard touch, and not for a negative one.
+        target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
+        # One cell more is a change of rank 1: rho - target = slope / (1 / d + M), solved for 1 / d.
+        added_ohm = slope / np.maximum(port_ohm[asked] - target_ohm, 1e-9) - cell_volt
+        added_siemens = 1.0 / np.maximum(added_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
+        by_cell = np.zeros(net.shape)
+        by_cell.ravel()[asked] = added_siemens
+        rival = np.maximum(by_cell.max(axis=1, keepdims=True), by_cell.max(axis=0)).ravel()[asked]
+        counts = added_siemens >= RIVAL_SHARE * rival
+        return asked[counts], added_siemens[counts]
 
     @property
-    def cell(self) -> Float:
+    def log_cells(self) -> Float:
         """Log resistances of all cells, (RC,)."""
-        cell = self._skin.prior.expected.copy()
-        cell[self.cells] = -self.log_siemens
-        return cell
+        log_cells = self._skin.prior.expected.copy()
+        log_cells[self.cells] = -self.log_siemens
+        return log_cells
 
     def explain(self) -> Touched | None:
-        """The last steps, with wires known to their covariance only; None if they contradict."""
-        skin, cells = self._skin, self.cells
-        if not cells.size:
-            nothing = (np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0)))
-            less = self._residual.min() < -DEMAND
-            return None if less else self._answer(np.zeros((0, 0)), 0.0, self._current, nothing)
+        """The last steps, with wires known to their covariance only.
+
+        None if the readings reject these touches: they leave more than noise, or show less current
+        than touches of no other cell could explain.
+        """
+        if not self.cells.size:
+            return self._nothing_touched()
+        # Where wires matter, S^-1 weighs the readings; elsewhere their noise does, which is cheap.
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpened(ports)
         covariance = gram(wires, onto=np.eye(ports.size, order="F"))
         factor = cholesky(covariance)
-        offset = skin.belief.moved(wires[:, -2:], skin.log_layers)
-        for _ in range(2):
+        # What the wires have been learned to be since the untouched skin was solved.
+        offset = self._skin.belief.moved_since(self._skin.log_layers, wires[:, -2:])
+        for _ in range(2):  # the start is near, so the second step hardly ever matters
             slopes = self._slopes()
             residual = self._residual[ports] - offset
-            of_touches = slopes[:, ports]
-            own = solve_lower(factor, of_touches.T)
-            rest = solve_lower(factor, residual)
-            free = slopes[:, light]
-            normal = free @ free.T + own.T @ own
-            pull = free @ self._residual[light] + rest @ own
-            moved, is_last = self._stepped(normal, pull)
-            self._place(cells, np.minimum(np.maximum(moved, skin.least_log[cells]), _HIGHEST_LOG))
+            heavy_slopes, light_slopes = slopes[:, ports], slopes[:, light]
+            # With L L^T = S: J S^-1 J^T, and J S^-1 r.
+            whitened = solve_lower(factor, heavy_slopes.T)
+            system = light_slopes @ light_slopes.T + whitened.T @ whitened
+            pull = light_slopes @ self._residual[light] + solve_lower(factor, residual) @ whitened
+            moved, is_last = self._stepped(system, pull)
+            least = self._skin.least_log_siemens[self.cells]
+            self._place(self.cells, np.minimum(np.maximum(moved, least), _HIGHEST_LOG_SIEMENS))
             if is_last:
                 break
         residual = self._residual[ports] - offset
-        left = solve(factor, residual)
-        if residual @ left > MISFIT * ports.size:
+        weighted_residual = solve(factor, residual)
+        if residual @ weighted_residual > MAX_CHI2 * ports.size:
             return None
-        if self._residual[light].min(initial=0.0) < -DEMAND:
+        if self._residual[light].min(initial=0.0) < -DEMAND_STDS:
             return None
-        current = self._current.copy()
-        current[ports] += (residual - left + offset) * self._std[ports]
-        of_cells = solve(cholesky(normal), np.eye(cells.size))
-        of_layers = of_cells @ own.T @ solve_lower(factor, wires[:, -2:])
-        unlimited = cholesky(gram(UNLIMITED_STD * of_touches.T, onto=covariance))
-        by_layers = np.hypot(*of_layers.T)
-        return self._answer(of_cells, by_layers, current, (wires[:, -2:], residual, unlimited))
+        # Of a residual of covariance S, S^-1 times it is noise. The rest is wires, and the model's.
+        modelled = self._current.copy()
+        modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
+        covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))
+        by_layers = covariance_of_cells @ whitened.T @ solve_lower(factor, wires[:, -2:])
+        # The lesson's S: whatever these touches are, they are noise without limit.
+        unlimited = cholesky(gram(UNLIMITED_STD * heavy_slopes.T, onto=covariance))
+        lesson = Lesson(wires[:, -2:], residual, unlimited)
+        return self._answer(covariance_of_cells, np.hypot(*by_layers.T), modelled, lesson)
+
+    def _nothing_touched(self) -> Touched | None:
+        """The answer if no cell is touched; None if a current is below an untouched skin's."""
+        if self._residual.min() < -DEMAND_STDS:
+            return None
+        lesson = Lesson(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0)))
+        return self._answer(np.zeros((0, 0)), np.zeros(0), self._current, lesson)
 
     def _answer(
-        self, covariance: Float, by_layers: Float | float, current: Float, lesson: Lesson
+        self, covariance: Float, wires_log_std: Float, modelled: Float, lesson: Lesson
     ) -> Touched:
+        """covariance, wires_log_std: of the touched cells. Others have their prior's deviation."""
         prior, cells = self._skin.prior, self.cells
-        std, by_all = prior.std.copy(), np.zeros(current.size)
+        std, by_wires = prior.std.copy(), np.zeros(modelled.size)
         std[cells] = np.sqrt(covariance.diagonal())
-        by_all[cells] = by_layers
+        by_wires[cells] = wires_log_std
         wires = self._skin.belief.mean
-        return Touched(cells, self.cell, std, by_all, wires, current, self.steps, lesson)
+        return Touched(cells, self.log_cells, std, by_wires, wires, modelled, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
-        """Whether wires matter to a port, (RC,): to those of the touched cells they always do."""
+        """Whether wires matter to a port, (RC,): to those of the touched cells they always do.
+
+        Touches let more current through the port's own wires: I^2 path is what these take of it.
+        """
         skin = self._skin
         move = (self._current**2 - skin.current**2) * skin.path_ohm * skin.wire_std
-        heavy: NDArray[np.bool_] = move > HEAVY * self._std
+        heavy: NDArray[np.bool_] = move > HEAVY_SHARE * self._std
         heavy[self.cells] = True
         return heavy
 
     def _sharpened(self, ports: Cells) -> Float:
-        """Jw; takes the drift of cells at rest from the touched network at these ports."""
+        """W at these ports. Their s, from here on, is that of the touched network.
+
+        There it has the drift of cells at rest alone: wires are in S.
+        """
         assert self._touched is not None
         skin, net = self._skin, self._skin.net
         currents, sensed = self._touched.cell_current(ports)
@@ -397,11 +464,11 @@ class FewTouches:
         by_cell = currents * sensed / net.cell_siemens
         by_cell[:, self.cells] = 0.0
         by_cell *= skin.prior.std
-        slack = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
-        self._std[ports] = np.sqrt(self._reading_std[ports] ** 2 + slack)
+        model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
+        self._std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
         self._std[self.cells] = self._reading_std[self.cells]
-        self._loose_std = self._std
+        self._approximate_std = self._std
         self._residual = (self._measured - self._current) / self._std
-        wires = net.wires_of(ports, currents, sensed)
-        wires *= -(square / self._std[ports])[:, None]
-        return skin.belief.root(wires)
+        by_wire = net.by_wires_of(ports, currents, sensed)
+        by_wire *= -(square / self._std[ports])[:, None]
+        return skin.belief.per_std(by_wire)
