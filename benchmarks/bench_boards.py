@@ -27,14 +27,9 @@ from __future__ import annotations
 
 import json
 import os
-import select
-import subprocess
 import sys
 import time
-import tty
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -42,9 +37,10 @@ import numpy as np
 from bars import at_least, at_most, report  # beside this file
 from bench_force import PRESSES, board_8x8, calibration
 from numpy.typing import NDArray
+from served import serve, served  # beside this file
 
 import ohmskin
-from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import load_readings
 
@@ -62,7 +58,8 @@ class CheapBoard(EmulatedBoard):
 
     def __init__(self, codes: NDArray[np.uint16], unit_id: int) -> None:
         self.made = codes
-        super().__init__(lambda *_: codes[0] / 1024, 8, 8, rate_hz=RATE_HZ, unit_id=unit_id)
+        settings = BoardSettings(rate_hz=RATE_HZ, unit_id=unit_id)
+        super().__init__(lambda *_: codes[0] / 1024, settings)
 
     def codes_at(self, time_s: float, mode: str = "near") -> NDArray[np.uint16]:
         return self.made[round(time_s * RATE_HZ) % len(self.made)]
@@ -74,68 +71,19 @@ def made_codes() -> NDArray[np.uint16]:
     return quantise(ratio + NOISE_LSB / 1024 * random.standard_normal(ratio.shape))
 
 
-def serve(count: int) -> None:
-    """Serve so many boards until stdin closes: print their ports, and at the end what was."""
-    codes = made_codes()
-    boards: dict[int, CheapBoard] = {}
-    dropped = 0
-    for unit_id in range(1, count + 1):
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        os.set_blocking(master, False)
-        boards[master] = CheapBoard(np.roll(codes, 97 * unit_id, axis=0), unit_id)
-        print(os.ttyname(slave), flush=True)
-    begin_s, before = time.monotonic(), os.times()
-    while True:
-        due_s = [board.next_scan_s for board in boards.values()]
-        wake_s = min((due for due in due_s if due is not None), default=float("inf"))
-        wait_s = min(max(0.0, wake_s - (time.monotonic() - begin_s)), 0.2)
-        ready = select.select([*boards, sys.stdin], [], [], wait_s)[0]
-        if sys.stdin in ready:
-            break
-        now_s = time.monotonic() - begin_s
-        for master, board in boards.items():
-            octets = board.advance(now_s)
-            if master in ready:
-                board.receive(os.read(master, 4096))
-                octets += board.advance(now_s)
-            if octets:
-                try:
-                    dropped += len(octets) - os.write(master, octets)
-                except BlockingIOError:
-                    dropped += len(octets)
+def serve_boards() -> None:
+    """Serve the boards, and print at the end what was."""
+    codes, before, begin_s = made_codes(), os.times(), time.monotonic()
+    shifted = (np.roll(codes, 97 * unit_id, axis=0) for unit_id in range(1, BOARDS + 1))
+    servers = serve([CheapBoard(made, unit_id) for unit_id, made in enumerate(shifted, start=1)])
     after, end_s = os.times(), time.monotonic()
     used_s = (after.user - before.user) + (after.system - before.system)
-    percent = 100 * used_s / (end_s - begin_s)
-    print(json.dumps({"begin_s": begin_s, "dropped": dropped, "cpu_percent": percent}))
-
-
-class Served:
-    """Boards in another process. ports: theirs. said: afterwards, what `serve` printed."""
-
-    def __init__(self, count: int) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, __file__, "--serve", str(count)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self._process.stdout is not None
-        self.ports = [self._process.stdout.readline().strip() for _ in range(count)]
-        self.said: dict[str, float] = {}
-
-    def end(self) -> None:
-        out, _ = self._process.communicate(timeout=20)
-        self.said = json.loads(out)
-
-
-@contextmanager
-def served(count: int) -> Iterator[Served]:
-    boards = Served(count)
-    try:
-        yield boards
-    finally:
-        boards.end()
+    said = {
+        "begins_s": [server.begin_s for server in servers],
+        "dropped": sum(server.lost_bytes for server in servers),
+        "cpu_percent": 100 * used_s / (end_s - begin_s),
+    }
+    print(json.dumps(said))
 
 
 # --------------------------------------------------------------------------------- measurement
@@ -150,7 +98,7 @@ def measure(minutes: float) -> dict[str, Any]:
     counts, missed, pressed = Counter[int](), 0, 0
     ages_s, times_s = [], []
     with (
-        served(BOARDS) as emulated,
+        served(__file__, BOARDS) as emulated,
         ohmskin.open_all(emulated.ports, calibrations=calibrations) as skins,
     ):
         before, begin_s = os.times(), time.monotonic()
@@ -161,15 +109,16 @@ def measure(minutes: float) -> dict[str, Any]:
             pressed += bool(each.scan.contacts)
             ages_s.append(now_s - each.scan.host_time_s)
             if now_s - begin_s > SETTLED_S:
-                times_s.append((each.scan.time_us, each.time_s))
+                times_s.append((each.unit_id, each.scan.time_us, each.time_s))
             if now_s - begin_s >= 60 * minutes:
                 break
         after, end_s = os.times(), time.monotonic()
         lost = [skin.stats.overflowed + skin.stats.line.damaged for skin in skins.values()]
     took_s = end_s - begin_s
     used_s = (after.user - before.user) + (after.system - before.system)
-    board_us, time_s = np.array(times_s).T
-    middle_s = emulated.said["begin_s"] + 1e-6 * board_us + 0.5 / RATE_HZ
+    unit_id, board_us, time_s = np.array(times_s).T
+    begin_s = np.array(emulated.said["begins_s"])[unit_id.astype(int) - 1]
+    middle_s = begin_s + 1e-6 * board_us + 0.5 / RATE_HZ
     error_ms, age_ms = 1e3 * np.abs(time_s - middle_s), 1e3 * np.array(ages_s)
     return {
         "boards": len(counts),
@@ -201,7 +150,7 @@ BARS = (
 
 def main() -> int:
     if sys.argv[1:2] == ["--serve"]:
-        serve(int(sys.argv[2]))
+        serve_boards()
         return 0
     minutes = float(sys.argv[sys.argv.index("--minutes") + 1]) if "--minutes" in sys.argv else 5.0
     figures = measure(minutes)

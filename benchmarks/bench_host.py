@@ -29,23 +29,21 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
-import tty
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from bars import at_least, at_most, report  # beside this file
+from served import serve, served  # beside this file
 
 import ohmskin
-from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.faults import LineFaults
 from ohmskin.errors import PortError
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import BoardDecoder, Scan
@@ -59,68 +57,34 @@ LATENCY_SCANS = 400
 CPU_SECONDS = 6.0
 CPU_RUNS = 3
 RECORD_SECONDS = 10.0
-SERVE_SECONDS = "60"  # at most: this process ends it sooner
 
 # ------------------------------------------------------------------- the board, another process
 
 
-def serve(seconds: float) -> None:
-    """Serve an emulated board: print its port, then, when stdin closes, when it wrote each scan."""
-    ratio = np.random.default_rng(0).random((8, 8, 4))
-    board = EmulatedBoard(lambda *_: ratio, 8, 8, rate_hz=RATE_HZ)
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    print(os.ttyname(slave), flush=True)
-    begin_s = time.monotonic()
-    written: list[tuple[float, bytes]] = []
-    while (now_s := time.monotonic() - begin_s) < seconds:
-        octets = board.advance(now_s)
-        if octets:
-            written.append((time.monotonic(), octets))
-            os.write(master, octets)
-        due = board.next_scan_s
-        wait_s = 0.2 if due is None else max(0.0, due - (time.monotonic() - begin_s))
-        ready = select.select([master, sys.stdin], [], [], wait_s)[0]
-        if sys.stdin in ready:
-            break
-        if master in ready:
-            board.receive(os.read(master, CHUNK_BYTES))
+class NotedLine(LineFaults):
+    """A line without faults. passed: when octets began to be written [s], and these."""
+
+    def __post_init__(self) -> None:
+        self.passed: list[tuple[float, bytes]] = []
+
+    def apply(self, chunk: bytes, now_s: float) -> bytes:
+        if chunk:
+            self.passed.append((time.monotonic(), chunk))
+        return chunk
+
+
+def serve_noted() -> None:
+    """Serve a board, and print at the end when each scan was written."""
+    ratio, line = np.random.default_rng(0).random((8, 8, 4)), NotedLine()
+    serve([EmulatedBoard(lambda *_: ratio, BoardSettings(rate_hz=RATE_HZ))], line)
     decoder = BoardDecoder()
     times_s = {
         message.number: host_time_s
-        for host_time_s, octets in written
+        for host_time_s, octets in line.passed
         for message in decoder.feed(octets, host_time_s)
         if isinstance(message, Scan)
     }
     print(json.dumps(times_s))
-
-
-class Served:
-    """A board in another process. `path`: its port. `written_s`: afterwards, times by scan."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, __file__, "--serve", SERVE_SECONDS],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self._process.stdout is not None
-        self.path = self._process.stdout.readline().strip()
-        self.written_s: dict[int, float] = {}
-
-    def end(self) -> None:
-        out, _ = self._process.communicate(timeout=20)
-        self.written_s = {int(number): time_s for number, time_s in json.loads(out).items()}
-
-
-@contextmanager
-def served() -> Iterator[Served]:
-    board = Served()
-    try:
-        yield board
-    finally:
-        board.end()
 
 
 # -------------------------------------------------------------------------------- measurements
@@ -154,11 +118,11 @@ def decode_rate(codes: Callable[[int], np.ndarray]) -> float:
 def latencies_ms() -> np.ndarray:
     """Of every scan that `latest` gave out."""
     returned_s: dict[int, float] = {}
-    with served() as board, ohmskin.open(board.path) as skin:
+    with served(__file__) as board, ohmskin.open(board.ports[0]) as skin:
         for _ in range(LATENCY_SCANS):
             scan = skin.latest()
             returned_s[scan.number] = time.monotonic()
-    return np.array([1e3 * (at_s - board.written_s[n]) for n, at_s in returned_s.items()])
+    return np.array([1e3 * (at_s - board.said[str(n)]) for n, at_s in returned_s.items()])
 
 
 def reader_cpu_percent(
@@ -186,7 +150,7 @@ def reader_cpu_percent(
 
 def read_cpu_percent() -> float:
     """`reader_cpu_percent` of a served board."""
-    with served() as board, ohmskin.open(board.path) as skin:
+    with served(__file__) as board, ohmskin.open(board.ports[0]) as skin:
         return reader_cpu_percent(skin)
 
 
@@ -194,8 +158,8 @@ def record_cpu_percent() -> float:
     """As `reader_cpu_percent`, of a process that records."""
     with (
         tempfile.TemporaryDirectory() as place,
-        served() as board,
-        ohmskin.open(board.path) as skin,
+        served(__file__) as board,
+        ohmskin.open(board.ports[0]) as skin,
         Recorder(Path(place) / "bench.mcap", skin.info) as recorder,
     ):
         return reader_cpu_percent(skin, recorder.add)
@@ -260,7 +224,7 @@ BARS = (
 
 def main() -> int:
     if sys.argv[1:2] == ["--serve"]:
-        serve(float(sys.argv[2]))
+        serve_noted()
         return 0
     figures = measure()
     all_met = report(figures, BARS)

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
-from ohmskin.emulate.board import DEFAULT_RATE_HZ, EmulatedBoard
+from ohmskin.emulate.board import DEFAULT_RATE_HZ, BoardSettings, EmulatedBoard
+from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.link import protocol
-from ohmskin.link.framing import encode
-from ohmskin.link.messages import BoardDecoder, Scan
+from ohmskin.link.host_clock import SteppedClock
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.press import LEAVE_S, PressModel, robot_presses
 from studies.trials import SPREAD, knowledge_of, skin_at_rest
@@ -232,15 +231,11 @@ class OneFrameBoard:
 
     def __init__(self, shape: tuple[int, int], seed: int, mode: str = "near") -> None:
         self._ratio, self._mode = np.empty(0), mode
-        self._board = EmulatedBoard(
-            lambda _time_s, _mode: self._ratio,
-            *shape,
-            rate_hz=DEFAULT_RATE_HZ,
-            noise_lsb=NOISE_LSB,
-            seed=seed,
-            mode=mode,
+        settings = BoardSettings(*shape, mode=mode, rate_hz=DEFAULT_RATE_HZ)
+        board = EmulatedBoard(
+            lambda _time_s, _mode: self._ratio, settings, noise_lsb=NOISE_LSB, seed=seed
         )
-        self._decoder = BoardDecoder()
+        self._board = SteppedSkin(EmulatorLink(board, clock=SteppedClock()))
 
     def read(self, time_s: float, skin: Skin) -> Float:
         """Readings (R, C, 4) of a frame begun at a time, or when the frame before is over."""
@@ -249,17 +244,7 @@ class OneFrameBoard:
         else:
             every = all_readings(skin, end_admittance(skin))
             self._ratio = every[..., [ENUMS["reading"].values[n] for n in MODES[self._mode]]]
-        board = self._board
-        octets = board.advance(time_s)
-        self._command("start")
-        due_s = board.next_scan_s
-        assert due_s is not None
-        octets += board.advance(due_s)
-        self._command("stop")
-        scans = [m for m in self._decoder.feed(octets, due_s) if isinstance(m, Scan)]
-        assert len(scans) == 1
-        return scans[0].ratio
-
-    def _command(self, name: str) -> None:
-        frame = protocol.FRAMES[name]
-        self._board.receive(encode(frame.id, 0, frame.pack()))
+        self._board.step(time_s - self._board.now_s)
+        scan = self._board.latest()
+        self._board.stop()
+        return scan.ratio

@@ -21,7 +21,8 @@ import second_simulator
 from command_line import ENVIRONMENT, Command, Done, Run
 from lockstep import elf_of
 from ohmskin.cli import main as cli
-from ohmskin.emulate.board import EmulatedBoard, PtyServer
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.driver import PtyServer
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.opening import emulated
 from ports import USB_IDS, Attach, Serve
@@ -80,25 +81,10 @@ def pty_board() -> Iterator[Serve]:
         def serve(of: str | EmulatedBoard, silent_s: float = 0.0) -> PtyServer:
             board, _, faults = emulated(of) if isinstance(of, str) else (of, "", None)
             server = PtyServer(board, faults)
-            done = threading.Event()
-
-            def work() -> None:
-                done.wait(silent_s)
-                while not done.is_set():
-                    server.serve(0.05)
-
-            thread = threading.Thread(target=work, name=f"serve {of}")
+            thread = threading.Timer(silent_s, server.serve)
             thread.start()
-            close_files = server.close
-
-            def close() -> None:
-                if not done.is_set():
-                    done.set()
-                    thread.join()
-                    close_files()
-
-            server.close = close  # type: ignore[method-assign]
-            stack.callback(close)
+            for end in (thread.join, thread.cancel, server.close):  # the last one first
+                stack.callback(end)
             return server
 
         yield serve

@@ -34,7 +34,6 @@ import numpy as np
 import pytest
 
 import ohmskin
-from bench_board import Bench
 from calibrations import of_scene
 from command_line import ENVIRONMENT, Command, Run, finish
 from ohmskin.force.reader import DEFAULT_METHOD
@@ -42,6 +41,7 @@ from ohmskin.record.recording import ForceSample, Tare, load_recording
 from places import ROOT
 from ports import Attach, Serve
 from recordings import HOST_BEGIN_S, record_presses, sensor_log, write_log, write_recording
+from stepped import stepped
 
 PROGRAMS = "ohmskin|make|uv|build/lowest/bin/python|python|pip|pio|npm|sudo|apt-get|export"
 SPAN = re.compile(r"`(ohmskin\s[^`]*(?:PORT|/dev/tty|emulator://|first\.mcap)[^`]*)`")
@@ -243,7 +243,7 @@ def printed_by(
         skin = "plate=plate.csv" if words[1] == "verify" else "scene=rest"
         skin = "scene=corners" if "--press" in words else skin
         url = words[2] if finds else f"emulator://8x8?{skin}"
-        monkeypatch.setattr(ohmskin, "open", lambda *_, **__: Bench(url))
+        monkeypatch.setattr(ohmskin, "open", lambda *_, **__: stepped(url))
     arguments = words[1:]
     if arguments[0] in STOPPED and "--help" not in arguments:
         option, seconds = STOPPED[arguments[0]]

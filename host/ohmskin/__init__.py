@@ -25,6 +25,7 @@ from ohmskin.errors import (
 )
 
 if TYPE_CHECKING:
+    from ohmskin.emulate.driver import SteppedSkin
     from ohmskin.estimate.base import Estimate, Estimator
     from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
     from ohmskin.estimate.methods import METHODS, make_estimator
@@ -62,6 +63,7 @@ __all__ = [
     "Scan",
     "SelfTestReport",
     "SkinKnowledge",
+    "SteppedSkin",
     "TareRefused",
     "WireOhm",
     "load_calibration",
@@ -74,6 +76,7 @@ __version__ = "0.1.0"
 # Public names by the module that has them. A module is imported when one of its names is first
 # asked for: a program that only reads a board need not wait for scipy.
 _MODULES = {
+    "emulate.driver": ("SteppedSkin",),
     "estimate.base": ("Estimate", "Estimator"),
     "estimate.knowledge": ("SkinKnowledge", "WireOhm"),
     "estimate.methods": ("METHODS", "make_estimator"),

@@ -3,7 +3,8 @@
 
 ==================================  ==========================================================
 ``/dev/ttyACM0``, ``COM3``          a serial port; ``?baud=1000000`` for the faster line
-``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulate`)
+``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulate`);
+                                    ``speed=0``: its time passes as fast as its scans are taken
 ``simavr://uno?scene=ghost``        the built firmware, run by an AVR simulator in real time
 ``replay://FILE.mcap?speed=1``      a recording (`ohmskin.record.replay`); 0: as fast as it is taken
 ==================================  ==========================================================
@@ -44,7 +45,9 @@ _Number = TypeVar("_Number", int, float)
 # Noise of an emulated converter, unless told [LSB].
 _DEFAULT_NOISE_LSB = 0.3
 # Options of ``emulator://`` that are no faults, and of ``simavr://`` that are no settings.
-_OF_BOARD = ("scene", "begin", "plate", "seed", "rate", "noise", "unit", "mode", "foreign")
+_OF_BOARD = (
+    *("scene", "begin", "plate", "seed", "rate", "noise", "unit", "mode", "foreign", "speed"),
+)
 _NOT_OF_SIMULATOR = ("scene", "begin", "plate", "baud")
 
 
@@ -102,10 +105,13 @@ def _device(url: str) -> Device:
         baud = _baud(_options(url, query, "baud"))
         return Session(SerialLink(place), baud)
     if scheme == "emulator":
-        from ohmskin.emulate.board import EmulatorLink
+        from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+        from ohmskin.link.host_clock import HostClock, SteppedClock
 
         board, _, faults = emulated(url)
-        return Session(EmulatorLink(board, url, faults))
+        if is_stepped(url):
+            return SteppedSkin(EmulatorLink(board, url, faults, SteppedClock()))
+        return Session(EmulatorLink(board, url, faults, HostClock()))
     if scheme == "simavr":
         from ohmskin.emulate.simavr import SimavrLink
 
@@ -176,7 +182,7 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
 
     :raises PortError: the URL is wrong.
     """
-    from ohmskin.emulate.board import EmulatedBoard
+    from ohmskin.emulate.board import BoardSettings, EmulatedBoard
     from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
 
     scheme, place, query = _parts(url)
@@ -185,20 +191,31 @@ def emulated(url: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
     known = (*_OF_BOARD, *SKIN_FAULTS, *LINE_FAULTS)
     options = _options(url, query, *known)
     with _wrong(url):
+        if options.get("speed", "1") not in ("0", "1"):
+            raise ValueError("speed must be 1, or 0: as fast as scans are taken")
         seed = _number(options, "seed", 0)
         faults = faults_of(SkinFaults, options)
         scene = _scene(place, options, faults)
-        board = EmulatedBoard(
-            *(scene.ratio, scene.rows, scene.columns),
+        settings = BoardSettings(
+            *(scene.rows, scene.columns),
+            mode=options.get("mode", "near"),
             rate_hz=_number(options, "rate", 0.0) if "rate" in options else None,
+            unit_id=_number(options, "unit", 0),
+        )
+        board = EmulatedBoard(
+            scene.ratio,
+            settings,
             noise_lsb=_number(options, "noise", _DEFAULT_NOISE_LSB),
             seed=seed,
-            unit_id=_number(options, "unit", 0),
-            mode=options.get("mode", "near"),
-            layout_crc=protocol.LAYOUT_CRC ^ _number(options, "foreign", 0),
             sampled=faults.sampled,
+            says={"layout_crc": protocol.LAYOUT_CRC ^ _number(options, "foreign", 0)},
         )
         return board, scene, faults_of(LineFaults, options, seed=seed)
+
+
+def is_stepped(url: str) -> bool:
+    """Whether an emulated board has time only while somebody waits for it: ``speed=0``."""
+    return dict(parse_qsl(_parts(url)[2])).get("speed") == "0"
 
 
 def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None) -> Scene:

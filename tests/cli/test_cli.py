@@ -265,7 +265,7 @@ def test_ctrl_c_ends_a_stream(
     for pause_s in (0.3, 3.0, 20.0):  # a busy machine shows nothing in the first
         server = pty_board(EMULATED)  # one that does not scan yet
         process = command("stream", server.path, *arguments)
-        until(lambda: server._board.next_scan_s is not None)  # noqa: B023
+        until(lambda: server.board.next_scan_s is not None)  # noqa: B023
         time.sleep(pause_s)
         process.send_signal(signal.SIGINT)
         done = well(finish(process))

@@ -8,28 +8,16 @@ import os
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from command_line import Run, assert_one_line, well
 from ohmskin.cli import board as flash_command
-from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.scenes import Scene
 from ohmskin.link import session
-from ohmskin.opening import emulated
 from places import ROOT
 from ports import Attach, Serve
-
-
-class FlashedBoard(EmulatedBoard):
-    """One that says which real board it is."""
-
-    says = "uno"
-
-    def _send(self, name: str, tail: bytes = b"", **values: Any) -> None:
-        if name == "hello":
-            values["board"] = self.says
-        super()._send(name, tail, **values)
 
 
 class Writer:
@@ -65,11 +53,9 @@ def writer(
     return Writer(request.param, place)
 
 
-def board(says: str = "uno") -> FlashedBoard:
-    made = FlashedBoard(emulated("emulator://8x8")[0]._ratio_at, 8, 8)
-    made.says = says
-    made.reset()  # its first hello was of a class that did not know yet
-    return made
+def board(says: str = "uno") -> EmulatedBoard:
+    """One that says which real board it is."""
+    return EmulatedBoard(Scene().ratio, BoardSettings(), says={"board": says})
 
 
 @pytest.mark.parametrize(

@@ -4,16 +4,17 @@
 import pytest
 
 import ohmskin
-from bench_board import Bench
+from ohmskin.emulate.driver import SteppedSkin
+from stepped import stepped
 
 
 @pytest.fixture
-def benches(monkeypatch: pytest.MonkeyPatch) -> list[Bench]:
-    """The boards that the doctor opens, in simulated time."""
-    opened: list[Bench] = []
+def benches(monkeypatch: pytest.MonkeyPatch) -> list[SteppedSkin]:
+    """The boards that the doctor opens, in stepped time."""
+    opened: list[SteppedSkin] = []
 
-    def connect(url: str, **_: object) -> Bench:
-        opened.append(Bench(url))
+    def connect(url: str, **_: object) -> SteppedSkin:
+        opened.append(stepped(url))
         return opened[-1]
 
     monkeypatch.setattr(ohmskin, "open", connect)

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench_board import Bench, evidence
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, Severity, merged
 from ohmskin.doctor.gather import gather
 from ohmskin.doctor.signal import Rest, RestScans, examine_signal, find_hum, second_look
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
+from stepped import evidence, stepped
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
 
@@ -62,7 +62,8 @@ def test_a_sound_skin_has_no_finding_at_any_rate(rate: int) -> None:
 @pytest.mark.parametrize("scene", ["single", "ghost", "multi", "moving"])
 def test_a_touch_is_said_and_is_no_fault(scene: str) -> None:
     for seed, size in enumerate(("2x3", "8x8")):
-        bench = Bench(f"emulator://{size}?scene={scene}&seed={seed}", now_s=5.0)
+        bench = stepped(f"emulator://{size}?scene={scene}&seed={seed}")
+        bench.step(5.0)
         diagnosis = examine(gather(bench))
         assert [each.kind for each in diagnosis.findings] == [Kind.TOUCHED], (scene, size)
         assert diagnosis.worse == []
@@ -137,7 +138,7 @@ def test_faults_are_found_beside_a_touch() -> None:
 
 
 def test_lines_that_are_not_there_are_one_finding() -> None:
-    bench = Bench("emulator://4x6")
+    bench = stepped("emulator://4x6")
     bench.configure(rows=7, rate_hz=0)
     [finding] = examine(gather(bench)).findings
     assert (finding.kind, finding.place) == (Kind.OPEN_ROW, Place(rows=(4, 5, 6)))
@@ -222,7 +223,7 @@ def test_deviation_of_a_mean_of_codes(sound: Evidence) -> None:
 
 def test_settling_says_how_long_is_enough() -> None:
     for tau_us in (10, 15, 20):
-        bench = Bench(f"emulator://8x8?tau_us={tau_us}")
+        bench = stepped(f"emulator://8x8?tau_us={tau_us}")
         [finding] = examine(gather(bench)).findings
         enough_us = finding.values["needed_us"]
         assert f"--settle {enough_us} " in words_of(finding)["what_to_do"]
@@ -233,7 +234,7 @@ def test_settling_says_how_long_is_enough() -> None:
 
 def test_second_look_is_what_a_board_takes() -> None:
     for url in ("1x1", "1x1?rate=50", "2x2?rate=1", "16x16", "16x16?rate=1", "16x16?rate=0", "8x8"):
-        bench = Bench(f"emulator://{url}")
+        bench = stepped(f"emulator://{url}")
         board = bench.info
         other = second_look(board)
         if other is None:

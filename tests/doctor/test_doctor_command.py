@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.status import Status
 
 import ohmskin
-from bench_board import Bench
 from calibrations import calibration
 from command_line import Run, assert_one_line, well
 from ohmskin.arrays import Float
@@ -23,13 +22,15 @@ from ohmskin.circuit.skin import readings
 from ohmskin.doctor import gather as gathering
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather
-from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link import session
 from ports import Serve
 from recordings import write_recording
+from stepped import stepped, stepped_link
 
 
 @pytest.fixture
@@ -39,7 +40,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
 
 
-def test_a_sound_board_takes_less_than_ten_seconds(run: Run, benches: list[Bench]) -> None:
+def test_a_sound_board_takes_less_than_ten_seconds(run: Run, benches: list[SteppedSkin]) -> None:
     done = well(run("doctor", "emulator://8x8"))
     assert done.out.startswith("emulator://8x8: sound: nothing is wrong that an untouched")
     assert benches[0].now_s < 5  # and a second or two to connect
@@ -70,7 +71,7 @@ def test_page_and_json(run: Run) -> None:
     assert answer["measured"]["rows"] == 8
 
 
-def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[Bench]) -> None:
+def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[SteppedSkin]) -> None:
     arguments = ("emulator://8x8?scene=corners&wires=1.5", "--wires", "100,200", "--press")
     done = run("doctor", *arguments, "--json")
     assert benches[0].now_s < 18
@@ -88,7 +89,7 @@ def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[Bench
 
 @pytest.mark.parametrize(("tau_us", "slow"), [(0, False), (5, False), (8, True), (10, True)])
 def test_slow_nodes_are_seen_while_pressed(
-    run: Run, benches: list[Bench], tau_us: int, slow: bool
+    run: Run, benches: list[SteppedSkin], tau_us: int, slow: bool
 ) -> None:
     url = f"emulator://8x8?scene=corners&tau_us={tau_us}&noise=0.5"
     answer = json.loads(run("doctor", url, "--press", "--json").out)
@@ -129,7 +130,7 @@ def test_drift_of_a_press_is_no_slow_node() -> None:
                 siemens[cell] = (1 + 0.02 * (time_s - 5.5)) / 6e3
         return readings(replace(pressed, cell_siemens=siemens))
 
-    evidence = gather(Bench(EmulatedBoard(ratio, 8, 8, noise_lsb=0.3)), press=True)
+    evidence = gather(stepped(EmulatedBoard(ratio, BoardSettings(), noise_lsb=0.3)), press=True)
     assert len(evidence.pressed) == 10
     assert examine(evidence).findings == []
 
@@ -155,7 +156,7 @@ def test_a_terminal_shows_progress_and_what_is_pressed(
     ]
 
 
-def test_nobody_presses(run: Run, benches: list[Bench]) -> None:
+def test_nobody_presses(run: Run, benches: list[SteppedSkin]) -> None:
     answer = json.loads(run("doctor", "emulator://2x3?rate=10", "--press", "--json").out)
     assert answer["sound"] is True
     assert answer["measured"]["wires"] == "not known: no three corners of a rectangle were pressed"
@@ -164,7 +165,7 @@ def test_nobody_presses(run: Run, benches: list[Bench]) -> None:
 
 @pytest.mark.usefixtures("benches")
 def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
-    assert_one_line(run("doctor", "emulator://8x8?speed=1"), "no option 'speed'")
+    assert_one_line(run("doctor", "emulator://8x8?colour=1"), "no option 'colour'")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100"), "two numbers")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "-1", ">= 0")
     assert_one_line(run("doctor", "emulator://8x8", "--calibration", "/no/such.json"), "/no/such")
@@ -197,14 +198,14 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
 def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
     looks_us: list[int] = []
 
-    class Watched(Bench):
+    class Watched(SteppedSkin):
         def __iter__(self) -> Iterator[ohmskin.Scan]:
             looks_us.append(self.info.settle_us)
             if end is not None and len(looks_us) == 2:
                 raise end
             return super().__iter__()
 
-    bench = Watched("emulator://3x4")
+    bench = Watched(stepped_link("emulator://3x4"))
     before = bench.configure(rate_hz=77.5, settle_us=120, adc_prescaler="clock_250khz")
     with nullcontext() if end is None else pytest.raises(end):
         gather(bench)
@@ -249,7 +250,7 @@ def test_a_wrong_url_is_no_finding(run: Run) -> None:
 
 @pytest.mark.parametrize("speed", [0, 1])
 def test_the_end_of_a_recording_is_no_loss(run: Run, tmp_path: Path, speed: int) -> None:
-    bench, path = Bench("emulator://3x4"), tmp_path / "skin.mcap"
+    bench, path = stepped("emulator://3x4"), tmp_path / "skin.mcap"
     write_recording(path, bench.info, islice(bench, 60))
     for more in ((), ("--press",)):
         answer = json.loads(run("doctor", f"replay://{path}?speed={speed}", "--json", *more).out)

@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from bench_board import Bench, evidence
 from desk import examined
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
@@ -26,6 +25,7 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from places import DATA
+from stepped import evidence, stepped
 
 NOMINAL = (100.0, 200.0)
 EXACT_LSB = 12**-0.5
@@ -35,7 +35,7 @@ HELD = 30  # scans for which corners are held here
 def taken(*ratios: Float) -> CornerScans:
     """Readings, in 10 bits, that a board without noise has sent."""
     rows, columns = ratios[0].shape[:2]
-    scans = CornerScans(Bench(f"emulator://{rows}x{columns}").info)
+    scans = CornerScans(stepped(f"emulator://{rows}x{columns}").info)
     for ratio in ratios:
         scans.take(Scan(quantise(ratio), 0, 0, 0.0, 0))
     return scans

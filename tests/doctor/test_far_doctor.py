@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from test_doctor import told
 
-from bench_board import Bench, evidence
 from calibrations import calibration
 from command_line import Run, assert_one_line, well
 from lockstep import Rig, elf_of
@@ -27,6 +26,7 @@ from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
 from ohmskin.doctor.gather import gather
 from ohmskin.doctor.signal import Rest
+from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration, load_calibration
@@ -34,6 +34,7 @@ from ohmskin.force.calibration import Rest as CalibratedRest
 from ohmskin.link.codes import quantise
 from ohmskin.link.protocol import MODES
 from ohmskin.opening import emulated
+from stepped import evidence, stepped
 
 FAR = "emulator://8x8?mode=far&seed=1"
 HARSH = Path(__file__).parents[1] / "data" / "far_harsh_8x8.npz"
@@ -67,7 +68,7 @@ def diagnosis_of(ratio: Float, noise_lsb: float, scans: int = 225) -> Diagnosis:
     random = np.random.default_rng(1)
     noisy = ratio + noise_lsb / 1024 * random.standard_normal((scans, *ratio.shape))
     codes = quantise(np.clip(noisy, 0, 1)).mean(axis=0)
-    board = replace(Bench(FAR).info, rows=ratio.shape[0], columns=ratio.shape[1])
+    board = replace(stepped(FAR).info, rows=ratio.shape[0], columns=ratio.shape[1])
     seen_lsb = float(np.hypot(noise_lsb, 12**-0.5))
     rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0)), Diagnosis()
     examine_far(rest, examine_circuit(near_ends(rest), diagnosis), None, diagnosis)
@@ -152,7 +153,7 @@ def test_the_firmware_on_a_desk(far_open: int) -> None:
         rig.start_scan(mode="far", settle_us=300, rate_mhz=0)
         rig.run(3.0)
         codes = np.array([scan.codes for scan in rig.scans[2:]], dtype=float)
-    board = Bench(FAR).info
+    board = stepped(FAR).info
     noise_lsb = float(np.sqrt(np.mean(np.diff(codes, axis=0) ** 2) / 2))
     rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb, (100.0, 200.0)), Diagnosis()
     examine_far(rest, examine_circuit(near_ends(rest), diagnosis), None, diagnosis)
@@ -227,7 +228,8 @@ def test_two_broken_lines_that_cross_are_both_named() -> None:
 def test_a_touch_is_no_fault(scene: str) -> None:
     """While something moves, far ends are not judged."""
     for seed, size in enumerate(("3x3", "8x8")):
-        bench = Bench(f"emulator://{size}?mode=far&scene={scene}&seed={seed}", now_s=5.0)
+        bench = stepped(f"emulator://{size}?mode=far&scene={scene}&seed={seed}")
+        bench.step(5.0)
         diagnosis = examine(gather(bench))
         assert [each.kind for each in diagnosis.findings] == [Kind.TOUCHED], (scene, size)
         assert len(diagnosis.lines) == (0 if scene == "moving" else 6 if size == "3x3" else 16)
@@ -296,7 +298,7 @@ def test_all_far_ends_are_open_where_there_is_no_second_pair() -> None:
 # ------------------------------------------------------------------------------- the command
 
 
-def test_page_and_json(run: Run, benches: list[Bench]) -> None:
+def test_page_and_json(run: Run, benches: list[SteppedSkin]) -> None:
     done = well(run("doctor", FAR))
     assert benches[0].now_s < 8
     table = done.out[done.out.index("wires [ohm]") :].splitlines()
@@ -363,14 +365,14 @@ def test_wires_that_are_not_told_are_not_kept(run: Run, tmp_path: Path) -> None:
 
 
 def test_the_board_stays_in_its_mode() -> None:
-    bench = Bench(FAR)
+    bench = stepped(FAR)
     before = bench.info
     gather(bench, clocks=True)
     assert bench.info == before
 
 
 def test_a_plate_is_verified_by_the_near_ends(
-    run: Run, benches: list[Bench], tmp_path: Path
+    run: Run, benches: list[SteppedSkin], tmp_path: Path
 ) -> None:
     plate = tmp_path / "plate.csv"
     plate.write_text("10000,open\n22000,47000\n")

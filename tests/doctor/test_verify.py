@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 import ohmskin
-from bench_board import Bench
 from command_line import Run, assert_one_line
 from ohmskin.circuit.plate import load_plate
 from ohmskin.doctor import gather as gathering
 from ohmskin.doctor.plate import Tolerance
+from ohmskin.emulate.driver import SteppedSkin
+from stepped import stepped, stepped_link
 
 # One resistor a line, as docs/hardware.md says; and a chain, two a line.
 ONE_A_LINE = dict(enumerate((10e3, 15e3, 22e3, 33e3, 47e3, 68e3, 100e3, 220e3)))
@@ -44,7 +45,7 @@ def write(tmp_path: Path) -> Write:
 @pytest.fixture
 def benches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Boards in simulated time."""
-    monkeypatch.setattr(ohmskin, "open", lambda url, **_: Bench(url))
+    monkeypatch.setattr(ohmskin, "open", lambda url, **_: stepped(url))
 
 
 def verified(run: Run, url: str, plate: str, *more: str) -> tuple[int, dict]:
@@ -175,7 +176,7 @@ def test_an_emulated_plate_reads_as_ohms_law_says() -> None:
             patch.setattr(
                 "ohmskin.circuit.plate.read_bounded", lambda *_, ohm=ohm: str(ohm).encode()
             )
-            scan = next(iter(Bench(f"emulator://1x1?plate={path}&noise=0")))
+            scan = next(iter(stepped(f"emulator://1x1?plate={path}&noise=0")))
         assert scan.codes[0, 0].tolist() == [high, low, high, low]
 
 
@@ -235,14 +236,14 @@ def test_the_board_is_put_back(
 ) -> None:
     looks: list[tuple[int, str]] = []
 
-    class Watched(Bench):
+    class Watched(SteppedSkin):
         def __iter__(self) -> Iterator[ohmskin.Scan]:
             looks.append((self.info.settle_us, self.info.adc_prescaler))
             if end is not None and len(looks) == look:
                 raise end
             return super().__iter__()
 
-    bench = Watched("emulator://8x8")
+    bench = Watched(stepped_link("emulator://8x8"))
     before = bench.configure(rate_hz=31, settle_us=60, adc_prescaler="clock_250khz", rows=5)
     monkeypatch.setattr(ohmskin, "open", lambda url, **_: bench)
     plate = write({(0, 0): 22e3, (1, 1): 47e3}, size=2)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The emulated board, sans-IO, and that it and the firmware answer alike."""
 
+import re
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import ohmskin
 from lockstep import LockstepSim, elf_of
-from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate import board as emulator
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
 from ohmskin.errors import PortError
 from ohmskin.files import Closing
@@ -20,6 +21,8 @@ from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
 from ohmskin.link.session import configuration
 from ohmskin.opening import emulated
+from places import ROOT
+from stepped import stepped
 
 DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0}
 DEFAULT |= {"adc_prescaler": 32, "mode": 0}
@@ -28,8 +31,8 @@ DEFAULT |= {"adc_prescaler": 32, "mode": 0}
 class Emulated(Closing):
     """A board; `exchange` sends to it, lets time pass, and gives what it has sent."""
 
-    def __init__(self, **options: Any) -> None:
-        self.board = EmulatedBoard(Scene().ratio, 8, 8, **options)
+    def __init__(self) -> None:
+        self.board = EmulatedBoard(Scene().ratio, BoardSettings())
         self._now_s = 0.0
 
     def exchange(self, octets: bytes, seconds: float) -> bytes:
@@ -110,7 +113,7 @@ def test_scans_come_at_their_time_and_read_the_skin() -> None:
     def ratio(time_s: float, mode: str = "near") -> np.ndarray:
         return scene.ratio(BEGIN_S + time_s, mode)
 
-    board = EmulatedBoard(ratio, 5, 3, rate_hz=100)
+    board = EmulatedBoard(ratio, BoardSettings(5, 3, rate_hz=100))
     host = BoardDecoder()
     host.feed(board.advance(0.0), 0.0)
     start = protocol.FRAMES["start"]
@@ -151,7 +154,7 @@ def test_noise_is_that_of_the_seed_and_of_its_size() -> None:
     ratio = np.full((8, 8, 4), 0.5)
 
     def codes(seed: int, noise_lsb: float) -> np.ndarray:
-        board = EmulatedBoard(lambda *_: ratio, 8, 8, noise_lsb=noise_lsb, seed=seed)
+        board = EmulatedBoard(lambda *_: ratio, BoardSettings(), noise_lsb=noise_lsb, seed=seed)
         return np.stack([board.codes_at(0.0) for _ in range(40)]).astype(float)
 
     np.testing.assert_array_equal(codes(1, 3.0), codes(1, 3.0))
@@ -162,11 +165,9 @@ def test_noise_is_that_of_the_seed_and_of_its_size() -> None:
 
 
 def test_lines_beyond_the_skin_are_open() -> None:
-    host = Host(Emulated())
-    assert host.ask("configure", **(DEFAULT | {"rows": 9, "columns": 10, "rate_mhz": 0})) == "ok"
-    assert host.ask("start") == "ok"
-    host.run(0.1)
-    codes = host.scans()[-1].codes
+    skin = stepped("emulator://8x8?noise=0")
+    skin.configure(rows=9, columns=10, rate_hz=0)
+    codes = skin.latest().codes
     assert codes.shape == (9, 10, 4)
     np.testing.assert_array_equal(codes[8], np.tile([1023, 0, 1023, 0], (10, 1)))
     np.testing.assert_array_equal(codes[:, 8:], np.tile([1023, 0, 1023, 0], (9, 2, 1)))
@@ -186,24 +187,48 @@ def test_saved_settings_outlive_a_reset_and_others_do_not() -> None:
     assert (hello.rows, hello.unit_id, hello.settings) == (3, 77, "stored")
     assert (hello.scanning, hello.reset_cause) == (0, ("external",))
     assert host.ask("load_defaults") == "ok"
-    assert (host.hello().rows, host.hello().unit_id) == (8, 0)
+    assert (board.board.settings["rows"], board.board.settings["unit_id"]) == (8, 0)
     board.board.reset()
     assert host.hello().rows == 3
 
 
 def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
-    hello = Host(Emulated()).hello()
-    assert hello.rate_hz == pytest.approx(90, rel=1e-4)
-    board, _, _ = emulated("emulator://16x16")
-    message = BoardDecoder().feed(board.advance(0.0), 0.0)[0]
-    assert isinstance(message, Hello)
-    assert (message.rows, message.columns) == (16, 16)
-    assert message.rate_hz == pytest.approx(16e6 / ((11.5 * 32 + 20 * 16) * 1024))
+    assert stepped("emulator://8x8").info.rate_hz == pytest.approx(90, rel=1e-4)
+    hello = stepped("emulator://16x16").info
+    assert (hello.rows, hello.columns) == (16, 16)
+    assert hello.rate_hz == pytest.approx(16e6 / ((11.5 * 32 + 20 * 16) * 1024))
+
+
+def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
+    def source(file: str) -> str:
+        return (ROOT / "firmware" / "src" / file).read_text()
+
+    def number(file: str, name: str) -> int:
+        (digits,) = re.findall(rf"\b{name} = (\d+)", source(file))
+        return int(digits)
+
+    plan = "core/scan_plan.h"
+    assert number(plan, "SLOT_ADC_CLOCKS_MIN") == emulator.SLOT_ADC_CLOCKS_MIN
+    assert number(plan, "SLOT_CYCLES_MAX") == emulator.SLOT_CYCLES_MAX
+    near, far = number(plan, "SETTLE_US"), number(plan, "SETTLE_FAR_US")
+    assert {"near": near, "far": far} == emulator.SETTLE_US
+    assert emulator.HELD_ADC_CLOCKS == 11 + 1 / 2
+    assert "return static_cast<uint16_t>(11u * prescaler + prescaler / 2);" in source(plan)
+    version = [number("version.h", f"VERSION_{part}") for part in ("MAJOR", "MINOR", "PATCH")]
+    assert list(emulator.VERSION.values()) == version
+    told = source("core/settings.h").split("DEFAULT_SETTINGS = {")[1].split("};")[0]
+    defaults = EmulatedBoard(Scene().ratio, BoardSettings()).settings
+    in_order = ("unit_id", "rows", "columns", "rate_mhz", "settle_us")
+    numbers = re.findall(r"^ +(\d+),", told, re.MULTILINE)
+    assert [str(defaults[name]) for name in in_order] == numbers
+    assert (defaults["adc_prescaler"], defaults["mode"]) == ("clock_500khz", "near")
+    assert re.findall(r"frames::(\w+::\w+)", told) == ["AdcPrescaler::Clock500khz", "Mode::Near"]
 
 
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
+        ("emulator://8x8?speed=2", "speed must be 1, or 0"),
         ("emulator://8x8?rate=1000", "too_fast"),
         ("emulator://16x16?rate=90", "too_fast"),
         ("emulator://8x8?rate=0.5", "bad_rate"),

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 import ohmskin
-from bench_board import Bench
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
-from ohmskin.emulate.board import EmulatorLink, PtyServer
+from ohmskin.emulate.driver import EmulatorLink, PtyServer, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError
-from ohmskin.link import device, framing, protocol, session
+from ohmskin.link import framing, protocol, session
 from ohmskin.link.codes import quantise
-from ohmskin.link.serial_port import SerialLink
+from ohmskin.link.host_clock import SteppedClock
+from ohmskin.link.serial_port import READ_TIMEOUT_S, SerialLink
 from ohmskin.link.session import Session
 from ohmskin.opening import emulated
 from ports import Serve
-from stepped_link import SteppedLink
+from stepped import stepped, stepped_link
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
@@ -34,7 +34,7 @@ ADC = "clock_250khz"
     "faults", ["drop=0.1", "bitflip=3e-4", "garbage=0.3", "drop=0.05&bitflip=3e-4&garbage=0.1"]
 )
 def test_all_that_was_made_is_counted_and_all_that_came_is_the_truth(faults: str) -> None:
-    bench = Bench(f"emulator://2x2?scene=multi&begin=0&seed=2&noise=0&rate=100&{faults}")
+    bench = stepped(f"emulator://2x2?scene=multi&begin=0&seed=2&noise=0&rate=100&{faults}")
     found = list(itertools.islice(bench, 5000))
     expected = quantise(Scene("multi", 2, 2, seed=2).ratio(BEGIN_S))
     assert (np.array([scan.codes for scan in found]) == expected).all()
@@ -104,7 +104,7 @@ def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_reset_board_says_its_name_anew() -> None:
     """A name that was not saved is gone after a reset, and `info` must not pretend otherwise."""
-    with ohmskin.open("emulator://2x2?reset=0.5&unit=3") as skin:
+    with stepped("emulator://2x2?reset=0.5&unit=3") as skin:
         skin.set_unit_id(7)
         for _ in skin:
             if skin.stats.restarts:
@@ -114,7 +114,7 @@ def test_a_reset_board_says_its_name_anew() -> None:
 
 def test_restarts_and_missed_scans_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "ohmskin")
-    with ohmskin.open("emulator://2x2?reset=0.5&drop=0.3") as skin:
+    with stepped("emulator://2x2?reset=0.5&drop=0.3") as skin:
         for scan in skin:
             if skin.stats.restarts and scan.missed:
                 break
@@ -126,44 +126,45 @@ def test_restarts_and_missed_scans_are_logged(caplog: pytest.LogCaptureFixture) 
 class ResetAfterConfigure(EmulatorLink):
     """Resets the board right after its first answer to `configure`."""
 
-    resets_due = 1
+    resets, reset_due = 0, False
 
     def write(self, octets: bytes) -> None:
         super().write(octets)
         (frame,) = framing.Decoder().feed(octets)
-        if frame.type == protocol.FRAMES["configure"].id and self.resets_due:
-            self.resets_due -= 1
-            with self._wake:
-                self._waiting += self._board.advance(self._now_s())
-                self._board.reset()
+        self.reset_due = frame.type == protocol.FRAMES["configure"].id and not self.resets
+
+    def read(self, limit_s: float = READ_TIMEOUT_S) -> bytes:
+        answer = super().read(limit_s)
+        if self.reset_due:
+            self.board.reset()
+            self.resets, self.reset_due = 1, False
+        return answer
 
 
 def test_a_reset_right_after_configure_does_not_undo_it() -> None:
-    link = ResetAfterConfigure(emulated("emulator://4x4")[0], "a board")
-    with Session(link) as skin:
+    link = ResetAfterConfigure(emulated("emulator://4x4")[0], clock=SteppedClock())
+    with SteppedSkin(link) as skin:
         skin.start()
         assert skin.configure(rows=2, rate_hz=77).rows == 2
-        assert link.resets_due == 0
+        assert link.resets == 1
         assert skin.info.rate_asked_mhz == 77_000
         assert skin.latest().codes.shape == (2, 4, 4)
 
 
 def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
-    board, _, _ = emulated("emulator://4x4")
-    with Session(EmulatorLink(board, "a board")) as skin:
+    link = stepped_link("emulator://4x4")
+    with SteppedSkin(link) as skin:
         skin.configure(rows=2, columns=3, rate_hz=77)
-        board.reset()
+        link.board.reset()
         skin.start()
         assert skin.latest().codes.shape == (2, 3, 4)
         assert skin.info.rate_asked_mhz == 77_000
 
 
 def test_a_stall_of_two_seconds() -> None:
-    link = SteppedLink("emulator://2x2?rate=200&stall=2")
-    with Session(link) as skin:
-        skin.start()
+    with stepped("emulator://2x2?rate=200&stall=2") as skin:
         scans = iter(skin)
-        link.run(5.0)
+        skin.step(5.0)
         found = list(itertools.islice(scans, skin.stats.scans))
         gaps = [scan.missed for scan in found if scan.missed]
         assert gaps == [pytest.approx(400, abs=1)]
@@ -192,14 +193,11 @@ def test_a_serial_port_that_goes_away(use: str, pty_board: Serve) -> None:
     timer.join()
 
 
-def test_a_board_that_stops_talking(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.3)
-    monkeypatch.setattr(session, "COMMAND_TIMEOUT_S", 0.1)
-    link = SteppedLink("emulator://2x2?stall=600")
-    with Session(link) as skin:
+def test_a_board_that_stops_talking() -> None:
+    with stepped("emulator://2x2?stall=600") as skin:
         skin.start()
-        link.run(2.0)
-        with pytest.raises(DeviceLost, match=r"said nothing for 0\.3 s"):
+        skin.step(2.0)
+        with pytest.raises(DeviceLost, match=r"said nothing for 5\.0 s"):
             list(skin)
         with pytest.raises(DeviceLost, match="said nothing"):
             READS["latest"](skin)
@@ -241,11 +239,9 @@ def test_a_board_on_a_desk(board: str) -> None:
     np.testing.assert_allclose(np.mean(codes, axis=0), lsb, atol=0.4)
 
 
-def test_a_lost_answer_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "COMMAND_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(session, "ATTEMPTS", 80 * [("baud_default", True, 0.05)])
+def test_a_lost_answer_is_asked_for_again() -> None:
     for seed in range(5):
-        with ohmskin.open(f"emulator://2x2?rate=200&drop=0.15&seed={seed}", start=False) as skin:
+        with stepped(f"emulator://2x2?rate=200&drop=0.15&seed={seed}") as skin:
             for unit_id in range(10):
                 try:
                     skin.set_unit_id(unit_id)
@@ -255,7 +251,7 @@ def test_a_lost_answer_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_refusals_on_a_bad_line_stay_refusals() -> None:
-    with ohmskin.open("emulator://4x4?drop=0.1&bitflip=1e-4&seed=3") as skin:
+    with stepped("emulator://4x4?drop=0.1&bitflip=1e-4&seed=3") as skin:
         before = skin.info
         for _ in range(5):
             with pytest.raises(CommandRefused, match="bad_rows"):

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import ohmskin
-from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, calibration, of_scene
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.errors import DeviceLost, TareRefused
@@ -23,6 +22,7 @@ from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from recordings import write_recording
+from stepped import stepped
 
 GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 Record = Callable[[int, int], str]
@@ -83,7 +83,7 @@ def test_a_calibration_of_another_mode_is_refused_even_if_forced(of: str, board:
 
 
 def test_scans_of_another_mode_are_refused() -> None:
-    bench = Bench(GHOST)
+    bench = stepped(GHOST)
     reader = SkinReader(bench.info)
     scans = iter(bench)
     reader.read(next(scans))
@@ -92,7 +92,7 @@ def test_scans_of_another_mode_are_refused() -> None:
 
 
 def test_a_tare_says_the_mode_of_the_board() -> None:
-    bench = Bench("emulator://4x4")
+    bench = stepped("emulator://4x4")
     reader = SkinReader(bench.info)
     assert reader.tare(next(iter(bench)).ratio).mode == "near"
 
@@ -196,7 +196,7 @@ def recorded(tmp_path: Path) -> Record:
     """A function that records so many scans of a ghost, and a tare before one of them."""
 
     def record(count: int, tare_at: int) -> str:
-        path, bench = tmp_path / "skin.mcap", Bench(GHOST)
+        path, bench = tmp_path / "skin.mcap", stepped(GHOST)
         scans = list(islice(bench, count))
         tares = [Tare(scan.ratio, scan.host_time_s) for scan in scans[tare_at : tare_at + 1]]
         write_recording(path, bench.info, [*scans[:tare_at], *tares, *scans[tare_at:]])

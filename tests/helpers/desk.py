@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench_board import Bench
 from lockstep import Rig
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
@@ -18,6 +17,7 @@ from ohmskin.doctor.findings import Diagnosis
 from ohmskin.doctor.wires import CornerScans, moved_across, suggested_corners
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Scan
+from stepped import stepped
 from studies.trials import skin_at_rest, touch
 
 REST_SCANS, SCANS = 20, 3
@@ -73,7 +73,7 @@ def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) 
 
 def examined(seed: int, nominal: tuple[float, float]) -> Diagnosis:
     """What the doctor says of that skin on that board, wires among it: corners are pressed."""
-    board = Bench("emulator://8x8").info
+    board = stepped("emulator://8x8").info
     presses, corners = CornerScans(board), suggested_corners(8, 8)
     with _on_desk(seed) as (rig, rest, _):
         rest_codes = _scans(rig, LOOK_SCANS)

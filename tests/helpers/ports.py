@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 
-from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.driver import PtyServer
 
 Serve = Callable[..., PtyServer]
 Attach = Callable[..., None]

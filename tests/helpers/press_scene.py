@@ -2,13 +2,11 @@
 """A skin that a robot presses with known forces; its cells follow `studies.press`."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
-from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.scenes import Scene
 from studies.press import LEAVE_S, PressModel, robot_presses
 
@@ -36,9 +34,6 @@ class PressScene(Scene):
             model = PressModel(seed=int(random.integers(1 << 32)))
             self._histories.append((times_s, forces_n, model.rise(times_s, forces_n)))
         self._starts_s = np.array(starts_s)
-
-    def board(self, **settings: Any) -> EmulatedBoard:
-        return EmulatedBoard(self.ratio, self.rows, self.columns, **settings)
 
     def skin(self, time_s: float) -> Skin:
         rest = super().skin(time_s)

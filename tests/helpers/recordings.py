@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 import ohmskin
-from bench_board import Bench
 from ohmskin.arrays import Float
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recorded
 from press_scene import PressScene
+from stepped import stepped
 
 URL = "emulator://3x4?scene=multi&begin=0&seed=3&rate=400"
 HOST_BEGIN_S = 1000.0
@@ -52,15 +53,15 @@ def replayed(path: Path, speed: float = 0) -> list[Scan]:
 
 def record_presses(path: Path, seconds: float, mode: str = "near") -> None:
     """Record what a board reads of `PRESSES`, with a jitter of 1 ms in host times."""
-    board = PRESSES.board(rate_hz=30.0, unit_id=3, seed=1, noise_lsb=0.3, mode=mode)
-    bench, random = Bench(board), np.random.default_rng(2)
-    hello = bench.info
+    settings = BoardSettings(PRESSES.rows, PRESSES.columns, mode, rate_hz=30.0, unit_id=3)
+    skin = stepped(EmulatedBoard(PRESSES.ratio, settings, seed=1, noise_lsb=0.3))
+    hello, random = skin.info, np.random.default_rng(2)
 
     def arrived(scan: Scan) -> Scan:
         middle_s = 1e-6 * scan.time_us + 0.5 / hello.rate_hz
         return replace(scan, host_time_s=HOST_BEGIN_S + middle_s + random.exponential(1e-3))
 
-    scans = takewhile(lambda scan: scan.host_time_s < seconds, bench)
+    scans = takewhile(lambda scan: scan.host_time_s < seconds, skin)
     write_recording(path, hello, map(arrived, scans))
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import ohmskin
-from bench_board import Bench
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, ProtocolError
 from ohmskin.link import device, framing, protocol
@@ -25,8 +26,9 @@ from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import MODES
 from ohmskin.link.session import Session
+from ohmskin.opening import emulated
 from ports import Serve
-from stepped_link import SteppedLink
+from stepped import stepped, stepped_link
 from waiting import until
 
 REST = "emulator://3x4?scene=rest&rate=100"
@@ -39,6 +41,7 @@ pytestmark = pytest.mark.usefixtures("nothing_left")
 
 BACKENDS = [
     "emulator",
+    "stepped",
     "pty",
     pytest.param("uno", marks=pytest.mark.simavr),
     pytest.param("megaatmega2560", marks=pytest.mark.simavr),
@@ -49,8 +52,8 @@ BACKENDS = [
 @pytest.fixture(params=BACKENDS)
 def url(request: pytest.FixtureRequest, pty_board: Serve) -> str:
     emulator = f"emulator://8x8?{SCENE}"
-    if request.param == "emulator":
-        return emulator
+    if request.param in ("emulator", "stepped"):
+        return emulator + (request.param == "stepped") * "&speed=0"
     if request.param == "pty":
         return pty_board(emulator).path
     return f"simavr://{request.param}{'&' if '?' in request.param else '?'}{SCENE}"
@@ -123,6 +126,8 @@ def test_latest_is_the_newest_and_each_comes_once(url: str) -> None:
         numbers = [skin.latest().number for _ in range(10)]
         assert all(a < b for a, b in itertools.pairwise(numbers))
         first = skin.latest()
+        if isinstance(skin, SteppedSkin):
+            skin.step(0.5)
         until(lambda: skin.stats.scans >= first.number + 30)
         received = skin.stats.scans
         newest = skin.latest()
@@ -315,9 +320,9 @@ def test_close_stops_the_board_and_its_port_can_be_opened_again(pty_board: Serve
         with ohmskin.open(server.path) as skin:
             assert skin.info.unit_id == round_number
             assert skin.latest().codes.shape == (4, 4, 4)
-            assert server._board.next_scan_s is not None
+            assert server.board.next_scan_s is not None
             skin.set_unit_id(round_number + 1)
-        until(lambda: server._board.next_scan_s is None)
+        until(lambda: server.board.next_scan_s is None)
 
 
 def test_a_board_left_scanning_is_taken_over(pty_board: Serve) -> None:
@@ -367,24 +372,23 @@ def test_a_scene_begins_untouched_in_the_simulator_too() -> None:
 @pytest.mark.parametrize("fault", ["", "&drop=0.2"])
 def test_a_slow_iterator_is_told_what_it_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "QUEUE_SCANS", 16)
-    link = SteppedLink(f"emulator://1x1?rate=1000{fault}")
-    with Session(link) as skin:
-        skin.start()
+    with stepped(f"emulator://1x1?rate=1000{fault}") as skin:
         slow, quick = iter(skin), iter(skin)
-        link.run(0.01)
+        begun = skin.stats.scans  # some, if the answer to start was dropped
+        skin.step(0.01)
         before = next(slow)
-        taken = take(quick, skin.stats.scans)
+        taken = take(quick, skin.stats.scans - begun)
         for _ in range(10):
-            link.run(0.01)
-            taken += take(quick, skin.stats.scans - len(taken))
+            skin.step(0.01)
+            taken += take(quick, skin.stats.scans - begun - len(taken))
         later = take(slow, 16)
         stats = skin.stats
     assert later[-1] == taken[-1]
     for scan in later:
         assert scan.missed == scan.number - before.number - 1
         before = scan
-    assert stats.overflowed == stats.scans - 17
-    assert len(taken) == stats.scans
+    assert stats.overflowed == stats.scans - begun - 17
+    assert len(taken) == stats.scans - begun
     assert (stats.missed > 0) == bool(fault)
 
 
@@ -403,18 +407,18 @@ def test_an_iterator_never_used_costs_nothing(
 
 
 def test_latest_waits_as_long_as_told() -> None:
-    link = SteppedLink("emulator://1x1?rate=1")
-    with Session(link) as skin:
+    with stepped("emulator://1x1?rate=1") as skin:
         skin.start()
-        link.run(0.9)
+        skin.step(0.8)
         with pytest.raises(DeviceLost, match=r"0\.1 s"):
             skin.latest(timeout_s=0.1)
-        link.run(0.2)
+        assert skin.now_s == pytest.approx(0.9)
+        skin.step(0.2)
         assert skin.latest(timeout_s=10).number == 0
 
 
 def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = SteppedLink("emulator://1x1")
+    link = EmulatorLink(emulated("emulator://1x1")[0])
     skin, both, closed = Session(link), threading.Barrier(2), list[str]()
     skin.start()
     monkeypatch.setattr(link, "close", lambda: closed.append("once"))
@@ -431,7 +435,7 @@ def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_mean_is_not_of_scans_of_two_modes() -> None:
     """Where somebody configures the board meanwhile, the mean is of the scans after that."""
-    near, far = (list(itertools.islice(Bench(f"{REST}&mode={mode}"), 9)) for mode in MODES)
+    near, far = (list(itertools.islice(stepped(f"{REST}&mode={mode}"), 9)) for mode in MODES)
     mean = device.mean_ratio([*near[:4], *far])
     np.testing.assert_allclose(mean, np.mean([scan.ratio for scan in far], axis=0))
     assert np.abs(mean - near[0].ratio).max() > 0.3
@@ -458,7 +462,7 @@ def test_scans_for_so_long_by_the_board_s_clock(
 
 def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "SILENCE_TIMEOUT_S", 0.1)
-    with ohmskin.open("emulator://1x1?rate=2") as skin:
+    with stepped("emulator://1x1?rate=2") as skin:
         assert [scan.number for scan in take(iter(skin), 2)] == [0, 1]
 
 
@@ -494,7 +498,7 @@ def test_what_is_asked_of_a_closed_skin_says_that_it_was_closed(url: str) -> Non
 
 def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """While one is being sent and answered, the other is not written."""
-    link = SteppedLink("emulator://1x1")
+    link = EmulatorLink(emulated("emulator://1x1")[0])
     with Session(link) as skin:
         other, written, early = threading.Thread(target=skin.save), threading.Event(), []
         write = link.write
@@ -517,19 +521,6 @@ def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch)
 # ------------------------------------------------------------------------ boards that are broken
 
 
-def lying(link: SteppedLink, **fields: Any) -> SteppedLink:
-    """A board whose `hello` has these fields, whatever it does."""
-    board = link._board
-    send = board._send
-
-    def send_lie(name: str, tail: bytes = b"", /, **values: Any) -> None:
-        send(name, tail, **(values | fields if name == "hello" else values))
-
-    board._send = send_lie  # type: ignore[method-assign]
-    board.reset()
-    return link
-
-
 IMPOSSIBLE_HELLO = (
     "rows 0, rows 17, rows 255, columns 0, columns 17, readings_per_cell 0, readings_per_cell 2, "
     "adc_bits 12, ref_top_ohm 0, ref_bottom_ohm 0, clock_hz 0, scan_cycles 0, scan_cycles 1, "
@@ -544,26 +535,25 @@ def test_a_board_that_says_what_cannot_be(said: str) -> None:
     if name in ("adc_prescaler", "mode"):
         text[said] = f"{name} unknown_{value}"
     with pytest.raises(ProtocolError, match=f"hello says {text.get(said, said)}"):
-        Session(lying(SteppedLink("emulator://4x4"), **{name: int(value)}))
+        stepped(EmulatedBoard(Scene().ratio, BoardSettings(), says={name: int(value)}))
 
 
 def test_a_board_that_says_what_cannot_be_while_it_scans() -> None:
-    link = SteppedLink("emulator://4x4?rate=100")
-    with Session(link) as skin:
+    link = stepped_link("emulator://4x4?rate=100")
+    with SteppedSkin(link) as skin:
         scans = iter(skin)
-        lying(link, scan_cycles=0)
-        link.say(0.1)
+        link.board.says["scan_cycles"] = 0
+        link.board.reset()
         with pytest.raises(ProtocolError, match="hello says scan_cycles 0"):
             list(scans)
 
 
 def test_scans_of_another_size_than_hello_says() -> None:
-    link = SteppedLink("emulator://4x4?rate=100")
-    with Session(link) as skin:
+    link = stepped_link("emulator://4x4?rate=100")
+    with SteppedSkin(link) as skin:
         scans = iter(skin)
-        link.run(0.1)
-        link._board._settings["rows"] = 2
-        link.say(0.1)
+        skin.step(0.1)
+        link.board.settings["rows"] = 2
         assert {scan.codes.shape for scan in take(scans, 10)} == {(4, 4, 4)}
         with pytest.raises(ProtocolError, match="hello says 4x4 cells, its scans have 2x4"):
             next(scans)
@@ -572,7 +562,7 @@ def test_scans_of_another_size_than_hello_says() -> None:
 def test_a_defect_in_the_reading_thread_is_told_to_who_waits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    link = SteppedLink("emulator://4x4")
+    link = EmulatorLink(emulated("emulator://4x4")[0])
     with Session(link) as skin:
         scans = iter(skin)
         monkeypatch.setattr(link, "read", lambda: 1 // 0)

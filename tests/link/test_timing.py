@@ -6,10 +6,11 @@ import pytest
 
 from lockstep import CPU_HZ, Rig, first_holds
 from ohmskin.arrays import Float
-from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.link.clock import line_delay_s, reading_offsets_s, scan_s, slot_s
-from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.link.messages import Hello, Scan
 from skins import scan_order
+from stepped import stepped
 
 
 @pytest.mark.parametrize(
@@ -26,10 +27,10 @@ def test_readings_are_timed_as_the_emulated_board_takes_them(
         return ratio
 
     still = np.full((rows, columns, 4), 0.5)
-    board = EmulatedBoard(lambda *_: still, rows, columns, rate_hz=rate_hz, sampled=sampled)
-    board.codes_at(0.0)
-    (hello,) = BoardDecoder().feed(board.advance(0.0), 0.0)
-    assert isinstance(hello, Hello)
+    settings = BoardSettings(rows, columns, rate_hz=rate_hz)
+    skin = stepped(EmulatedBoard(lambda *_: still, settings, sampled=sampled))
+    skin.latest()
+    hello = skin.info
     assert slot_s(hello) == slots_s[0]
     offsets_s = reading_offsets_s(hello)
     assert offsets_s.shape == (rows, columns, 4)

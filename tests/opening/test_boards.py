@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import ohmskin
-from bench_board import Bench
 from calibrations import of_scene
 from ohmskin.emulate.board import CLOCK_HZ
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
@@ -21,6 +20,7 @@ from ohmskin.link import session
 from ohmskin.link.messages import Scan
 from ohmskin.opening import Boards, BoardScan
 from ports import Attach, Serve
+from stepped import stepped
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
@@ -87,7 +87,7 @@ class Past:
         random = np.random.default_rng(1)
         self.scans: list[Scan] = []
         for begin_s in begins_s:
-            bench = Bench(url)
+            bench = stepped(url)
             self.info = bench.info
             for scan in itertools.takewhile(lambda scan: scan.host_time_s <= 2.0, bench):
                 arrived_s = begin_s + scan.host_time_s + random.exponential(2e-3)

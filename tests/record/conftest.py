@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from bench_board import Bench
 from ohmskin.link.messages import Hello
 from recordings import URL
+from stepped import stepped
 
 
 @pytest.fixture(scope="session")
 def hello() -> Hello:
-    return Bench(URL).info
+    return stepped(URL).info
 
 
 @pytest.fixture

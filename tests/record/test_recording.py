@@ -19,7 +19,6 @@ import pytest
 from mcap.reader import make_reader
 
 import ohmskin
-from bench_board import Bench
 from command_line import Command, Done, Run, assert_one_line, finish, well
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
@@ -36,13 +35,14 @@ from ohmskin.record.recording import (
     messages,
 )
 from recordings import URL, assert_same, replayed, scan, write_recording
+from stepped import stepped
 from waiting import until
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
 
 def test_everything_is_read_again(path: Path, hello: Hello) -> None:
-    scans = list(islice(Bench(URL), 50))
+    scans = list(islice(stepped(URL), 50))
     tare = Tare(np.mean([each.ratio for each in scans], axis=0), 0.5)
     others = [Mark("pressed \u00fc", 1.5), ForceSample(0.25, 2.5, "scale")]
     write_recording(path, hello, [*scans, tare, *others])
@@ -159,7 +159,7 @@ def test_the_record_loop(
 
 
 def test_replay_is_the_recording_bit_for_bit(path: Path, hello: Hello) -> None:
-    scans = list(islice(Bench(f"{URL}&drop=0.05"), 300))
+    scans = list(islice(stepped(f"{URL}&drop=0.05"), 300))
     assert any(each.missed for each in scans)
     write_recording(path, hello, scans)
     assert_same(replayed(path), scans, host_time=False)
@@ -304,7 +304,7 @@ def test_a_tare_that_says_no_mode_is_of_mode_near(path: Path, hello: Hello) -> N
 
 
 def test_a_tare_is_recorded_with_the_mode_of_its_scans(tmp_path: Path) -> None:
-    bench = Bench("emulator://3x4?mode=far")
+    bench = stepped("emulator://3x4?mode=far")
     with Recorder(tmp_path / "far.mcap", bench.info) as recorder:
         record(bench, recorder, islice(bench, 20), tare_s=0.1)
     [tare] = load_recording(tmp_path / "far.mcap").tares
@@ -314,7 +314,7 @@ def test_a_tare_is_recorded_with_the_mode_of_its_scans(tmp_path: Path) -> None:
 @pytest.fixture
 def recorded(path: Path) -> Path:
     rest, touched = (
-        Bench(f"emulator://3x4?scene={scene}&begin=0&noise=0") for scene in ("rest", "single")
+        stepped(f"emulator://3x4?scene={scene}&begin=0&noise=0") for scene in ("rest", "single")
     )
     tare = Tare(next(iter(rest)).ratio, 0.0)
     write_recording(path, rest.info, [tare, *islice(touched, 5)])

@@ -2,15 +2,15 @@
 """The press model, against analytic answers and its own claims; a skin that follows it."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.link.codes import quantise
-from ohmskin.link.framing import encode
-from ohmskin.link.messages import BoardDecoder, Scan
-from ohmskin.link.protocol import FRAMES
 from press_scene import PressScene
+from stepped import stepped
 from studies.press import PressModel
 
 QUIET = PressModel(noise=0.0, drift=0.0, gain_spread=0.0, exponent_spread=0.0)
@@ -130,10 +130,7 @@ def test_the_scene_answers_the_same_whenever_asked() -> None:
 def test_the_board_reads_the_forces() -> None:
     """What is pressed conducts, and the scan says when it was."""
     scene = PressScene(2, 2, seed=1)
-    board = scene.board()
-    board.receive(encode(FRAMES["start"].id, 0, FRAMES["start"].pack()))
-    scans = [m for m in BoardDecoder().feed(board.advance(20.005), 0.0) if isinstance(m, Scan)]
-    assert len(scans) == 1800
+    scans = list(islice(stepped(EmulatedBoard(scene.ratio, BoardSettings(2, 2))), 1800))
     for scan in scans[::97]:
         np.testing.assert_allclose(scan.codes, quantise(scene.ratio(scan.time_us * 1e-6)), atol=1)
     conducts = np.array([scan.ratio[0, 0, 1] for scan in scans])

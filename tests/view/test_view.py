@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench_board import Bench
 from calibrations import NEWTON_SIEMENS, of_scene
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import port_resistance_ohm
@@ -22,6 +21,7 @@ from ohmskin.view import boards
 from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
 from ports import Serve
 from recordings import write_recording
+from stepped import stepped
 from viewed import GHOST, LIMIT_S, REST, panel, served
 from waiting import until
 
@@ -346,7 +346,7 @@ def test_a_calibration_of_another_unit_is_not_taken_unless_forced() -> None:
 
 
 def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> None:
-    path, bench = tmp_path / "skin.mcap", Bench(GHOST)
+    path, bench = tmp_path / "skin.mcap", stepped(GHOST)
     tare = Tare(Scene("ghost", 8, 8, seed=1).rest_ratio, 0.0)
     write_recording(path, bench.info, [tare, *islice(bench, 30)])
     with served(f"replay://{path}") as client, panel(client) as page:

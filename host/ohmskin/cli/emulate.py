@@ -8,10 +8,11 @@ from typer import Argument
 from ohmskin.cli.board import Seconds
 from ohmskin.cli.demo import URL
 from ohmskin.ctrl_c import ends_by_ctrl_c
-from ohmskin.emulate.board import PtyServer
+from ohmskin.emulate.driver import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
-from ohmskin.opening import emulated
+from ohmskin.errors import PortError
+from ohmskin.opening import emulated, is_stepped
 
 # The options of an emulator:// URL, for the command's help.
 _OPTIONS: Final = {
@@ -33,6 +34,8 @@ def emulate(
     seconds: Seconds = 0.0,
 ) -> None:
     """Serve an emulated board at a pseudo-terminal. Ctrl-C ends it."""
+    if is_stepped(url):
+        raise PortError("a pseudo-terminal has real time: leave out speed=0")
     board, _, faults = emulated(url)
     with PtyServer(board, faults) as server, ends_by_ctrl_c():
         print(server.path, flush=True)  # noqa: T201

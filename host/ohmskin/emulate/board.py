@@ -2,8 +2,7 @@
 """A skin board without hardware: ``emulator://8x8?scene=ghost&seed=1``.
 
 `EmulatedBoard` speaks the board's side of the protocol, sans-IO: `receive` takes bytes from the
-host, `advance` lets time pass and returns what was sent. `EmulatorLink` and `PtyServer` run it in
-real time, as a `Link` and at a pseudo-terminal.
+host, `advance` lets time pass and returns what was sent. `ohmskin.emulate.driver` runs it.
 
 Not modelled:
 
@@ -16,13 +15,9 @@ Not modelled:
 """
 
 import math
-import os
-import select
-import threading
-import time
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,41 +25,66 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM
 from ohmskin.emulate.faults import LineFaults
-from ohmskin.errors import DeviceLost, PortError
-from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
-from ohmskin.link.serial_port import READ_TIMEOUT_S
 
+# Readings of the skin: (time since the board was switched on [s], mode) -> (rows, columns, 4).
 RatioAt = Callable[[float, str], Float]
+# What the converter makes of them: (readings, start of the scan [s], slot [s], settle time [s],
+# mode) -> readings. A scan takes one reading a slot, each that settle time after the pins changed.
 Sampled = Callable[[Float, float, float, float, str], Float]
 
-VERSION = {"version_major": 0, "version_minor": 1, "version_patch": 0}
-CLOCK_HZ = 16_000_000
-DEFAULT_RATE_HZ = 90.0
-_CONSTANTS = protocol.CONSTANTS
-_PRESCALERS = protocol.ENUMS["adc_prescaler"].values
-_REASONS = protocol.ENUMS["result"].docs
-# Longest time from the hold of a reading to the change of pins [s]; the longest slot [cycles], and
-# what it leaves for settling unless asked [us], by mode (firmware/src/core/scan_plan.h).
-_SELECT_S = 120 / CLOCK_HZ
-_SLOT_CYCLES_MAX = 60_000
-_SETTLE_US = {"near": 20, "far": 35}
+# Numbers of the firmware, by which `hello` answers as a real board does. That they are those of its
+# source is tested in tests/emulate/test_emulator.py.
+#
+# The version that hello says (firmware/src/version.h).
+VERSION: Final = {"version_major": 0, "version_minor": 1, "version_patch": 0}
+# The processor's clock on an Uno and a Mega 2560 [Hz] (Arduino's data sheets).
+CLOCK_HZ: Final = 16_000_000
+# The scan rate of a board that nobody has configured [Hz] (firmware/src/core/settings.h).
+DEFAULT_RATE_HZ: Final = 90.0
+# A slot is not longer than this [cycles] (firmware/src/core/scan_plan.h): timer 1 has 16 bits.
+SLOT_CYCLES_MAX: Final = 60_000
+# A slot is not shorter than this [ADC clocks], so that a conversion ends in it (scan_plan.h).
+SLOT_ADC_CLOCKS_MIN: Final = 15
+# From the hold of a reading to the end of its conversion, the sample capacitor is off the skin for
+# this time [ADC clocks] (scan_plan.h).
+HELD_ADC_CLOCKS: Final = 11.5
+# A slot leaves this time for settling [us] if neither rate nor settle time is asked for, by mode
+# (scan_plan.h).
+SETTLE_US: Final = {"near": 20, "far": 35}
+# The pins change at most this time after the hold of a reading [cycles] (docs/timing.md).
+SELECT_CYCLES: Final = 120
+
+_CONSTANTS: Final = protocol.CONSTANTS
+_PRESCALERS: Final = protocol.ENUMS["adc_prescaler"].values
+_REASONS: Final = protocol.ENUMS["result"].docs
+_SCAN: Final = protocol.FRAMES["scan"]
 # Settings that hello says by the same name.
-_OF_HELLO = ("unit_id", "rows", "columns", "mode", "adc_prescaler")
-# At a pseudo-terminal: without scans, faults that are due are looked for as often as this [s].
-_IDLE_S = 0.2
-# The largest number of bytes that is taken there from the host at once.
-_READ_SIZE = 4096
+_OF_HELLO: Final = ("unit_id", "rows", "columns", "mode", "adc_prescaler")
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """What a board is set to when it is switched on."""
+
+    rows: int = 8
+    columns: int = 8
+    mode: str = "near"
+    rate_hz: float | None = None  # None: 90, or as fast as the converter runs if that is less
+    unit_id: int = 0
 
 
 class EmulatedBoard:
     """A board whose skin reads `ratio_at(seconds, mode)`, shape (rows, columns, 4).
 
-    rate_hz: the scan rate at boot; None: 90, or as fast as the converter runs if that is less.
-    noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed: of the noise.
-    sampled(readings, start_s, slot_s, settle_s, mode): what the converter reads, (rows, columns,
-    4), in a scan that starts at a time, one reading a slot, each so long after the change of pins.
+    settings: those of the start; the skin has the same rows and columns, whatever the host
+    configures later. noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed:
+    of the noise. sampled: what the converter reads of the skin; None: just that. says: fields of
+    `hello` that the board says in place of the truth, to see what a host makes of it.
+
+    `settings` holds what is set now, in the fields of `configure` and `set_unit_id`; `says` and
+    `settings` may be changed at any time.
 
     :raises ValueError: a board cannot do that.
     """
@@ -72,35 +92,22 @@ class EmulatedBoard:
     def __init__(
         self,
         ratio_at: RatioAt,
-        rows: int,
-        columns: int,
+        settings: BoardSettings,
         *,
-        rate_hz: float | None = None,
         noise_lsb: float = 0.0,
         seed: int = 0,
-        unit_id: int = 0,
-        mode: str = "near",
-        layout_crc: int = protocol.LAYOUT_CRC,
         sampled: Sampled | None = None,
+        says: Mapping[str, protocol.Value] = {},
     ) -> None:
         if not 0 <= noise_lsb <= 1 << protocol.ADC_BITS:
             raise ValueError(f"noise must be from 0 to {1 << protocol.ADC_BITS}, not {noise_lsb}")
+        self.says = dict(says)
         self._ratio_at = ratio_at
         self._sampled = sampled
-        self._skin_shape = (rows, columns)
+        self._skin_shape = (settings.rows, settings.columns)
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
         self._random = np.random.default_rng(seed)
-        self._layout_crc = layout_crc
-        rate_mhz = protocol.rate_mhz(DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
-        skin = {"unit_id": unit_id, "rows": rows, "columns": columns, "mode": mode}
-        pace = {"rate_mhz": rate_mhz, "settle_us": 0, "adc_prescaler": "clock_500khz"}
-        self._defaults: dict[str, Any] = {**skin, **pace}
-        try:
-            _scan_plan(self._defaults)
-        except _Refused as refusal:
-            if rate_hz is not None or str(refusal) != "too_fast":
-                raise ValueError(f"{refusal}: {_REASONS[str(refusal)]}") from None
-            self._defaults["rate_mhz"] = 0
+        self._defaults = _defaults(settings)
         self._stored: dict[str, Any] | None = None
         self.now_s = 0.0
         self.reset("power_on")
@@ -108,11 +115,11 @@ class EmulatedBoard:
     def reset(self, cause: str = "external") -> None:
         """Do what the reset button does: scanning stops, unsaved settings are lost."""
         self._decoder = framing.Decoder()
-        self._settings = dict(self._stored or self._defaults)
+        self.settings = dict(self._stored or self._defaults)
         self._settings_source = "stored" if self._stored else "defaults_blank"
         self._reset_cause = cause
         self._boot_s = self.now_s
-        self._plan = _scan_plan(self._settings)
+        self._plan = _scan_plan(self.settings)
         self._baud = _CONSTANTS["baud_default"]
         self._sequence = 0
         self._scan = 0
@@ -148,14 +155,14 @@ class EmulatedBoard:
 
     def codes_at(self, time_s: float, mode: str = "") -> NDArray[np.uint16]:
         """Codes of a scan, shape (rows, columns, 4); lines beyond the skin are open."""
-        rows, columns = self._settings["rows"], self._settings["columns"]
-        mode = mode or self._settings["mode"]
+        rows, columns = self.settings["rows"], self.settings["columns"]
+        mode = mode or self.settings["mode"]
         ratio = np.tile([float(n in "aceg") for n in protocol.MODES[mode]], (rows, columns, 1))
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s, mode)[: have[0], : have[1]]
         if self._sampled is not None:
             slot_s = self._plan["slot_cycles"] / CLOCK_HZ
-            ratio = self._sampled(ratio, time_s, slot_s, slot_s - _SELECT_S, mode)
+            ratio = self._sampled(ratio, time_s, slot_s, slot_s - SELECT_CYCLES / CLOCK_HZ, mode)
         if self._noise_ratio:
             ratio += self._noise_ratio * self._random.standard_normal(ratio.shape)
         return quantise(ratio, protocol.ADC_BITS)
@@ -184,32 +191,37 @@ class EmulatedBoard:
                     self._plan = _scan_plan(values)
                 except _Refused as refusal:
                     return str(refusal)
-                self._settings.update(values)
+                self.settings.update(values)
             case "start" if not scanning:
                 self._started_s, self._scan = self.now_s, 0
             case "stop" if scanning:
                 self._started_s = None
             case "set_unit_id":
-                self._settings["unit_id"] = values["unit_id"]
+                self.settings["unit_id"] = values["unit_id"]
             case "save":
-                self._stored = dict(self._settings)
+                self._stored = dict(self.settings)
             case "load_defaults":
-                self._settings = dict(self._defaults)
-                self._plan = _scan_plan(self._settings)
+                self.settings = dict(self._defaults)
+                self._plan = _scan_plan(self.settings)
             case "self_test":
-                none = (1 << protocol.ADC_BITS) - 1, 0
-                bounds = dict.fromkeys(protocol.ENUMS["reading"].values, none)
-                for mode in ("near", self._settings["mode"]):
-                    codes = self.codes_at(self.now_s, mode).reshape(-1, protocol.READINGS_PER_CELL)
-                    each = zip(codes.min(0).tolist(), codes.max(0).tolist(), strict=True)
-                    bounds.update(zip(protocol.MODES[mode], each, strict=True))
-                least, most = zip(*bounds.values(), strict=True)
-                self._send("self_test_report", findings=(), code_min=least, code_max=most)
+                self._send_self_test_report()
             case "set_baud":
                 if values["baud"] not in (_CONSTANTS["baud_default"], _CONSTANTS["baud_fast"]):
                     return "bad_baud"
                 self._baud = values["baud"]
         return "ok"
+
+    def _send_self_test_report(self) -> None:
+        """Say the least and the largest code of each reading, over all cells."""
+        # As the firmware says a reading that it has not taken: the least is above the largest.
+        not_taken = ((1 << protocol.ADC_BITS) - 1, 0)
+        bounds = dict.fromkeys(protocol.ENUMS["reading"].values, not_taken)
+        for mode in ("near", self.settings["mode"]):
+            codes = self.codes_at(self.now_s, mode).reshape(-1, protocol.READINGS_PER_CELL)
+            of_mode = zip(codes.min(0).tolist(), codes.max(0).tolist(), strict=True)
+            bounds.update(zip(protocol.MODES[mode], of_mode, strict=True))
+        least, largest = zip(*bounds.values(), strict=True)
+        self._send("self_test_report", findings=(), code_min=least, code_max=largest)
 
     def _send(self, name: str, tail: bytes = b"", /, **values: protocol.Value) -> None:
         frame = protocol.FRAMES[name]
@@ -221,40 +233,54 @@ class EmulatedBoard:
         self._send(
             "scan",
             protocol.pack_codes(codes),
-            scan=self._scan % (1 << 32),
-            time_us=round((start_s - self._boot_s) * 1e6) % (1 << 32),
+            scan=self._scan % _SCAN.span("scan"),
+            time_us=round((start_s - self._boot_s) * 1e6) % _SCAN.span("time_us"),
             dropped=0,
-            rx_errors=self._decoder.stats.damaged % (1 << 16),
+            rx_errors=self._decoder.stats.damaged % _SCAN.span("rx_errors"),
             rows=codes.shape[0],
             columns=codes.shape[1],
-            mode=self._settings["mode"],
+            mode=self.settings["mode"],
         )
         self._scan += 1
 
     def _send_hello(self) -> None:
-        self._send(
-            "hello",
-            layout_crc=self._layout_crc,
-            **{name: self._settings[name] for name in _OF_HELLO},
+        truth: dict[str, protocol.Value] = {
+            **{name: self.settings[name] for name in _OF_HELLO},
             **self._plan,
             **VERSION,
-            board="emulated",
-            readings_per_cell=protocol.READINGS_PER_CELL,
-            adc_bits=protocol.ADC_BITS,
-            ref_top_ohm=round(DEFAULT_REF_OHM),
-            ref_bottom_ohm=round(DEFAULT_REF_OHM),
-            rate_asked_mhz=self._settings["rate_mhz"],
-            clock_hz=CLOCK_HZ,
-            settle_asked_us=self._settings["settle_us"],
-            baud=self._baud,
-            settings=self._settings_source,
-            reset_cause=(self._reset_cause,),
-            scanning=int(self._started_s is not None),
-        )
+            "layout_crc": protocol.LAYOUT_CRC,
+            "board": "emulated",
+            "readings_per_cell": protocol.READINGS_PER_CELL,
+            "adc_bits": protocol.ADC_BITS,
+            "ref_top_ohm": round(DEFAULT_REF_OHM),
+            "ref_bottom_ohm": round(DEFAULT_REF_OHM),
+            "rate_asked_mhz": self.settings["rate_mhz"],
+            "clock_hz": CLOCK_HZ,
+            "settle_asked_us": self.settings["settle_us"],
+            "baud": self._baud,
+            "settings": self._settings_source,
+            "reset_cause": (self._reset_cause,),
+            "scanning": int(self._started_s is not None),
+        }
+        self._send("hello", **(truth | self.says))
 
 
 class _Refused(Exception):
     """Carries the name of a `result`."""
+
+
+def _defaults(settings: BoardSettings) -> dict[str, Any]:
+    """The fields of `configure` and `set_unit_id` of a board that nobody has configured."""
+    rate_hz = DEFAULT_RATE_HZ if settings.rate_hz is None else settings.rate_hz
+    pace = {"rate_mhz": protocol.rate_mhz(rate_hz), "settle_us": 0, "adc_prescaler": "clock_500khz"}
+    defaults = {n: value for n, value in asdict(settings).items() if n != "rate_hz"} | pace
+    try:
+        _scan_plan(defaults)
+    except _Refused as refusal:
+        if settings.rate_hz is not None or str(refusal) != "too_fast":
+            raise ValueError(f"{refusal}: {_REASONS[str(refusal)]}") from None
+        defaults["rate_mhz"] = 0
+    return defaults
 
 
 def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
@@ -276,10 +302,9 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
             raise _Refused(result)
     prescaler = _PRESCALERS[wanted["adc_prescaler"]]
     readings = wanted["rows"] * wanted["columns"] * protocol.READINGS_PER_CELL
-    # From the hold to the end of the conversion the sample capacitor is off.
-    slot, held = 15 * prescaler, 11 * prescaler + prescaler // 2
+    slot, held = SLOT_ADC_CLOCKS_MIN * prescaler, int(HELD_ADC_CLOCKS * prescaler)
     if settle or not rate:
-        slot = max(slot, (settle or _SETTLE_US[wanted["mode"]]) * CLOCK_HZ // 1_000_000 + held)
+        slot = max(slot, (settle or SETTLE_US[wanted["mode"]]) * CLOCK_HZ // 1_000_000 + held)
     if not rate:
         shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
         period = slot * max(readings, math.ceil(shortest / slot))
@@ -288,105 +313,7 @@ def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
         if period < slot * readings:
             raise _Refused("too_fast")
         # Equal slots fill the period: as short as the settle time lets them be, or long ones.
-        slots = period // slot if settle else max(readings, -(-period // _SLOT_CYCLES_MAX))
+        slots = period // slot if settle else max(readings, -(-period // SLOT_CYCLES_MAX))
         slot = period // slots
     settle_us = (slot - held) * 1_000_000 // CLOCK_HZ
     return {"scan_cycles": period, "slot_cycles": slot, "settle_us": settle_us}
-
-
-class _Running:
-    """An `EmulatedBoard` in real time, from now on, with the `LineFaults` of a bad line."""
-
-    def __init__(self, board: EmulatedBoard, faults: LineFaults | None) -> None:
-        self._board = board
-        self._faults = faults or LineFaults()
-        self._begin_s = time.monotonic()
-
-    def _now_s(self) -> float:
-        return time.monotonic() - self._begin_s
-
-
-class EmulatorLink(_Running):
-    """A running board as a `Link`."""
-
-    resets_board = False
-
-    def __init__(self, board: EmulatedBoard, name: str, faults: LineFaults | None = None) -> None:
-        super().__init__(board, faults)
-        self.name = name
-        self._wake = threading.Condition()
-        self._waiting = bytearray()  # bytes that the host has not read yet
-        self._closed = False
-
-    def read(self) -> bytes:
-        """See `Link.read`."""
-        with self._wake:
-            deadline = self._now_s() + READ_TIMEOUT_S
-            while (now := self._listen()) < deadline and not self._waiting:
-                self._wake.wait(min(deadline, self._board.next_scan_s or deadline) - now)
-            octets, self._waiting = bytes(self._waiting), bytearray()
-            return octets
-
-    def write(self, octets: bytes) -> None:
-        """See `Link.write`."""
-        with self._wake:
-            self._listen()
-            self._board.receive(octets)
-            self._wake.notify_all()
-
-    def _listen(self) -> float:
-        """Take what arrives from the board by now; returns now."""
-        now = self._now_s()
-        if self._closed or self._faults.vanished(now):
-            raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
-        self._waiting += self._board.heard(self._faults, now)
-        return now
-
-    def set_baud(self, baud: int) -> None:
-        """See `Link.set_baud`: an emulated line has no speed."""
-
-    def close(self) -> None:
-        """See `Link.close`."""
-        with self._wake:
-            self._closed = True
-            self._wake.notify_all()
-
-
-class PtyServer(_Running, Closing):
-    """Serves a running board at `path`, for as long as `serve` runs.
-
-    Bytes that no program takes are thrown away, as a serial port does that nobody has open.
-
-    :raises PortError: this system has no pseudo-terminals.
-    """
-
-    def __init__(self, board: EmulatedBoard, faults: LineFaults | None = None) -> None:
-        try:
-            import tty
-        except ImportError as exc:
-            raise PortError("this system has no pseudo-terminals: use emulator:// itself") from exc
-        super().__init__(board, faults)
-        self._master, slave = os.openpty()
-        self._files = [self._master, slave]
-        tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(slave)
-
-    def serve(self, seconds: float = float("inf")) -> None:
-        """Serve for `seconds`, or until the faults let the board vanish."""
-        end_s = self._now_s() + seconds
-        while (now := self._now_s()) < end_s and not self._faults.vanished(now):
-            self._write(self._board.heard(self._faults, now))
-            wake_s = min(now + _IDLE_S, end_s, self._board.next_scan_s or end_s)
-            if select.select([self._master], [], [], max(0.0, wake_s - self._now_s()))[0]:
-                self._write(self._board.heard(self._faults, self._now_s()))
-                self._board.receive(os.read(self._master, _READ_SIZE))
-
-    def _write(self, octets: bytes) -> None:
-        with suppress(BlockingIOError):
-            os.write(self._master, octets)
-
-    def close(self) -> None:
-        """Take the pseudo-terminal away. May be called again."""
-        while self._files:
-            os.close(self._files.pop())

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The conversation with a board: one thread reads, and commands wait for their answers.
 
-port -> `_read`, in a thread of its own -> `BoardDecoder` -> `_keep` -> who waits for it
+port -> `_read`, in a thread of its own -> `_take` -> `BoardDecoder` -> `_keep` -> who waits for it
 
 A scan goes to the queues of `Device`, an answer to the thread that waits for it in `_command`. The
 thread also looks after the board: one that was reset while it scanned is made to scan again.
 """
 
 import threading
-import time
 from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -23,6 +22,7 @@ from ohmskin.errors import (
 )
 from ohmskin.link import framing, protocol
 from ohmskin.link.device import COMMAND_TRIES, LOG, Device, configuration
+from ohmskin.link.host_clock import HostClock
 from ohmskin.link.messages import (
     Ack,
     BoardDecoder,
@@ -71,6 +71,7 @@ COMMAND_TIMEOUT_S = 1.0
 _SPEED_LOST_S = 2.5
 # It is asked again after so long: a boot loader that took the question for an upload is done then.
 _ASK_AGAIN_S = 6.5
+_MACHINE_CLOCK: Final = HostClock()
 _BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
 
 
@@ -81,7 +82,8 @@ def _size(of: Hello | Scan) -> str:
 class Session(Device):
     """A board at a `Link` that has said hello. One that is reset while it scans is started again.
 
-    baud: speed of the line to change to.
+    baud: speed of the line to change to. clock: tells when scans came [s], for their
+    `host_time_s`.
 
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
@@ -89,16 +91,18 @@ class Session(Device):
     :raises DeviceLost: the port went away meanwhile.
     """
 
-    def __init__(self, link: Link, baud: int | None = None) -> None:
+    def __init__(
+        self, link: Link, baud: int | None = None, clock: HostClock = _MACHINE_CLOCK
+    ) -> None:
         self._link = link
+        self._clock = clock
         self._decoder = BoardDecoder()
         super().__init__(link.name, self._decoder.stats)
         self._acks: dict[int, Ack] = {}  # by the sequence numbers of their commands
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0  # number of the last command
-        work, name = (self._read,), f"read {link.name}"
-        self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
-        self._thread.start()
+        self._heard_s = clock.now_s()  # when a valid frame last came
+        self._begin_reading()
         try:
             self._connect()
             if self.info.scanning:
@@ -111,6 +115,14 @@ class Session(Device):
         except BaseException:
             self.close()
             raise
+
+    def _begin_reading(self) -> None:
+        work, name = (self._read,), f"read {self.name}"
+        self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
+        self._thread.start()
+
+    def _end_reading(self) -> None:
+        self._thread.join()
 
     def _connect(self) -> None:
         """Wait for hello, by whichever attempt it comes."""
@@ -137,7 +149,7 @@ class Session(Device):
                 with suppress(OhmskinError):  # it may be gone already
                     self._send("stop")
             self._closing = True
-            self._thread.join()
+            self._end_reading()
             self._link.close()
         self._want_scans = False
         super().close()
@@ -174,23 +186,25 @@ class Session(Device):
 
     def _read(self) -> None:
         """The work of the reading thread, until the session is closed."""
-        heard_s = time.monotonic()
         while not self._closing:
-            chunk = self._link.read()
-            now_s = time.monotonic()
-            with self._changed:
-                messages = self._decoder.feed(chunk, now_s)
-                for message in messages:
-                    self._keep(message)
-                if messages:
-                    heard_s = now_s
-                    self._changed.notify_all()
-            if self._want_scans and now_s - heard_s > _SPEED_LOST_S:
-                # A board that was reset is back at its default speed, at which its hello was not
-                # understood.
-                heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
-                self._link.set_baud(protocol.CONSTANTS["baud_default"])
-                self._send("get_hello")
+            self._take(self._link.read())
+
+    def _take(self, octets: bytes) -> None:
+        """Act on what has arrived; ask a board that has been silent for too long."""
+        now_s = self._clock.now_s()
+        with self._changed:
+            messages = self._decoder.feed(octets, now_s)
+            for message in messages:
+                self._keep(message)
+            if messages:
+                self._heard_s = now_s
+                self._changed.notify_all()
+        if self._want_scans and now_s - self._heard_s > _SPEED_LOST_S:
+            # A board that was reset is back at its default speed, at which its hello was not
+            # understood.
+            self._heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
+            self._link.set_baud(protocol.CONSTANTS["baud_default"])
+            self._send("get_hello")
 
     def _keep(self, message: Message) -> None:
         """Give a message to who waits for it. Raises ProtocolError for what no board can say."""

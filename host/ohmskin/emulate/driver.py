@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs an emulated board, behind a line with faults: in this process, or at a pseudo-terminal.
+
+A program that opens ``emulator://`` gets a `Session` over an `EmulatorLink`, in real time. With
+``speed=0`` it gets a `SteppedSkin`: the same session and the same link, by a clock that stands
+still unless somebody waits.
+"""
+
+import os
+import select
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.faults import LineFaults
+from ohmskin.errors import DeviceLost, PortError
+from ohmskin.files import Closing
+from ohmskin.link.host_clock import HostClock
+from ohmskin.link.serial_port import READ_TIMEOUT_S
+from ohmskin.link.session import Session
+
+# The most bytes of commands that a pseudo-terminal gives at once: more than Linux keeps of them.
+_READ_BYTES: Final = 4096
+
+
+class _Running:
+    """A board that is switched on now. `begin_s`: when that was, on the clock [s]."""
+
+    def __init__(self, board: EmulatedBoard, faults: LineFaults | None, clock: HostClock) -> None:
+        self.board = board
+        self.clock = clock
+        self.begin_s = clock.now_s()
+        self._faults = faults or LineFaults()
+
+    def _now_s(self) -> float:
+        """The time since the board was switched on [s]."""
+        return self.clock.now_s() - self.begin_s
+
+
+class EmulatorLink(_Running):
+    """A running board as a `Link`. Its scans come when its clock says so."""
+
+    resets_board = False
+
+    def __init__(
+        self,
+        board: EmulatedBoard,
+        name: str = "emulated board",
+        faults: LineFaults | None = None,
+        clock: HostClock | None = None,
+    ) -> None:
+        super().__init__(board, faults, clock or HostClock())
+        self.name = name
+        self._wake = threading.Condition()
+        self._arrived = bytearray()  # what the host has not read yet
+        self._closed = False
+
+    def read(self, limit_s: float = READ_TIMEOUT_S) -> bytes:
+        """See `Link.read`; waits for `limit_s` at most."""
+        with self._wake:
+            end_s = self._now_s() + limit_s
+            while (now_s := self._listen()) < end_s and not self._arrived:
+                due_s = min(end_s, self.board.next_scan_s or end_s)
+                self.clock.wait(self._wake, due_s - now_s)
+            octets, self._arrived = bytes(self._arrived), bytearray()
+            return octets
+
+    def write(self, octets: bytes) -> None:
+        """See `Link.write`."""
+        with self._wake:
+            self._listen()
+            self.board.receive(octets)
+            self._wake.notify_all()
+
+    def _listen(self) -> float:
+        """Take what arrives from the board by now; returns now."""
+        now_s = self._now_s()
+        if self._closed or self._faults.vanished(now_s):
+            raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
+        self._arrived += self.board.heard(self._faults, now_s)
+        return now_s
+
+    def set_baud(self, baud: int) -> None:
+        """See `Link.set_baud`: an emulated line has no speed."""
+
+    def close(self) -> None:
+        """See `Link.close`."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify_all()
+
+
+class SteppedSkin(Session):
+    """An emulated board whose time passes only while somebody waits for it: ``speed=0``.
+
+    Whoever takes a scan lets time pass until the board has sent it, which takes as long as the
+    machine needs to compute the scan. There is no thread, so every run of a program is the same.
+    `host_time_s` of a scan is the time since the board was switched on.
+    """
+
+    def __init__(self, link: EmulatorLink) -> None:
+        """link: one with a `SteppedClock`."""
+        self._read_link = link.read
+        super().__init__(link, clock=link.clock)
+
+    @property
+    def now_s(self) -> float:
+        """The time since the board was switched on [s]."""
+        return self._clock.now_s()
+
+    def step(self, seconds: float) -> None:
+        """Let time pass. What the board sends meanwhile is taken as by a program that waits.
+
+        :raises DeviceLost: the board went away.
+        """
+        with self._changed:
+            self._wait(lambda: False, seconds)
+
+    def _begin_reading(self) -> None:
+        """Nothing reads by itself."""
+
+    def _end_reading(self) -> None:
+        """Nothing has to end."""
+
+    def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:
+        end_s = self.now_s + limit_s
+        while not ready() and self._failure is None and self.now_s < end_s:
+            self._run(lambda: self._take_next(end_s - self.now_s))
+        return super()._wait(ready, 0.0)
+
+    def _take_next(self, limit_s: float) -> None:
+        # No step is longer than that of a thread that reads, because each looks for faults.
+        self._take(self._read_link(min(limit_s, READ_TIMEOUT_S)))
+
+
+class PtyServer(_Running, Closing):
+    """Serves a running board at `path`, while `serve` runs.
+
+    Bytes that no program takes are thrown away, as a serial port does that nobody has open;
+    `lost_bytes` counts them.
+
+    :raises PortError: this system has no pseudo-terminals.
+    """
+
+    def __init__(self, board: EmulatedBoard, faults: LineFaults | None = None) -> None:
+        try:
+            import tty
+        except ImportError as exc:
+            raise PortError("this system has no pseudo-terminals: use emulator:// itself") from exc
+        super().__init__(board, faults, HostClock())
+        self.lost_bytes = 0
+        self._closing, self._serving = False, threading.Lock()
+        self._master, slave = os.openpty()
+        self._files = [self._master, slave]
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(slave)
+
+    def serve(self, seconds: float = float("inf")) -> None:
+        """Serve for `seconds`, until `close`, or until the faults let the board vanish."""
+        end_s = self._now_s() + seconds
+        with self._serving:
+            while not self._closing and (now_s := self._now_s()) < end_s:
+                if self._faults.vanished(now_s):
+                    break
+                self._write(self.board.heard(self._faults, now_s))
+                wake_s = min(now_s + READ_TIMEOUT_S, end_s, self.board.next_scan_s or end_s)
+                if select.select([self._master], [], [], max(0.0, wake_s - self._now_s()))[0]:
+                    self._write(self.board.heard(self._faults, self._now_s()))
+                    self.board.receive(os.read(self._master, _READ_BYTES))
+
+    def _write(self, octets: bytes) -> None:
+        taken = 0
+        with suppress(BlockingIOError):
+            taken = os.write(self._master, octets)
+        self.lost_bytes += len(octets) - taken
+
+    def close(self) -> None:
+        """End `serve`, and take the pseudo-terminal away. May be called again, by any thread."""
+        self._closing = True
+        with self._serving:  # which ends within READ_TIMEOUT_S
+            while self._files:
+                os.close(self._files.pop())
