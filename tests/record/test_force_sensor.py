@@ -353,7 +353,7 @@ def test_a_display_counts_what_is_pressed(tmp_path: Path) -> None:
         recorder.add(ForceSample(0.5, 0.0))
 
         def see(scan: Scan) -> None:
-            display.see(scan)
+            display.look(scan)
             if scan.number % 4 == 0:
                 heads.append(picture()[0])
 

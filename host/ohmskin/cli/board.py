@@ -26,16 +26,20 @@ from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.link.serial_port import SerialPort, serial_ports
 
-# avrdude's options, and the boot loaders: PlatformIO's name, speed [baud]. An attempt takes 5 s.
+# How each board is flashed: avrdude's options, and its boot loaders by their names in PlatformIO,
+# with their speeds [baud]. Nanos were sold with two boot loaders. Two attempts, of 5 s each, show
+# that it is the other one; avrdude's ten would take a minute.
 _BOARDS: Final = {
     "uno": ("-p atmega328p -c arduino", {"uno": 115200}),
     "nano": ("-p atmega328p -c arduino -x attempts=2", {"nano": 115200, "nano_old": 57600}),
     "megaatmega2560": ("-p atmega2560 -c wiring", {"megaatmega2560": 115200}),
 }
 _ROOT: Final = Path(__file__).parents[3]
-_FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # in a wheel alone
-# A flashed board is in its boot loader for up to 3 s, and its port may be gone meanwhile [s].
+_FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # there is none but in a wheel
+# A flashed board must answer within this time [s]. Chosen: it is in its boot loader for up to 3 s,
+# and its port may be gone meanwhile.
 REBOOT_S: Final = 5.0
+# It is looked for so often meanwhile [s]. Chosen: short beside 3 s.
 _RETRY_S: Final = 0.2
 
 _out = Console(soft_wrap=True)
@@ -65,14 +69,14 @@ def wires_of(text: str) -> WireOhm:
 
 def ports(as_json: Annotated[bool, Option("--json", help="one JSON array")] = False) -> None:
     """List serial ports, and the kinds of ports that need no board."""
-    found = serial_ports()
+    there = serial_ports()
     if as_json:
-        print(json.dumps([asdict(port) for port in found]))  # noqa: T201
+        print(json.dumps([asdict(port) for port in there]))  # noqa: T201
         return
     table = Table("port", "board", "description", box=None)
-    for port in found:
+    for port in there:
         table.add_row(port.path, port.board or "?", port.description)
-    _out.print(table if found else "no serial ports: is the board plugged in?")
+    _out.print(table if there else "no serial ports: is the board plugged in?")
     _out.print(
         "without a board: emulator://8x8?scene=ghost, simavr://uno?scene=ghost, replay://FILE.mcap"
     )
@@ -93,7 +97,7 @@ def info(
         return
     findings = tested.findings if tested else ()
     table = Table(box=None, show_header=False)
-    for name, text in _said_of(board).items():
+    for name, text in _board_in_words(board).items():
         table.add_row(name, text)
     if tested is not None:
         ranges = zip("ABCDEFGH", tested.code_min, tested.code_max, strict=True)
@@ -107,8 +111,8 @@ def info(
         raise SystemExit(1)
 
 
-def _said_of(board: Hello) -> dict[str, str]:
-    """What a board says of itself, in people's units."""
+def _board_in_words(board: Hello) -> dict[str, str]:
+    """What a board says of itself, in people's units, by what it is called."""
     rate = f"{1e-3 * board.rate_asked_mhz:.2f} Hz" if board.rate_asked_mhz else "the fastest"
     us = board.settle_asked_us
     settle = f"{us} us" if us else "as long as the rate allows"
@@ -189,7 +193,7 @@ def flash(
 
 
 def _uploads(board: str, port: str) -> dict[int, list[str]]:
-    """The command that writes the firmware to a board, by the speed of the boot loader [baud]."""
+    """The commands that may flash a board, by the speed of the boot loader that they try [baud]."""
     options, loaders = _BOARDS[board]
     if (_ROOT / "platformio.ini").is_file():
         pio = shutil.which("pio", path=str(Path(sys.executable).parent)) or shutil.which("pio")
@@ -211,27 +215,27 @@ def _uploads(board: str, port: str) -> dict[int, list[str]]:
 
 
 def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str]:
-    """The board and the port that are meant.
+    """The board and the port to flash, of which either may be empty where USB ids tell it.
 
-    :raises PortError: that is not clear.
+    :raises PortError: it is not clear which board or which port is meant.
     """
     if board and board not in _BOARDS:
         raise PortError(f"no board '{board}': there are {', '.join(_BOARDS)}")
     real = os.path.realpath(port)  # a link of udev's has no USB id of its own
-    meant = [each for each in attached if not port or os.path.realpath(each.path) == real]
-    if port and not meant and not os.path.exists(port):
+    possible = [one for one in attached if not port or os.path.realpath(one.path) == real]
+    if port and not possible and not os.path.exists(port):
         raise PortError(f"no port {port}", "'ohmskin ports' lists the ports there are")
-    fit = [each for each in meant if each.board in ((board,) if board else _BOARDS)]
-    if len(fit) == 1:
-        return fit[0].board, fit[0].path
-    if port and meant and meant[0].board:
-        raise PortError(f"{port} is a {meant[0].board}, not a {board}: say which you mean")
+    fitting = [one for one in possible if one.board in ((board,) if board else _BOARDS)]
+    if len(fitting) == 1:
+        return fitting[0].board, fitting[0].path
+    if port and possible and possible[0].board:
+        raise PortError(f"{port} is a {possible[0].board}, not a {board}: say which you mean")
     if board and port:
         return board, port
-    seen = ", ".join(f"{each.path} ({each.board or each.description or '?'})" for each in meant)
+    ports = ", ".join(f"{one.path} ({one.board or one.description or '?'})" for one in possible)
     raise PortError(
-        f"{len(fit) or 'no'} {board or 'known'} boards are found by their USB ids: say which is "
-        f"where: ohmskin flash {' | '.join(_BOARDS)} --port PORT: {seen or 'there is no port'}"
+        f"{len(fitting) or 'no'} {board or 'known'} boards are found by their USB ids: say which "
+        f"is where: ohmskin flash {' | '.join(_BOARDS)} --port PORT: {ports or 'there is no port'}"
     )
 
 

@@ -38,8 +38,8 @@ from ohmskin.link.device import Device, mean_ratio
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
 
-# Standard gravity [m/s^2].
-GRAVITY: Final = 9.80665
+# Standard gravity [m/s^2], by its definition (CGPM, 1901).
+GRAVITY_M_PER_S2: Final = 9.80665
 
 Out = Annotated[Path, Argument(help="calibration file to write (.json)")]
 Method = Annotated[str, Option(help=" | ".join(LEVEL_METHODS))]
@@ -73,7 +73,7 @@ def weights(
     Every press is kept at once, in OUT with .presses.csv: after Ctrl-C the same command goes on.
     """
     calibrator_of = _options(out, method, indenter_mm2, wires, table=True)
-    forces_n = [1e-3 * mass_g * GRAVITY for mass_g in _grams(grams)]
+    forces_n = [1e-3 * mass_g * GRAVITY_M_PER_S2 for mass_g in _grams(grams)]
     kept = _KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         shape = skin.info.rows, skin.info.columns
@@ -137,7 +137,7 @@ def recording(
         if any(scan.mode != given.hellos[-1].mode for scan in given.scans):
             raise ValueError("modes near and far are mixed in it: record the presses in one mode")
         if log is None:  # the scans have the same clock
-            samples = np.array([(each.host_time_s, each.force_n) for each in given.forces])
+            samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
             log = ForceLog(*samples.T)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s))
         history = calibrator.measure(given.scans, progress("scans"))
@@ -210,10 +210,10 @@ def _options(
     *inputs: Path | None,
     table: bool = False,
 ) -> Callable[[Hello, Float], Calibrator]:
-    """Check what all commands are told, before anybody presses cells for an hour.
+    """Check the options that all commands have, before anybody presses cells for an hour.
 
-    table: whether presses are in a table. Returns what makes the calibrator of a board and the
-    readings (R, C, 4) of its untouched skin.
+    table: whether presses are in a table. Returns a function that makes the calibrator from what
+    the board says of itself and the readings (R, C, 4) of its untouched skin.
     """
     nominal = wires_of(wires)
     if method not in LEVEL_METHODS:
@@ -250,7 +250,10 @@ def _from_table(calibrator: Calibrator, table: PressTable, source: Path, out: Pa
 def _finish(
     calibrator: Calibrator, presses: Presses, source: Path, out: Path, note: str = ""
 ) -> None:
-    """Write the calibration that the presses from `source` tell, and say what it is worth."""
+    """Write the calibration that is learned from presses, and say how good it is.
+
+    source: where the presses are from. note: is printed first.
+    """
     with naming(source):
         calibration, message = calibrator.calibration(presses)
     calibration.save(out)
@@ -263,7 +266,7 @@ def _finish(
         title = "held-out error [N], of so many presses, of cells' own curves"
         _out.print(cell_table(texts, title))
     if message:
-        error_n = model.held_out_rmse[model.pooled].max()  # of one cell alone none is known
+        error_n = model.held_out_rmse[model.pooled].max()  # NaN where one cell alone was pressed
         _out.print(message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else ""))
     top, bottom, log_std = calibration.nominal_wire_ohm
     if log_std is not None:
@@ -277,7 +280,7 @@ def _finish(
 
 
 class _KeptPresses:
-    """A table of presses and its file, which is whole after each change."""
+    """A table of presses and its file, which is written anew, and whole, at each change."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -306,36 +309,36 @@ class _KeptPresses:
 def _guided(
     skin: Device, calibrator: Calibrator, kept: _KeptPresses, missing: list[Press], total: int
 ) -> int:
-    """Ask for what is missing. Returns how much still is, after an interruption.
+    """Ask for the missing presses. Returns how many still are, after an interruption.
 
     Lines say what to do next. A terminal also gets a bar, and a bell for each press.
     """
     guide, rest = Guide(missing), calibrator.rest_level
-    done, said = total - len(missing), ""
+    done, last_line = total - len(missing), ""
     columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
     bar = Progress(*columns, console=_out, transient=True, disable=not _out.is_terminal)
     task = bar.add_task("", total=total)
     with bar:
         for scan in until_ctrl_c(iter(skin.latest, None)):
-            found = calibrator.estimator.estimate(scan.ratio)
-            step = guide.feed(1e-6 * scan.time_us, found.level - rest, found.touched)
+            frame = calibrator.estimator.estimate(scan.ratio)
+            step = guide.feed(1e-6 * scan.time_us, frame.level - rest, frame.touched)
             if step.wanted is not None and step.rise is not None:
                 kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
                 done += 1
                 _out.bell()
-            line, now = _said_of(step)
-            if line and line != said:
+            line, now = _step_in_words(step)
+            if line and line != last_line:
                 counted = f"{done} of {total}: " if step.rise is not None else ""
                 _out.print(counted + line, markup=False, highlight=False)
-                said = line
+                last_line = line
             bar.update(task, completed=done, description=now)
             if step.state is State.DONE:
                 break
     return total - done
 
 
-def _said_of(step: Step) -> tuple[str, str]:
-    """What to do next, empty where nothing changes, and what goes on meanwhile."""
+def _step_in_words(step: Step) -> tuple[str, str]:
+    """What the person has to do next, empty where nothing changes, and what goes on meanwhile."""
     press, line, now = step.wanted, "", step.state.value
     if press is None:
         return "", ""
@@ -343,7 +346,7 @@ def _said_of(step: Step) -> tuple[str, str]:
         rise = f"{1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} microsiemens above rest"
         line = f"{rise}: take it off"
     elif step.state is State.PUT:
-        weight = f"{1e3 * press.force_n / GRAVITY:.6g} g ({press.force_n:.3f} N)"
+        weight = f"{1e3 * press.force_n / GRAVITY_M_PER_S2:.6g} g ({press.force_n:.3f} N)"
         row, column = press.cell
         line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
     elif step.state is State.WRONG:

@@ -12,7 +12,7 @@ from rich.console import Console
 import ohmskin
 from ohmskin.arrays import Bool, Float
 from ohmskin.cli.record import progress
-from ohmskin.cli.stream import FULL_SCALE_US, WIDE, coloured
+from ohmskin.cli.stream import FULL_SCALE_USIEMENS, WIDE, coloured
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import check_place, whole_file
@@ -48,7 +48,7 @@ def compare(port: str, seconds: float, picture: Path) -> None:
     title = f"scene '{scene.name}', simulated {board.rows}x{board.columns} skin"
     out = _out if _out.is_terminal else WIDE
     out.print(f"{title}: cell conductance in microsiemens")
-    tables = [coloured(1e6 * siemens, FULL_SCALE_US, name) for name, siemens, _ in views]
+    tables = [coloured(1e6 * siemens, FULL_SCALE_USIEMENS, name) for name, siemens, _ in views]
     out.print(Columns(tables))
     for (name, _, touched), estimates in zip(views[1:], zip(*frames, strict=True), strict=True):
         ghosts = int((touched & ~truth).sum())
@@ -80,7 +80,7 @@ def _save_picture(path: Path, views: Sequence[tuple[str, Float, Bool]], title: s
     all_axes = figure.subplots(1, len(views), squeeze=False)[0]
     for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
         drawn_us = np.maximum(1e6 * cell_siemens, 0.1)  # the logarithm of 0 is no colour
-        axes.imshow(drawn_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_US)
+        axes.imshow(drawn_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_USIEMENS)
         for row, column in np.argwhere(touched):
             text = f"{drawn_us[row, column]:.0f}"
             colour = "white" if drawn_us[row, column] < 50 else "black"

@@ -16,7 +16,9 @@ import ohmskin
 from ohmskin.ctrl_c import forget_ctrl_c
 from ohmskin.errors import OhmskinError
 
-# Where each command is, and what the list of commands says of it: the first paragraph of its help.
+# The module and function of each command, and what the list of commands says of it. That is the
+# first paragraph of the command's own help, and a test compares both. It stands here, too, because
+# `ohmskin --help` would take seconds if it imported all these modules.
 _COMMANDS: Final = {
     "board.ports": "List serial ports, and the kinds of ports that need no board.",
     "board.info": "Say what board is at PORT and how it scans.",
@@ -37,26 +39,26 @@ _COMMANDS: Final = {
 
 
 class _Command(TyperCommand):
-    """A command whose module is not imported yet: what the list of commands needs to know."""
+    """A command whose module is not imported yet. It knows what the list of commands shows."""
 
     def __init__(self, place: str, help_: str) -> None:
         self._module, _, name = place.partition(".")
         super().__init__(name, help=help_)
 
     def load(self) -> Any:
-        """The command itself, or the group of them. Its module may have EPILOGS for their help."""
+        """The command itself, or the group of them. Its module may have EPILOGS for the help."""
         assert self.name is not None
         module = import_module(f"ohmskin.cli.{self._module}")
-        found, made = getattr(module, self.name), typer.Typer(add_completion=False)
-        if isinstance(found, typer.Typer):
-            made.add_typer(found, name=self.name)
+        function, group = getattr(module, self.name), typer.Typer(add_completion=False)
+        if isinstance(function, typer.Typer):
+            group.add_typer(function, name=self.name)
         else:
             epilog = getattr(module, "EPILOGS", {}).get(self.name)
-            made.command(self.name, epilog=epilog)(found)
-        return typer.main.get_group(made).commands[self.name]
+            group.command(self.name, epilog=epilog)(function)
+        return typer.main.get_group(group).commands[self.name]
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
-        """What runs is the command itself."""
+        """The command itself is run, and so imported now."""
         return self.load().make_context(info_name, args, parent, **extra)
 
 
@@ -78,7 +80,7 @@ def _top(version: Annotated[bool, typer.Option("--version", help="the version")]
 
 app = typer.main.get_command(_typer)
 assert isinstance(app, TyperGroup)
-app.commands = {place.partition(".")[2]: _Command(place, said) for place, said in _COMMANDS.items()}
+app.commands = {place.partition(".")[2]: _Command(place, text) for place, text in _COMMANDS.items()}
 
 
 def main() -> None:
@@ -99,13 +101,14 @@ def run(commands: Callable[..., Any], program: str) -> None:
     except (OhmskinError, ValueError, OSError) as exc:
         _fail(program, str(exc))
     except (Exception, KeyboardInterrupt) as exc:
-        # Of an import that Ctrl-C ends may come an ImportError.
+        # An import that Ctrl-C ends may raise an ImportError, whose cause is Ctrl-C.
         if isinstance(exc.__cause__ or exc, (typer.Abort, KeyboardInterrupt)):
             sys.exit(130)
-        said = getattr(exc, "format_message", None)
-        if said is None:
+        # Errors of Typer say by this method what is wrong with the command line.
+        message = getattr(exc, "format_message", None)
+        if message is None:
             raise
-        if text := said():  # a wrong use of the command line
+        if text := message():
             _fail(program, text)
         sys.exit(2)  # no command at all: the help is the answer
 

@@ -36,7 +36,8 @@ from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import FORMATS, Mark, load_recording
 from ohmskin.record.recording import export as export_recording
 
-# With a force sensor the first scans are a tare of so many seconds, unless told.
+# With a force sensor the first scans are a tare of so many seconds [s], unless told. Chosen: a
+# person who starts the command still takes a hand away in the first second.
 FORCE_TARE_S: Final = 2.0
 
 _out = Console(soft_wrap=True)
@@ -71,23 +72,23 @@ def record(
         recorder = stack.enter_context(Recorder(file, skin.info))
         for text in mark or ():
             recorder.add(Mark(text, time.monotonic()))
-        see = None
+        look = None
         if sensor is not None:
             _out.print(f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it")
             if _out.is_terminal:
                 display = PressDisplay(recorder)
                 live = Live(get_renderable=display.picture, console=_out, transient=True)
                 stack.enter_context(live)
-                see = display.see
+                look = display.look
         if sys.stdin is not None and sys.stdin.isatty():
-            # The end of the recording does not wait for a line.
+            # A thread, because the end of the recording must not wait for a line.
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
             recording.record(
                 *(skin, recorder, asked_for(until_ctrl_c(skin), scans, seconds)),
                 tare_s=tare_s,
                 sensor=sensor,
-                beside=see,
+                beside=look,
             )
         except DeviceLost as exc:
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
@@ -106,9 +107,9 @@ def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
 
 
 class PressDisplay:
-    """What a person sees who presses cells while they are recorded, and so which are missing.
+    """Shows a person who presses cells, while they are recorded, which cells are still missing.
 
-    counts: presses of each cell (R, C), of one cell alone, for `CERTAIN_S`.
+    counts: presses of each cell, (R, C): how often it alone was pressed for `CERTAIN_S`.
     """
 
     def __init__(self, recorder: Recorder) -> None:
@@ -116,19 +117,19 @@ class PressDisplay:
         self._recorder = recorder
         self._reader: SkinReader | None = None
         self._on = OnSkin()
-        self._seen_s = float("-inf")
+        self._looked_s = float("-inf")
 
-    def see(self, scan: Scan) -> None:
-        """Look at a scan that was recorded; at some of them, for estimates take time."""
+    def look(self, scan: Scan) -> None:
+        """Look at a scan that was recorded, if the last look was long ago: estimates take time."""
         tare = self._recorder.tare
-        if tare is None or scan.host_time_s - self._seen_s < DISPLAY_EVERY_S:
+        if tare is None or scan.host_time_s - self._looked_s < DISPLAY_EVERY_S:
             return
-        self._seen_s = scan.host_time_s
+        self._looked_s = scan.host_time_s
         if self._reader is None:
             self._reader = SkinReader(self._recorder.board, rest_ratio=tare.rest_ratio)
         if tare.is_of(scan):
-            found = self._reader.estimate(scan.ratio)
-            pressed = pressed_cells(self._reader.rise(found), found.touched)
+            frame = self._reader.estimate(scan.ratio)
+            pressed = pressed_cells(self._reader.rise(frame), frame.touched)
             if self._on.see(scan.host_time_s, pressed) and len(self._on.cells) == 1:
                 self.counts[self._on.cells[0]] += 1
 

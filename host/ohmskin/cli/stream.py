@@ -29,17 +29,20 @@ from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
 _out = Console()
-# For tables in a file or pipe, which have no width: 16 columns, or three of 8 side by side.
+# For tables in a file or pipe, which have no width: 16 columns, or three tables of 8 side by side.
 WIDE: Final = Console(width=160)
-# Conductance at which a table's colours end: a cell of 5 kOhm [microsiemens].
-FULL_SCALE_US: Final = 200.0
-# Force at which a table's colours end [N].
+# Conductance at which a table's colours end [microsiemens]. Chosen: a firm press makes 5 kOhm.
+FULL_SCALE_USIEMENS: Final = 200.0
+# Force at which a table's colours end [N]. Chosen: more than a fingertip usually presses.
 FULL_SCALE_N: Final = 10.0
-# An untouched cell's force counts as known up to this deviation [N], as on the page.
+# An untouched cell shows its force, and no "?", if its standard deviation is at most this [N].
+# Chosen: the page's scale of forces begins there.
 KNOWN_N: Final = 0.1
 _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
-# Time between two pictures in a terminal, and in a file or pipe [s]; every scan is counted.
+# Time between two pictures in a terminal [s]. Chosen: an estimate takes time, and nobody reads more
+# numbers. Scans in between are counted, and not estimated.
 DISPLAY_EVERY_S: Final = 0.1
+# The same in a file or pipe [s], where pictures are kept.
 _PRINT_EVERY_S: Final = 1.0
 
 
@@ -61,17 +64,17 @@ def stream(
     if method not in ("", "none", *METHODS):
         raise ValueError(f"no method '{method}': there are none, {', '.join(METHODS)}")
     if method and str(calibration) == os.environ.get("OHMSKIN_CALIBRATION"):
-        calibration = None  # what is said goes before what the environment says
+        calibration = None  # an option goes before what the environment says
     if method and calibration is not None:
         raise ValueError("say either --method or --calibration: a calibration has its own method")
-    told = None if calibration is None else load_calibration(calibration)
+    loaded = None if calibration is None else load_calibration(calibration)
     with ohmskin.open(port) as skin:
         board = skin.info
         reader = None
         if method != "none":
-            reader = SkinReader(board, told, method=method, force=force)
+            reader = SkinReader(board, loaded, method=method, force=force)
         if tare_s and reader is not None:
-            reader.tare(skin.mean_ratio(tare_s), force=told is None)
+            reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
         with ends_by_ctrl_c():
             given = asked_for(skin, scans, seconds)
             if as_json:
@@ -96,19 +99,19 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
             "ratio": scan.ratio.tolist(),
         }
         if reader is not None:
-            found = reader.read(scan)
+            shown = reader.read(scan)
             line["method"] = reader.method
-            line["cell_siemens"] = numbers(found.estimate.cell_siemens)
-            line["cell_siemens_std"] = numbers(found.estimate.cell_siemens_std)
-            line["converged"] = found.estimate.converged
-            line["message"] = found.estimate.message
+            line["cell_siemens"] = numbers(shown.estimate.cell_siemens)
+            line["cell_siemens_std"] = numbers(shown.estimate.cell_siemens_std)
+            line["converged"] = shown.estimate.converged
+            line["message"] = shown.estimate.message
             if reader.has_forces:
-                line["force_n"] = numbers(found.force_n)
-                line["force_n_std"] = numbers(found.force_n_std)
+                line["force_n"] = numbers(shown.force_n)
+                line["force_n_std"] = numbers(shown.force_n_std)
                 of_contact = ("identity", "row", "column", "force_n", "force_n_std")
                 line["contacts"] = [
-                    {name: numbers(getattr(each, name)) for name in of_contact}
-                    for each in found.contacts
+                    {name: numbers(getattr(contact, name)) for name in of_contact}
+                    for contact in shown.contacts
                 ]
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
@@ -118,17 +121,17 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
 
 
 def numbers(values: ArrayLike) -> Any:
-    """As JSON has them, with null in place of what is not finite."""
+    """Values as lists for JSON, with null in place of what is not finite, which JSON cannot say."""
     return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
-    shown_s = 0.0
+    drawn_s = 0.0
     live = Live(console=_out, auto_refresh=False) if _out.is_terminal else None
     with live or nullcontext():
         for scan in scans:
-            if scan.host_time_s - shown_s >= (DISPLAY_EVERY_S if live else _PRINT_EVERY_S):
-                shown_s = scan.host_time_s
+            if scan.host_time_s - drawn_s >= (DISPLAY_EVERY_S if live else _PRINT_EVERY_S):
+                drawn_s = scan.host_time_s
                 picture = _picture(skin, reader, scan)
                 if live:
                     live.update(picture, refresh=True)
@@ -145,23 +148,24 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     if reader is None:
         title = f"{skin.name}: reading B in thousandths of Vdd"
         level = 1e3 * scan.ratio[:, :, scan.reading_names.index("b")]
-        return Group(Text(title), coloured(level, FULL_SCALE_US), Text(caption))
-    found = reader.read(scan)
-    if not found.estimate.converged:
-        caption += f"  not converged: {found.estimate.message}"
+        # Small readings are about as large, in these units, as conductances are in microsiemens.
+        return Group(Text(title), coloured(level, FULL_SCALE_USIEMENS), Text(caption))
+    shown = reader.read(scan)
+    if not shown.estimate.converged:
+        caption += f"  not converged: {shown.estimate.message}"
     if reader.has_forces:
         title = f"{skin.name}: force by '{reader.method}' [N], ?: uncertain"
-        least_n = np.where(found.estimate.touched, 0.0, KNOWN_N)
-        uncertain = found.force_n_std > np.maximum(found.force_n, least_n)
-        table = coloured(np.where(uncertain, np.nan, found.force_n), FULL_SCALE_N)
+        least_n = np.where(shown.estimate.touched, 0.0, KNOWN_N)
+        uncertain = shown.force_n_std > np.maximum(shown.force_n, least_n)
+        table = coloured(np.where(uncertain, np.nan, shown.force_n), FULL_SCALE_N)
         contacts = (
-            f"contact {each.identity}: {each.force_text} at ({each.row:.1f}, {each.column:.1f})"
-            for each in found.contacts
+            f"contact {one.identity}: {one.force_text} at ({one.row:.1f}, {one.column:.1f})"
+            for one in shown.contacts
         )
         caption = f"{'   '.join(contacts) or 'no contact'}\n{caption}"
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
-        table = coloured(1e6 * found.estimate.cell_siemens, FULL_SCALE_US)
+        table = coloured(1e6 * shown.estimate.cell_siemens, FULL_SCALE_USIEMENS)
     return Group(Text(title), table, Text(caption))
 
 
@@ -172,7 +176,7 @@ def coloured(values: Float, full_scale: float, title: str = "") -> Table:
 
 
 def _colour(share: float) -> str:
-    """Of a share of the full scale, on a logarithmic scale from a hundredth of it."""
+    """The colour of a share of the full scale, on a logarithmic scale that begins at 0.01."""
     if not share > 0.01:
         return _COLOURS[0]
     return _COLOURS[min(int((1 + np.log10(share) / 2) * len(_COLOURS)), len(_COLOURS) - 1)]

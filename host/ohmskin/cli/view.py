@@ -6,7 +6,7 @@ import sys
 import threading
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 from typer import Argument, Option
 
@@ -14,8 +14,10 @@ from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.errors import OhmskinError
 from ohmskin.force.calibration import load_calibration
 
-HTTP_PORT = 8765
-_DISPLAYS = {"DISPLAY", "WAYLAND_DISPLAY"}
+# The port at which the page is, unless told. Chosen: few other programs use it.
+HTTP_PORT: Final = 8765
+# Where Linux says that a browser has somewhere to open.
+_DISPLAYS: Final = {"DISPLAY", "WAYLAND_DISPLAY"}
 
 
 def view(
