@@ -10,11 +10,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ohmskin.circuit.skin import readings
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
+from ohmskin.doctor.circuit import examine_circuit
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, Severity, merged
 from ohmskin.doctor.gather import gather
-from ohmskin.doctor.signal import Rest, RestScans, examine_signal, find_hum, second_look
+from ohmskin.doctor.signal import Look, Rest, examine_signal, find_hum, second_look
+from ohmskin.emulate.scenes import Scene
+from ohmskin.link.codes import quantise
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
 from stepped import evidence, stepped
 
@@ -137,6 +141,28 @@ def test_faults_are_found_beside_a_touch() -> None:
         assert told(url) == [FOUND[f"8x8?{fault}"], ("touched", "cell (4, 4)")]
 
 
+def test_an_open_line_of_a_noisy_board_is_open() -> None:
+    """Noise looks like some current there, since no code is below zero."""
+    assert told("emulator://8x8?open_row=3&noise=10") == [
+        ("open_row", "row 3"),
+        ("noise", "whole skin"),
+    ]
+
+
+def test_a_hand_on_most_of_the_skin_is_seen(sound: Evidence) -> None:
+    """What its cells scatter by is not taken for the scatter of cells at rest."""
+    skin, random = Scene("rest", 8, 8, seed=1).skin(0.0), np.random.default_rng(0)
+    siemens = skin.cell_siemens.copy()
+    siemens[:5] += 10 ** random.uniform(-5.3, -3.7, (5, 8))
+    codes = quantise(readings(replace(skin, cell_siemens=siemens))).astype(np.float64)
+    board = replace(sound.board, rows=8, columns=8)
+    rest, diagnosis = Rest(board, codes, 50, 0.4, (100.0, 200.0)), Diagnosis()
+    touched = examine_circuit(rest, diagnosis).touched
+    assert touched[:5].sum() > 30
+    assert not touched[5:].any()
+    assert diagnosis.findings == []
+
+
 def test_lines_that_are_not_there_are_one_finding() -> None:
     bench = stepped("emulator://4x6")
     bench.configure(rows=7, rate_hz=0)
@@ -178,9 +204,9 @@ def test_hum_is_not_seen_in_noise_or_in_other_tones() -> None:
         assert "hum" not in dict(told(f"emulator://4x4?hum={hz}&hum_lsb=3"))
 
 
-def rest_of(url: str) -> RestScans:
+def rest_of(url: str) -> Look:
     read = evidence(url)
-    return RestScans.of(read.board, read.scans)
+    return Look.of(read.board, read.scans)
 
 
 def test_noisy_lines_and_cells_are_named() -> None:

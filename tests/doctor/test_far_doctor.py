@@ -285,12 +285,11 @@ def test_wires_that_are_not_nominal_are_told() -> None:
 def test_all_far_ends_are_open_where_there_is_no_second_pair() -> None:
     """Sense nodes that are connected to nothing keep what they had."""
     read = evidence(FAR)
-    board, scans = read.settled or (read.board, read.scans)
-    assert scans[0].mode == "far"
-    for scan in scans:
-        scan.codes[..., 1] = np.roll(scan.codes[..., 0].T.ravel(), 1).reshape(8, 8).T
-        scan.codes[..., 3] = np.roll(scan.codes[..., 2].T.ravel(), 1).reshape(8, 8).T
-    rows, columns = examine(replace(read, board=board, scans=scans, settled=None)).findings
+    assert read.settled is not None
+    for codes in (*(scan.codes for scan in read.scans), *read.settled.codes):
+        codes[..., 1] = np.roll(codes[..., 0].T.ravel(), 1).reshape(8, 8).T
+        codes[..., 3] = np.roll(codes[..., 2].T.ravel(), 1).reshape(8, 8).T
+    rows, columns = examine(read).findings
     assert (rows.kind, columns.kind) == (Kind.OPEN_FAR, Kind.OPEN_FAR)
     assert rows.place.rows == columns.place.columns == tuple(range(8))
 

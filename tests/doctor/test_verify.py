@@ -298,7 +298,7 @@ def test_empty_fields_are_open(tmp_path: Path) -> None:
 def test_the_firmware_in_the_simulator(
     run: Run, write: Write, monkeypatch: pytest.MonkeyPatch, desk: str
 ) -> None:
-    monkeypatch.setattr(gathering, "CLOCK_S", 0.3)
+    monkeypatch.setattr(gathering, "NOISE_S", 0.3)
     plate, there = write(PLATE), write(other(PLATE, **{"4,5": 49.35e3}), "there")
     code, told = verified(run, f"simavr://uno?plate={plate}{desk}", plate)
     assert code == 0, told["findings"]

@@ -7,11 +7,13 @@ from typing import Any, Final
 
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, LineWire, Place, WireShare
 from ohmskin.doctor.gather import Step
-from ohmskin.doctor.wires import KNOWN_STD, CornerScans
+from ohmskin.doctor.limits import KNOWN_STD
+from ohmskin.doctor.wires import CornerScans
 from ohmskin.link.protocol import ENUMS
 
 FIELDS: Final = ("where", "measured", "expected", "what_to_do")
-MOST_CELLS: Final = 6  # [cells] More are not named one by one.
+# [cells] More cells are counted, and not named. Chosen: they fill a line of a terminal.
+MOST_CELLS: Final = 6
 
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
@@ -24,11 +26,11 @@ def words_of(finding: Finding) -> dict[str, str]:
     kind, place, values = finding.kind, finding.place, finding.values
     words = {"where": named(place), "one_place": place != WHOLE_SKIN, **values, **_words(finding)}
     table = _TABLES[words.get("table", kind.id)]
-    told = dict(table)
+    said = dict(table)
     for case in table.keys() - FIELDS:
         if words.get(case) or case in words.values():
-            told |= table[case]
-    return {field: told[field].format(**words) for field in FIELDS}
+            said |= table[case]
+    return {field: said[field].format(**words) for field in FIELDS}
 
 
 def _words(finding: Finding) -> dict[str, Any]:
@@ -56,12 +58,12 @@ def _words(finding: Finding) -> dict[str, Any]:
         case Kind.REFERENCE_RATIO:
             return {"nominal_ratio": values["ref_top_ohm"] / values["ref_bottom_ohm"]}
         case Kind.OPEN_JOINT | Kind.BRIDGE | Kind.WRONG_RESISTOR:
-            plate_ohm, told = values["plate_ohm"], kilohm(values["cell_ohm"])
-            return {"cell": told, "plate": plate_ohm and kilohm(plate_ohm)}
+            plate_ohm = values["plate_ohm"]
+            return {"cell": kilohm(values["cell_ohm"]), "plate": plate_ohm and kilohm(plate_ohm)}
         case Kind.LINEARITY:
             bad = values["readings"]
-            told = "; ".join(f"{name}: {line_in_words(values['lines'][name])}" for name in bad)
-            return {"names": ", ".join(bad), "told": told}
+            lines_said = (f"{name}: {line_in_words(values['lines'][name])}" for name in bad)
+            return {"names": ", ".join(bad), "told": "; ".join(lines_said)}
         case Kind.ADC_NOISE:
             return {"told": ", ".join(f"{c}: {lsb:.2f} LSB" for c, lsb in values["clocks"].items())}
         case Kind.RESTARTED:
@@ -84,8 +86,8 @@ def kilohm(ohm: float) -> str:
 
 def line_in_words(line: dict[str, float]) -> str:
     """The line that is fitted to the readings of a configuration."""
-    told = "slope {slope:.4f}, offset {offset_lsb:+.2f} LSB, residual {residual_lsb:.2f} LSB"
-    return told.format(**line)
+    text = "slope {slope:.4f}, offset {offset_lsb:+.2f} LSB, residual {residual_lsb:.2f} LSB"
+    return text.format(**line)
 
 
 def named(place: Place) -> str:
@@ -118,11 +120,11 @@ def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:
     """The figures; and the wires in words, unless touches or faults hide them."""
     if diagnosis.nominal_ohm is None:
         return diagnosis.measured
-    told, pressed = _UNTOUCHED, diagnosis.pressed
+    wires, pressed = _UNTOUCHED, diagnosis.pressed
     if pressed is not None:
-        told = _ohm(pressed[0], diagnosis.nominal_ohm) if pressed else _NOT_PRESSED
-    lines = [f"{named(each.place)}: {_times(each)}" for each in (pressed or ())[1:]]
-    return {**diagnosis.measured, "wires": told, "wires_of_lines": lines}
+        wires = _ohm(pressed[0], diagnosis.nominal_ohm) if pressed else _NOT_PRESSED
+    lines = [f"{named(share.place)}: {_times(share)}" for share in (pressed or ())[1:]]
+    return {**diagnosis.measured, "wires": wires, "wires_of_lines": lines}
 
 
 def _times(share: WireShare) -> str:
@@ -139,8 +141,8 @@ def _ohm(share: WireShare, nominal_ohm: tuple[float, float]) -> str:
 def line_wire_in_words(line: LineWire) -> str:
     """A line of the table of wires."""
     pairs = zip(line.segment_ohm, line.segment_std_ohm, strict=True)
-    each = " ".join(f"{ohm:6.0f}" if std < KNOWN_STD * ohm else "     ?" for ohm, std in pairs)
-    return f"{named(line.place):<18}{line.ohm:6.0f} +- {line.std_ohm:<4.0f}{each}"
+    texts = (f"{ohm:6.0f}" if std < KNOWN_STD * ohm else "     ?" for ohm, std in pairs)
+    return f"{named(line.place):<18}{line.ohm:6.0f} +- {line.std_ohm:<4.0f}{' '.join(texts)}"
 
 
 def step_in_words(step: Step, detail: Any) -> tuple[str, str]:

@@ -34,16 +34,16 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
-from ohmskin.doctor.findings import (
+from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
+from ohmskin.doctor.limits import (
+    ADC_ERROR_LSB,
     ALL_STDS,
+    DEAD_SHARE,
     MANY_STDS,
     ONE_STDS,
-    Diagnosis,
-    Kind,
-    Place,
-    lines_of,
+    ROUNDING_LSB,
 )
-from ohmskin.doctor.signal import ADC_ERROR_LSB, ROUNDING_LSB, Rest
+from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 
@@ -64,13 +64,8 @@ DOUBLED: Final = 1.4
 # [ports] Lines do not agree in so many ports by chance. Chosen: cells scatter by 10 %.
 ALIKE_PORTS: Final = 5
 
-# Dead cells.
-# [1] A cell with less than this share of the conductance that it should have does not conduct.
-# Chosen: cells at rest scatter by 10 %, a dead one has none.
-DEAD_SHARE: Final = 0.3
-
 # Touched and saturated cells.
-# [1] This share of the cells, at least, is taken to be at rest. Chosen: touches cover less.
+# [1] This share of the cells, at least, is taken to be at rest. Chosen: a hand covers less.
 REST_QUANTILE: Final = 0.25
 # [S] No cell at rest conducts more. Chosen: 1e-6 is usual.
 MOST_AT_REST_SIEMENS: Final = 5e-6

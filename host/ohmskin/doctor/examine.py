@@ -19,7 +19,7 @@ from ohmskin.circuit.small import one_blas_thread
 from ohmskin.doctor.circuit import examine_circuit
 from ohmskin.doctor.far import examine_far, near_ends, segments_of
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, merged
-from ohmskin.doctor.signal import Rest, RestScans, examine_settling, examine_signal
+from ohmskin.doctor.signal import Look, Rest, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import WireOhm
@@ -35,8 +35,6 @@ BAD_RESETS: Final = ("brown_out", "watchdog")
 class Evidence:
     """What `examine` goes by. What could not be had is None or empty, and is not judged.
 
-    A look is what the board said of itself and its scans then.
-
     board: what the board says of itself, as it is configured.
     scans: the first look, by this configuration.
     stats: counts of the connection.
@@ -47,32 +45,32 @@ class Evidence:
     latency: timer of the USB bridge [ms], and the file that sets it.
     host_version: version of this package.
     lost: why the board went away meanwhile.
-    clocks: a look by each ADC clock.
+    clocks: a look by each ADC clock, None for one that shows too few scans.
     loss: this share of missing scans is no fault [1].
-    pressed: looks at pressed corners, by turns as configured and with a longer settle time.
+    pressed: such looks at pressed corners, by turns as configured and with a longer settle time.
     """
 
     board: Hello
     scans: list[Scan] = field(default_factory=list)
     stats: BoardStats = field(default_factory=BoardStats)
-    settled: tuple[Hello, list[Scan]] | None = None
+    settled: Look | None = None
     report: SelfTestReport | None = None
     wire_ohm: tuple[float, float] | None = None
     presses: CornerScans | None = None
     latency: tuple[int, str] | None = None
     host_version: str = ""
     lost: str = ""
-    clocks: list[tuple[Hello, list[Scan]]] = field(default_factory=list)
+    clocks: list[Look | None] = field(default_factory=list)
     loss: float = 0.0
-    pressed: list[tuple[Hello, list[Scan]]] = field(default_factory=list)
+    pressed: list[Look | None] = field(default_factory=list)
 
 
-def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
+def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     """Add what the scans show of a skin: signal, lines, cells, far ends, and wires.
 
     usual: the first look. Wires are at fault only if nominal ones are known.
     """
-    settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
+    settled = evidence.settled
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
     moves, scans, far = bool(moved.any()), usual, usual.board.mode == "far"
     # Far ends are always read with more time: even a part of a code counts there.
@@ -102,7 +100,7 @@ def examine_skin(evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> 
 
 def examine(
     evidence: Evidence,
-    of_scans: Callable[[Evidence, RestScans, Diagnosis], None] = examine_skin,
+    of_scans: Callable[[Evidence, Look, Diagnosis], None] = examine_skin,
 ) -> Diagnosis:
     """All findings, and the figures behind them.
 
@@ -110,7 +108,7 @@ def examine(
     without regard to those of others; here they are merged.
     """
     board, stats = evidence.board, evidence.stats
-    usual = RestScans.of(board, evidence.scans)
+    usual = Look.of(board, evidence.scans)
     diagnosis = Diagnosis()
     diagnosis.measured = {
         "board": board.board,

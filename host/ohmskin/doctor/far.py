@@ -47,9 +47,9 @@ import numpy as np
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit import skin as circuit
 from ohmskin.doctor.circuit import LinesAndCells
-from ohmskin.doctor.findings import FEW_STDS, MANY_STDS, Diagnosis, Kind, LineWire, Place, lines_of
-from ohmskin.doctor.signal import ADC_ERROR_LSB, Rest
-from ohmskin.doctor.wires import CHANGED_SHARE, KNOWN_STD
+from ohmskin.doctor.findings import Diagnosis, Finding, Kind, LineWire, Place, lines_of
+from ohmskin.doctor.limits import ADC_ERROR_LSB, CHANGED_SHARE, FEW_STDS, KNOWN_STD, MANY_STDS
+from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD
@@ -111,8 +111,8 @@ class FarReadings:
         std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * loss)
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
         self._loss_std_floating = np.stack([loss, std, floating], axis=1) / self._current
-        known = SkinKnowledge(*self.shape, *self._refs, rest.board.adc_bits)
-        self._matrix = make_estimator("matrix", known)
+        board = SkinKnowledge(*self.shape, *self._refs, rest.board.adc_bits)
+        self._matrix = make_estimator("matrix", board)
         self.cell_siemens = self._matrix.estimate(near).cell_siemens
 
     def layers(self, wire_ohm: Float) -> tuple[LayerReadings, LayerReadings]:
@@ -289,10 +289,11 @@ class _Layer:
         alive = np.flatnonzero(~in_line)
         beyond = self.across[alive[-1] + 1 :] if alive.size else []
         if beyond and self.lost[line]:
-            between, explained = (self.across[alive[-1]], beyond[0]), np.zeros_like(dead)
+            explained = np.zeros_like(dead)
             np.moveaxis(explained, self.axis, 0)[self.numbers[line], beyond] = True
-            cells = Place.of_cells(explained)
-            diagnosis.add(Kind.BROKEN_YARN, self.place([line]), cells, between=between)
+            values = {"between": (self.across[alive[-1]], beyond[0])}
+            place, cells = self.place([line]), Place.of_cells(explained)
+            diagnosis.findings.append(Finding(Kind.BROKEN_YARN, place, values, cells))
         return bool(beyond)
 
     def report_wires(self, nominal_ohm: float | None, diagnosis: Diagnosis) -> None:

@@ -24,13 +24,6 @@ class Severity(StrEnum):
     NOTE = "note"  # good to know; nothing is wrong with the skin
 
 
-# How many standard deviations a value must be off before it is a finding. The more values are
-# looked at, the further off one of them is by chance. Shares are those of normal deviations.
-ONE_STDS: Final = 3.0  # One value: of 370 sound boards, one is that far off.
-FEW_STDS: Final = 3.5  # Some ten values, such as lines: one of 2,000 is.
-MANY_STDS: Final = 5.0  # Hundreds of values, such as cells or segments: one of 1.7 million is.
-ALL_STDS: Final = 6.0  # All 1,024 readings of the largest scan: one of 500 million is.
-
 _FAULT, _WARNING, _NOTE = Severity
 _CELLS: Final = "worst cell_ohm plate_ohm off_percent most_percent"  # of resistors of a plate
 _CHANGE: Final = "change_lsb most_lsb settle_us longer_us needed_us pressed"
@@ -158,15 +151,15 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
        beyond a break in a yarn are dead, but the yarn is what must be mended.
     2. Findings stand in the order of their kinds; of one kind, as they were found.
     """
-    kinds, told = list(Kind), []
+    kinds, kept = list(Kind), []
     for finding in findings:
         place: Place | None = finding.place
         for other in findings:
             if place is not None and finding.kind.name in other.kind.explains:
                 place = place.without(other.explained or other.place)
         if place is not None:
-            told.append(replace(finding, place=place))
-    return sorted(told, key=lambda finding: kinds.index(finding.kind))
+            kept.append(replace(finding, place=place))
+    return sorted(kept, key=lambda finding: kinds.index(finding.kind))
 
 
 @dataclass(frozen=True)
@@ -223,16 +216,9 @@ class Diagnosis:
     pressed: list[WireShare] | None = None
     lines: list[LineWire] = field(default_factory=list)
 
-    def add(
-        self,
-        kind: Kind,
-        place: Place = WHOLE_SKIN,
-        explained: Place | None = None,
-        /,
-        **values: Any,
-    ) -> None:
-        """Add a finding with these values: see `Finding`."""
-        self.findings.append(Finding(kind, place, values, explained))
+    def add(self, kind: Kind, place: Place = WHOLE_SKIN, /, **values: Any) -> None:
+        """Add a finding with these values."""
+        self.findings.append(Finding(kind, place, values))
 
     @property
     def worse(self) -> list[Finding]:

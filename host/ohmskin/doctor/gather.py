@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures a board for `examine`: which scans are taken, by which settings, for how long.
 
-A look is a number of scans by one configuration, with what the board said of itself then. The first
-look is as the board is configured. The others differ in one thing each (settle time, ADC clock), so
-that what they show otherwise is the fault of this thing.
+A look is a number of scans by one configuration. The first look is by that of the board. The others
+differ from it in one thing, settle time or ADC clock. What readings change then is due to that.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,7 +11,7 @@ from enum import Enum, auto
 from typing import Any, Final
 
 from ohmskin.doctor.examine import Evidence
-from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, REST_S, SETTLED_S, second_look
+from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, NOISE_S, REST_S, SETTLED_S, Look, second_look
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
 from ohmskin.link.device import Device, configuration, scans_for
@@ -22,8 +21,6 @@ from ohmskin.link.serial_port import latency_timer
 
 # [s] A person has this long to press all corners. Chosen: three times what it takes.
 WAIT_S: Final = 30.0
-# [s] A look by another ADC clock takes this long. Chosen: it shows noise alone, which needs little.
-CLOCK_S: Final = 1.0
 # [looks] While corners are pressed, each settle time gets this many looks. Chosen: their scatter
 # shows how much the hand drifts.
 TURNS: Final = 5
@@ -90,7 +87,7 @@ def gather(
                 report(Step.ADC_CLOCK, clock)
                 # As fast as it can: a slow clock does not reach the rate of the board.
                 settings = {"adc_prescaler": clock, "rate_hz": 0}
-                evidence.clocks.append(_look(device, CLOCK_S, settings))
+                evidence.clocks.append(_look(device, NOISE_S, settings))
         if presses is not None:
             evidence.presses = presses
             _scan_presses(device, presses, report)
@@ -130,12 +127,12 @@ def _settings(board: Hello) -> dict[str, Any]:
     return settings
 
 
-def _look(device: Device, seconds: float, settings: dict[str, Any]) -> tuple[Hello, list[Scan]]:
-    """What a board with these settings says of itself, and its scans."""
+def _look(device: Device, seconds: float, settings: dict[str, Any]) -> Look | None:
+    """Scans of a board with these settings; None if they are too few."""
     device.stop()
     board, scans = device.configure(**settings), list[Scan]()
     _scan(device, scans, seconds)
-    return board, scans
+    return Look.of(board, scans)
 
 
 def _scan(device: Device, scans: list[Scan], seconds: float) -> None:

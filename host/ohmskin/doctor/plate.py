@@ -41,17 +41,10 @@ from ohmskin.circuit.skin import (
     port_resistance_ohm,
     readings,
 )
-from ohmskin.doctor.circuit import DEAD_SHARE
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
-from ohmskin.doctor.signal import (
-    NOISY_LSB,
-    RestScans,
-    examine_settling,
-    find_hum,
-    noise_variance,
-    report_hum,
-)
+from ohmskin.doctor.limits import DEAD_SHARE, NOISY_LSB, PRESSED_LSB
+from ohmskin.doctor.signal import Look, examine_settling, find_hum, noise_variance, report_hum
 from ohmskin.estimate.base import TOUCH_STDS, Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
@@ -63,7 +56,7 @@ FULL: Final = 1 << ADC_BITS  # [LSB] Vdd, as a code: the board's converter says 
 # deviations. Chosen: 1 MOhm, far above what a plate's resistors are.
 BRIDGE_SIEMENS: Final = 1e-6
 # [1] In the right order, lines differ from the plate by less than this share of what they differ in
-# the wrong one. Chosen.
+# the wrong one. Chosen: a wrong resistor stays wrong in any order.
 SWAPPED_SHARE: Final = 0.5
 # [1] A resistor tells the references if its share of the loop with them is between these. Chosen:
 # else the references, or the resistor, have too few codes.
@@ -74,14 +67,23 @@ LEAST_SPAN_LSB: Final = 50.0
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The most that a sound board has; ``ohmskin verify --help`` says where options are from."""
+    """The most that a sound board has. ``ohmskin verify --help`` has sources of the first three.
+
+    cell_percent: error of a resistor [%].
+    reference_percent: error of a reference resistor [%].
+    settling_lsb: change of a reading with a longer settle time [LSB].
+    slope: slope of the straight line, less 1 [1]: a gain error of 2 LSB, and a bow of 1.5.
+    offset_lsb: its offset [LSB]: 2 LSB, 2 of the gain, half a code, and noise.
+    residual_lsb: distance of a reading from it [LSB]: a bow of 1.5 LSB, and rounding.
+    noise_lsb: noise of a reading [LSB].
+    """
 
     cell_percent: float = 3.0
     reference_percent: float = 1.5
-    settling_lsb: float = 4.0
-    slope: float = 0.01  # a gain error of 2 LSB, a bow of 1.5
-    offset_lsb: float = 5.0  # 2 LSB, and 2 of gain; half a code; noise
-    residual_lsb: float = 2.0  # a bow of 1.5 LSB, rounding
+    settling_lsb: float = PRESSED_LSB
+    slope: float = 0.01
+    offset_lsb: float = 5.0
+    residual_lsb: float = 2.0
     noise_lsb: float = NOISY_LSB
 
 
@@ -119,9 +121,9 @@ class PlateExam:
         self.lines: dict[str, dict[str, float]] = {}
         self.noise_lsb: dict[str, float] = {}
 
-    def examine(self, evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
+    def examine(self, evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
         """Add what the scans show of the plate. usual: the first look."""
-        settled = None if evidence.settled is None else RestScans.of(*evidence.settled)
+        settled = evidence.settled
         self._examine_signal(evidence, usual, diagnosis)
         scans = usual
         if settled is not None:
@@ -137,16 +139,16 @@ class PlateExam:
         self.predicted_lsb = FULL * READING_SIGN * (ratio - READING_OFFSET)
         self._examine_lines(diagnosis)
 
-    def _examine_signal(self, evidence: Evidence, usual: RestScans, diagnosis: Diagnosis) -> None:
+    def _examine_signal(self, evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
         """Add hum, and noise by ADC clock, of the readings that nothing clips."""
         report_hum(find_hum(usual), usual.board.rate_hz, diagnosis)
-        for scans in (usual, *(RestScans.of(*look) for look in evidence.clocks)):
-            if scans is not None:
+        for look in (usual, *evidence.clocks):
+            if look is not None:
                 # An offset may clip readings that are as near to Vdd or ground.
-                lit = np.abs(scans.mean - FULL / 2) < FULL / 2 - self.tolerance.offset_lsb
-                variance = noise_variance(scans.codes)[lit]
+                lit = np.abs(look.mean - FULL / 2) < FULL / 2 - self.tolerance.offset_lsb
+                variance = noise_variance(look.codes)[lit]
                 noise_lsb = float(np.mean(variance)) ** 0.5 if lit.any() else 0.0
-                self.noise_lsb.setdefault(scans.board.adc_prescaler, noise_lsb)
+                self.noise_lsb.setdefault(look.board.adc_prescaler, noise_lsb)
         most_lsb = self.tolerance.noise_lsb
         loud = {clock: lsb for clock, lsb in self.noise_lsb.items() if lsb > most_lsb}
         if loud:

@@ -34,7 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.doctor.findings import ALL_STDS, WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
+from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
 from ohmskin.link.clock import reading_offsets_s, slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -49,6 +50,9 @@ REST_S: Final = 2.5
 SETTLED_S: Final = 1.6
 # [s] The second look in mode far. Chosen: it measures wires, which show as few codes.
 FAR_S: Final = 4.0
+# [s] Scans of this time show their noise, and their mean has little of it. Chosen: 90 scans, whose
+# mean has a tenth.
+NOISE_S: Final = 1.0
 # [scans] Noise and hum are not judged by fewer. Chosen: two a block (BLOCKS).
 LEAST_SCANS: Final = 16
 # [1] The second look has a settle time that is so many times as long. Chosen: four times as many
@@ -59,7 +63,8 @@ LEAST_LONGER_US: Final = 100
 # [us] In mode far it is at least this long: wires show as a few codes, so that a tenth counts.
 # Chosen: with less, far nodes keep a part of a code (docs/troubleshooting.md).
 LONGER_FAR_US: Final = 300
-# [1] A settle time that is longer by less than this factor shows nothing new. Chosen.
+# [1] A settle time that is longer by less than this factor shows nothing new. Chosen: it changes
+# what a slow node lacks by less than that lack itself.
 NOT_LONGER: Final = 1.2
 # [Hz] The second look is not slower, unless the board is. Chosen: some six scans in SETTLED_S.
 LEAST_LOOK_HZ: Final = 4.0
@@ -69,35 +74,29 @@ LEAST_LOOK_HZ: Final = 4.0
 MAINS_HZ: Final = (50.0, 60.0)
 # [Hz] They are looked for so far off: a board's ceramic resonator is off by up to 0.5 %.
 MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)
-# [LSB] Rounding to a code is off by up to half of one. Hum of a smaller amplitude is not reported,
-# and scatter is taken to be at least this, since rounding may hide it.
-ROUNDING_LSB: Final = 0.5
 # [deviations] P of hum is above that of noise by this many, if all readings were independent. The
 # four readings of a cell round alike, so that it is half as many. Chosen: 5 of these.
 HUM_OVER_NOISE: Final = 10.0
 # [1] P of hum is above that of frequencies beside it by this factor, which drift and other tones
-# are not. Chosen.
+# are not. Chosen: in noise, the largest of some is about twice the usual one.
 HUM_OVER_BESIDE: Final = 3.0
 # [1 / duration] Frequencies beside a tone. A Hann window's main lobe ends at 2 (Harris 1978).
 BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)
 # [1] If two mains differ by less than this factor in how much of them has one phase, they may be
-# one, which is seen twice. Chosen.
+# one, which is seen twice. Chosen: noise changes it by less.
 IN_PHASE: Final = 1.5
-# [1] From this |m|^2 on, a sine and its mirror image cannot be told apart. Chosen.
+# [1] From this |m|^2 on, a sine and its mirror image cannot be told apart. Chosen: their difference
+# is divided by 1 - |m|^2, and its noise with it.
 OVERLAP: Final = 0.5
-# [Hz] Mains that are seen slower than this, plus 4 / duration, look like drift. Chosen.
+# [Hz] Mains that are seen slower than this, plus 4 / duration, look like drift. Chosen: skins drift
+# in seconds.
 STILL_HZ: Final = 0.5
 
 # Noise.
-# [LSB] Offset of a sound converter, and as much gain error at full scale (ATmega328P data sheet,
-# ADC characteristics: 2 LSB each).
-ADC_ERROR_LSB: Final = 2.0
 # [LSB] Noise of a sound board before rounding. Chosen: as of emulated boards.
 ADC_NOISE_LSB: Final = 0.3
 # [LSB] Rounding adds the deviation of a value that may be anywhere within a code.
 SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5
-# [LSB] A board with more noise in its usual cell is noisy. Chosen: nearly twice SOUND_NOISE_LSB.
-NOISY_LSB: Final = 0.8
 # [LSB] A noisy line or cell has more. Chosen: above NOISY_LSB, as the worst of many is judged.
 NOISY_CELL_LSB: Final = 1.0
 # [1] It also has this factor over the usual noise. Chosen: three times the power.
@@ -113,7 +112,7 @@ UNSETTLED_LSB: Final = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class RestScans:
+class Look:
     """A look: scans by one configuration.
 
     board: what the board said of itself.
@@ -144,17 +143,17 @@ class RestScans:
 
     @cached_property
     def window(self) -> Float:
-        """w (N,)."""
+        """w, (N,)."""
         window = np.hanning(len(self.codes) + 2)[1:-1]
         return np.asarray(window / window.sum())
 
     def amplitude(self, frequency_hz: float) -> Complex:
-        """c (R, C, 4)."""
+        """c at this frequency, (R, C, 4) [LSB]."""
         turn = np.exp(-2j * np.pi * frequency_hz * self.time_s)
         return 2 * np.tensordot(self.window * turn, self.codes - self.mean, axes=1)
 
     def power(self, frequency_hz: float) -> float:
-        """P."""
+        """P at this frequency [LSB^2]."""
         return float(np.mean(np.abs(self.amplitude(frequency_hz)) ** 2))
 
     @property
@@ -213,7 +212,7 @@ class Hum:
 
 
 def examine_signal(
-    scans: RestScans, diagnosis: Diagnosis, other: RestScans | None = None
+    scans: Look, diagnosis: Diagnosis, other: Look | None = None
 ) -> tuple[float, Bool]:
     """Add hum and noise. Returns the noise of a reading without hum [LSB], and which cells moved.
 
@@ -263,7 +262,7 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 # ----------------------------------------------------------------------------------------- hum
 
 
-def find_hum(scans: RestScans) -> Hum | None:
+def find_hum(scans: Look) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen.
 
     If both mains are found, one of them may be an alias of the other. The right one is that whose
@@ -306,7 +305,7 @@ def report_hum(hum: Hum | None, rate_hz: float, diagnosis: Diagnosis) -> None:
         )
 
 
-def _hum_at(mains_hz: float, scans: RestScans) -> Hum | None:
+def _hum_at(mains_hz: float, scans: Look) -> Hum | None:
     """Hum near one of the mains; None if it is too weak to matter, or does not stand out.
 
     A sine a is seen as c = a + m conj(a), because near half the scan rate the sine and its mirror
@@ -405,7 +404,7 @@ def second_look(board: Hello) -> dict[str, Any] | None:
 
 
 def examine_settling(
-    usual: RestScans, settled: RestScans, diagnosis: Diagnosis, most_lsb: float = UNSETTLED_LSB
+    usual: Look, settled: Look, diagnosis: Diagnosis, most_lsb: float = UNSETTLED_LSB
 ) -> bool:
     """Whether means change with a longer settle time by more than `most_lsb`, noise apart.
 
@@ -427,7 +426,7 @@ def examine_settling(
     return bool(cells.any())
 
 
-def settling_values(usual: RestScans, settled: RestScans, change_lsb: float) -> dict[str, float]:
+def settling_values(usual: Look, settled: Look, change_lsb: float) -> dict[str, float]:
     """What describes a change with a longer settle time: change, both times, and the time required.
 
     A node comes nearer to its final voltage by the factor exp(-t / tau) in each slot t. Within a

@@ -1,38 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wires of a skin against nominal ones, from three corners of a rectangle that are pressed.
 
+Why three corners. Call them (a, b), (a, b') and (a', b), of which (a, b) is between the other two.
+The fourth one, (a', b'), is not pressed, so its port's current takes the way through all three,
+in series. So four ports show four sums of three unknown cells and of wires. If the untouched cells
+conducted nothing, this would be left:
+
+    rho[a,b] + rho[a,b'] + rho[a',b] - rho[a',b'] = 2 (top + bottom)
+
+top is the wire of row a from its electrode to the nearer of columns b and b', bottom that of column
+b to the nearer of rows a and a'. Only their sum is seen. So both layers are taken to have changed
+by the same factor exp(y).
+
 Symbols. Index 0 is the untouched skin, index 1 the pressed one.
 
 ====== ============ =====================================================================
 symbol shape        meaning
 ====== ============ =====================================================================
-z      (RC,)        port resistances read, less those of the model [ohm]
-n      (RC,)        deviations of what was read [ohm]
-B      (RC, RC)     slopes of the model by the cells' log resistances [ohm]
-W      (RC, 2RC)    slopes of the model by the segments' log resistances [ohm]
-y      ()           log of the wires over nominal
-p      (RC,)        what a press adds to the cells' log resistances; 0 but for the free cells
+y      ()           log of the wires over nominal: what is sought
+z      (RC,)        port resistances as read, less those of the model [ohm]
+n      (RC,)        standard deviations of the port resistances as read [ohm]
+c      (RC,)        log resistances of the untouched cells
+p      (RC,)        what a press adds to these; 0 but for the free cells, which may be pressed
+B      (RC, RC)     slopes of the model's port resistances by the cells' log resistances [ohm]
+W      (RC, 2RC)    slopes of these by the segments' log resistances [ohm]
+V      (RC,)        variance of p: wide for the free cells, narrow for all others
 ====== ============ =====================================================================
 
-With three corners of a rectangle pressed, (a, b) the one between the other two, (a, b') and
-(a', b), the current of the fourth goes through all three in series, so that four ports see three
-unknown cells and the wires. But for the untouched cells,
-
-    rho[a,b] + rho[a,b'] + rho[a',b] - rho[a',b'] = 2 (top + bottom)
-
-with top the wire of row a from its electrode up to the nearer of columns b and b', and bottom that
-of column b up to the nearer of rows a and a'. So only the sum of both layers is seen, and they are
-taken to have changed alike. The untouched cells follow from what was read of them,
-dc = B0^-1 (z0 - W0 dy), so
+The untouched cells are those that explain the untouched skin, whatever the wires are:
+dc = B0^-1 (z0 - W0 dy). The readings of the pressed skin then are
 
     r = z1 - B1 B0^-1 z0 = W dy + B1 dp + noise ,   W = W1 - B1 B0^-1 W0
 
     S = n1^2 + B1 B0^-1 n0^2 B0^-T B1^T + SEGMENT_STD^2 W W^T + B1 V B1^T
 
-with V wide for the free cells, narrow for others. With w the sum of W over all segments, a
-Gauss-Newton step is dy = w^T S^-1 r / (w^T S^-1 w), but for a weak prior of y. Free are the three
-cells and their neighbours, since a fingertip may press these as well. What stays unexplained widens
-the deviation.
+S is the covariance of all that is not y: noise of both skins, what segments have of their own, and
+presses. With w the sum of W over all segments, a Gauss-Newton step is
+
+    dy = w^T S^-1 r / (w^T S^-1 w) ,
+
+and a weak prior keeps y near 0. Free are the three corners and their neighbours, since a fingertip
+may press these as well. If the residual is larger than S says, the deviation of y is widened.
 """
 
 from collections import defaultdict
@@ -41,54 +49,45 @@ from itertools import permutations
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit, current_std
-from ohmskin.doctor.findings import FEW_STDS, WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
-from ohmskin.doctor.signal import Rest, RestScans, rounding_std_lsb, settling_values
+from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
+from ohmskin.doctor.limits import CHANGED_SHARE, FEW_STDS, KNOWN_STD, PRESSED_LSB
+from ohmskin.doctor.signal import NOISE_S, Look, Rest, rounding_std_lsb, settling_values
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import MAX_ITERATIONS, SEGMENT_STD, UNLIMITED_STD
+from ohmskin.estimate.prior import MAX_ITERATIONS, MAX_STEP_LOG, SEGMENT_STD, UNLIMITED_STD
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ADC_BITS
 
 Corners = tuple[Cell, Cell, Cell]
 
-# What counts as a change. Shares are over nominal; deviations are those of their logs.
-# [share] A larger deviation is too close to CHANGED_SHARE to say what the resistance is. Chosen.
-KNOWN_STD: Final = 0.15
-# [share] Wires that differ by less from what they should be are no fault. Chosen: estimators expect
-# changes of LAYER_STD anyway.
-CHANGED_SHARE: Final = 0.25
 
 # Standard deviations before the readings.
 # [log] All wires may have changed by a factor of seven. Chosen: readings decide.
 BEFORE_STD: Final = 2.0
-# [log] An untouched cell drifts by this in the seconds since rest was read. Chosen.
+# [log] An untouched cell drifts by this in the seconds since rest was read. Chosen: a fifth of
+# REST_STD, which is for hours.
 DRIFT_STD: Final = 0.01
 
 # Presses.
-# [s] Corners are held this long. Chosen: a mean of 90 scans has a tenth of their noise.
-PRESS_S: Final = 1.0
 # [S] A firm press conducts more. Chosen: 20 times a cell at rest.
 PRESSED_SIEMENS: Final = 2e-5
 # [1] No other cell conducts more than this share of the weakest corner: else it is pressed, too.
-# Chosen.
+# Chosen: three fingers press alike.
 FOURTH_SHARE: Final = 0.5
-# [1] Corners with less than this share of the most scans were pressed in passing. Chosen.
+# [1] Corners with less than this share of the most scans were pressed in passing. Chosen: both
+# wanted rectangles are held for as long.
 HELD_SHARE: Final = 0.5
 # [scans] Fewer scans of a look at pressed corners do not count. Chosen: the hand moved in it.
 LEAST_HELD: Final = 5
-# [LSB] Readings of pressed corners that change by more have not settled. Chosen: a firm press shows
-# some 400, and 1 % of that is no fault.
-PRESSED_LSB: Final = 4.0
 
-# The fit. It takes at most MAX_ITERATIONS steps, as those of estimators.
-# [log] No step is longer: slopes do not hold further away. Chosen.
-LONGEST_STEP: Final = 1.0
+# The fit. Its steps are at most MAX_ITERATIONS and no longer than MAX_STEP_LOG, as in estimators.
 # [log] The step that is shorter is the last. Chosen: far below any deviation.
 CLOSE_STEP: Final = 1e-4
 
@@ -111,7 +110,7 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
 
 
 def suggested_corners(rows: int, columns: int) -> Corners:
-    """Where to press: far from the electrodes, and apart.
+    """Where to press: far from the electrodes, where wires are long, and apart from each other.
 
     :raises ValueError: a skin of one row or column has no rectangle.
     """
@@ -168,46 +167,47 @@ class CornerScans:
         self._last: Corners | None = None
 
     def take(self, scan: Scan) -> None:
-        """Keep a scan if three corners are pressed in it, and nothing else is."""
-        siemens = self._siemens(scan)
+        """Keep a scan if three corners are pressed in it, and nothing else is.
+
+        Corners that were held for NOISE_S are read. Then `wanted` is the fourth corner with two of
+        them. Corners that were read before may stay pressed meanwhile: they need no holding.
+        """
+        siemens = self._siemens(scan.codes)
         self.pressed = Place.of_cells(siemens > PRESSED_SIEMENS).cells
         corners = pressed_corners(siemens)
         self.hold = corners is not None and corners != self._last
         if corners is None:
             return
         self._codes[corners].append(scan.codes.astype(np.float64))
-        if self.hold and len(self._codes[corners]) >= PRESS_S * self._board.rate_hz:
+        if self.hold and len(self._codes[corners]) >= NOISE_S * self._board.rate_hz:
             self.hold, self.again, self.done = False, True, self.again
             self._last, self.wanted = corners, moved_across(corners)
 
-    def _siemens(self, scan: Scan) -> Float:
+    def _siemens(self, codes: ArrayLike) -> Float:
         """Conductances (R, C) [S]; zeros for another size: the board was reset meanwhile."""
-        shape = self._board.rows, self._board.columns
-        if scan.codes.shape[:2] != shape:
-            return np.zeros(shape)
-        return self._matrix.estimate(scan.ratio).cell_siemens
+        ratio = ratio_from_codes(codes, self._board.adc_bits)
+        if ratio.shape[:2] != (self._board.rows, self._board.columns):
+            return np.zeros(ratio.shape[:2])
+        return self._matrix.estimate(ratio).cell_siemens
 
-    def examine_settling(
-        self, looks: Sequence[tuple[Hello, list[Scan]]], diagnosis: Diagnosis
-    ) -> None:
+    def examine_settling(self, looks: Sequence[Look | None], diagnosis: Diagnosis) -> None:
         """Add a finding if readings of pressed corners change with a longer settle time.
 
         looks: by turns as usual and with the longer time. A hand drifts alike in both, and the
         scatter among looks of one kind shows by how much.
         """
+        # By corners: the means of each look as usual, and of those with the longer time.
         means: defaultdict[Corners, list[list[Float]]] = defaultdict(lambda: [[], []])
-        for turn, (_, scans) in enumerate(looks):
-            codes = defaultdict(list)
-            for scan in scans:
-                if corners := pressed_corners(self._siemens(scan)):
-                    codes[corners].append(scan.codes)
-            for corners, held in codes.items():
-                if len(held) >= LEAST_HELD:
-                    means[corners][turn % 2].append(np.mean(held, axis=0))
+        for turn, look in enumerate(looks):
+            held = defaultdict(list)
+            for codes in () if look is None else look.codes:
+                if corners := pressed_corners(self._siemens(codes)):
+                    held[corners].append(codes)
+            for corners, scans in held.items():
+                if len(scans) >= LEAST_HELD:
+                    means[corners][turn % 2].append(np.mean(scans, axis=0))
         in_both = [of_corners for of_corners in means.values() if min(map(len, of_corners)) >= 2]
-        if not in_both:
-            return
-        usual, settled = (RestScans.of(*look) for look in looks[:2])
+        usual, settled = looks[:2] if in_both else (None, None)
         if usual is None or settled is None:
             return
         changes = []
@@ -241,10 +241,9 @@ class CornerScans:
         return shares_of(measured)
 
     def _free(self, corners: Corners) -> Bool:
-        """Cells that may be pressed, (R, C): three corners with their neighbours.
+        """Cells that may be pressed, (R, C): the corners, and their neighbours for wide fingertips.
 
-        The neighbours of the fourth corner are not among them: they may be neighbours of another
-        one, too, but if all four places could be pressed, nothing would tell the wires.
+        The fourth corner and its neighbours are not among them, since its current tells the wires.
         """
         rows, columns = np.indices((self._board.rows, self._board.columns))
         *near, near_fourth = (
@@ -313,11 +312,11 @@ def _pressed_fit(
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
         precision = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
         pull = float(slopes @ weighed[:, 1]) - log_share * BEFORE_STD**-2
-        step = float(np.clip(pull / precision, -LONGEST_STEP, LONGEST_STEP))
+        step = float(np.clip(pull / precision, -MAX_STEP_LOG, MAX_STEP_LOG))
         log_share += step
         untouched = untouched + at_rest @ (off_rest - step * by_rest_wires.sum(axis=1))
         lift_step = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
-        lift += np.where(free, np.clip(lift_step, -LONGEST_STEP, LONGEST_STEP), 0.0)
+        lift += np.where(free, np.clip(lift_step, -MAX_STEP_LOG, MAX_STEP_LOG), 0.0)
         if abs(step) < CLOSE_STEP:
             break
     misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
