@@ -19,10 +19,10 @@ Edges: both are compressed, log(1 + z / (0.2 z_99)) with their own 99th percenti
 strong and weak presses count alike. Then both are differentiated by a Gaussian of 50 ms: creep,
 drift and the zero are slow, while a press begins and ends in both at once.
 
-At each lag r is normalised by what both share there, without gaps, so a large press wins at no lag
-by its size. G is the log-likelihood ratio of "x is a multiple of y and noise" to "x is noise": by r
-alone, two short stretches that are alike by chance would win. A delay inside the force sensor, such
-as that of its filter, is part of the offset.
+At each lag r is normalised by what both share there, without gaps. So a large press does not win at
+a wrong lag by its size. By r alone, two short stretches could win that are alike by chance. G is
+the log-likelihood ratio of "x is a multiple of y and noise" to "x is noise", which grows with n. A
+delay inside the force sensor, such as that of its filter, is part of the offset.
 """
 
 from dataclasses import dataclass
@@ -34,29 +34,36 @@ from numpy.typing import ArrayLike
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.tables import ForceLog, between_gaps
 
-# Both are compared on a grid of this step [s]: as fine as the scans of most boards.
-STEP_S: Final = 0.01
-# Standard deviation of the Gaussian that differentiates [s]: see the module.
+# Both are compared on a grid of this step. Chosen: as fine as the scans of most boards.
+GRID_STEP_S: Final = 0.01
+# Standard deviation of the Gaussian that differentiates. Chosen: longer than a scan takes, shorter
+# than a press begins.
 SMOOTHING_S: Final = 0.05
-# A rise of this share of the 99th percentile is where the logarithm begins to compress.
-COMPRESSION: Final = 0.2
-# A longer recording or log [s] takes more memory than a session of presses needs.
+# A rise of this share of the 99th percentile is where the logarithm begins to compress. Chosen: a
+# press of a fifth of the force then counts 0.4 of a strong one.
+COMPRESSION_SHARE: Final = 0.2
+# A longer recording or log is refused. Chosen: it would take memory that no session needs.
 MAX_SPAN_S: Final = 6 * 3600.0
-# Both must have measured together for so long [s]: shorter stretches are alike by chance.
+# Both must have measured together for so long. Chosen: shorter stretches are alike by chance.
 MIN_OVERLAP_S: Final = 15.0
-# They must have measured together for this share of the shorter one.
+# And for this share of the shorter one, for the same reason. Chosen.
 MIN_OVERLAP_SHARE: Final = 0.5
-# A smaller r is that of two sessions which have nothing in common (test_alignment.py).
+# A smaller r is that of sessions that have nothing in common (tests/calibrate/test_alignment.py).
 MIN_CORRELATION: Final = 0.6
-# Where another offset has more than this share of the best G, neither can be trusted.
-MAX_SECOND: Final = 0.7
+# Where another offset has more than this share of the best G, neither can be trusted. Of simulated
+# sessions (tests/calibrate/test_alignment.py), irregular ones have up to 0.14, even ones from 0.74.
+MAX_SECOND_SHARE: Final = 0.7
+# Two sums of products that differ by less than this share are the same but for the FFT's rounding.
+_ROUNDING_SHARE: Final = 1e-9
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """log time + offset_s = scan time.
+    """How the force sensor's clock and that of the scans belong together.
 
-    correlation: r at that offset, of edges. overlap_s: for how long both measured there [s].
+    offset_s: log time + offset_s = scan time [s].
+    correlation: r at that offset.
+    overlap_s: for how long both measured there [s].
     """
 
     offset_s: float
@@ -73,7 +80,7 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     Raises ValueError for bad arrays; if nothing was pressed; if both ran together for too short; if
     nothing fits; and if another offset fits nearly as well, as with presses that repeat evenly.
     """
-    time_s, rises = (np.asarray(each, dtype=np.float64) for each in (scan_time_s, rise))
+    time_s, rises = (np.asarray(values, dtype=np.float64) for values in (scan_time_s, rise))
     good = np.isfinite(rises) & (np.diff(time_s, prepend=-np.inf) > 0)
     if not good.all():
         scan = int(np.argmin(good))
@@ -81,28 +88,31 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
     x, in_x = _edges(time_s, rises, "the skin's rise")
     y, in_y = _edges(log.time_s, log.force_n, "the force")
     r, shared = correlations(x, in_x, y, in_y)
-    shorter_s = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * STEP_S
-    enough = shared * STEP_S >= max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s)
+    shorter_s = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * GRID_STEP_S
+    enough = shared * GRID_STEP_S >= max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s)
     if not enough.any():
         needed = f"{MIN_OVERLAP_S:g} s, and for half of the shorter one, gaps left out"
         raise ValueError(f"scans and force log overlap at no offset for {needed}")
-    likeness = np.where(enough, r, 0.0).clip(0.0, 1 - 1e-12)
+    likeness = np.where(enough, r, 0.0).clip(0.0, 1 - 1e-12)  # log1p(-1) is infinite
     score = -0.5 * shared * np.log1p(-(likeness**2))
     best = int(np.argmax(score))
     if likeness[best] < MIN_CORRELATION:
-        found = f"their best correlation is {likeness[best]:.2f}, less than {MIN_CORRELATION:g}"
-        raise ValueError(f"scans and force log fit at no offset: {found}: are they of one session?")
+        least = f"their best correlation is {likeness[best]:.2f}, less than {MIN_CORRELATION:g}"
+        raise ValueError(f"scans and force log fit at no offset: {least}: are they of one session?")
     _check_unique(r, score, best)
     lag = best + _vertex(score, best) - (y.size - 1)
     return Alignment(
-        offset_s=float(time_s[0] - log.time_s[0] + lag * STEP_S),
+        offset_s=float(time_s[0] - log.time_s[0] + lag * GRID_STEP_S),
         correlation=float(r[best]),
-        overlap_s=float(shared[best] * STEP_S),
+        overlap_s=float(shared[best] * GRID_STEP_S),
     )
 
 
 def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
-    """Edges on a grid that begins with `time_s`, 0 in gaps; and where there is no gap."""
+    """Edges on a grid that begins with `time_s`, 0 in gaps; and where there is no gap.
+
+    Raises ValueError, naming the values, where they last too short or too long, or do not rise.
+    """
     from scipy.ndimage import binary_erosion, gaussian_filter1d
 
     span_s = float(time_s[-1] - time_s[0])
@@ -114,18 +124,18 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
     if values.min() == values.max() or strong <= 0:
         raise ValueError(f"{name} does not rise: nothing was pressed")
     # A sensor's glitch counts no more than a press twice as strong as all others.
-    compressed = np.log1p(np.clip(values, 0.0, 2 * strong) / (COMPRESSION * strong))
-    grid_s = np.arange(int(span_s / STEP_S) + 1) * STEP_S
+    compressed = np.log1p(np.clip(values, 0.0, 2 * strong) / (COMPRESSION_SHARE * strong))
+    grid_s = np.arange(int(span_s / GRID_STEP_S) + 1) * GRID_STEP_S
     level = between_gaps(grid_s, time_s - time_s[0], compressed)
-    known = np.isfinite(level)
+    is_level = np.isfinite(level)
     # Gaps are left out of the Gaussian's weights: nothing is made up inside them.
     weighted, weight = (
-        gaussian_filter1d(each, SMOOTHING_S / STEP_S, mode="constant")
-        for each in (np.where(known, level, 0.0), known.astype(np.float64))
+        gaussian_filter1d(values, SMOOTHING_S / GRID_STEP_S, mode="constant")
+        for values in (np.where(is_level, level, 0.0), is_level.astype(np.float64))
     )
-    smooth = weighted / np.where(known, weight, 1.0)
-    inside = binary_erosion(known, np.ones(3))
-    return np.where(inside, np.gradient(smooth, STEP_S), 0.0), inside
+    smooth = weighted / np.where(is_level, weight, 1.0)
+    inside = binary_erosion(is_level, np.ones(3))  # a difference needs both neighbours
+    return np.where(inside, np.gradient(smooth, GRID_STEP_S), 0.0), inside
 
 
 def correlations(x: Float, in_x: Bool, y: Float, in_y: Bool) -> tuple[Float, Float]:
@@ -136,7 +146,8 @@ def correlations(x: Float, in_x: Bool, y: Float, in_y: Bool) -> tuple[Float, Flo
     from scipy.signal import correlate
 
     mask_x, mask_y = in_x.astype(np.float64), in_y.astype(np.float64)
-    # The differences below would lose digits if the means were not taken off first.
+    # All lags at once, by FFT: r of each from sums over the points that x and y share there. The
+    # differences below would lose digits if the means were not taken off first.
     x = (x - x[in_x].mean()) * mask_x
     y = (y - y[in_y].mean()) * mask_y
 
@@ -149,8 +160,9 @@ def correlations(x: Float, in_x: Bool, y: Float, in_y: Bool) -> tuple[Float, Flo
     square_x = sums(x * x, mask_y) - sum_x**2 / count
     square_y = sums(mask_x, y * y) - sum_y**2 / count
     product = sums(x, y) - sum_x * sum_y / count
-    # A stretch with less than this share of all edges holds none, only the rounding of the FFT.
-    varies = (square_x > 1e-9 * np.sum(x * x)) & (square_y > 1e-9 * np.sum(y * y))
+    # A stretch without edges has only the rounding of the FFT.
+    varies = square_x > _ROUNDING_SHARE * np.sum(x * x)
+    varies &= square_y > _ROUNDING_SHARE * np.sum(y * y)
     squares = np.where(varies, square_x * square_y, 1.0)
     return np.where(varies, product / np.sqrt(squares), 0.0).clip(-1.0, 1.0), shared
 
@@ -162,10 +174,11 @@ def _check_unique(r: Float, score: Float, best: int) -> None:
     others = score.copy()
     others[ends[after - 1] : ends[after]] = 0.0
     second = int(np.argmax(others))
-    if others[second] > MAX_SECOND * score[best]:
+    if others[second] > MAX_SECOND_SHARE * score[best]:
+        away_s = abs(second - best) * GRID_STEP_S
         raise ValueError(
-            f"an offset {abs(second - best) * STEP_S:.2f} s away fits nearly as well: the presses "
-            "are too even or too few: press at irregular intervals, and begin and end untouched"
+            f"an offset {away_s:.2f} s away fits nearly as well: the presses are too even or too "
+            "few: press at irregular intervals, and begin and end untouched"
         )
 
 

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leads a person from press to press: which one is wanted next, and when it is read. Sans-IO."""
+"""Leads a person from press to press: which one is wanted next, and when it is read.
+
+A `Guide` is fed with scans and says what it waits for. It has no clock, no terminal and no board:
+who feeds it has them.
+"""
 
 import math
 from collections import Counter, deque
@@ -15,18 +19,19 @@ from ohmskin.calibrate.presses import SECOND_SHARE
 # Cells as (row, column).
 Cells = tuple[tuple[int, int], ...]
 
-# Something counts from so long on [s]: a weight that lands or a hand that brushes past is shorter.
+# Something counts when it has lasted for so long. Chosen: a weight that lands, or a hand that
+# brushes past, takes less.
 CERTAIN_S: Final = 0.3
-# A press is read over so long [s].
-WINDOW_S: Final = 1.0
-# A press is read over so many scans at least, because fewer do not tell a change from noise.
-MIN_SCANS: Final = 8
-# Largest change from one half of the window to the other. A conductance that creeps by 30 % a
-# decade of time changes by less from 2 s after the touch on.
-MAX_CHANGE: Final = 0.03
-# Largest scatter in the window. Creep scatters less, a hand scatters more, even where its wiggle
-# leaves both halves the same mean.
-MAX_SCATTER: Final = 0.05
+# A press is read over a window of so long. Chosen: noise averages out, and nobody loses patience.
+READING_S: Final = 1.0
+# And over so many scans at least. Chosen: fewer do not tell a change from noise.
+MIN_READING_SCANS: Final = 8
+# Largest change from one half of the window to the other, as a share of the mean. Chosen: a
+# conductance that creeps by 30 % a decade of time changes by less from 2 s after the touch on.
+MAX_CHANGE_SHARE: Final = 0.03
+# Largest standard deviation in the window, noise apart, as a share of the mean. Chosen: creep
+# scatters less, a hand more, even where its wiggle leaves both halves the same mean.
+MAX_SCATTER_SHARE: Final = 0.05
 
 
 class Press(NamedTuple):
@@ -49,11 +54,14 @@ class State(Enum):
 class Step(NamedTuple):
     """Where a scan has led to.
 
+    state: what the guide waits for now.
     wanted: the press that is wanted, or was read and is to be taken off; None when all are done.
-    cells: what is pressed. change: of the rise from one half of the window to the other, relative;
-    None before a whole window. rise: mean conductance of the cell above rest over the window [S],
-    if this scan completes the press; else None. rise_std: standard error of that mean [S], from the
-    scatter of the scans.
+    cells: what is pressed.
+    change: of the rise from one half of the window to the other, as a share of its mean; None
+        before a whole window.
+    rise: mean conductance of the cell above rest over the window [S], if this scan completes the
+        press; else None.
+    rise_std: standard error of that mean [S], from the scatter of the scans.
     """
 
     state: State
@@ -73,19 +81,28 @@ def pressed_cells(rise: Float, touched: Bool) -> Cells:
 
 
 def still_wanted(wanted: Iterable[Press], read: Iterable[Press]) -> list[Press]:
-    """What is wanted and not read yet, in order. Each press read counts once."""
-    left = Counter((cell, round(force_n, 9)) for cell, force_n in read)
+    """What is wanted and not read yet, in order. Each press that was read counts once.
+
+    Forces that were kept in a file may differ in their last digit, so they are rounded.
+    """
+
+    def alike(press: Press) -> Press:
+        return press._replace(force_n=round(press.force_n, 9))
+
+    spare = Counter(map(alike, read))
     missing = []
     for press in wanted:
-        alike = (press.cell, round(press.force_n, 9))
-        if left[alike] <= 0:
+        if spare[alike(press)] <= 0:
             missing.append(press)
-        left[alike] -= 1
+        spare[alike(press)] -= 1
     return missing
 
 
 class OnSkin:
-    """What is pressed, without what lasts for less than `CERTAIN_S`: `cells`."""
+    """What is on the skin, without what lasts for less than `CERTAIN_S`.
+
+    cells: what is pressed, for certain.
+    """
 
     def __init__(self) -> None:
         self.cells: Cells = ()
@@ -118,12 +135,14 @@ class Guide:
     DONE     anything                                nothing: all were read
     ======== ======================================= ==============================================
 
-    For certain: see `OnSkin`. Steady: with the rises x (n,) of the last `WINDOW_S`, at least
-    `MIN_SCANS`, and their mean m,
+    For certain: see `OnSkin`. Steady: with x (n,) the rises of the last `READING_S`, m their mean,
 
-        v = mean((x[i+1] - x[i])^2) / 2            the noise from scan to scan (von Neumann, 1941)
-        |mean of half 2 - mean of half 1| <= `MAX_CHANGE` m + 2 sqrt(4 v / n)     it does not creep
-        var(x) - v <= (`MAX_SCATTER` m)^2                             it does not go to and fro
+        v = mean((x[i+1] - x[i])^2) / 2             noise from scan to scan, without what is slower
+        |mean of half 2 - mean of half 1| <= `MAX_CHANGE_SHARE` m + 2 sqrt(4 v / n)   no creep
+        var(x) - v <= (`MAX_SCATTER_SHARE` m)^2                                       no wiggle
+
+    v is von Neumann's (1941). 4 v / n is the variance of the difference of two means of n / 2 each,
+    so noise alone is taken for creep in one of twenty windows.
     """
 
     def __init__(self, wanted: Sequence[Press]) -> None:
@@ -135,7 +154,7 @@ class Guide:
     def feed(self, time_s: float, rise: Float, touched: Bool) -> Step:
         """One scan, in order: time on any clock [s]; rise above rest [S], touched (R, C)."""
         if self._window and time_s <= self._window[-1][0]:
-            self._window.clear()
+            self._window.clear()  # the board was reset: its clock begins anew
         pressed = pressed_cells(rise, touched)
         if self._on.see(time_s, pressed):
             self._window.clear()
@@ -150,24 +169,24 @@ class Guide:
             return Step(State.TAKE_OFF, press, cells)
         if cells != (press.cell,):
             return Step(State.WRONG if cells else State.PUT, press, cells)
-        if pressed == cells:
+        if pressed == cells:  # and not a glimpse of something else
             self._window.append((time_s, float(rise[press.cell])))
         return self._held(press)
 
     def _held(self, press: Press) -> Step:
         """What the window says of the press: that it is steady, and so read, or not yet."""
         window, step = self._window, Step(State.HOLD, press, (press.cell,))
-        while len(window) > MIN_SCANS and window[-1][0] - window[1][0] >= WINDOW_S:
+        while len(window) > MIN_READING_SCANS and window[-1][0] - window[1][0] >= READING_S:
             window.popleft()
-        if len(window) < MIN_SCANS or window[-1][0] - window[0][0] < WINDOW_S:
+        if len(window) < MIN_READING_SCANS or window[-1][0] - window[0][0] < READING_S:
             return step
         x = np.array([rise for _, rise in window])
         mean, half = float(x.mean()), x.size // 2
         noise = float(np.mean(np.diff(x) ** 2)) / 2
         change = abs(float(x[half:].mean() - x[:half].mean()))
         step = step._replace(change=change / mean)
-        still_changes = change > MAX_CHANGE * mean + 2 * math.sqrt(4 * noise / x.size)
-        if still_changes or float(x.var()) - noise > (MAX_SCATTER * mean) ** 2:
+        creeps = change > MAX_CHANGE_SHARE * mean + 2 * math.sqrt(4 * noise / x.size)
+        if creeps or float(x.var()) - noise > (MAX_SCATTER_SHARE * mean) ** 2:
             return step
         self._is_read = True
         std = float(x.std(ddof=1)) / math.sqrt(x.size)

@@ -25,7 +25,7 @@ load of the machine.
 
 A delay that all scans have in common cannot be seen and is part of h.
 
-The line is fitted to the last `WINDOW_S`, because a resonator drifts while it warms. A new line
+The line is fitted to the last `FIT_WINDOW_S`, because a resonator drifts while it warms. A new line
 would make times jump, and perhaps go back. Therefore the difference to the old line is added at
 first, and fades within a second.
 
@@ -49,15 +49,15 @@ from ohmskin.link.messages import MAX_RATE_ERROR, Hello, Scan
 
 # Board time of the points that a line is fitted to. A ceramic resonator that warms drifts by up to
 # 10 ppm a second, which bends the line by 1 ms in this time.
-WINDOW_S: Final = 30.0
+FIT_WINDOW_S: Final = 30.0
 # A scan that comes this much before h shows that a clock has stepped. Chosen: no sound line is off
 # by as much, and a host that slept for a shorter time can be followed by the slow way.
-STEP_S: Final = 0.05
+CLOCK_STEP_S: Final = 0.05
 # Of each block of so much board time only the point that came earliest is kept: the others do not
 # change the line, and 120 points are fitted in no time. Chosen.
 _BLOCK_S: Final = 0.25
 # The difference between the old line and a better one fades within this time. Chosen: its largest
-# value, `STEP_S`, is then 5 % of the time that passes, so times go on rising.
+# value, `CLOCK_STEP_S`, is then 5 % of the time that passes, so times go on rising.
 _SLEW_S: Final = 1.0
 # A byte takes ten bits on a line of 8N1, as frames.toml says of `baud_default`: a start bit, eight
 # data bits and a stop bit.
@@ -185,13 +185,13 @@ class BoardClock:
         u_s, t_s = 1e-6 * time_us, host_time_s
         line = self._line
         late_s = 0.0 if line is None else t_s - line.at(u_s)
-        if line is None or u_s <= self._last_u_s or late_s < -STEP_S:
+        if line is None or u_s <= self._last_u_s or late_s < -CLOCK_STEP_S:
             self._restart(u_s, t_s)
             return
         self._last_u_s = u_s
         ends_block = u_s - self._block_u_s >= _BLOCK_S
         if ends_block:
-            while self._points and u_s - self._points[0][0] > WINDOW_S:
+            while self._points and u_s - self._points[0][0] > FIT_WINDOW_S:
                 self._points.popleft()
             self._points.append((u_s, t_s))
             self._block_u_s = u_s
@@ -223,28 +223,28 @@ class BoardClock:
         assert self._line is not None
         before_s = self.host_s(1e6 * u_s)
         self._line = _line_below(self._points, self._line.rate)
-        self._slew_s = min(max(before_s - self._line.at(u_s), -STEP_S), STEP_S)
+        self._slew_s = min(max(before_s - self._line.at(u_s), -CLOCK_STEP_S), CLOCK_STEP_S)
         self._slew_from_u_s = u_s
 
 
 def scan_times_s(scans: list[Scan]) -> Float:
     """Times of recorded scans on the host's clock [s], (n,), without the jitter of their arrival.
 
-    All are late by about a scan. Nothing has to wait for what comes later here, as it does in
-    `BoardClock`: at every half `WINDOW_S` of the board's clock there is a knot, whose time is by
-    the line that fits the window around it. Between knots, times are interpolated. A board that is
-    reset begins its clock anew, so the scans before and after a reset are taken separately.
+    All are late by about a scan. Here, unlike in `BoardClock`, a line can be fitted to what came
+    later as well. At every half `FIT_WINDOW_S` of the board's clock there is a knot, whose time is
+    by the line that fits the window around it. Between knots, times are interpolated. A board that
+    is reset begins its clock anew, so scans before and after a reset are taken separately.
     """
     host_s = np.array([scan.host_time_s for scan in scans])
     board_s = 1e-6 * np.array([scan.time_us for scan in scans])
-    times_s = np.empty_like(host_s)
+    times_s, half_s = np.empty_like(host_s), FIT_WINDOW_S / 2
     restarts = np.flatnonzero(np.diff(board_s) <= 0) + 1
     for part in np.split(np.arange(host_s.size), restarts):
         u_s, t_s = board_s[part], host_s[part]
-        count = 2 + int((u_s[-1] - u_s[0]) / (WINDOW_S / 2))
+        count = 2 + int((u_s[-1] - u_s[0]) / half_s)
         knots: list[_Point] = []
         for knot_s in np.linspace(u_s[0], u_s[-1], count).tolist():
-            first, last = np.searchsorted(u_s, [knot_s - WINDOW_S / 2, knot_s + WINDOW_S / 2])
+            first, last = np.searchsorted(u_s, [knot_s - half_s, knot_s + half_s])
             points = list(zip(u_s[first:last].tolist(), t_s[first:last].tolist(), strict=True))
             if points:
                 knots.append((knot_s, _line_below(points, 1.0).at(knot_s)))
