@@ -68,8 +68,8 @@ _FAR_CHI2: Final = 100.0
 _LIGHT_DAMPING: Final = 1e-3
 # A fit whose steps need more damping than this has failed. Chosen: such a step moves no number.
 _LARGEST_DAMPING: Final = 1e12
-# How often a step is solved again, with the cells held that it took over a bound. Chosen: later
-# rounds hardly find any, and the next step tries again.
+# How often a step is solved, each time with those cells held that it took over a bound. Chosen:
+# what is not found in a few rounds is found by the next step.
 _BOUND_ROUNDS: Final = 5
 
 

@@ -70,10 +70,11 @@ from ohmskin.circuit.skin import (
 from ohmskin.estimate.knowledge import SkinKnowledge
 
 # Largest offset of a sense node that is believed, over Vdd. A larger one stays in the residuals and
-# counts as noise. Chosen: 8 LSB of 10 bits, some times what a converter's data sheet allows.
+# counts as noise. Chosen: nearly twice the absolute accuracy that the ATmega328P's data sheet gives
+# (4.5 LSB of 10 bits at 1 MHz).
 MOST_OFFSET_RATIO: Final = 0.008
-# The current into the row, and not that out of the column, has what floating lines draw (`c`).
-# Readings of the row's node (top) tell the one, readings of the column's the other.
+# Sign of each reading's residual in c: c is half of the current into the row, which readings of the
+# top node show, less the current out of the column, which readings of the bottom node show.
 _INTO_ROW: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
 
 
@@ -124,7 +125,7 @@ class NearEnds:
         self._slope_ohm, self._at_no_current = READING_SIGN[:n] * reference, READING_OFFSET[:n]
         self.square_ohm = float(np.sum(reference**2))  # sum_k R_k^2
         self._into_row = _INTO_ROW[:n] / reference / n
-        # The node of each reading: the two nodes' offsets, in the order of A, B, C, D.
+        # The node of each reading, A to D: 0 is that of the row, 1 that of the column.
         self._node = [0, 1, 1, 0][:n]
 
     def read(self, ratio: Float) -> NearReadings:
@@ -133,7 +134,7 @@ class NearEnds:
         signal = ratio - self._at_no_current
         current: Float = signal @ self._slope_ohm / self.square_ohm
         residual = signal - current[..., None] * self._slope_ohm
-        # A with D and B with C; where there are only A and B, A with B for both nodes.
+        # A with D and B with C: the readings of a node. In mode far, A with B for both nodes.
         of_nodes = 0.5 * (residual[..., :2] + residual[..., :-3:-1]).reshape(-1, 2)
         middle = len(of_nodes) // 2
         offset = np.partition(of_nodes.T, middle)[self._node, middle]  # faster than median
@@ -150,7 +151,7 @@ class NearEnds:
         return np.asarray(charging * np.clip(share, -1.0, 1.0))
 
     def best_three(self, ratio: Float) -> BestThree:
-        """Of the four readings (4,) of one cell. It is for mode near: far has two readings."""
+        """Of the four readings (4,) that a cell has in mode near."""
         threes = []
         for left_out in range(READINGS_PER_CELL):
             kept = np.arange(READINGS_PER_CELL) != left_out

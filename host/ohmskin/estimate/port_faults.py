@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import NearEnds, NearReadings, PortCurrents
@@ -117,7 +117,9 @@ class LinePairs:
     """Tells which rows (axis 0), or which columns (axis 1), read alike though they did not at rest.
 
     Two shorted lines are one node, so their currents from every other line are the same. It is told
-    what frames show, and then says which pairs have been alike for long enough to be shorted.
+    what frames show, and then says which pairs have been alike for long enough to be shorted. The
+    lines `high` (lines,) that it is asked about are those with more current at all of their ports
+    than before: a short adds to all of them.
     """
 
     def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
@@ -129,45 +131,50 @@ class LinePairs:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames before: no frame has shown any two lines apart."""
+        """Forget the frames before.
+
+        Until a frame has shown two lines apart, they count as if they had always been alike: the
+        first frame may name a short that was there when reading began.
+        """
         self._alike_frames: NDArray[np.intp] = np.full((self._lines, self._lines), ALIKE_FRAMES)
         self._is_shorted = np.zeros((self._lines, self._lines), dtype=bool)
 
-    def were_shorted_at_rest(self, high: NDArray[np.bool_]) -> str:
+    def were_shorted_at_rest(self, high: Bool) -> str:
         """The first pair of the lines `high` that was alike at rest already, in words, or empty.
 
-        Of fewer lines, the median says little; lines with few ports may be alike by chance.
+        Few lines have no median that two of them do not move. Lines with few ports may be alike by
+        chance.
         """
         if self._lines < 4 or self._ports < 3:
             return ""
         return self._first(self._rest_apart < SAME_STDS, high)
 
-    def need_telling(self, high: NDArray[np.bool_]) -> bool:
-        """Whether a frame in which these lines are `high` (lines,) can show shorted lines.
+    def need_telling(self, high: Bool) -> bool:
+        """Whether a frame with these lines `high` is worth telling: comparing all pairs takes long.
 
-        This is asked first because it saves time: comparing all pairs takes long. A pair needs two
-        high lines. But as long as some pair has not been seen apart, every frame may show it so.
+        A pair needs two high lines. But while some pair counts as alike, a frame may show it apart.
         Lines with fewer than three ports may be alike by chance.
         """
         all_seen_apart = self._alike_frames.max() < ALIKE_FRAMES
         return self._ports >= 3 and not (all_seen_apart and np.count_nonzero(high) < 2)
 
     def tell(self, now: PortCurrents) -> None:
-        """What a frame shows of all pairs."""
+        """Take what a frame shows of all pairs."""
         apart = self._apart(now)
-        # A frame that is noisier than rest may not tell lines apart that differed at rest. What is
-        # alike then counts as apart: nobody can know.
+        # A pair can be found if it differed at rest by clearly more than this frame's noise. This
+        # frame may be too noisy to tell the others from shorted ones, so they count as apart.
         noisier = max(self._largest_std(now) / self._rest_std, 1.0)
         apart[self._rest_apart <= 2 * SAME_STDS * noisier] = np.inf
-        # Between one and two times the limit, noise may be what differs: it shows nobody apart.
+        # Two shorted lines may differ by more than the limit in a noisy frame. So only a difference
+        # of twice the limit shows them apart.
         self._alike_frames = np.where(apart > 2 * SAME_STDS, 0, self._alike_frames + 1)
         self._is_shorted = (apart < SAME_STDS) & (self._alike_frames >= ALIKE_FRAMES)
 
-    def shorted(self, high: NDArray[np.bool_]) -> str:
+    def shorted(self, high: Bool) -> str:
         """The first pair of the lines `high` that is shorted, by what was told; or empty."""
         return self._first(self._is_shorted, high)
 
-    def _first(self, is_alike: NDArray[np.bool_], high: NDArray[np.bool_]) -> str:
+    def _first(self, is_alike: Bool, high: Bool) -> str:
         if not is_alike.any():
             return ""
         pairs = np.argwhere(np.triu(is_alike & high & high[:, None], 1))
@@ -214,9 +221,8 @@ class SkinFaults:
             # no line counts as open that conducts a quarter of the median line.
             is_dark = (most < FAULT_STDS) & (float(np.median(most)) > 4 * FAULT_STDS)
             if is_dark.any():
-                return (
-                    f"{_LINES[axis]} {int(is_dark.argmax())} conducted nothing at rest: is it open?"
-                )
+                line = f"{_LINES[axis]} {is_dark.argmax()}"
+                return f"{line} conducted nothing at rest: is it open?"
             median_line = np.median(self._rest.current, axis=axis, keepdims=True)
             high = np.all(self._rest.current > PAIR_TIMES * median_line, axis=1 - axis)
             if pair := pairs.were_shorted_at_rest(high):

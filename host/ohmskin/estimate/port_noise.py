@@ -52,8 +52,8 @@ _MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}
 # A cell is usual if its readings disagree by less than so many standard deviations, of the median
 # cell or of rounding. Chosen: noise hardly ever exceeds it; what does has a cause of its own.
 USUAL_STDS: Final = 3.0
-# If noise is less than this share of the variance, most of a disagreement stays. Chosen: then what
-# stays is larger than noise, and by chance no frame shows half of the deviation it has.
+# If noise is less than this share of the usual cell's variance, most of a disagreement stays.
+# Chosen: that is half of its deviation, so what stays is larger than noise.
 NOISE_SHARE: Final = 0.25
 # Share of a staying disagreement that is still in the current after what floating lines draw is
 # taken from it. Measured in firmware/sim with its preset `desk`, as `make bench-desk` does.
@@ -125,7 +125,10 @@ class ReadingNoise:
         return Spread(square, median, by_cell, float(usual.sum()) / usual.size)  # faster than mean
 
     def explains(self, spread: Spread) -> bool:
-        """Whether rounding and a converter's noise can be all that makes readings disagree."""
+        """Whether rounding and a converter's noise can be all that makes readings disagree.
+
+        v_n is at least 2 s^2. If that is not much less than v, nothing can be told to stay.
+        """
         return self._independent >= NOISE_SHARE * spread.usual
 
     def of_change(self, residual: Float) -> float:
@@ -141,7 +144,7 @@ class ReadingNoise:
 
         Readings of one scan are codes; a mean of many lies between codes.
         """
-        code = ratio / (self._ratio_std * 12**0.5) - 0.5
+        code = ratio / (self._ratio_std * 12**0.5) - 0.5  # a step of width w has variance w^2 / 12
         return 0.0 if np.abs(code - np.rint(code)).max() > 0.01 else np.inf
 
     def variances(self, spread: Spread, changing: float) -> Variances:
@@ -162,8 +165,9 @@ class ReadingNoise:
         """Variance of the difference between readings at two ends of mode far, (R, C) [V^2/Vdd^2].
 
         Noise of both readings adds up. What stays has moved both near readings of a cell by the
-        same d. Their variance, of one degree of freedom, counts it as 2 d^2; the difference has it
-        once, as d^2: half of that variance. Rounding of two readings is the least.
+        same d. Their residuals are d each, and with one degree of freedom this is a variance of
+        2 d^2. The difference has d once, so it has half of that variance. It has at least the
+        rounding of two readings.
         """
         staying = np.maximum(variances.error - variances.noise, 0.0)
         return np.maximum(2.0 * variances.noise + 0.5 * staying, 2.0 * self._rounding)
