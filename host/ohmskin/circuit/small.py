@@ -97,8 +97,8 @@ class _OneBlasThread(ContextDecorator):
             if not self._inside:
                 if self._libraries is None:
                     # Looking through all loaded libraries takes milliseconds: so only once.
-                    found = ThreadpoolController().lib_controllers
-                    self._libraries = [library for library in found if library.user_api == "blas"]
+                    libraries = ThreadpoolController().lib_controllers
+                    self._libraries = [one for one in libraries if one.user_api == "blas"]
                 numbers = ((library, library.num_threads) for library in self._libraries)
                 self._before = [(library, number) for library, number in numbers if number != 1]
                 _set_threads([(library, 1) for library, _ in self._before])

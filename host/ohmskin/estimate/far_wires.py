@@ -18,24 +18,28 @@ v      scalar    variance of z about y, and of what a line's segments add to t  
 L, l   (n, n)    information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2; l is (n,)
 ====== ========= ================================================================== ==========
 
-The circuit gives c and q: they depend little on the wires. So p = m c z is linear. A frame shows
-the layers by itself. An offset of the far ends makes rows seem to lose too much and columns too
-little, so it is found with the layers. Minimised is, over t and o,
+The circuit gives c and q, which depend little on the wires. So p = m c z is linear in the segments.
 
-    sum_lines (p - t q -+ o h)^T (s^2 + v q q^T)^-1 (p - t q -+ o h) + o^2 ,
+A frame alone shows the layers. An offset of the far ends would make rows seem to lose too much and
+columns too little, so it is found with the layers. Minimised is, over t and o,
 
-weighed against what frames before have shown, which fades: a skin bends. (v: a line may exceed its
-layer by what one segment may, so lines, and not ports, are what is independent.) What single
-segments have of their own takes many frames. It does not fade, in shares of a reference m, which
-stays until the layer differs from it by more than a segment does:
+    sum_lines (p - t q -+ o h)^T (s^2 + v q q^T)^-1 (p - t q -+ o h) + o^2     (- rows, + columns).
+
+v q q^T is there because the ports of a line share its segments: what these have of their own moves
+all ports of the line together, so they are not as many independent looks at the layer. The result
+is weighed against what frames before have shown. That fades, because a skin bends.
+
+What single segments have of their own takes many frames. It does not fade, because it is kept in
+shares of a reference m, and a bend stretches all segments alike. m stays until the layer differs
+from it by more than a segment does. With the normal prior of z, the mean y and the variance v,
 
     z = y + v (1 + v L)^-1 (l - L y) , y = sum_lines 1^T (1 + v L)^-1 l / sum 1^T (1 + v L)^-1 L 1 ,
 
-of covariance v (1 + v L)^-1.
+of covariance v (1 + v L)^-1; y is where the readings of all lines are most probable.
 
-A calmer frame takes the place of no lesson here, as it does where wires are learned from touches:
-each frame measures the layers anew, so no lesson's error stays in them; and of the segments' sums,
-a noisy frame is a small part, because it is weighed by its noise.
+No calmer frame takes a lesson's place here, as it does where touches teach the wires. There, a
+touch is a lesson once, and its error would stay. Here, each frame measures the layers anew, and in
+the sums L and l a noisy frame counts for little, because it is weighed by its noise.
 """
 
 import numpy as np
@@ -67,7 +71,8 @@ class MeasuredWires(WireBelief):
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Take the layers from this frame, weighed against the frames before.
 
-        log_cells: nearly right will do, as c and q depend little on the cells.
+        log_cells: those that the fit starts from will do: c and q need no more than a model of the
+        frame that is nearly right.
         """
         self._measure(self.circuit(log_cells), ports)
 
@@ -89,7 +94,7 @@ class MeasuredWires(WireBelief):
     def _factors(self, circuit: PortCircuit, ports: PortReadings) -> tuple[Float, Float]:
         """t of both layers and o, (3,), and their covariance: the normal equations of the cost.
 
-        With a b for a^T b / s^2, a sum over the ports of a line, Sherman and Morrison's formula is
+        With ab for a^T b / s^2, a sum over the ports of a line, Sherman and Morrison's formula is
 
             a^T (s^2 + v q q^T)^-1 b = ab - gain qa qb ,   gain = 1 / (1 / v + qq) .
 

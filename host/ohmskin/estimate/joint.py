@@ -45,9 +45,11 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 from ohmskin.estimate.wire_belief import LearnedWires, WireBelief
 
-# Fits of the rest readings, each about the median of the one before: `make ablate` tries fewer.
+# `make ablate` tries half, twice and none of both numbers; docs/estimate.md says what each earns.
+
+# Fits of the rest readings, each about the median of the one before.
 REST_FITS: Final = 3
-# A cell that conducts less than at rest by more deviations of its prior is at fault: `make ablate`.
+# A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
 
 

@@ -69,7 +69,7 @@ from ohmskin.estimate.prior import (
     UNLIMITED_STD,
     CellPrior,
 )
-from ohmskin.estimate.wire_belief import Lesson, WireBelief, path_ohm
+from ohmskin.estimate.wire_belief import Lesson, WireBelief
 
 Cells = NDArray[np.intp]
 
@@ -247,7 +247,7 @@ class SparseFit:
         per_std = belief.per_std(by_wire * (self.current**2)[:, None])
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
-        self.path_ohm = path_ohm(*belief.segment_ohm(belief.mean), far=belief.far)
+        self.path_ohm = belief.wires(belief.mean).path_ohm
         self.wire_std = float(np.hypot(belief.layer_std(), SEGMENT_STD))
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
@@ -394,7 +394,7 @@ class FewTouches:
         factor = cholesky(covariance)
         # What the wires have been learned to be since the untouched skin was solved.
         offset = self._skin.belief.moved_since(self._skin.log_layers, wires[:, -2:])
-        for _ in range(2):  # the start is near, so the second step hardly ever matters
+        for _ in range(2):  # `converge` has led near, by steps without S
             slopes = self._slopes()
             residual = self._residual[ports] - offset
             heavy_slopes, light_slopes = slopes[:, ports], slopes[:, light]

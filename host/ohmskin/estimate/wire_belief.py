@@ -115,7 +115,8 @@ class WireBelief(ABC):
         *ohms, log_std = wires
         layer_std = UNKNOWN_LAYER_STD if None in ohms else LAYER_STD
         # C0 in two parts that are independent: the mean of both logs, and half of their difference.
-        # Who has measured wires (`log_std`) has measured both in series: the difference stays open.
+        # Whoever has measured wires (`log_std`) has measured both in series, so their difference
+        # stays as open as before. No measurement is believed to be better than 1 %.
         half_apart = 0.5 * layer_std**2
         both = half_apart if log_std is None else float(np.clip(log_std, 0.01, 1.0)) ** 2
         apart = np.array([[1.0, -1.0], [-1.0, 1.0]])
@@ -153,8 +154,8 @@ class WireBelief(ABC):
     def _is_news(self, log_cells: Float) -> bool:
         """Whether these cells (RC,) differ from the last lesson's by `MAX_STEP_LOG` somewhere.
 
-        Frames that are alike have errors that are alike, as the same cells hide the same wires. A
-        lesson from each of them would count one error as many independent ones.
+        Frames that are alike have errors that are alike, from the same drift of cells and the same
+        odd segments. A lesson from each of them would count one error as many independent ones.
         """
         before = self._lesson_cells
         return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
@@ -220,11 +221,19 @@ class WireBelief(ABC):
 
     def wires(self, log_wires: Float) -> SkinWires:
         """The wires of an answer whose fit found these logs, (2RC,)."""
-        segments = self.segment_ohm(log_wires)
-        return SkinWires(segments, segments * self.segment_std(), path_ohm(*segments, far=self.far))
+        top, bottom = segments = self.segment_ohm(log_wires)
+        # A sensed far end has the potential of the cell, as no current flows from one to the other:
+        # the wires of such a line do not count.
+        by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
+        path = by_top * top.cumsum(axis=1) + by_bottom * bottom.cumsum(axis=0)
+        return SkinWires(segments, segments * self.segment_std(), path.ravel())
 
     def wires_without_fit(self, log_wires: Float) -> SkinWires:
-        """The same of a fit that took the wires as believed: made once until the belief changes."""
+        """The same of a fit that took the wires as believed.
+
+        Such fits come one after the other, so the first one's wires are kept until the belief
+        changes.
+        """
         if self._without_fit is None:
             self._without_fit = wires = self.wires(log_wires)
             for array in (wires.segment_ohm, wires.segment_std_ohm):
@@ -267,29 +276,18 @@ class LearnedWires(WireBelief):
         # One reading shows its own touch, of unknown resistance, and so nothing of the wires.
         if len(residual) < 2:
             return
-        # In the order of the module's text: X = gain per_layer_std, L J^T N^-1, A. The lesson's
-        # slopes are in deviations of the belief now, the step is from the one before: so logs.
+        # The lesson is in deviations of the belief that the fit had, but the step may start from an
+        # older one. So what the readings alone say is found first, in logs: weights are L J^T N^-1,
+        # and the information is A. X is gain per_layer_std.
         gain = solve(factor, per_layer_std).T
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(2) - gain @ per_layer_std) @ gain
         information = weights @ per_layer_std @ per_log
         before, root = self._before_lesson
-        # z is at the mean that the fit had; from the mean before, readings are off by more.
+        # z is the residual at the mean that the fit had. At the mean before, it differs by what the
+        # mean has moved since.
         pull = weights @ residual + information @ (self.log_layers - before)
         covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + information)
         log_layers = before + covariance @ pull
         covariance += FADE_SHARE * (self._prior_covariance - covariance)
         self._believe(log_layers, np.asarray(np.linalg.cholesky(covariance), np.float64))
-
-
-def path_ohm(
-    top_wire_ohm: Float, bottom_wire_ohm: Float, *, far: tuple[bool, bool] = (False, False)
-) -> Float:
-    """Wires between each cell and the sensed ends of its lines [ohm], (RC,).
-
-    A sensed far end has the potential of the cell, as no current flows from one to the other: the
-    wires of such a line do not count.
-    """
-    top, bottom = (0.0 if is_far else 1.0 for is_far in far)
-    path = top * top_wire_ohm.cumsum(axis=1) + bottom * bottom_wire_ohm.cumsum(axis=0)
-    return np.asarray(path.ravel())
