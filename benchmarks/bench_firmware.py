@@ -179,8 +179,7 @@ def _measure_late(board: str, rng: np.random.Generator) -> dict[str, int]:
         for late in (1, 2, 8, 32):
             with Rig(board) as rig:
                 rig.run(0.05)
-                rig.randomize(rng)
-                codes = rig._tables[-1][:8, :8, :4]
+                codes = rig.randomize(rng)[:8, :8, :4]
                 rig.sim.set(late_cycles=late)
                 rig.start_scan(**scan)
                 rig.run(0.2)

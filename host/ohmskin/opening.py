@@ -220,7 +220,7 @@ def is_stepped(url: str) -> bool:
 
 def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None) -> Scene:
     from ohmskin.circuit.plate import load_plate
-    from ohmskin.emulate.scenes import Scene
+    from ohmskin.emulate.scenes import PlateScene, Scene
 
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", size)
     rows, columns = map(int, match.groups()) if match else (0, 0)
@@ -228,10 +228,15 @@ def _scene(size: str, options: dict[str, str], faults: SkinFaults | None = None)
     if not (1 <= rows <= most[0] and 1 <= columns <= most[1]):
         raise ValueError(f"a size is as 8x8, from 1x1 to {most[0]}x{most[1]}, not '{size}'")
     seed = _number(options, "seed", 0)
-    plate = load_plate(options["plate"]) if "plate" in options else None
     begin_s = _number(options, "begin", 0.0) if "begin" in options else None
     name = options.get("scene", "rest")
-    return Scene(name, rows, columns, seed=seed, faults=faults, plate=plate, begin_s=begin_s)
+    if "plate" not in options:
+        return Scene(name, rows, columns, seed=seed, faults=faults, begin_s=begin_s)
+    plate = load_plate(options["plate"])
+    if plate.shape != (rows, columns):
+        cells = "x".join(map(str, plate.shape))
+        raise ValueError(f"the plate has {cells} cells, the skin {rows}x{columns}")
+    return PlateScene(plate, name, seed=seed, faults=faults, begin_s=begin_s)
 
 
 # ------------------------------------------------------------------------------ several boards

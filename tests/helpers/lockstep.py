@@ -286,9 +286,11 @@ class Rig(Closing):
         self._table_cycles.append(int(self.sim.stats()["cycles"]))
         self._tables.append(codes)
 
-    def randomize(self, rng: np.random.Generator) -> None:
-        """A new random skin, from this cycle on."""
-        self.set_codes(rng.integers(CODES, size=TABLE_SHAPE, dtype=np.uint16), rng)
+    def randomize(self, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """A new random skin, from this cycle on; the codes that it reads."""
+        codes = rng.integers(CODES, size=TABLE_SHAPE, dtype=np.uint16)
+        self.set_codes(codes, rng)
+        return codes
 
     def holds(self) -> NDArray[np.void]:
         """Every hold since `start_scan`."""

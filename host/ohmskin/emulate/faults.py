@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can be wrong with an emulated board's line and skin, to see that a host finds it.
 
-`LineFaults` change the bytes that the board sends. `SkinFaults` change resistances (`damaged`),
-join ends of lines (`readings`), or change each reading at its own instant (`sampled`).
+`LineFaults` change the bytes that the board sends. `SkinFaults` act in three places, in this order:
 
-A fault has the name of an option of ``emulator://``. Beside its type stand the kind of its values
-and what ``ohmskin emulate --help`` says of it.
+============  ===================================================================================
+`damaged`     changes resistances: open lines, bad contacts, dead cells, wrong references
+`readings`    changes how ends of lines are connected: shorts, far ends that are open or exchanged
+`sampled`     changes each reading at its own instant: hum, and nodes that have not settled
+============  ===================================================================================
+
+A field of these classes is an option of ``emulator://`` of the same name. Its annotation says which
+values it takes (`_Kind`), and what ``ohmskin emulate --help`` says of it.
 """
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Annotated, Any, Final, TypeVar, get_type_hints
 
@@ -21,16 +26,16 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, Skin, all_readings, end_admittance, readings
 from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, from_scan_order, in_scan_order
 
-# Resistance of a wire that is open [ohm], a million times that of a cell at rest.
+# An open wire, and a cell without contact, have this resistance [ohm]. Chosen: a million times that
+# of a cell at rest, so that no code shows its current; a number at all, so that the network of
+# resistors stays connected and can be solved.
 OPEN_OHM: Final = 1e12
-# Conductance of a short, 0.1 ohm [S].
+# A short has this conductance [S]. Chosen: 0.1 ohm, much less than a segment of wire.
 SHORT_SIEMENS: Final = 10.0
-# Conductance of an open cell [S] where a network must be connected: 10 TOhm.
-_LEAST_SIEMENS: Final = 1e-13
-# Readings of each sense node: with the top pin high, and with the bottom pin high.
-_NODES: Final = ("ad", "bc", "eh", "fg")
-# A stall begins so long after the board's start [s].
+# A stall begins this time after the board's start [s]. Chosen: a host has connected by then.
 _STALL_AFTER_S: Final = 2.0
+# The readings of each sense node: with the top pin high, and with the bottom pin high.
+_NODES: Final = ("ad", "bc", "eh", "fg")
 
 FaultsT = TypeVar("FaultsT")
 Pair = tuple[int, int]
@@ -51,7 +56,7 @@ def _pair(text: str) -> Pair:
 
 
 Share = Annotated[float, _Kind(float, lambda share: 0 <= share <= 1, "a share, from 0 to 1")]
-# Numbers beyond these stand for no skin and no line; arithmetic with them would overflow.
+# No skin and no line has numbers beyond these, and arithmetic with larger ones would overflow.
 _ABOVE_0: Final = _Kind(float, lambda n: 1e-6 <= n <= 1e9, "from 1e-6 to 1e9")
 _OR_0: Final = _Kind(float, lambda n: n == 0 or _ABOVE_0.can_be(n), "0, or from 1e-6 to 1e9")
 Amount = Annotated[float, _OR_0]
@@ -64,13 +69,15 @@ Cell = Annotated[Pair | None, _Kind(_pair, lambda cell: True, "two numbers, as 1
 
 
 def _options(faults: type) -> dict[str, tuple[_Kind, str]]:
-    """Kind and text of each fault."""
+    """Kind of values, and text for the help, of each fault."""
     hints = get_type_hints(faults, include_extras=True)
     return {n: hint.__metadata__ for n, hint in hints.items() if hasattr(hint, "__metadata__")}
 
 
 def faults_of(faults: type[FaultsT], options: Mapping[str, str], **others: Any) -> FaultsT:
-    """The faults that the options of a URL name; other options are left alone. others: fields.
+    """The faults that the options of a URL name; options that are no faults are left alone.
+
+    others: fields that are no options.
 
     :raises ValueError: a value that cannot be.
     """
@@ -95,10 +102,10 @@ class LineFaults:
     vanish: Annotated[Amount, "seconds until the board is unplugged"] = 0.0
     silent: Annotated[Amount, "1: the board never says anything"] = 0.0
     seed: int = 0
-    _resets_done: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng(self.seed)
+        self._resets_done = 0
 
     def apply(self, chunk: bytes, now_s: float) -> bytes:
         """What arrives of a chunk sent at `now_s`."""
@@ -117,7 +124,7 @@ class LineFaults:
         return chunk
 
     def resets(self, now_s: float) -> bool:
-        """Whether a reset is due; True once for each."""
+        """Whether a reset has become due since the last call."""
         due, done = int(now_s / self.reset) if self.reset else 0, self._resets_done
         self._resets_done = max(due, done)
         return due > done
@@ -162,16 +169,16 @@ class SkinFaults:
         """Raise ValueError for a line or a cell that a rows x columns skin does not have."""
         for axis, (what, count) in enumerate((("row", rows), ("column", columns))):
             cells = (self.dead, self.saturated, self.broken_row, self.broken_column)
-            named = [cell[axis] for cell in cells if cell is not None]
+            lines = [cell[axis] for cell in cells if cell is not None]
             for name, value in vars(self).items():
                 if what in name and "broken" not in name and value is not None:
-                    named += value if isinstance(value, tuple) else (value,)
-            for line in named:
+                    lines += value if isinstance(value, tuple) else (value,)
+            for line in lines:
                 if not 0 <= line < count:
                     raise ValueError(f"no {what} {line}: the skin has {what}s 0 to {count - 1}")
 
     def damaged(self, skin: Skin) -> Skin:
-        """`skin` with all faults of resistances except shorted lines."""
+        """`skin` with the faults that are other resistances than it has."""
         cell = skin.cell_siemens.copy()
         if self.dead is not None:
             cell[self.dead] = 0.0
@@ -190,36 +197,37 @@ class SkinFaults:
         return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom)
 
     def readings(self, damaged: Skin, mode: str = "near") -> Float:
-        """Exact readings (R, C, 4) of a skin that `damaged` has made, with all faults of its ends.
+        """Exact readings (R, C, 4) of a skin that `damaged` has made, with the faults of its ends.
 
-        An open far end reads what its node had before: the far end of the cell scanned before.
+        The sense node of an open far end is connected to nothing. It keeps its charge, and so the
+        voltage of the far end that was connected to it in the cell scanned before.
         """
         rows, far = len(damaged.cell_siemens), sum(damaged.shape)
         firsts = {"rows": 0, "columns": rows, "far_rows": far, "far_columns": far + rows}
         shorts = [(n, getattr(self, f"short_{what}")) for what, n in firsts.items()]
         joints = [(n + pair[0], n + pair[1]) for n, pair in shorts if pair]
         if mode == "near" and not joints:
-            return readings(damaged)
+            return readings(damaged)  # quicker: no fault of far ends is seen at near ends
         ends = np.arange(2 * far)
         for n, pair in ((far, self.swap_far_rows), (far + rows, self.swap_far_columns)):
             if pair:
                 ends[[n + pair[0], n + pair[1]]] = n + pair[1], n + pair[0]
-        found = joined_readings(damaged, joints, ends)
+        a_to_h = joined_readings(damaged, joints, ends)
         if (row := self.open_far_row) is not None:
-            before = found[row - 1] if row else np.roll(found[-1], 1, axis=0)
-            found[row, :, 4::3] = before[:, 4::3]  # e and h
+            before = a_to_h[row - 1] if row else np.roll(a_to_h[-1], 1, axis=0)
+            a_to_h[row, :, 4::3] = before[:, 4::3]  # e and h
         if (column := self.open_far_column) is not None:
-            found[:, column, 5:7] = found[-1, column - 1, 5:7]  # f and g
-        return np.asarray(found[..., [ENUMS["reading"].values[name] for name in MODES[mode]]])
+            a_to_h[:, column, 5:7] = a_to_h[-1, column - 1, 5:7]  # f and g
+        return np.asarray(a_to_h[..., [ENUMS["reading"].values[name] for name in MODES[mode]]])
 
     def sampled(
         self, ratio: Float, start_s: float, slot_s: float, settle_s: float, mode: str
     ) -> Float:
         """What the converter reads of a scan with settled readings `ratio` (R, C, 4), same shape.
 
-        The scan starts at start_s, with one reading a slot. A node that would settle to x[n] has
-        in slot n the voltage v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau), with an equal scan
-        before this one. Hum adds hum_lsb sin(2 pi hum t) at the reading's own time t.
+        The scan starts at start_s, with one reading a slot. In slot n a node heads for x[n], and
+        reaches v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau). The scan before this one is taken
+        to be equal. Hum adds hum_lsb sin(2 pi hum t) at the reading's own time t.
         """
         read = in_scan_order(ratio)
         if self.tau_us:
@@ -244,7 +252,7 @@ SKIN_FAULTS: Final = {name: text for name, (_, text) in _options(SkinFaults).ite
 def _settled(voltage: Float, kept: float) -> Float:
     """v[n] = x[n] + (v[n-1] - x[n]) kept, after a scan of the same voltages x."""
     settled = goals = voltage.tolist()
-    for _ in range(2):
+    for _ in range(2):  # the scan before, and this one
         settled = list(accumulate(goals, lambda v, x: x + (v - x) * kept, initial=settled[-1]))[1:]
     return np.array(settled)
 
@@ -253,9 +261,9 @@ def joined_readings(skin: Skin, joints: Iterable[Pair], ends: NDArray[np.intp]) 
     """Readings a to h, (R, C, 8), with pairs of ends joined by 0.1 ohm each.
 
     Ends are numbered as in `circuit.skin.end_admittance`; ends: where the multiplexers find each. A
-    joint adds its conductance to Y. Open cells are taken for 10 TOhm.
+    joint adds its conductance to Y. Cells without contact are taken for `OPEN_OHM`.
     """
-    skin = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, _LEAST_SIEMENS))
+    skin = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, 1 / OPEN_OHM))
     admittance = end_admittance(skin)
     for joint in joints:
         pair = np.array(joint)

@@ -17,46 +17,57 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SkinFaults
 
-# Medians of an untouched cell and of the wire segments of rows and of columns [ohm], in the range
-# of a knitted skin. Single ones are spread log-normally, by this share.
+# Medians of an untouched cell, and of the wire segments of rows and of columns [ohm]. Chosen: in
+# the range of a knitted skin.
 REST_OHM: Final = 1.0e6
 TOP_WIRE_OHM: Final = 100.0
 BOTTOM_WIRE_OHM: Final = 200.0
-_SPREAD: Final = 0.1
-# A cell counts as touched where a touch adds as much as a cell at rest has [S].
-_TOUCHED_SIEMENS: Final = 1e-6
+# Cells and segments scatter about their medians by this share: it is the standard deviation of
+# their logarithm. Chosen.
+_SPREAD_SHARE: Final = 0.1
+# Touches begin at this time [s]. Chosen: who tares before, tares the untouched skin.
+BEGIN_S: Final = 3.0
+# Those of the scene "corners" begin at this time [s]. Chosen: the doctor has examined the untouched
+# skin by then, behind a boot loader too, and waits for presses of corners.
+_CORNERS_BEGIN_S: Final = 8.0
+# In the scene "corners", each rectangle is pressed for this time [s]. Chosen.
+_CORNERS_HELD_S: Final = 1.5
+# Its three touches: resistance [ohm], and how often in a second it trembles, as a finger does [Hz].
+# Chosen so that no two tremble together.
+_CORNERS_OHM_HZ: Final = ((5e3, 3.1), (8e3, 4.7), (6e3, 6.1))
+# Conductances of these touches tremble by this share to either side. Chosen.
+_TREMBLE_SHARE: Final = 0.05
+# In the scene "moving", a finger goes round in this time [s]. Chosen.
+_MOVING_PERIOD_S: Final = 4.0
+# Its pressure falls off from its middle as a normal density of this standard deviation [cells].
+# Chosen: it then covers some 15 cells.
+_FINGER_STD_CELLS: Final = 0.7
+# A cell in its middle gains this conductance [S]. Chosen: 5 kOhm is a firm touch.
+_FINGER_SIEMENS: Final = 2e-4
 
 SCENES: Final = {
     "rest": "nothing touches the skin",
-    "single": "after 3 s (begin=0: at once, as in every scene), one touch in the middle",
-    "ghost": "after 3 s, three corners of a rectangle: raw readings show a fourth",
-    "multi": "after 3 s, five touches, at places drawn from the seed",
-    "corners": "after 8 s, three corners of a rectangle; every 1.5 s one of them moves across",
-    "moving": "after 3 s, one fingertip on a closed curve over the whole skin, once in 4 s",
+    "single": f"after {BEGIN_S:g} s (begin=0: at once, as in every scene), one touch in the middle",
+    "ghost": f"after {BEGIN_S:g} s, three corners of a rectangle: raw readings show a fourth",
+    "multi": f"after {BEGIN_S:g} s, five touches, at places drawn from the seed",
+    "corners": f"after {_CORNERS_BEGIN_S:g} s, three corners of a rectangle; every "
+    f"{_CORNERS_HELD_S:g} s one of them moves across",
+    "moving": f"after {BEGIN_S:g} s, one fingertip on a closed curve over the whole skin, once in "
+    f"{_MOVING_PERIOD_S:g} s",
 }
-# When touches begin, and those of the scene "corners" [s]: the doctor has examined rest by then,
-# behind a bootloader too.
-BEGIN_S: Final = 3.0
-_CORNERS_BEGIN_S: Final = 8.0
-# The scene "moving": its period, the radius and the peak of the finger's pressure.
-_MOVING_PERIOD_S: Final = 4.0
-_FINGER_CELLS: Final = 0.7
-_FINGER_SIEMENS: Final = 2e-4
-# The scene "corners": its step, and resistances that tremble as fingers do, by a share, at rates.
-_CORNERS_HELD_S: Final = 1.5
-_CORNER_OHM: Final = (5e3, 8e3, 6e3)
-_TREMBLE: Final = 0.05
-_TREMBLE_HZ: Final = (3.1, 4.7, 6.1)
 
 
 class Scene:
     """A scene by name (see `SCENES`) on a rows x columns skin.
 
-    Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns). faults: what is
-    wrong with the skin; an `EmulatedBoard` adds those that depend on the instant of a reading.
-    plate: conductances (R, C) of resistors on wires of no resistance [S], in place of the untouched
-    skin. begin_s: when touches begin [s]; None: as `SCENES` says. `moves`: whether touches change
-    after that.
+    Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns).
+
+    seed: of the wires and cells at rest, and of the touches of "multi".
+    faults: what is wrong with the skin; a fault that differs from reading to reading, such as hum,
+    is not in `ratio`: `EmulatedBoard` adds it.
+    begin_s: when touches begin [s]; None: as `SCENES` says.
+
+    `moves`: whether touches change after they have begun.
 
     :raises ValueError: no such scene or time, or a skin too small for the scene or the faults.
     """
@@ -69,7 +80,6 @@ class Scene:
         *,
         seed: int = 0,
         faults: SkinFaults | None = None,
-        plate: Float | None = None,
         begin_s: float | None = None,
     ) -> None:
         if name not in SCENES:
@@ -80,8 +90,8 @@ class Scene:
         self.rows = rows
         self.columns = columns
         self.moves = name in ("corners", "moving")
-        known_s = {"rest": float("inf"), "corners": _CORNERS_BEGIN_S}.get(name, BEGIN_S)
-        self.begin_s = known_s if begin_s is None else begin_s
+        usual_s = {"rest": float("inf"), "corners": _CORNERS_BEGIN_S}.get(name, BEGIN_S)
+        self.begin_s = usual_s if begin_s is None else begin_s
         if not self.begin_s >= 0:
             raise ValueError(f"begin must be 0 s or later, not {begin_s}")
         self.faults = faults or SkinFaults()
@@ -89,14 +99,9 @@ class Scene:
         random = np.random.default_rng(seed)
 
         def spread(middle: float) -> Float:
-            return middle * np.exp(_SPREAD * random.standard_normal((rows, columns)))
+            return middle * np.exp(_SPREAD_SHARE * random.standard_normal((rows, columns)))
 
         self._rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
-        if plate is not None:
-            if plate.shape != (rows, columns):
-                size = "x".join(map(str, plate.shape))
-                raise ValueError(f"the plate has {size} cells, the skin {rows}x{columns}")
-            self._rest = Skin(plate, np.zeros_like(plate), np.zeros_like(plate))
         self._touches = self._place(random)
         self._still_ratio = lru_cache(
             lambda at_s, mode: self.faults.readings(self.skin(at_s), mode)
@@ -119,9 +124,9 @@ class Scene:
         return self.faults.damaged(touched)
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
-        """Cells whose conductance a touch raises by 1 uS or more, shape (rows, columns)."""
+        """Cells, (rows, columns), to which a touch adds as much as a cell has at rest, 1 uS."""
         rest_siemens = self.faults.damaged(self._rest).cell_siemens
-        return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= _TOUCHED_SIEMENS)
+        return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= 1 / REST_OHM)
 
     def ratio(self, time_s: float, mode: str = "near") -> Float:
         """Exact readings of a mode at a time, shape (rows, columns, 4)."""
@@ -134,24 +139,26 @@ class Scene:
         if self.name == "single":
             touches[self.rows // 2, self.columns // 2] = 1 / 5e3
         elif self.name == "ghost":
-            (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
             # The touches are light: with heavy ones, methods that neglect the wires show a trace at
             # the fourth corner.
-            touches[[top, top, bottom], [left, right, left]] = 1 / np.array([30e3, 40e3, 35e3])
+            for cell, ohm in zip(self._three_corners(0), (30e3, 40e3, 35e3), strict=True):
+                touches[cell] = 1 / ohm
         elif self.name == "multi":
             count = min(5, touches.size)
             cells = random.choice(touches.size, count, replace=False)
             touches.flat[cells] = 1 / np.exp(random.uniform(np.log(2e3), np.log(5e4), count))
         return touches
 
+    def _three_corners(self, across: int) -> list[tuple[int, int]]:
+        """Corners of a rectangle: of the first and the fourth, only the fourth if across is 1."""
+        (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
+        return [(bottom, right) if across else (top, left), (top, right), (bottom, left)]
+
     def _corners(self, time_s: float) -> Float:
         touches = np.zeros((self.rows, self.columns))
-        (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
         across = int((time_s - self.begin_s) / _CORNERS_HELD_S) % 2
-        alone = (bottom, right) if across else (top, left)
-        cells = (alone, (top, right), (bottom, left))
-        for cell, ohm, hz in zip(cells, _CORNER_OHM, _TREMBLE_HZ, strict=True):
-            touches[cell] = (1 + _TREMBLE * np.sin(2 * np.pi * hz * time_s)) / ohm
+        for cell, (ohm, hz) in zip(self._three_corners(across), _CORNERS_OHM_HZ, strict=True):
+            touches[cell] = (1 + _TREMBLE_SHARE * np.sin(2 * np.pi * hz * time_s)) / ohm
         return touches
 
     def _finger(self, time_s: float) -> Float:
@@ -159,7 +166,26 @@ class Scene:
         row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
         away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
-        return np.asarray(_FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_CELLS**2)))
+        return np.asarray(_FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_STD_CELLS**2)))
+
+
+class PlateScene(Scene):
+    """A scene on a plate of known resistors, in place of a skin: its wires have no resistance.
+
+    siemens: conductances of the resistors, (rows, columns) [S]. The others are as those of `Scene`.
+    """
+
+    def __init__(
+        self,
+        siemens: Float,
+        name: str = "rest",
+        *,
+        seed: int = 0,
+        faults: SkinFaults | None = None,
+        begin_s: float | None = None,
+    ) -> None:
+        super().__init__(name, *siemens.shape, seed=seed, faults=faults, begin_s=begin_s)
+        self._rest = Skin(siemens, np.zeros_like(siemens), np.zeros_like(siemens))
 
 
 def _two_of(count: int) -> tuple[int, int]:

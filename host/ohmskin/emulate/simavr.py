@@ -28,11 +28,16 @@ BOARDS: Final = ("uno", "megaatmega2560")
 _REPOSITORY: Final = Path(__file__).resolve().parents[3]
 # The simulator, in a checkout; it need not exist.
 PROGRAM: Final = _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
-# Requests and replies begin with an operation (u8) and the length of what follows (u32).
+# Requests and replies begin with an operation (u8) and the length of what follows (u32):
+# firmware/sim/README.md.
 _HEADER: Final = struct.Struct("<BI")
-# A simulator whose pipes are closed ends at once; after this time it is killed [s].
+# Added to the number of rows in the request "C", this says that far ends are in its matrix, too.
+_FAR_ENDS: Final = 0x80
+# A simulator whose pipes are closed ends at once. One that has not after this time [s] hangs, and
+# is killed. Chosen.
 _EXIT_TIMEOUT_S: Final = 2.0
-# The skin's readings follow a moving scene in steps of this time [s].
+# While touches move, the simulator is told a new skin every so often [s]. Chosen: a scan at 90 Hz
+# takes 11 ms, and solving a skin of 16x16 some milliseconds.
 _TABLE_EVERY_S: Final = 0.02
 
 
@@ -155,6 +160,7 @@ class SimavrLink(SerialLink):
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
         elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
         own = dict(settings)
+        # A board on a desk has the boot loader that it is sold with.
         loader = own.pop("bootloader", "board" if "desk" in own else "")
         with ExitStack() as opened:
             try:
@@ -186,8 +192,7 @@ class SimavrLink(SerialLink):
     def _show(self, time_s: float) -> None:
         skin = self._scene.skin(time_s)
         admittance = end_admittance(skin)
-        # 128: far ends are in it, too.
-        self.sim.request("C", bytes([128 + self._scene.rows]) + admittance.tobytes())
+        self.sim.request("C", bytes([_FAR_ENDS + self._scene.rows]) + admittance.tobytes())
         self.sim.set_table(all_readings(skin, admittance))
 
     def close(self) -> None:
