@@ -73,7 +73,8 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     settled = evidence.settled
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
     moves, scans, far = bool(moved.any()), usual, usual.board.mode == "far"
-    # Far ends are always read with more time: even a part of a code counts there.
+    # The means are those with the longer settle time if the usual one is too short. In mode far
+    # they always are: wires change readings by few codes there, so that a part of a code counts.
     if settled is not None and not moves and (examine_settling(usual, settled, diagnosis) or far):
         scans = settled
     # Unless told otherwise, wires are as those of emulated skins.

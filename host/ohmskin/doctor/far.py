@@ -71,7 +71,7 @@ MOST_LINE_OHM: Final = 50e3
 
 @dataclass(frozen=True, eq=False)
 class LayerReadings:
-    """What the readings say of the wires of a layer. The table of symbols is that of the module.
+    """What the readings say of the wires of a layer, by the symbols of this module.
 
     current_share: A, (L, n, n).
     loss_ohm: u, (L, n) [ohm].
@@ -86,7 +86,7 @@ class LayerReadings:
 
     @cached_property
     def weighed(self) -> Float:
-        """A^T / s^2, (L, n, n): what makes normal equations of readings."""
+        """A^T / s^2, (L, n, n): times A or u, the two sides of the normal equations."""
         return (self.current_share / self.std_ohm[..., None] ** 2).swapaxes(1, 2)
 
 
@@ -99,7 +99,8 @@ class FarReadings:
 
     def __init__(self, rest: Rest, kept: list[list[int]]) -> None:
         self._refs, ratio = (rest.board.ref_top_ohm, rest.board.ref_bottom_ohm), rest.ratio
-        # A scan goes down one column after the other. Readings of the cell that was read before:
+        # A far node that floats keeps the voltage of the cell that was read before. A scan goes
+        # down one column after the other.
         before = np.roll(ratio.swapaxes(0, 1).reshape(-1, 4), 1, axis=0)
         before = before.reshape(ratio.shape[1], -1, 4).swapaxes(0, 1)[np.ix_(*kept)]
         ratio = ratio[np.ix_(*kept)]
@@ -108,6 +109,7 @@ class FarReadings:
         self._current = np.maximum(circuit.current_from_ratio(near, *self._refs), 1e-9)
         a, e, b, f = np.moveaxis(ratio, -1, 0)
         loss = np.stack([a - e, f - b])
+        # A loss is the difference of two readings, and A r is not known exactly.
         std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * loss)
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
         self._loss_std_floating = np.stack([loss, std, floating], axis=1) / self._current
@@ -135,9 +137,10 @@ class FarReadings:
         )
 
     def ends(self, wire_ohm: Float) -> tuple[Float, Float]:
-        """What u of each line would be with each far end of its layer, by the circuit [ohm].
+        """What u of each line would be if the far end of another line were read for it [ohm].
 
-        Of rows (R, R, C), of columns (C, C, R): far end, line, port of the line.
+        This is what the circuit says of swapped ends, if the segments are `wire_ohm` (2, R, C).
+        Of rows (R, R, C), of columns (C, C, R): the end that is read, the line, its port.
         """
         rows, lines = self.shape[0], sum(self.shape)
         admittance = circuit.end_admittance(circuit.Skin(self.cell_siemens, *wire_ohm))
@@ -166,7 +169,11 @@ class Fit(NamedTuple):
 def _fit(layer: LayerReadings, mean_ohm: Float, prior: Float) -> Fit:
     """The segments of least cost |(u - A r) / s|^2 + (r - mean)^T prior (r - mean).
 
-    mean_ohm: mean of the segments, (..., 1, 1). prior: (..., n, n) [1 / ohm^2].
+    mean_ohm: mean of the segments, (..., 1, 1) [ohm].
+    prior: inverse of their covariance before the readings, (..., n, n) [1 / ohm^2].
+
+    A cost above the number of readings, less one, shows that the model is wrong by more than s
+    says. The covariance is widened by as much.
     """
     covariance = np.linalg.inv(layer.weighed @ layer.current_share + prior)
     expected = prior.sum(axis=-1, keepdims=True) * mean_ohm
@@ -178,21 +185,23 @@ def _fit(layer: LayerReadings, mean_ohm: Float, prior: Float) -> Fit:
     return Fit(ohm[..., 0], covariance * misfit[..., None, None], cost)
 
 
-def fit_even(layer: LayerReadings) -> Fit:
-    """Segments that scatter about the mean of their line, which may be anything: L lines."""
+def fit_alike(layer: LayerReadings) -> Fit:
+    """Segments that scatter about the mean of their line. The mean may be anything."""
     count = layer.loss_ohm.shape[1]
-    # About m, to scale the cost: what each segment has if all are equal.
+    # What each segment has if all are equal. It scales the cost in place of m, which is near it.
     pull = (layer.weighed @ layer.loss_ohm[..., None]).sum(axis=1)
     precision = (layer.weighed @ layer.current_share).sum(axis=(1, 2))
     equal_ohm = (pull / precision[:, None])[..., None]
     scale = (SPREAD * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
-    return _fit(layer, equal_ohm, scale * (np.eye(count) - 1 / count))  # which leaves m free
+    # This matrix takes the mean out of r, so that only differences from it cost something.
+    return _fit(layer, equal_ohm, scale * (np.eye(count) - 1 / count))
 
 
-def fit_odd(layer: LayerReadings, usual_ohm: float) -> Fit:
-    """Segments that scatter about the usual one of the layer, but for one that may be anything.
+def fit_one_bad(layer: LayerReadings, usual_ohm: float) -> Fit:
+    """Segments that scatter about the usual one of the layer, but for one, which may be anything.
 
-    Each segment is that one by turns, and in the last fit none is: (n + 1, L) fits.
+    There are n + 1 fits of each line, (n + 1, L): the k-th segment is the free one in the k-th fit,
+    and none is in the last.
     """
     count = layer.loss_ohm.shape[1]
     bound = (1 - np.eye(count + 1, count))[:, None, None]  # 0: this segment is free
@@ -203,7 +212,8 @@ def fit_odd(layer: LayerReadings, usual_ohm: float) -> Fit:
 class _Layer:
     """The rows (axis 0) or the columns (axis 1) that are kept, and what was found of their wires.
 
-    numbers: the numbers of its lines. across: those of the lines that cross them.
+    numbers: the numbers of its lines.
+    across: the numbers of the lines that cross them.
     measured: which lines have wires that are measured, (L,).
     lost: which lines have a far end at fault, (L,).
     fit: segments of all lines.
@@ -217,10 +227,11 @@ class _Layer:
         # A shorted line has currents of others in its wire, so that u = A r does not hold.
         shorted = [n for group in shorts for n in group]
         self.measured = alone = ~np.isin(self.numbers, shorted)
-        self.fit = fit_even(readings)
+        self.fit = fit_alike(readings)
         least_cost = self.fit.cost
         if len(alone) > 2:  # else no line is usual
-            least_cost = np.minimum(least_cost, fit_odd(readings, self.usual_ohm).cost.min(axis=0))
+            one_bad = fit_one_bad(readings, self.usual_ohm)
+            least_cost = np.minimum(least_cost, one_bad.cost.min(axis=0))
         # A connected end costs less than MANY_STDS^2 a reading, and not clearly more than if it
         # floated.
         most_of_any = MANY_STDS**2 * max(len(self.across) - 1, 1)
@@ -300,14 +311,15 @@ class _Layer:
         """Add the wire of each measured line, and lines that are clearly not as they should be.
 
         All lines together are compared with `nominal_ohm`, if it is known. Each line is compared
-        with the usual one, unless one bad segment explains it better. Of two lines, none is usual.
+        with the usual one, unless one bad segment explains it better: then this is added. Of two
+        lines, nobody can say which is usual.
         """
         measured: list[int] = np.flatnonzero(self.measured).tolist()
         if nominal_ohm and measured:
             self._compare(measured, nominal_ohm, diagnosis)
-        odd, usual_ohm = fit_odd(self.readings, self.usual_ohm), self.usual_ohm
+        one_bad, usual_ohm = fit_one_bad(self.readings, self.usual_ohm), self.usual_ohm
         for line in measured if len(self.measured) > 2 else ():
-            if not self._report_segment(line, odd, usual_ohm, diagnosis):
+            if not self._report_segment(line, one_bad, usual_ohm, diagnosis):
                 self._compare([line], usual_ohm, diagnosis)
         for line in measured:
             ohm, covariance = self.fit.ohm[line], self.fit.covariance[line]
@@ -315,22 +327,26 @@ class _Layer:
             segments = ohm.tolist(), (covariance.diagonal() ** 0.5).tolist()
             diagnosis.lines.append(LineWire(self.place([line]), *whole, *segments))
 
-    def _report_segment(self, line: int, odd: Fit, usual_ohm: float, diagnosis: Diagnosis) -> bool:
-        """Whether one bad segment explains a line clearly better than anything else; adds it then.
+    def _report_segment(
+        self, line: int, one_bad: Fit, usual_ohm: float, diagnosis: Diagnosis
+    ) -> bool:
+        """Whether one bad segment explains a line clearly better than anything else does.
 
-        odd: what `fit_odd` gives. The line takes the segments of the fit that explains it.
+        Then it is added, and the line takes the segments of that fit.
+        one_bad: what `fit_one_bad` gives of all lines.
         """
-        costs, no_odd_cost = odd.cost[:-1, line], odd.cost[-1, line]
+        costs, none_bad_cost = one_bad.cost[:-1, line], one_bad.cost[-1, line]
         # Several segments may explain the line. The nearest one has the crimp in it, or is the
         # nearest to it: contacts fail more often than yarn.
         candidates = np.flatnonzero(costs < costs.min() + ALIKE_COST)
         k = int(candidates[0])
-        more_ohm = float(odd.ohm[k, line, k]) - usual_ohm
-        clear = costs[k] < min(self.fit.cost[line] + ALIKE_COST, no_odd_cost - MANY_STDS**2)
+        more_ohm = float(one_bad.ohm[k, line, k]) - usual_ohm
+        clear = costs[k] < min(self.fit.cost[line] + ALIKE_COST, none_bad_cost - MANY_STDS**2)
         if not clear or more_ohm < CHANGED_SHARE * len(self.across) * usual_ohm:
             return False
-        self.fit.ohm[line], self.fit.covariance[line] = odd.ohm[k, line], odd.covariance[k, line]
-        values = {"more_ohm": more_ohm, "std_ohm": float(odd.covariance[k, line, k, k]) ** 0.5}
+        self.fit.ohm[line] = one_bad.ohm[k, line]
+        self.fit.covariance[line] = one_bad.covariance[k, line]
+        values = {"more_ohm": more_ohm, "std_ohm": float(one_bad.covariance[k, line, k, k]) ** 0.5}
         between = self.across[k - 1] if k else -1, self.across[candidates[-1]]
         kind = Kind.BAD_SEGMENT if k else Kind.BAD_CRIMP
         diagnosis.add(kind, self.place([line]), between=between, **values)

@@ -143,7 +143,7 @@ class Look:
 
     @cached_property
     def window(self) -> Float:
-        """w, (N,)."""
+        """w: a Hann window over the scans, (N,)."""
         window = np.hanning(len(self.codes) + 2)[1:-1]
         return np.asarray(window / window.sum())
 
@@ -158,7 +158,7 @@ class Look:
 
     @property
     def hidden_hz(self) -> tuple[float, ...]:
-        """Mains that these scans cannot show [Hz]."""
+        """Mains that these scans cannot show [Hz]: all of them, if the scans are few."""
         seconds = float(np.ptp(self.time_s)) if len(self.codes) >= LEAST_SCANS else 0.0
         return _hidden_hz(self.board.rate_hz, seconds)
 
@@ -217,6 +217,9 @@ def examine_signal(
     """Add hum and noise. Returns the noise of a reading without hum [LSB], and which cells moved.
 
     other: a look at another scan rate. It may show a hum that stands still in the first one.
+
+    Noise is that of the usual cell, after hum and what moves slowly are taken out. While something
+    moves, noise is not judged: readings of a touched cell change for another reason.
     """
     hum, hidden_hz = find_hum(scans), scans.hidden_hz
     without_hum = scans.codes - scans.mean
@@ -281,9 +284,9 @@ def find_hum(scans: Look) -> Hum | None:
         turn = np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
         return float(np.abs(np.mean(scans.amplitude(hum.frequency_hz) * turn)))
 
-    less, more = sorted(hums, key=in_phase_lsb)
-    if in_phase_lsb(more) > IN_PHASE * in_phase_lsb(less):
-        return more
+    weaker, stronger = sorted(hums, key=in_phase_lsb)
+    if in_phase_lsb(stronger) > IN_PHASE * in_phase_lsb(weaker):
+        return stronger
     return replace(hums[0], mains_hz=MAINS_HZ)
 
 
@@ -324,7 +327,7 @@ def _hum_at(mains_hz: float, scans: Look) -> Hum | None:
     of_noise = 4 * float(np.mean((scans.codes - scans.mean) ** 2) * np.sum(scans.window**2))
     lsb = max(share * (power - of_noise), 0.0) ** 0.5
     seconds = np.ptp(scans.time_s)
-    beside = np.median([scans.power(hz + far / seconds) for far in BESIDE])
+    beside = np.median([scans.power(hz + away / seconds) for away in BESIDE])
     over_noise = power > of_noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
     if lsb > ROUNDING_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
         return Hum((mains_hz,), hz, sine, lsb)
@@ -351,7 +354,8 @@ def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
 def _moved(without_hum: Float, variance: Float) -> Bool:
     """Cells (R, C) whose mean changes from block to block of the scans by more than noise does.
 
-    without_hum: readings less their means, (N, R, C, 4). variance: of the noise of each.
+    without_hum: readings less their means, (N, R, C, 4) [LSB].
+    variance: of the noise of each reading, (R, C, 4) [LSB^2].
     """
     if len(without_hum) < LEAST_SCANS:
         return np.zeros(without_hum.shape[1:3], dtype=np.bool_)
