@@ -20,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 
 from calibrations import calibration
 from ohmskin.calibrate.tables import load_force_log, load_press_table
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import PortError, RecordingError
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -28,7 +29,6 @@ from ohmskin.link import framing, protocol
 from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
 from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
-from ohmskin.opening import emulated
 from ohmskin.record.force_sensor import ForceLineDecoder
 from ohmskin.record.readings import load_readings
 from ohmskin.record.recording import SCHEMAS, TOPIC, export, load_recording

@@ -24,7 +24,7 @@ from ohmskin.cli import main as cli
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.driver import PtyServer
 from ohmskin.emulate.simavr import PROGRAM
-from ohmskin.opening import emulated
+from ohmskin.emulate.urls import emulated
 from ports import USB_IDS, Attach, Serve
 from studies.__main__ import app as studies
 

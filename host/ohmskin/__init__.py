@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from ohmskin.link.clock import BoardClock
     from ohmskin.link.device import Device
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
-    from ohmskin.opening import Boards, BoardScan, open, open_all
+    from ohmskin.opening import open
+    from ohmskin.several_boards import Boards, BoardScan, open_all
 
 __all__ = [
     "METHODS",
@@ -86,7 +87,8 @@ _MODULES = {
     "link.clock": ("BoardClock",),
     "link.device": ("Device",),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
-    "opening": ("BoardScan", "Boards", "open", "open_all"),
+    "opening": ("open",),
+    "several_boards": ("BoardScan", "Boards", "open_all"),
 }
 
 

@@ -28,12 +28,12 @@ from ohmskin.doctor.gather import gather
 from ohmskin.doctor.signal import Rest
 from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.simavr import PROGRAM
+from ohmskin.emulate.urls import emulated
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.calibration import Rest as CalibratedRest
 from ohmskin.link.codes import quantise
 from ohmskin.link.protocol import MODES
-from ohmskin.opening import emulated
 from stepped import evidence, stepped
 
 FAR = "emulator://8x8?mode=far&seed=1"

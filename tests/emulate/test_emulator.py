@@ -14,13 +14,13 @@ from lockstep import LockstepSim, elf_of
 from ohmskin.emulate import board as emulator
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import PortError
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
 from ohmskin.link.session import configuration
-from ohmskin.opening import emulated
 from places import ROOT
 from stepped import stepped
 

@@ -15,13 +15,13 @@ from lockstep import LockstepSim
 from ohmskin.emulate import simavr
 from ohmskin.emulate.driver import EmulatorLink, PtyServer, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError
 from ohmskin.link import framing, protocol, session
 from ohmskin.link.codes import quantise
 from ohmskin.link.host_clock import SteppedClock
 from ohmskin.link.serial_port import READ_TIMEOUT_S, SerialLink
 from ohmskin.link.session import Session
-from ohmskin.opening import emulated
 from ports import Serve
 from stepped import stepped, stepped_link
 

@@ -9,9 +9,9 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SKIN_FAULTS, SkinFaults, faults_of
 from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import PortError
 from ohmskin.link.protocol import MODES
-from ohmskin.opening import emulated
 from skins import scan_order
 
 R, C = 4, 5

@@ -7,8 +7,8 @@ from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.gather import gather
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.urls import emulated
 from ohmskin.link.host_clock import SteppedClock
-from ohmskin.opening import emulated
 
 
 def stepped_link(of: str | EmulatedBoard) -> EmulatorLink:

@@ -10,9 +10,9 @@ from itertools import pairwise
 import pytest
 
 from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import DeviceSilent
 from ohmskin.link.host_clock import SteppedClock
-from ohmskin.opening import emulated
 
 QUIET_S = 2.0  # from the opening of the port to the first question
 AGAIN_S = 6.0  # from a question to the next, so that a loader that has heard it is done

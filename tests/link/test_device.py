@@ -20,13 +20,13 @@ import ohmskin
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, ProtocolError
 from ohmskin.link import device, framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import MODES
 from ohmskin.link.session import Session
-from ohmskin.opening import emulated
 from ports import Serve
 from stepped import stepped, stepped_link
 from waiting import until

@@ -18,7 +18,7 @@ from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import session
 from ohmskin.link.messages import Scan
-from ohmskin.opening import Boards, BoardScan
+from ohmskin.several_boards import Boards, BoardScan
 from ports import Attach, Serve
 from stepped import stepped
 

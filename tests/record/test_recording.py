@@ -20,9 +20,9 @@ from mcap.reader import make_reader
 
 import ohmskin
 from command_line import Command, Done, Run, assert_one_line, finish, well
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.opening import emulated
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import (

@@ -13,12 +13,12 @@ import ohmskin
 from ohmskin.arrays import Bool, Float
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import FULL_SCALE_USIEMENS, WIDE, coloured
+from ohmskin.emulate.urls import emulated
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import check_place, whole_file
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.device import scans_for
-from ohmskin.opening import emulated
 
 # The methods that are compared: one that shows ghosts, and one that does not.
 _METHODS: Final = ("ohm", "joint")

@@ -11,8 +11,8 @@ from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.emulate.driver import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import SCENES
+from ohmskin.emulate.urls import emulated, is_stepped
 from ohmskin.errors import PortError
-from ohmskin.opening import emulated, is_stepped
 
 # The options of an emulator:// URL, for the command's help.
 _OPTIONS: Final = {

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a URL to a board without hardware: ``emulator://8x8?scene=ghost`` and ``simavr://uno``.
+
+docs/commands.md lists the options. They are those of the board and of what touches its skin, named
+here, and those of faults, which `faults` defines.
+"""
+
+import re
+from typing import Final
+
+from ohmskin.circuit.plate import load_plate
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
+from ohmskin.emulate.scenes import PlateScene, Scene
+from ohmskin.emulate.simavr import SimavrLink
+from ohmskin.errors import PortError
+from ohmskin.link.host_clock import HostClock, SteppedClock
+from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
+from ohmskin.link.session import Session
+from ohmskin.link.url import PortUrl
+
+# Noise of an emulated converter, unless told [LSB]. Chosen: a sound board's converter has as much.
+DEFAULT_NOISE_LSB: Final = 0.3
+# The options of both kinds of boards that say what the skin is and what touches it.
+_OF_SCENE: Final = ("scene", "begin", "plate")
+# The options of an emulated board that are no faults.
+_OF_BOARD: Final = (*_OF_SCENE, "seed", "rate", "noise", "unit", "mode", "foreign", "speed")
+
+
+def open_emulator(text: str) -> Session:
+    """Connect to the board of an ``emulator://`` URL.
+
+    :raises PortError: the URL is wrong.
+    """
+    board, _, faults = emulated(text)
+    if is_stepped(text):
+        return SteppedSkin(EmulatorLink(board, text, faults, SteppedClock()))
+    return Session(EmulatorLink(board, text, faults, HostClock()))
+
+
+def open_simavr(text: str) -> Session:
+    """Connect to the board of a ``simavr://`` URL, whose other options are the simulator's.
+
+    :raises PortError: the URL is wrong, or the simulator or the firmware is not built.
+    """
+    url = PortUrl.of(text)
+    settings, baud = dict(url.options), url.baud
+    with url.blamed():
+        scene = _scene(url, f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}")
+        for name in (*_OF_SCENE, "baud"):
+            settings.pop(name, None)
+        return Session(SimavrLink(url.place, scene, text, settings), baud)
+
+
+def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
+    """The emulated board of an ``emulator://`` URL, what it reads, and the faults of its line.
+
+    :raises PortError: the URL is wrong.
+    """
+    url = PortUrl.of(text)
+    if url.scheme != "emulator":
+        raise PortError(f"{text} is not emulated: write emulator://8x8")
+    url.check_options(*_OF_BOARD, *SKIN_FAULTS, *LINE_FAULTS)
+    with url.blamed():
+        if url.options.get("speed", "1") not in ("0", "1"):
+            raise ValueError("speed must be 1, or 0: as fast as scans are taken")
+        seed = url.number("seed", 0)
+        faults = faults_of(SkinFaults, url.options)
+        scene = _scene(url, url.place, faults)
+        settings = BoardSettings(
+            *(scene.rows, scene.columns),
+            mode=url.options.get("mode", "near"),
+            rate_hz=url.number_if_given("rate"),
+            unit_id=url.number("unit", 0),
+        )
+        board = EmulatedBoard(
+            scene.ratio,
+            settings,
+            noise_lsb=url.number("noise", DEFAULT_NOISE_LSB),
+            seed=seed,
+            sampled=faults.sampled,
+            says={"layout_crc": LAYOUT_CRC ^ url.number("foreign", 0)},
+        )
+        return board, scene, faults_of(LineFaults, url.options, seed=seed)
+
+
+def is_stepped(text: str) -> bool:
+    """Whether an emulated board has time only while somebody waits for it: ``speed=0``."""
+    return PortUrl.of(text).options.get("speed") == "0"
+
+
+def _scene(url: PortUrl, size: str, faults: SkinFaults | None = None) -> Scene:
+    """The scene that a URL asks for, on a skin of a size as "8x8". Raises ValueError as `Scene`."""
+    match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", size)
+    rows, columns = map(int, match.groups()) if match else (0, 0)
+    most_rows, most_columns = CONSTANTS["rows_max"], CONSTANTS["columns_max"]
+    if not (1 <= rows <= most_rows and 1 <= columns <= most_columns):
+        raise ValueError(f"a size is as 8x8, from 1x1 to {most_rows}x{most_columns}, not '{size}'")
+    name, begin_s = url.options.get("scene", "rest"), url.number_if_given("begin")
+    seed = url.number("seed", 0)
+    if "plate" not in url.options:
+        return Scene(name, rows, columns, seed=seed, faults=faults, begin_s=begin_s)
+    plate = load_plate(url.options["plate"])
+    if plate.shape != (rows, columns):
+        cells = "x".join(map(str, plate.shape))
+        raise ValueError(f"the plate has {cells} cells, the skin {rows}x{columns}")
+    return PlateScene(plate, name, seed=seed, faults=faults, begin_s=begin_s)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several boards at once: all are opened or none, and their scans come in order of one clock."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+from ohmskin import opening
+from ohmskin.errors import DeviceSilent, PortError
+from ohmskin.files import Closing, naming
+from ohmskin.force.calibration import Calibration
+from ohmskin.force.reader import CalibratedSkin
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
+from ohmskin.link.device import Device
+from ohmskin.link.messages import Scan
+from ohmskin.link.serial_port import serial_ports
+
+
+class BoardScan(NamedTuple):
+    """A scan of one of several boards.
+
+    unit_id: of the board.
+    scan: a `Scan`; a `ForceScan` if the boards were opened with calibrations.
+    time_s: when the middle of the scan was, on `time.monotonic()` [s]. It is late by the delay that
+        USB has for all scans alike, which no host can see.
+    """
+
+    unit_id: int
+    scan: Any
+    time_s: float
+
+
+class Boards(Closing, dict[int, Any]):
+    """Open boards by unit id: each a `Device`, or a `CalibratedSkin` if calibrations were given.
+
+    Made by `open_all`. ``with`` closes all, and so does `close`.
+
+    :raises PortError: two have the same unit id.
+    """
+
+    def __init__(self, devices: Sequence[Device | CalibratedSkin]) -> None:
+        for device in devices:
+            unit_id = device.info.unit_id
+            first = self.setdefault(unit_id, device)
+            if first is not device:
+                raise PortError(
+                    f"{first.name} and {device.name} are both unit {unit_id}: rename one: "
+                    f"ohmskin configure {device.name} --unit-id NUMBER --save"
+                )
+
+    def scans(self) -> Iterator[BoardScan]:
+        """Every scan of every board from now on, in order of their times.
+
+        A scan is given when every other board has sent a later one: late by about a period of the
+        slowest board. A program for which that is too late reads each device's `latest`.
+
+        :raises DeviceLost: one of the boards went away; its text names the port.
+        """
+        # All boards begin now. The merge would begin each of them when it first takes a scan of it.
+        begun = [(device, iter(device)) for device in self.values()]
+        of_boards = [_timed(device, scans) for device, scans in begun]
+        return heapq.merge(*of_boards, key=lambda board_scan: board_scan.time_s)
+
+    def close(self) -> None:
+        """Stop all boards and give their ports back. May be called again."""
+        with ExitStack() as closing:
+            for device in self.values():
+                closing.push(device)
+
+
+def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[BoardScan]:
+    """The scans of a device with their times by the host's clock, as its scans tell it."""
+    clock, unit_id = BoardClock(), device.info.unit_id
+    for scan in scans:
+        board = device.info
+        took_us = 1e6 * scan_s(board)
+        clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
+        yield BoardScan(unit_id, scan, clock.host_s(scan.time_us + took_us / 2))
+
+
+def open_all(
+    urls: Iterable[str] | None = None,
+    *,
+    calibrations: Iterable[opening.CalibrationLike] | None = None,
+    start: bool = True,
+) -> Boards:
+    """Connect to several boards, all of these or none, and start scanning unless told otherwise.
+
+    urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a
+    Mega 2560. A port of these that does not answer as a skin is skipped: it is another device. A
+    skin that cannot be used, because its port is busy or its firmware is of another version, is an
+    error. calibrations: `Calibration` or files; each board takes the one of its unit id.
+
+    >>> with open_all(["emulator://8x8?unit=1", "emulator://8x8?unit=2"]) as skins:
+    ...     sorted(skins)
+    [1, 2]
+
+    :raises PortError: as `ohmskin.open`; no board is found; two have the same unit id.
+    :raises DeviceSilent: as `ohmskin.open`, for a port that was named.
+    :raises ProtocolMismatch: as `ohmskin.open`.
+    :raises ValueError: as `ohmskin.open`; a board has no calibration, or two are of one unit.
+    """
+    searches = urls is None
+    ports = [port.path for port in serial_ports() if port.board] if urls is None else list(urls)
+    if not ports:
+        raise PortError("no skin board found: name ports out of those that 'ohmskin ports' lists")
+    by_unit = None if calibrations is None else _by_unit(calibrations)
+    with ExitStack() as opened:
+
+        def connect(url: str) -> Device | CalibratedSkin | None:
+            try:
+                device = opened.enter_context(opening.open(url, start=False))
+            except DeviceSilent:
+                if searches:
+                    return None
+                raise
+            return device if by_unit is None else _calibrated(device, by_unit)
+
+        # At once, because each takes as long as its board to boot.
+        with ThreadPoolExecutor(len(ports)) as pool:
+            devices = [device for device in pool.map(connect, ports) if device is not None]
+        if not devices:
+            raise PortError(f"no skin board answers at {', '.join(ports)}: are they flashed?")
+        boards = Boards(devices)
+        if start:
+            for device in devices:
+                device.start()
+        opened.pop_all()
+        return boards
+
+
+def _calibrated(device: Device, by_unit: dict[int, Calibration]) -> CalibratedSkin:
+    unit_id = device.info.unit_id
+    with naming(device.name):
+        if unit_id not in by_unit:
+            raise ValueError(f"no calibration is of its unit, {unit_id}: calibrate this skin")
+        return CalibratedSkin(device, by_unit[unit_id])
+
+
+def _by_unit(calibrations: Iterable[opening.CalibrationLike]) -> dict[int, Calibration]:
+    by_unit: dict[int, Calibration] = {}
+    for calibration in map(opening.loaded, calibrations):
+        if by_unit.setdefault(calibration.unit_id, calibration) is not calibration:
+            raise ValueError(f"two calibrations are of unit {calibration.unit_id}: give one")
+    return by_unit
