@@ -24,11 +24,13 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEX := host/ohmskin/firmware
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
+BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers far orders desk force view \
+                boards quick)
+
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware test-arduino-gcc check-firmware sim \
-        test-host fuzz chart stability ablate far experiments bench-firmware bench-import bench-host bench-estimators bench-fingers bench-far bench-desk bench-force bench-view \
-        bench-boards clean distclean
+        test-host fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -119,35 +121,48 @@ far: setup ## lines sensed at both ends, near ends, zero potential, simulated: d
 experiments: setup ## the paper's experiments with force, simulated: docs/force-*.png
 	for each in flat curved timeseries minimum; do $(STUDY) experiment $$each || exit 1; done
 
+BENCH := $(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks
+
 bench-firmware: setup firmware sim ## measure the firmware in the simulator
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_firmware.py
+	$(BENCH)/bench_firmware.py
 
 bench-import: setup-host ## measure what importing the package and asking for its help cost
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_import.py
+	$(BENCH)/bench_import.py
 
 bench-host: setup-host ## measure decoding, latency and load of the host
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_host.py
+	$(BENCH)/bench_host.py
 
 bench-estimators: setup-host ## measure the estimators: time, error, stated uncertainty
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_estimators.py
+	$(BENCH)/bench_estimators.py
+
+bench-tables: setup-host ## measure the paper's sweeps, and methods that are told less: tables of docs
+	$(BENCH)/bench_tables.py
 
 bench-fingers: setup-host ## measure fingertips where nobody knows the wires, and the paper's method
-	$(ONE_THREAD) PYTHONPATH=. $(BIN)/python benchmarks/bench_fingers.py
+	$(BENCH)/bench_fingers.py
 
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
-	$(ONE_THREAD) PYTHONPATH=. $(BIN)/python benchmarks/bench_far.py
+	$(BENCH)/bench_far.py
+
+bench-orders: setup firmware sim ## measure in which order mode far should take its readings, simulated
+	$(BENCH)/bench_orders.py
 
 bench-desk: setup firmware sim ## measure estimates from a board as unkind as one on a desk, simulated
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_desk.py
+	$(BENCH)/bench_desk.py
 
 bench-force: setup-host ## measure the way from scan to force: time, ten minutes live, replay
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_force.py
+	$(BENCH)/bench_force.py
 
 bench-view: setup ## measure the page: latency to the screen, frames, load
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_view.py
+	$(BENCH)/bench_view.py
 
 bench-boards: setup-host ## measure one process that reads eight boards at once: five minutes
-	$(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks/bench_boards.py
+	$(BENCH)/bench_boards.py
+
+bench-quick: setup firmware sim ## see that all benchmarks run, in minutes: the figures mean nothing
+	for file in benchmarks/bench_*.py; do \
+		echo $$file; $(BENCH)/$${file##*/} --quick || exit; \
+	done
 
 clean: ## remove what was built
 	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

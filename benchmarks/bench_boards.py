@@ -26,7 +26,6 @@ emulator_dropped_bytes  that the pseudo-terminals did not take: more than 4 KiB 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections import Counter
@@ -34,21 +33,21 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from bars import at_least, at_most, report  # beside this file
-from bench_force import PRESSES, board_8x8, calibration
 from numpy.typing import NDArray
-from served import serve, served  # beside this file
 
 import ohmskin
-from ohmskin.emulate.board import BoardSettings, EmulatedBoard
-from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.record.readings import load_readings
+from bars import at_least, at_most, run_minutes  # beside this file
+from bench_force import PRESSES, board_8x8, calibration
+from ohmskin.emulate.board import DEFAULT_RATE_HZ, BoardSettings, EmulatedBoard
+from ohmskin.link.codes import quantise
+from served import Load, serve, served  # beside this file
+from studies.conditions import converted
+from studies.trials import NOISE_LSB, reference_trial, rounded
 
 BOARDS = 8
-RATE_HZ = 90
-NOISE_LSB = 0.3
-NOISES = 10  # of each reading
-SETTLED_S = 5.0
+RATE_HZ = round(DEFAULT_RATE_HZ)
+NOISES = 10  # how often each frame is made, each time with other noise. Chosen.
+SETTLED_S = 5.0  # until a board's clock is known. Chosen.
 
 # ------------------------------------------------------------------ the boards, another process
 
@@ -62,26 +61,24 @@ class CheapBoard(EmulatedBoard):
         super().__init__(lambda *_: codes[0] / 1024, settings)
 
     def codes_at(self, time_s: float, mode: str = "near") -> NDArray[np.uint16]:
-        return self.made[round(time_s * RATE_HZ) % len(self.made)]
+        codes: NDArray[np.uint16] = self.made[round(time_s * RATE_HZ) % len(self.made)]
+        return codes
 
 
 def made_codes() -> NDArray[np.uint16]:
-    ratio = np.tile(load_readings(PRESSES).ratio, (NOISES, 1, 1, 1))
-    random = np.random.default_rng(1)
-    return quantise(ratio + NOISE_LSB / 1024 * random.standard_normal(ratio.shape))
+    ratio = np.tile(reference_trial(PRESSES).readings.ratio, (NOISES, 1, 1, 1))
+    return quantise(converted(ratio, np.random.default_rng(1), NOISE_LSB))
 
 
 def serve_boards() -> None:
     """Serve the boards, and print at the end what was."""
-    codes, before, begin_s = made_codes(), os.times(), time.monotonic()
+    codes, load = made_codes(), Load()
     shifted = (np.roll(codes, 97 * unit_id, axis=0) for unit_id in range(1, BOARDS + 1))
     servers = serve([CheapBoard(made, unit_id) for unit_id, made in enumerate(shifted, start=1)])
-    after, end_s = os.times(), time.monotonic()
-    used_s = (after.user - before.user) + (after.system - before.system)
     said = {
         "begins_s": [server.begin_s for server in servers],
         "dropped": sum(server.lost_bytes for server in servers),
-        "cpu_percent": 100 * used_s / (end_s - begin_s),
+        "cpu_percent": load.percent(),
     }
     print(json.dumps(said))
 
@@ -90,9 +87,8 @@ def serve_boards() -> None:
 
 
 def measure(minutes: float) -> dict[str, Any]:
-    untouched = load_readings(PRESSES).rest_ratio
-    assert untouched is not None
-    rest_ratio = ratio_from_codes(quantise(untouched))
+    rest_ratio = rounded(reference_trial(PRESSES).readings).rest_ratio
+    assert rest_ratio is not None
     of_skin = calibration(board_8x8(), rest_ratio, "touch")
     calibrations = [replace(of_skin, unit_id=unit_id) for unit_id in range(1, BOARDS + 1)]
     counts, missed, pressed = Counter[int](), 0, 0
@@ -101,21 +97,18 @@ def measure(minutes: float) -> dict[str, Any]:
         served(__file__, BOARDS) as emulated,
         ohmskin.open_all(emulated.ports, calibrations=calibrations) as skins,
     ):
-        before, begin_s = os.times(), time.monotonic()
-        for each in skins.scans():
-            now_s = time.monotonic()
-            counts[each.unit_id] += 1
-            missed += each.scan.missed
-            pressed += bool(each.scan.contacts)
-            ages_s.append(now_s - each.scan.host_time_s)
-            if now_s - begin_s > SETTLED_S:
-                times_s.append((each.unit_id, each.scan.time_us, each.time_s))
-            if now_s - begin_s >= 60 * minutes:
+        load = Load()
+        for timed in skins.scans():
+            counts[timed.unit_id] += 1
+            missed += timed.scan.missed
+            pressed += bool(timed.scan.contacts)
+            ages_s.append(time.monotonic() - timed.scan.host_time_s)
+            if load.seconds() > SETTLED_S:
+                times_s.append((timed.unit_id, timed.scan.time_us, timed.time_s))
+            if load.seconds() >= 60 * minutes:
                 break
-        after, end_s = os.times(), time.monotonic()
+        took_s, cpu_percent = load.seconds(), load.percent()
         lost = [skin.stats.overflowed + skin.stats.line.damaged for skin in skins.values()]
-    took_s = end_s - begin_s
-    used_s = (after.user - before.user) + (after.system - before.system)
     unit_id, board_us, time_s = np.array(times_s).T
     begin_s = np.array(emulated.said["begins_s"])[unit_id.astype(int) - 1]
     middle_s = begin_s + 1e-6 * board_us + 0.5 / RATE_HZ
@@ -133,7 +126,7 @@ def measure(minutes: float) -> dict[str, Any]:
         "age_ms_end": round(float(np.mean(age_ms[-BOARDS * RATE_HZ :])), 2),
         "clock_error_ms_p50": round(float(np.percentile(error_ms, 50)), 3),
         "clock_error_ms_p99": round(float(np.percentile(error_ms, 99)), 3),
-        "cpu_percent": round(100 * used_s / took_s, 1),
+        "cpu_percent": round(cpu_percent, 1),
         "emulator_cpu_percent": round(emulated.said["cpu_percent"], 1),
         "emulator_dropped_bytes": emulated.said["dropped"],
     }
@@ -152,11 +145,7 @@ def main() -> int:
     if sys.argv[1:2] == ["--serve"]:
         serve_boards()
         return 0
-    minutes = float(sys.argv[sys.argv.index("--minutes") + 1]) if "--minutes" in sys.argv else 5.0
-    figures = measure(minutes)
-    all_met = report(figures, BARS)
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    return run_minutes(__doc__, measure, BARS, minutes=5.0, least_minutes=0.15)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,10 @@
     make bench-estimators
 
 Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
-missed. Everything is simulated: presses_8x8, the sweeps and the scenes they are taken from are
-readings made with ngspice (tests/data), the others come from the circuit that ngspice was compared
-with. All readings are 10 bit, and all frames warm: in order, each started from the one before,
-unless another thing is said. What is measured how:
+missed. Everything is simulated: presses_8x8 and the sweeps are readings made with ngspice
+(tests/data), the others come from the circuit that ngspice was compared with. All readings are 10
+bit, and all frames warm: in order, each started from the one before, unless another thing is said.
+What is measured how:
 
 unit_ms                 what one look at an 8x8 circuit must cost, one core, median: a Cholesky
                         factorisation, a solution for 16 columns and a product of symmetric
@@ -20,8 +20,8 @@ units_*                 median time of a frame's estimate over that of the unit 
                         `regularized`, both of its steps, in milliseconds.
 ms_joint_16x16_finger_p99  99th percentile in milliseconds; a scan takes 26.6 ms.
 error_*, ghost_*        random 8x8, up to 8 touches, cold: error of a pressed cell's conductance,
-                        median and 90th percentile; largest conductance reported at a cell that
-                        nothing presses, above rest, 95th percentile of the frames.
+                        median and 90th percentile; largest conductance above the true one of a cell
+                        that nothing presses, 95th percentile of the frames.
 sweeps_worst_share      the paper's sweeps, exact readings, `joint`: RMSE over the best figure that
                         the paper has for the same point, the worst of the ten points.
 bent_*                  8x8 with wires 35 % above nominal, frames 50 to 69: median error of a
@@ -41,69 +41,48 @@ within_*                `joint`, all scenes above, and the sweeps: share of all 
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from bars import at_least, at_most, report  # beside this file
-from numpy.typing import NDArray
 
+from bars import Part, at_least, at_most, run  # beside this file
 from ohmskin.arrays import Float
-from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
-from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.emulate.board import DEFAULT_RATE_HZ
+from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.record.readings import Readings, estimate_file, load_readings
+from ohmskin.link.protocol import ADC_BITS
+from ohmskin.record.readings import Readings, estimate_file
 from studies.information import information_limit
+from studies.judge import Judged, answers_of, judge, judge_trial, pooled
 from studies.published import RMSE_MEGOHM
 from studies.trials import (
-    PRESSED,
+    JUMP,
+    Trial,
     bent_trial,
     finger_trial,
+    knowledge_of,
     random_trial,
+    reference_trial,
+    rounded,
     skin_at_rest,
+    stretched,
     touch,
     trial_of,
 )
 
-DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
-SEED = 1000
-WARM_UP = 3  # frames
+METHODS = ("joint", "touch")
+SEED = 1000  # of the first skin
+# Skins that are timed, that are read at random, and whose wires are not as told.
+TIMED, JUDGED, CHANGED = 4, 20, 12
+WARM_UP = 3  # frames of each skin whose time does not count
 LEARNED = 50  # frames after which a bent skin is judged
-
-
-def ten_bits(exact: Readings) -> Readings:
-    assert exact.rest_ratio is not None
-    ratio, rest = (ratio_from_codes(quantise(each)) for each in (exact.ratio, exact.rest_ratio))
-    return replace(exact, ratio=ratio, rest_ratio=rest, adc_bits=10)
-
-
-@dataclass
-class Errors:
-    """Errors of many frames: relative ones of pressed cells, and all over what was stated."""
-
-    relative: list[Float]
-    over_stated: list[Float]
-    ghost_siemens: list[float]
-
-    def add(
-        self, out: dict[str, NDArray[Any]], truth: Float, rest: Float, pressed: NDArray[np.bool_]
-    ) -> None:
-        error = out["cell_siemens"] - truth
-        self.relative.append(np.abs(error / truth)[pressed])
-        self.over_stated.append(np.abs(error / out["cell_siemens_std"]).ravel())
-        above = np.where(pressed, 0.0, out["cell_siemens"] - rest)
-        self.ghost_siemens += list(above.max(axis=(1, 2)))
-
-    @classmethod
-    def none(cls) -> Errors:
-        return cls([], [], [])
+BEFORE = 40  # frames of a stretched skin before its wires rise at once, and as many after
+FILES = ("random_2x2", "random_4x6", "random_8x8", "bent_8x8", "presses_8x8")
+DEVIATIONS = (1, 2, 4)  # how many stated ones errors are counted within
 
 
 # ---------------------------------------------------------------------------------------- time
@@ -145,47 +124,48 @@ def median_units(method: str, sources: list[Readings]) -> float:
     return round(float(np.median(seconds / units)), 1)
 
 
-def random_scenes(lines: int, touches: int, frames: int, trials: int) -> list[Readings]:
+def random_scenes(lines: int, touches: int, frames: int, skins: int) -> list[Readings]:
     return [
-        random_trial(lines, lines, touches, frames, SEED + trial).rounded(10)
-        for trial in range(trials)
+        random_trial(lines, lines, touches, frames, SEED + number).rounded(ADC_BITS)
+        for number in range(skins)
     ]
 
 
-def fingers(lines: int, frames: int, trials: int) -> list[Readings]:
+def fingers(lines: int, frames: int, skins: int) -> list[Readings]:
     """Wires not told, as nobody knows them."""
     return [
-        replace(
-            finger_trial(lines, lines, frames, SEED + trial).rounded(10),
-            nominal_top_wire_ohm=None,
-            nominal_bottom_wire_ohm=None,
-        )
-        for trial in range(trials)
+        finger_trial(lines, lines, frames, SEED + number).rounded(ADC_BITS, wires_told=False)
+        for number in range(skins)
     ]
 
 
-def times() -> dict[str, float]:
-    presses = [ten_bits(load_readings(DATA / "presses_8x8.npz"))] * 3
-    five, eight = random_scenes(8, 5, 30, 4), random_scenes(16, 8, 20, 4)
-    paper_s, _ = times_of("regularized", random_scenes(2, 3, 20, 3))
+def times(part: Part) -> dict[str, float]:
+    skins = part.of(TIMED)
+
+    def frames(count: int) -> int:
+        return WARM_UP + part.of(count - WARM_UP)
+
+    presses = [rounded(reference_trial("presses_8x8", slice(frames(90))).readings)] * 3
+    five = random_scenes(8, 5, frames(30), skins)
+    eight = random_scenes(16, 8, frames(20), skins)
+    large = random_scenes(32, 10, frames(20), min(2, skins))
+    paper_s, _ = times_of("regularized", random_scenes(2, 3, frames(20), min(3, skins)))
     figures = {
-        "units_joint_8x8_random": median_units("joint", random_scenes(8, 8, 30, 4)),
+        "units_joint_8x8_random": median_units("joint", random_scenes(8, 8, frames(30), skins)),
         "units_joint_16x16_random": median_units("joint", eight),
         "units_touch_8x8_random": median_units("touch", five),
         "units_touch_16x16_random": median_units("touch", eight),
-        "units_touch_32x32_random": median_units("touch", random_scenes(32, 10, 20, 2)),
+        "units_touch_32x32_random": median_units("touch", large),
         "ms_paper_2x2_random": round(1e3 * float(np.median(paper_s)), 1),
     }
-    for method in ("matrix", "joint", "touch"):
+    for method in ("matrix", *METHODS):
         figures[f"units_{method}_8x8_presses"] = median_units(method, presses)
-        seconds, units = times_of(method, fingers(8, 90, 4))
-        ratio = seconds / units
-        figures[f"units_{method}_8x8_finger"] = round(float(np.median(ratio)), 1)
-        figures[f"units_{method}_8x8_finger_p99"] = round(
-            float(np.percentile(ratio, 99) / np.median(ratio)), 2
-        )
+        seconds, units = times_of(method, fingers(8, frames(90), skins))
+        median, p99 = np.percentile(seconds / units, [50, 99])
+        figures[f"units_{method}_8x8_finger"] = round(float(median), 1)
+        figures[f"units_{method}_8x8_finger_p99"] = round(float(p99 / median), 2)
         figures["unit_ms"] = round(1e3 * float(np.median(units)), 4)
-    seconds, _ = times_of("joint", fingers(16, 60, 4))
+    seconds, _ = times_of("joint", fingers(16, frames(60), skins))
     figures["ms_joint_16x16_finger"] = round(1e3 * float(np.median(seconds)), 1)
     figures["ms_joint_16x16_finger_p99"] = round(1e3 * float(np.percentile(seconds, 99)), 1)
     return figures
@@ -194,140 +174,116 @@ def times() -> dict[str, float]:
 # ------------------------------------------------------------------------------------ accuracy
 
 
-def random_errors(method: str, trials: int) -> Errors:
-    errors = Errors.none()
-    for trial in range(trials):
-        scene = random_trial(8, 8, 8, 20, SEED + 100 + trial)
-        out = estimate_file(scene.rounded(10), method, cold=True)
-        errors.add(out, scene.cell_siemens, scene.rest.cell_siemens, scene.pressed)
-    return errors
-
-
-def random_figures(method: str, errors: Errors) -> dict[str, float]:
-    relative = 100 * np.concatenate(errors.relative)
-    return {
-        f"error_{method}_median_percent": round(float(np.median(relative)), 3),
-        f"error_{method}_p90_percent": round(float(np.percentile(relative, 90)), 3),
-        f"ghost_{method}_p95_us": round(1e6 * float(np.percentile(errors.ghost_siemens, 95)), 3),
+def random_figures(method: str, skins: int) -> tuple[Judged, dict[str, float]]:
+    trials = [random_trial(8, 8, 8, 20, SEED + 100 + number) for number in range(skins)]
+    judged = pooled(
+        judge_trial(estimate_file(trial.rounded(ADC_BITS), method, cold=True), trial)
+        for trial in trials
+    )
+    return judged, {
+        f"error_{method}_median_percent": round(judged.error_percent(), 3),
+        f"error_{method}_p90_percent": round(judged.error_percent(0.9), 3),
+        f"ghost_{method}_p95_us": round(judged.ghost_us(), 3),
     }
 
 
-def bent_errors(method: str, trials: int) -> tuple[Errors, dict[str, float]]:
-    errors, alone, known = Errors.none(), [], []
-    for trial in range(trials):
-        scene = bent_trial(8, 8, 8, LEARNED + 20, SEED + 200 + trial)
-        told = scene.rounded(10)
-        out = estimate_file(told, method)
-        late = {name: array[LEARNED:] for name, array in out.items()}
-        pressed = scene.pressed[LEARNED:]
-        errors.add(late, scene.cell_siemens[LEARNED:], scene.rest.cell_siemens, pressed)
-        for skin, where in zip(scene.frames[LEARNED:], pressed, strict=True):
-            knowledge = told.knowledge(0)
-            alone.append(information_limit(skin, knowledge, where)[where])
-            known.append(information_limit(skin, knowledge, where, layer_std=0.0)[where])
-    median = float(np.median(np.concatenate(errors.relative)))
-    return errors, {
-        f"bent_{method}_median_percent": round(100 * median, 3),
-        f"bent_{method}_over_limit": round(median / float(np.median(np.concatenate(alone))), 3),
-        f"bent_{method}_over_limit_known": round(
-            median / float(np.median(np.concatenate(known))), 3
-        ),
+def limit_percent(trials: list[Trial], **known: float) -> float:
+    """Median deviation of a pressed cell in the posterior at the truth, of frames judged."""
+    stds = []
+    for trial in trials:
+        knowledge = trial.rounded(ADC_BITS).knowledge(0)
+        for skin, pressed in zip(trial.frames[LEARNED:], trial.pressed[LEARNED:], strict=True):
+            stds.append(information_limit(skin, knowledge, pressed, **known)[pressed])
+    return 100 * float(np.median(np.concatenate(stds)))
+
+
+def bent_figures(method: str, skins: int) -> tuple[Judged, dict[str, float]]:
+    trials = [bent_trial(8, 8, 8, LEARNED + 20, SEED + 200 + number) for number in range(skins)]
+    late = slice(LEARNED, None)
+    judged = pooled(
+        judge_trial(estimate_file(trial.rounded(ADC_BITS), method), trial, late) for trial in trials
+    )
+    median = judged.error_percent()
+    known = limit_percent(trials, layer_std=0.0)
+    return judged, {
+        f"bent_{method}_median_percent": round(median, 3),
+        f"bent_{method}_over_limit": round(median / limit_percent(trials), 3),
+        f"bent_{method}_over_limit_known": round(median / known, 3),
     }
 
 
-def stretched_figures(method: str, trials: int) -> dict[str, float]:
+def stretched_figures(method: str, skins: int) -> dict[str, float]:
     """A skin whose wires rise by half at once, after 40 frames on which they were learned."""
-    first, last, away = [], [], []
-    for trial in range(trials):
-        random = np.random.default_rng(SEED + 300 + trial)
+    first, last, after = [], [], []
+    for number in range(skins):
+        random = np.random.default_rng(SEED + 300 + number)
         rest = skin_at_rest(8, 8, random)
-        top_ohm, bottom_ohm = 1.5 * rest.top_wire_ohm, 1.5 * rest.bottom_wire_ohm
-        longer = replace(rest, top_wire_ohm=top_ohm, bottom_wire_ohm=bottom_ohm)
-        skins = [touch(skin, int(random.integers(1, 9)), random) for skin in [rest, longer] * 40]
-        scene = trial_of(rest, skins[::2] + skins[1::2])
-        out = estimate_file(scene.rounded(10), method)
-        error = np.abs(out["cell_siemens"] - scene.cell_siemens)
-        relative, pressed = error / scene.cell_siemens, scene.pressed
-        first.append(relative[40:45][pressed[40:45]])
-        last.append(relative[60:][pressed[60:]])
-        away.append((error / out["cell_siemens_std"])[40:][pressed[40:]])
-    figures = {
-        "first_percent": np.median(np.concatenate(first)),
-        "last_percent": np.median(np.concatenate(last)),
-        "within_4_std_percent": np.mean(np.concatenate(away) < 4),
-    }
+        both = [rest, stretched(rest, JUMP)] * BEFORE
+        frames = [touch(skin, int(random.integers(1, 9)), random) for skin in both]
+        trial = trial_of(rest, frames[::2] + frames[1::2])
+        out = estimate_file(trial.rounded(ADC_BITS), method)
+        first.append(judge_trial(out, trial, slice(BEFORE, BEFORE + 5)))
+        last.append(judge_trial(out, trial, slice(BEFORE + 20, None)))
+        after.append(judge_trial(out, trial, slice(BEFORE, None)))
     return {
-        f"stretched_{method}_{name}": round(100 * float(value), 2)
-        for name, value in figures.items()
+        f"stretched_{method}_first_percent": round(pooled(first).error_percent(), 2),
+        f"stretched_{method}_last_percent": round(pooled(last).error_percent(), 2),
+        f"stretched_{method}_within_4_std_percent": round(
+            pooled(after).pressed_within_percent(), 2
+        ),
     }
 
 
 def finger_figures(method: str) -> dict[str, float]:
     scene = Scene("moving", 8, 8, seed=1)
-    knowledge = SkinKnowledge(
-        8,
-        8,
-        adc_bits=10,
-        rest_ratio=ratio_from_codes(quantise(scene.rest_ratio)),
-        nominal_wire_ohm=WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM),
-    )
-    estimator = make_estimator(method, knowledge)
-    relative, away = [], []
-    for time_s in BEGIN_S + np.arange(360) / 90:
-        found = estimator.estimate(ratio_from_codes(quantise(scene.ratio(time_s))))
-        truth = scene.skin(time_s).cell_siemens
-        error = np.abs(found.cell_siemens - truth)
-        relative.append((error / truth)[scene.touched(time_s)])
-        away.append(error / found.cell_siemens_std)
+    rest_siemens = scene.skin(0.0).cell_siemens
+    estimator = make_estimator(method, knowledge_of(ratio_from_codes(quantise(scene.rest_ratio))))
+    times_s = BEGIN_S + np.arange(360) / DEFAULT_RATE_HZ
+    estimates = [
+        estimator.estimate(ratio_from_codes(quantise(scene.ratio(time_s)))) for time_s in times_s
+    ]
+    truth = np.array([scene.skin(time_s).cell_siemens for time_s in times_s])
+    touched = np.array([scene.touched(time_s) for time_s in times_s])
+    judged = judge(answers_of(estimates), truth, rest_siemens, touched)
     return {
-        f"finger_{method}_percent": round(100 * float(np.median(np.concatenate(relative))), 2),
-        f"finger_{method}_within_4_std_percent": round(
-            100 * float(np.mean(np.concatenate(away) < 4)), 2
-        ),
+        f"finger_{method}_percent": round(judged.error_percent(), 2),
+        f"finger_{method}_within_4_std_percent": round(judged.within_percent(), 2),
     }
-
-
-def file_errors(names: tuple[str, ...], method: str) -> Errors:
-    """Of the reference files, 10 bit."""
-    errors = Errors.none()
-    for name in names:
-        out = estimate_file(ten_bits(load_readings(DATA / f"{name}.npz")), method)
-        with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
-            truth, rest = 1 / file["cell_ohm"], 1 / file["rest_ohm"]
-        errors.add(out, truth, rest, truth > PRESSED * rest)
-    return errors
 
 
 def sweeps_worst_share() -> float:
     shares = []
     for sweep, figures in RMSE_MEGOHM.items():
-        out = estimate_file(load_readings(DATA / f"{sweep}_3x3.npz"), "joint")
-        with np.load(DATA / f"{sweep}_3x3.npz", allow_pickle=False) as file:
-            square = (out["cell_ohm"] - file["cell_ohm"]) ** 2
-        rmse_megohm = 1e-6 * np.sqrt(np.mean(square, axis=(1, 2)))
+        trial = reference_trial(f"{sweep}_3x3")
+        rmse_megohm = judge_trial(estimate_file(trial.readings, "joint"), trial).rmse_megohm
         shares.append(rmse_megohm / np.min(list(figures.values()), axis=0))
     return float(np.max(shares))
 
 
-def accuracy() -> dict[str, float]:
+def accuracy(part: Part) -> dict[str, float]:
     figures: dict[str, float] = {}
-    stated = []
-    for method in ("joint", "touch"):
-        random = random_errors(method, 20)
-        figures |= random_figures(method, random)
-        bent, bent_figures = bent_errors(method, 12)
-        figures |= bent_figures
-        figures |= stretched_figures(method, 12)
+    by_joint = []
+    for method in METHODS:
+        random, of_random = random_figures(method, part.of(JUDGED))
+        bent, of_bent = bent_figures(method, part.of(CHANGED))
+        figures |= of_random | of_bent
+        figures |= stretched_figures(method, part.of(CHANGED))
         figures |= finger_figures(method)
         if method == "joint":
-            stated += random.over_stated + bent.over_stated
+            by_joint += [random, bent]
     figures["sweeps_worst_share"] = round(sweeps_worst_share(), 4)
-    names = ("random_2x2", "random_4x6", "random_8x8", "bent_8x8", "presses_8x8")
-    stated += file_errors((*names, "wire_sweep_3x3", "cell_sweep_3x3"), "joint").over_stated
-    away = np.concatenate(stated)
-    for limit in (1, 2, 4):
-        figures[f"within_{limit}_std_percent"] = round(100 * float(np.mean(away < limit)), 2)
+    for name in (*FILES, *(f"{sweep}_3x3" for sweep in RMSE_MEGOHM)):
+        trial = reference_trial(name)
+        by_joint.append(judge_trial(estimate_file(rounded(trial.readings), "joint"), trial))
+    for stds in DEVIATIONS:
+        percent = pooled(by_joint).within_percent(stds)
+        figures[f"within_{stds}_std_percent"] = round(percent, 2)
     return figures
+
+
+def measure(part: Part) -> dict[str, float]:
+    """All figures, as the JSON line has them."""
+    return times(part) | accuracy(part)
 
 
 # ---------------------------------------------------------------------------------------- bars
@@ -356,10 +312,7 @@ BARS = (
 
 
 def main() -> int:
-    figures = times() | accuracy()
-    all_met = report(figures, BARS)
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    return run(__doc__, measure, BARS)
 
 
 if __name__ == "__main__":

@@ -42,128 +42,96 @@ MODE_bent_METHOD_p90    the same of the 90th percentiles.
 from __future__ import annotations
 
 import itertools
-import json
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from bars import Bar, at_least, at_most, report  # beside this file
-from numpy.typing import NDArray
 
+from bars import Bar, Part, at_least, at_most, run  # beside this file
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import REST_STD, SEGMENT_STD, UNKNOWN_LAYER_STD
-from ohmskin.link.codes import quantise, ratio_from_codes, ratio_std
-from ohmskin.link.protocol import ENUMS, MODES
+from ohmskin.link.codes import ratio_std
+from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES
 from ohmskin.record.readings import Readings, estimate_file
 from studies.information import PRESSED_STD
+from studies.judge import judge_trial, pooled
 from studies.trials import (
-    PRESSED,
+    BEND,
+    NOMINAL_WIRE_OHM,
     Trial,
     finger_trial,
     random_trial,
-    skin_at_rest,
+    reference_trial,
     stretched,
-    touch,
     trial_of,
 )
 
-FOLDER = Path(__file__).resolve().parents[1] / "tests" / "data" / "far"
 KINDS = {
     "random": ("random_8x8_0", "random_8x8_1", "random_5x9_0", "random_5x9_1"),
     "harsh": ("harsh_8x8_0", "harsh_8x8_1"),
     "finger": ("finger_8x8_0", "finger_8x8_1"),
 }
 METHODS = ("joint", "touch")
-BITS = (10, 12)
-SEED = 7000
-WARM_UP = 3  # frames
+BITS = (ADC_BITS, 12)  # of the board's converter, and of a better one
+SEED = 7000  # of the first skin
+# Skins of each kind that are timed; skins whose wires are learned, of each of two; skins that bend.
+TIMED, LEARNED, BENT = 4, 6, 3
+FRAMES = 50  # of each skin whose wires are learned
+FILE_FRAMES = 40  # of each file of tests/data/far
+WARM_UP = 3  # frames of each skin whose time does not count
+# How often the same frames are timed: other work on the machine only adds, so the least counts.
 PASSES = 3
-BEND = 1.35
-SEGMENT_OHM = ((100.0, 200.0), (150.0, 300.0))  # of the random skins of tests/data/far
+# A wire segment of a row and of a column [ohm]: those of the random skins of tests/data/far.
+SEGMENT_OHM = (NOMINAL_WIRE_OHM, (150.0, 300.0))
+# Rises that each cell is calibrated with [S]. Chosen: from the lightest touch to the hardest.
 CALIBRATED_SIEMENS = np.geomspace(1e-5, 1e-3, 9)
+LEAST_SIEMENS = 1e-8  # a rise below this counts as this: it has a logarithm
 
 
 # ------------------------------------------------------------------------------ scenes of ngspice
 
 
-@dataclass(frozen=True, eq=False)
-class Scenes:
-    """Frames of one file: exact readings a to h, and the truth (F, R, C) and (R, C) [S]."""
-
-    ratio: Float
-    rest_ratio: Float
-    names: tuple[str, ...]
-    cell_siemens: Float
-    rest_siemens: Float
-
-    @classmethod
-    def load(cls, name: str) -> Scenes:
-        with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as file:
-            return cls(
-                file["ratio"],
-                file["rest_ratio"],
-                tuple(file["reading_names"].tolist()),
-                1 / file["cell_ohm"],
-                1 / file["rest_ohm"],
-            )
-
-    def read(self, mode: str, bits: int) -> Readings:
-        chosen = [self.names.index(name) for name in MODES[mode]]
-        ratio, rest = (
-            ratio_from_codes(quantise(exact[..., chosen], bits), bits)
-            for exact in (self.ratio, self.rest_ratio)
-        )
-        return Readings(ratio, rest, adc_bits=bits, reading_names=MODES[mode])
-
-    @property
-    def pressed(self) -> NDArray[np.bool_]:
-        return np.asarray(self.cell_siemens > PRESSED * self.rest_siemens)
-
-
-def errors(kind: str, mode: str, method: str, bits: int) -> dict[str, float]:
-    relative, stated, ghost_us, trusted = [], [], [], []
+def errors(kind: str, mode: str, method: str, bits: int, frames: int) -> dict[str, float]:
+    parts = []
     for name in KINDS[kind]:
-        scenes = Scenes.load(name)
-        out = estimate_file(scenes.read(mode, bits), method, cold=True)
-        error, pressed = out["cell_siemens"] - scenes.cell_siemens, scenes.pressed
-        relative.append(np.abs(error / scenes.cell_siemens)[pressed])
-        stated.append((out["cell_siemens_std"] / scenes.cell_siemens)[pressed])
-        trusted.append(out["converged"])
-        ghost_us.append(1e6 * np.where(pressed, 0.0, error).max(axis=(1, 2)))
-    of_cell, std = np.concatenate(relative), np.concatenate(stated)
+        trial = reference_trial(f"far/{name}", slice(-frames, None))
+        answers = estimate_file(trial.rounded(bits, mode=mode), method, cold=True)
+        parts.append(judge_trial(answers, trial))
+    judged = pooled(parts)
+    stated = np.median(judged.stated) / np.median(judged.relative)
     return {
-        "percent": round(100 * float(np.median(of_cell)), 3),
-        "p90_percent": round(100 * float(np.quantile(of_cell, 0.9)), 2),
-        "within_4": round(100 * float(np.mean(of_cell < 4 * std)), 2),
-        "stated": round(float(np.median(std) / np.median(of_cell)), 2),
-        "trusted": round(100 * float(np.mean(np.concatenate(trusted))), 1),
-        "ghost_us": round(float(np.quantile(np.concatenate(ghost_us), 0.95)), 3),
+        "percent": round(judged.error_percent(), 3),
+        "p90_percent": round(judged.error_percent(0.9), 2),
+        "within_4": round(judged.pressed_within_percent(), 2),
+        "stated": round(float(stated), 2),
+        "trusted": round(judged.converged_percent(), 1),
+        "ghost_us": round(judged.ghost_us(), 3),
     }
 
 
 # ------------------------------------------------------------------------------------------ time
 
 
-def times() -> dict[str, float]:
+def times(part: Part) -> dict[str, float]:
+    random, finger, skins = part.of(97), part.of(147), range(part.of(TIMED))
     figures: dict[str, float] = {}
-    of_kind = {
-        "random": [random_trial(8, 8, 8, 100, SEED + n) for n in range(4)],
-        "finger": [finger_trial(8, 8, 150, SEED + n) for n in range(4)],
+    by_kind = {
+        "random": [random_trial(8, 8, 8, WARM_UP + random, SEED + number) for number in skins],
+        "finger": [finger_trial(8, 8, WARM_UP + finger, SEED + number) for number in skins],
     }
-    for kind, trials in of_kind.items():
-        read = [
-            {mode: trial.rounded(10, mode=mode, wires_told=False) for mode in MODES}
-            for trial in trials
-        ]
+    for kind, trials in by_kind.items():
+        read = [{mode: untold(trial, mode) for mode in MODES} for trial in trials]
         for method in METHODS:
-            passes = [[seconds(each, method) for each in read] for _ in range(PASSES)]
-            taken = np.min([np.concatenate(each) for each in passes], axis=0)
-            near, far = np.quantile(taken, [0.5, 0.99], axis=0).T
+            passes = [
+                [seconds(of_skin, method) for of_skin in read] for _ in range(part.of(PASSES))
+            ]
+            taken_s = np.min([np.concatenate(of_pass) for of_pass in passes], axis=0)
+            near, far = np.quantile(taken_s, [0.5, 0.99], axis=0).T
             figures[f"time_{kind}_{method}"] = round(float(far[0] / near[0]), 2)
             figures[f"time_{kind}_{method}_p99"] = round(float(far[1] / near[1]), 2)
             figures[f"ms_near_{kind}_{method}"] = round(1e3 * float(near[0]), 2)
@@ -171,50 +139,52 @@ def times() -> dict[str, float]:
     return figures
 
 
-def seconds(read: dict[str, Readings], method: str) -> Float:
+def untold(trial: Trial, mode: str) -> Readings:
+    """Readings of 10 bits, where nobody knows the wires."""
+    return trial.rounded(ADC_BITS, mode=mode, wires_told=False)
+
+
+def seconds(read: dict[str, Readings], name: str) -> Float:
     """Of each frame but the first ones, near and far, (F, 2): one beside the other."""
-    estimators = [make_estimator(method, read[mode].knowledge(0)) for mode in ("near", "far")]
+    methods = [make_estimator(name, read[mode].knowledge(0)) for mode in ("near", "far")]
     frames = zip(read["near"].ratio, read["far"].ratio, strict=True)
-    taken = [
-        [each.estimate(ratio).seconds for each, ratio in zip(estimators, pair, strict=True)]
+    taken_s = [
+        [method.estimate(ratio).seconds for method, ratio in zip(methods, pair, strict=True)]
         for pair in frames
     ]
-    return np.array(taken[WARM_UP:])
+    return np.array(taken_s[WARM_UP:])
 
 
 # ------------------------------------------------------------------------------- wires and forces
 
 
 def wire_trial(wire_ohm: tuple[float, float], number: int) -> Trial:
-    random = np.random.default_rng(SEED + 100 + number)
-    rest = skin_at_rest(8, 8, random, wire_ohm=wire_ohm)
-    counts = random.integers(0, 9, 50)
-    return trial_of(rest, [touch(rest, int(count), random) for count in counts])
+    return random_trial(8, 8, 8, FRAMES, SEED + 100 + number, wire_ohm=wire_ohm)
 
 
-def wires(mode: str, method: str, kinds: Sequence[tuple[float, float]]) -> float:
+def wires(mode: str, method: str, kinds: Sequence[tuple[float, float]], skins: int) -> float:
     off = []
-    for wire_ohm, number in itertools.product(kinds, range(6)):
+    for wire_ohm, number in itertools.product(kinds, range(skins)):
         trial = wire_trial(wire_ohm, number)
-        out = estimate_file(trial.rounded(10, mode=mode, wires_told=False), method)
+        out = estimate_file(untold(trial, mode), method)
         truth = trial.rest.top_wire_ohm, trial.rest.bottom_wire_ohm
         for name, ohm in zip(("top_wire_ohm", "bottom_wire_ohm"), truth, strict=True):
             off.append(np.abs(out[name][-1] / ohm - 1).ravel())
     return round(100 * float(np.median(np.concatenate(off))), 2)
 
 
-def wires_limit() -> float:
+def wires_limit(frames: int) -> float:
     """By central differences of exact readings: cells of each frame are integrated out."""
     names = list(ENUMS["reading"].values)
     chosen = [names.index(name) for name in MODES["far"]]
-    std = ratio_std(10)
-    away = []
-    for number in range(2):
-        trial = wire_trial(SEGMENT_OHM[number], number)
+    std = ratio_std(ADC_BITS)
+    stds = []
+    for number, wire_ohm in enumerate(SEGMENT_OHM):
+        trial = wire_trial(wire_ohm, number)
         cells = trial.rest.cell_siemens.size
         shared = np.kron(np.eye(2), np.full((cells, cells), UNKNOWN_LAYER_STD**2))
         information = np.linalg.inv(shared + SEGMENT_STD**2 * np.eye(2 * cells))
-        for skin, pressed in zip(trial.frames, trial.pressed, strict=True):
+        for skin, pressed in list(zip(trial.frames, trial.pressed, strict=True))[:frames]:
             logs = np.log([1 / skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm])
 
             def read(log_ohm: Float, shape: tuple[int, ...] = logs.shape) -> Float:
@@ -229,9 +199,9 @@ def wires_limit() -> float:
             variance = np.where(pressed.ravel(), PRESSED_STD, REST_STD) ** 2
             noise = by_cell * variance @ by_cell.T + np.eye(len(slopes))
             information += by_wire.T @ np.linalg.solve(noise, by_wire)
-        away.append(np.sqrt(np.linalg.inv(information).diagonal()))
+        stds.append(np.sqrt(np.linalg.inv(information).diagonal()))
     normal = np.abs(np.random.default_rng(SEED).standard_normal((400, 1)))
-    return round(100 * float(np.median(normal * np.concatenate(away))), 2)
+    return round(100 * float(np.median(normal * np.concatenate(stds))), 2)
 
 
 def force_n(rise_siemens: Float) -> Float:
@@ -253,16 +223,16 @@ def curves(trial: Trial, mode: str, method: str) -> tuple[Float, Float]:
             pressed.flat[cell] += siemens
             frames.append(replace(rest, cell_siemens=pressed))
         force.append(np.full((rows, columns), np.log(force_n(siemens))))
-    read = trial_of(rest, frames).rounded(10, mode=mode, wires_told=False)
-    found = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
-    own = found.reshape(-1, rows * columns, rows * columns).diagonal(axis1=1, axis2=2)
-    rise = own.reshape(-1, rows, columns) - rest.cell_siemens
-    return np.log(np.maximum(rise, 1e-8)), np.array(force)
+    read = untold(trial_of(rest, frames), mode)
+    siemens = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
+    pressed = siemens.reshape(-1, rows * columns, rows * columns).diagonal(axis1=1, axis2=2)
+    rise = pressed.reshape(-1, rows, columns) - rest.cell_siemens
+    return np.log(np.maximum(rise, LEAST_SIEMENS)), np.array(force)
 
 
 def by_curve(rise_siemens: Float, curve: tuple[Float, Float]) -> Float:
     """Forces (F, R, C) [N] by the curve of each cell, straight on beyond its ends."""
-    log_rise, force = np.log(np.maximum(rise_siemens, 1e-8)), np.empty_like(rise_siemens)
+    log_rise, force = np.log(np.maximum(rise_siemens, LEAST_SIEMENS)), np.empty_like(rise_siemens)
     for cell in np.ndindex(*rise_siemens.shape[1:]):
         at, x, y = log_rise[:, *cell], curve[0][:, *cell], curve[1][:, *cell]
         part = np.clip(np.searchsorted(x, at), 1, x.size - 1)
@@ -271,19 +241,20 @@ def by_curve(rise_siemens: Float, curve: tuple[Float, Float]) -> Float:
     return force
 
 
-def bent(mode: str, method: str) -> dict[str, float]:
+def bent(mode: str, method: str, skins: int) -> dict[str, float]:
     off: dict[float, list[Float]] = {1.0: [], BEND: []}
-    for number in range(3):
+    for number in range(skins):
         trial = random_trial(8, 8, 8, 60, SEED + 200 + number)
         curve, rest = curves(trial, mode, method), trial.rest.cell_siemens
         true_n = force_n(trial.cell_siemens - rest)
-        for factor, found in off.items():
+        for factor, shares in off.items():
             frames = [stretched(skin, factor) for skin in trial.frames]
-            read = trial_of(trial.rest, frames).rounded(10, mode=mode, wires_told=False)
+            read = untold(trial_of(trial.rest, frames), mode)
             siemens = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
             force = by_curve(siemens - rest, curve)
-            found.append(np.abs(force / np.where(trial.pressed, true_n, 1) - 1)[trial.pressed])
-    flat, moved = (np.quantile(np.concatenate(each), [0.5, 0.9]) for each in off.values())
+            share = force / np.where(trial.pressed, true_n, 1) - 1
+            shares.append(np.abs(share)[trial.pressed])
+    flat, moved = (np.quantile(np.concatenate(parts), [0.5, 0.9]) for parts in off.values())
     return {
         f"{mode}_bent_{method}": round(float(moved[0] / flat[0]), 2),
         f"{mode}_bent_{method}_p90": round(float(moved[1] / flat[1]), 2),
@@ -313,26 +284,26 @@ def bars_of(method: str) -> list[Bar]:
     return bars
 
 
+def measure(part: Part) -> dict[str, Any]:
+    """All figures, as the JSON line has them."""
+    figures: dict[str, Any] = {}
+    for mode, kind, method, bits in itertools.product(("far", "near"), KINDS, METHODS, BITS):
+        key = f"{mode}_{kind}_{method}" + ("" if bits == ADC_BITS else f"_bits{bits}")
+        of_kind = errors(kind, mode, method, bits, part.of(FILE_FRAMES))
+        figures |= {f"{key}_{name}": value for name, value in of_kind.items()}
+    figures |= times(part)
+    for mode, method in itertools.product(("far", "near"), METHODS):
+        for name, kinds in (("", SEGMENT_OHM), ("_100_200", SEGMENT_OHM[:1])):
+            percent = wires(mode, method, kinds, part.of(LEARNED))
+            figures[f"{mode}_wires_{method}{name}_percent"] = percent
+        figures |= bent(mode, method, part.of(BENT))
+    figures["far_wires_limit_percent"] = wires_limit(part.of(FRAMES))
+    return figures
+
+
 def main() -> int:
-    figures: dict[str, float] = {}
-    for mode in ("far", "near"):
-        for kind in KINDS:
-            for method in METHODS:
-                for bits in BITS:
-                    key = f"{mode}_{kind}_{method}" + ("" if bits == 10 else f"_bits{bits}")
-                    found = errors(kind, mode, method, bits)
-                    figures |= {f"{key}_{name}": value for name, value in found.items()}
-    figures |= times()
-    for mode in ("far", "near"):
-        for method in METHODS:
-            figures[f"{mode}_wires_{method}_percent"] = wires(mode, method, SEGMENT_OHM)
-            thin = wires(mode, method, SEGMENT_OHM[:1])
-            figures[f"{mode}_wires_{method}_100_200_percent"] = thin
-            figures |= bent(mode, method)
-    figures["far_wires_limit_percent"] = wires_limit()
-    all_met = report(figures, [bar for method in METHODS for bar in bars_of(method)])
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    bars = [bar for method in METHODS for bar in bars_of(method)]
+    return run(__doc__, measure, bars)
 
 
 if __name__ == "__main__":

@@ -21,38 +21,34 @@ replay_scans, _differ   scans of the first ten seconds of that, recorded and rep
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bars import at_least, at_most, report  # beside this file
 
 import ohmskin
+from bars import at_least, at_most, run_minutes  # beside this file
 from ohmskin.arrays import Float
 from ohmskin.calibrate.presses import Calibrator, Presses
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import ForceScan, SkinReader
-from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.record.readings import load_readings
 from ohmskin.record.recorder import Recorder
+from served import Load, started  # beside this file
+from studies.trials import reference_trial, rounded
 
-PRESSES = Path(__file__).resolve().parents[1] / "tests" / "data" / "presses_8x8.npz"
+PRESSES = "presses_8x8"  # of tests/data
 FINGER = "emulator://8x8?scene=moving&seed=1"
-SCANS = 360
-WARM_UP = 20
-RECORDED_S = 10.0
+SCANS, WARM_UP = 360, 20  # scans that are timed; the first ones do not count
+RECORDED_S = 10.0  # of the live run
+# Of every cell: how it answers to force [S/N]. Chosen: 5 N conduct as a firm touch, 10 kohm.
 SIEMENS_PER_NEWTON = 20e-6
 
 
@@ -91,9 +87,9 @@ def times_ms(reader: SkinReader, ratios: Float) -> Float:
 
 def scan_times() -> dict[str, float]:
     board = board_8x8()
-    pressed = load_readings(PRESSES)
-    assert pressed.rest_ratio is not None
-    pressed_rest = ratio_from_codes(quantise(pressed.rest_ratio))
+    pressed = reference_trial(PRESSES).readings
+    pressed_rest = rounded(pressed).rest_ratio
+    assert pressed_rest is not None
     scene = Scene("moving", 8, 8, seed=1)
     finger = np.array([scene.ratio(BEGIN_S + number / 90) for number in range(SCANS)])
     presses = np.tile(pressed.ratio, (-(-SCANS // len(pressed.ratio)), 1, 1, 1))
@@ -110,54 +106,39 @@ def scan_times() -> dict[str, float]:
     return figures
 
 
-@contextmanager
-def emulated() -> Iterator[str]:
-    """The port of a board that another process emulates."""
-    command = [sys.executable, "-m", "ohmskin", "emulate", FINGER]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        yield process.stdout.readline().strip()
-    finally:
-        process.terminate()
-        process.communicate(timeout=20)
-
-
 def live(minutes: float) -> dict[str, Any]:
     rest = Scene("moving", 8, 8, seed=1).rest_ratio
     seen: list[ForceScan] = []
-    with tempfile.TemporaryDirectory() as place, emulated() as port:
+    with tempfile.TemporaryDirectory() as place, started("emulate", FINGER) as (_, port):
         path = Path(place) / "live.mcap"
         with ohmskin.open(port, start=False) as skin:
             of_skin = calibration(skin.info, rest, "touch")
         with ohmskin.open(port, calibration=of_skin, start=False) as skin:
             recorder = Recorder(path, skin.info)
-            before, begin_s = os.times(), time.monotonic()
+            load = Load()
             count = missed = 0
             for scan in skin:
                 count += 1
                 missed += scan.missed
-                elapsed_s = time.monotonic() - begin_s
-                if elapsed_s < RECORDED_S:
+                if load.seconds() < RECORDED_S:
                     recorder.add(scan)
                     seen.append(replace(scan, contacts=()))
                 else:
                     recorder.close()
-                if elapsed_s >= 60 * minutes:
+                if load.seconds() >= 60 * minutes:
                     break
             recorder.close()
             age_s = time.monotonic() - scan.host_time_s
-            after, end_s = os.times(), time.monotonic()
+            scans_per_s, cpu_percent = count / load.seconds(), load.percent()
         with ohmskin.open(f"replay://{path}?speed=0", calibration=of_skin) as skin:
             again = list(skin)
-    used_s = (after.user - before.user) + (after.system - before.system)
     return {
         "live_minutes": minutes,
         "live_scans": count,
         "live_missed": missed,
-        "live_scans_per_s": round(count / (end_s - begin_s), 2),
+        "live_scans_per_s": round(scans_per_s, 2),
         "live_age_ms": round(1e3 * age_s, 2),
-        "live_cpu_percent": round(100 * used_s / (end_s - begin_s), 1),
+        "live_cpu_percent": round(cpu_percent, 1),
         "replay_scans": len(again),
         "replay_differ": abs(len(again) - len(seen))
         + sum(bits(one) != bits(other) for one, other in zip(seen, again, strict=False)),
@@ -177,12 +158,13 @@ BARS = (
 )
 
 
+def measure(minutes: float) -> dict[str, Any]:
+    """All figures, as the JSON line has them."""
+    return scan_times() | live(minutes)
+
+
 def main() -> int:
-    minutes = float(sys.argv[sys.argv.index("--minutes") + 1]) if "--minutes" in sys.argv else 10.0
-    figures = {**scan_times(), **live(minutes)}
-    all_met = report(figures, BARS)
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    return run_minutes(__doc__, measure, BARS, minutes=10.0, least_minutes=0.05)
 
 
 if __name__ == "__main__":

@@ -28,35 +28,34 @@ record_bytes_per_s     size of the file by length of the recording, of the emula
 from __future__ import annotations
 
 import json
-import os
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from bars import at_least, at_most, report  # beside this file
-from served import serve, served  # beside this file
+from numpy.typing import NDArray
 
 import ohmskin
-from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from bars import Part, at_least, at_most, run  # beside this file
+from ohmskin.arrays import Float
+from ohmskin.emulate.board import DEFAULT_RATE_HZ, BoardSettings, EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.errors import PortError
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.record.recorder import Recorder
+from served import Load, serve, served  # beside this file
 
-RATE_HZ = 90
-DECODED_SCANS = 3000
-DECODE_RUNS = 5
-CHUNK_BYTES = 4096
+RATE_HZ = round(DEFAULT_RATE_HZ)
+# All of these are chosen: so much that two runs on a quiet machine differ little.
+DECODED_SCANS, DECODE_RUNS = 3000, 5
+CHUNK_BYTES = 4096  # of the stream that is decoded
 LATENCY_SCANS = 400
-CPU_SECONDS = 6.0
-CPU_RUNS = 3
-RECORD_SECONDS = 10.0
+LOAD_S, LOAD_RUNS = 6.0, 3  # how long the load is measured, and how often
+RECORDED_S = 10.0  # of the recording whose size counts
 
 # ------------------------------------------------------------------- the board, another process
 
@@ -90,7 +89,7 @@ def serve_noted() -> None:
 # -------------------------------------------------------------------------------- measurements
 
 
-def decode_rate(codes: Callable[[int], np.ndarray]) -> float:
+def decode_rate(codes: Callable[[int], NDArray[np.uint16]]) -> float:
     """Scans a second through `BoardDecoder.feed` and `ratio`."""
     kind = protocol.FRAMES["scan"]
     stream = bytearray()
@@ -115,46 +114,44 @@ def decode_rate(codes: Callable[[int], np.ndarray]) -> float:
     return statistics.median(rates)
 
 
-def latencies_ms() -> np.ndarray:
+def latencies_ms(scans: int) -> Float:
     """Of every scan that `latest` gave out."""
     returned_s: dict[int, float] = {}
     with served(__file__) as board, ohmskin.open(board.ports[0]) as skin:
-        for _ in range(LATENCY_SCANS):
+        for _ in range(scans):
             scan = skin.latest()
             returned_s[scan.number] = time.monotonic()
     return np.array([1e3 * (at_s - board.said[str(n)]) for n, at_s in returned_s.items()])
 
 
 def reader_cpu_percent(
-    skin: ohmskin.Device, take: Callable[[Scan], object] = lambda scan: None
+    skin: ohmskin.Device, seconds: float, take: Callable[[Scan], object] = lambda scan: None
 ) -> float:
     """CPU time of this process per wall time while it reads every scan, and `take`s it."""
     scans = iter(skin)
     for _ in range(RATE_HZ):  # what is done once is not load
         next(scans)
-    before, begin_s = os.times(), time.monotonic()
+    load = Load()
     count = missed = 0
     for scan in scans:
         count += 1
         missed += scan.missed
         take(scan)
-        if time.monotonic() - begin_s >= CPU_SECONDS:
+        if load.seconds() >= seconds:
             break
-    after, end_s = os.times(), time.monotonic()
-    rate_hz = count / (end_s - begin_s)
+    rate_hz, percent = count / load.seconds(), load.percent()
     if missed or abs(rate_hz - RATE_HZ) > 1:
         print(f"{skin.name}: {rate_hz:.2f} scans a second, {missed} missed", file=sys.stderr)
-    used_s = (after.user - before.user) + (after.system - before.system)
-    return 100 * used_s / (end_s - begin_s)
+    return percent
 
 
-def read_cpu_percent() -> float:
+def read_cpu_percent(seconds: float) -> float:
     """`reader_cpu_percent` of a served board."""
     with served(__file__) as board, ohmskin.open(board.ports[0]) as skin:
-        return reader_cpu_percent(skin)
+        return reader_cpu_percent(skin, seconds)
 
 
-def record_cpu_percent() -> float:
+def record_cpu_percent(seconds: float) -> float:
     """As `reader_cpu_percent`, of a process that records."""
     with (
         tempfile.TemporaryDirectory() as place,
@@ -162,10 +159,10 @@ def record_cpu_percent() -> float:
         ohmskin.open(board.ports[0]) as skin,
         Recorder(Path(place) / "bench.mcap", skin.info) as recorder,
     ):
-        return reader_cpu_percent(skin, recorder.add)
+        return reader_cpu_percent(skin, seconds, recorder.add)
 
 
-def record_bytes_per_s() -> float:
+def record_bytes_per_s(seconds: float) -> float:
     """Of a scene that moves, with the noise of a converter."""
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "bench.mcap"
@@ -175,28 +172,29 @@ def record_bytes_per_s() -> float:
         ):
             scans = iter(skin)
             first = newest = next(scans)
-            while newest.time_us - first.time_us < 1e6 * RECORD_SECONDS:
+            while newest.time_us - first.time_us < 1e6 * seconds:
                 recorder.add(newest)
                 newest = next(scans)
         return 1e6 * path.stat().st_size / (newest.time_us - first.time_us)
 
 
-def measure() -> dict[str, Any]:
+def measure(part: Part) -> dict[str, float | None]:
     """All figures, as the JSON line has them."""
     random = np.random.default_rng(0)
     blocks = random.integers(0, 1024, (64, 8, 8, 4), dtype=np.uint16)
     zeros = np.zeros((8, 8, 4), dtype=np.uint16)
     rate = decode_rate(lambda number: blocks[number % len(blocks)])
     rate_zeros = decode_rate(lambda _: zeros)
-    latency = latencies_ms()
-    cpu = statistics.median(read_cpu_percent() for _ in range(CPU_RUNS))
-    record_cpu = statistics.median(record_cpu_percent() for _ in range(CPU_RUNS))
+    latency = latencies_ms(part.of(LATENCY_SCANS))
+    load_s, runs = part.share * LOAD_S, range(part.of(LOAD_RUNS))
+    cpu = statistics.median(read_cpu_percent(load_s) for _ in runs)
+    record_cpu = statistics.median(record_cpu_percent(load_s) for _ in runs)
+    cpu_simavr: float | None = None
     try:
         with ohmskin.open("simavr://uno") as skin:
-            cpu_simavr = round(reader_cpu_percent(skin), 2)
+            cpu_simavr = round(reader_cpu_percent(skin, load_s), 2)
     except PortError as exc:
         print(exc, file=sys.stderr)
-        cpu_simavr = None
     return {
         "decode_scans_per_s": round(rate),
         "decode_scans_per_s_zeros": round(rate_zeros),
@@ -205,7 +203,7 @@ def measure() -> dict[str, Any]:
         "cpu_percent_at_90hz": round(cpu, 2),
         "cpu_percent_at_90hz_simavr": cpu_simavr,
         "record_cpu_percent_at_90hz": round(record_cpu, 2),
-        "record_bytes_per_s": round(record_bytes_per_s()),
+        "record_bytes_per_s": round(record_bytes_per_s(part.share * RECORDED_S)),
     }
 
 
@@ -226,10 +224,7 @@ def main() -> int:
     if sys.argv[1:2] == ["--serve"]:
         serve_noted()
         return 0
-    figures = measure()
-    all_met = report(figures, BARS)
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    return run(__doc__, measure, BARS)
 
 
 if __name__ == "__main__":

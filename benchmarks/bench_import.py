@@ -19,15 +19,13 @@ word_ratio      time until `ohmskin demo` has printed something, over that of `i
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
 import subprocess
 import sys
 import time
 
-from bars import at_most, report
+from bars import QUICK, at_most, finish, options  # beside this file
 
 REFERENCE = ("-c", "import numpy, scipy.linalg, serial")
 OPEN = "import ohmskin\nwith ohmskin.open('emulator://2x2') as skin: skin.latest()"
@@ -61,9 +59,10 @@ def word_s(*arguments: str) -> float:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="measure what importing the package costs")
+    parser = options(__doc__)
     parser.add_argument("--runs", type=int, default=9, help="of each program")
-    runs = parser.parse_args().runs
+    asked = parser.parse_args()
+    runs = asked.part.of(asked.runs)
     programs = {"reference": REFERENCE, **PROGRAMS}
     for arguments in programs.values():
         cpu_s(arguments)  # its first run compiles modules
@@ -74,9 +73,8 @@ def main() -> int:
     words = [(word_s("-m", "ohmskin", "demo"), word_s("-c", "import numpy")) for _ in range(runs)]
     demo_s, numpy_s = map(statistics.median, zip(*words, strict=True))
     figures["word_ratio"] = round(demo_s / numpy_s, 2)
-    all_met = report(figures, BARS)
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    code = finish(figures, BARS)
+    return 0 if asked.part is QUICK else code
 
 
 if __name__ == "__main__":

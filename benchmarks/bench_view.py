@@ -26,26 +26,23 @@ page_bytes             of all files of the page.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bars import at_least, at_most, report  # beside this file
 
-PROGRAM = (sys.executable, "-m", "ohmskin")
+from bars import at_least, at_most, run_minutes  # beside this file
+from served import started  # beside this file
+
 SCENE = "emulator://8x8?scene=moving"
 PAGE = Path(__file__).parents[1] / "host" / "ohmskin" / "view" / "page"
-SETTLE_S = 5.0
-CLOCK_TRIES = 200
+SETTLE_S = 5.0  # until the page has its first scans. Chosen.
+CLOCK_TRIES = 200  # questions to the page, of which the shortest counts. Chosen.
 COLLECT = """() => {
     window.drawn = [];
     window.refreshes = 0;
@@ -58,18 +55,6 @@ COLLECT = """() => {
         drawn.push([detail.scan, detail.host_time_s, detail.nowMs]);
     });
 }"""
-
-
-@contextmanager
-def started(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process of the command line, and the first line that it prints."""
-    process = subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        yield process, process.stdout.readline().strip()
-    finally:
-        process.terminate()
-        process.wait(20)
 
 
 def cpu_s(pid: int) -> float:
@@ -150,18 +135,13 @@ BARS = (
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="measure the page of 'ohmskin view'")
-    parser.add_argument("--minutes", type=float, default=1.0, help="how long to measure")
-    minutes = parser.parse_args().minutes
     if not shutil.which("chromium"):
         print("needs Chromium, which 'make setup' installs", file=sys.stderr)
         return 2
     print(f"load at the beginning: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    figures = measure(minutes)
-    print(f"load at the end: {os.getloadavg()[0]:.1f}")
-    all_met = report(figures, BARS)
-    print(json.dumps(figures))
-    return 0 if all_met else 1
+    code = run_minutes(__doc__, measure, BARS, minutes=1.0, least_minutes=0.1)
+    print(f"load at the end: {os.getloadavg()[0]:.1f}", file=sys.stderr)
+    return code
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulated boards in a process of their own, at pseudo-terminals, for several benchmarks."""
+"""Emulated boards in a process of their own, and what a process uses of the processor."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -52,3 +54,37 @@ def served(script: str, count: int = 1) -> Iterator[Served]:
         yield process
     finally:
         process.end()
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A process of the command line ``ohmskin ARGUMENTS``, and the first line that it prints."""
+    command = [sys.executable, "-m", "ohmskin", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        yield process, process.stdout.readline().strip()
+    finally:
+        process.terminate()
+        process.communicate(timeout=20)
+
+
+class Load:
+    """What this process uses of a core, since the object was made."""
+
+    def __init__(self) -> None:
+        self._used_s, self._begin_s = self._now_s()
+
+    def percent(self) -> float:
+        """User and system time over wall time."""
+        used_s, now_s = self._now_s()
+        return 100 * (used_s - self._used_s) / (now_s - self._begin_s)
+
+    def seconds(self) -> float:
+        """Wall time."""
+        return time.monotonic() - self._begin_s
+
+    @staticmethod
+    def _now_s() -> tuple[float, float]:
+        used = os.times()
+        return used.user + used.system, time.monotonic()

@@ -84,12 +84,11 @@ def _of_readings(
 
 def _file(name: str, plan: Plan) -> list[Run]:
     """All of a file's frames, or as many as all skins of a small plan have, evenly spaced."""
-    trial = reference_trial(name)
-    most = min(plan.skins * plan.frames, len(trial.frames))
-    picked = np.linspace(0, len(trial.frames) - 1, most).round().astype(int)
-    readings = rounded(replace(trial.readings, ratio=trial.readings.ratio[picked]))
-    cells, rest = trial.cell_siemens[picked], trial.rest.cell_siemens
-    return [_of_readings(readings, cells, rest, min(PIECES, most))]
+    frames = len(reference_trial(name).frames)
+    most = min(plan.skins * plan.frames, frames)
+    trial = reference_trial(name, np.linspace(0, frames - 1, most).round().astype(np.intp))
+    readings, rest = rounded(trial.readings), trial.rest.cell_siemens
+    return [_of_readings(readings, trial.cell_siemens, rest, min(PIECES, most))]
 
 
 def _simulated(

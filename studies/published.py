@@ -58,16 +58,19 @@ FORCE_RMSE_N: Final = {
         ("solved", "estimation"): (2.208, 1.686, 3.509, 2.380),
     },
 }
-_PRESSED: Final = ([0, 0, 1], [0, 1, 0])  # three corners of a rectangle
-_PRESSED_OHM: Final = 1e3  # in the wire sweep, by its caption
-_WIRE_OHM: Final = 1e3  # in the cell sweep
+_PRESSED: Final = ([0, 0, 1], [0, 1, 0])  # rows and columns of three corners of a rectangle
+_PRESSED_OHM: Final = 1e3  # of a pressed cell in the wire sweep, by its caption
+_WIRE_OHM: Final = 1e3  # of a segment in the cell sweep, by its caption
 
 
-def sweep(name: str) -> list[tuple[Skin, Skin]]:
-    """The pressed skin and the untouched one of each condition of "cell_sweep" or "wire_sweep"."""
+def sweep(name: str, pressed_in_wires_ohm: float = _PRESSED_OHM) -> list[tuple[Skin, Skin]]:
+    """The pressed skin and the untouched one of each condition of "cell_sweep" or "wire_sweep".
+
+    pressed_in_wires_ohm: a pressed cell of the wire sweep.
+    """
     pairs = []
     for condition_ohm in 1e6 * np.array(CONDITIONS_MEGOHM[name]):
-        pressed_ohm = condition_ohm if name == "cell_sweep" else _PRESSED_OHM
+        pressed_ohm = condition_ohm if name == "cell_sweep" else pressed_in_wires_ohm
         wire_ohm = _WIRE_OHM if name == "cell_sweep" else condition_ohm
         rest = uniform_skin((3, 3), 1e-6, (wire_ohm, wire_ohm))
         cell_siemens = rest.cell_siemens.copy()

@@ -197,22 +197,24 @@ def trial_of(
     return Trial(told, tuple(frames), rest)
 
 
-def reference_trial(name: str) -> Trial:
+def reference_trial(name: str, frames: slice | NDArray[np.intp] = slice(None)) -> Trial:
     """The skin of a file of tests/data, solved by ngspice; `tests/data/README.md` describes them.
 
-    The wires of a sweep change from frame to frame: then `rest` has those of the first frame.
+    frames: which of them; all, unless others are chosen. In the paper's sweeps wires change from
+    frame to frame, so all of their frames are to be taken; `rest` has the wires of the first.
     """
     path = DATA / f"{name}.npz"
     given = load_readings(path)
+    given = replace(given, ratio=given.ratio[frames])
     with np.load(path, allow_pickle=False) as file:
-        cell_siemens, rest_siemens = 1 / file["cell_ohm"], 1 / file["rest_ohm"]
-        top, bottom = (
-            np.broadcast_to(file[f"{layer}_wire_ohm"], cell_siemens.shape)
-            for layer in ("top", "bottom")
+        cell_ohm, rest_siemens = file["cell_ohm"], 1 / file["rest_ohm"]
+        cell_siemens, top, bottom = (
+            np.broadcast_to(array, cell_ohm.shape)[frames]
+            for array in (1 / cell_ohm, file["top_wire_ohm"], file["bottom_wire_ohm"])
         )
     references = given.ref_top_ohm, given.ref_bottom_ohm
-    frames = (Skin(*layers, *references) for layers in zip(cell_siemens, top, bottom, strict=True))
-    return Trial(given, tuple(frames), Skin(rest_siemens, top[0], bottom[0], *references))
+    skins = (Skin(*layers, *references) for layers in zip(cell_siemens, top, bottom, strict=True))
+    return Trial(given, tuple(skins), Skin(rest_siemens, top[0], bottom[0], *references))
 
 
 def random_trial(

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure which readings mode far should take, and in which order, in the AVR simulator.
 
-    make firmware sim
-    PYTHONPATH=host:.:tests/helpers python benchmarks/far_readings.py
+    make bench-orders
 
 For each order of readings it builds the Uno's firmware in a temporary copy, whose frames.toml has
 this order. It scans four skins at 90 Hz with the capacitances of the setting `desk` (100 pF a node,
@@ -23,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bars import QUICK, options  # beside this file
 from ohmskin.arrays import Float
 from places import ROOT
 
@@ -56,7 +56,7 @@ def resistance(ratio: Float, names: tuple[str, ...]) -> Float:
     return np.asarray(voltage / (1 - of["a"] + of["b"]))
 
 
-def measure() -> None:
+def measure() -> int:
     """In a copy: print the errors of its order."""
     from lockstep import Rig
     from ohmskin.circuit.skin import Skin, all_readings, end_admittance
@@ -81,36 +81,40 @@ def measure() -> None:
             off = resistance(codes / 1024, names) / true - 1
             errors[what].append(100 * np.abs(off[skin.cell_siemens > 5e-6]))
     texts = []
-    for what, each in errors.items():
-        median, high = np.percentile(np.concatenate(each), [50, 90])
+    for what, parts in errors.items():
+        median, high = np.percentile(np.concatenate(parts), [50, 90])
         texts.append(f"{what} {median:5.2f} % {high:6.2f} %")
     print(f"{' '.join(names)}:  {',  '.join(texts)}", flush=True)
+    return 0
 
 
-def main() -> None:
-    for order in ORDERS:
+def main() -> int:
+    part = options(__doc__).parse_args().part
+    for order in ORDERS[:1] if part is QUICK else ORDERS:
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder)
-            for each in COPIED:
-                shutil.copytree(ROOT / each, copy / each)
+            for name in COPIED:
+                shutil.copytree(ROOT / name, copy / name)
             (copy / "firmware" / "test").mkdir()
-            for each in ("platformio.ini", "pyproject.toml", "firmware/reserve_r2.py"):
-                shutil.copy(ROOT / each, copy / each)
+            for name in ("platformio.ini", "pyproject.toml", "firmware/reserve_r2.py"):
+                shutil.copy(ROOT / name, copy / name)
             frames = copy / "protocol" / "frames.toml"
             far = 'name = "far", value = 1, readings = ['
             begin, end = frames.read_text().split(far)
             names = str(order.split())[1:]
             frames.write_text(begin + far + names + end.partition("]")[2])
             path = ":".join(map(str, (copy / "host", copy, copy / "tests" / "helpers")))
-            run = {"cwd": copy, "env": os.environ | {"PYTHONPATH": path}}
+            pio = str(Path(sys.executable).parent / "pio")
             for command in (
                 [sys.executable, "protocol/generate.py"],
-                [Path(sys.executable).parent / "pio", "run", "-s", "-e", "uno"],
-                [sys.executable, "benchmarks/far_readings.py", "measure"],
+                [pio, "run", "-s", "-e", "uno"],
+                [sys.executable, "benchmarks/bench_orders.py", "measure"],
             ):
                 quiet = subprocess.DEVNULL if command[-1] != "measure" else None
-                subprocess.run(command, check=True, stdout=quiet, **run)
+                environment = os.environ | {"PYTHONPATH": path}
+                subprocess.run(command, check=True, stdout=quiet, cwd=copy, env=environment)
+    return 0
 
 
 if __name__ == "__main__":
-    measure() if sys.argv[1:] == ["measure"] else main()
+    sys.exit(measure() if sys.argv[1:] == ["measure"] else main())
