@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
+from ohmskin.circuit.skin import (
+    Skin,
+    all_readings,
+    end_admittance,
+    port_resistance_ohm,
+    readings,
+)
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_faults import ALIKE_FRAMES
 from ohmskin.estimate.port_readings import PortReader
@@ -177,6 +183,20 @@ def test_what_stays_from_frame_to_frame_is_no_noise(rest: Skin) -> None:
         assert found.current_std.mean() > 0.7 * first.current_std.mean()
         again = reader.read(ten_bits(noisy))  # one scan at rest, not a mean of many
         np.testing.assert_array_equal(again.current_std, found.current_std)
+
+
+def test_what_moves_both_near_ends_alike_is_once_in_what_wires_lose(rest: Skin) -> None:
+    """Mode far, both near ends off by 14 LSB in every frame: 12 % of it, and noise of two codes."""
+    exact = all_readings(rest, end_admittance(rest))[..., [0, 4, 1, 5]]
+    sign = np.arange(64).reshape(8, 8) % 3 - 1.0  # median 0: no offset of the board
+    sign[0, 0] = 0.0  # the first port has settled
+    stays = 14 / 1024 * sign
+    ratio = ten_bits(exact + stays[..., None] * [1, 0, 1, 0])
+    reader = PortReader(SkinKnowledge(8, 8, adc_bits=10, reading_names=tuple("aebf")))
+    _, found = (reader.read(ratio, in_order=True) for _ in range(2))
+    current = (1 - exact[..., 0] + exact[..., 2]) / 60e3
+    std_lsb = (1024 * found.drop_std * current)[sign != 0]
+    np.testing.assert_allclose(std_lsb, np.hypot(0.12 * 14, (2 * 2 / 12) ** 0.5), rtol=0.1)
 
 
 def test_without_rest_readings_nothing_is_said_of_a_change(rest: Skin) -> None:
