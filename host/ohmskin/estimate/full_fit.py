@@ -145,8 +145,9 @@ class FullFit:
     def _step(self) -> tuple[Float, float]:
         """u' - u by the slopes there are, and the most deviations it moves of a reading, or cell.
 
-        J is in deviations of the last linearisation, but the prior of the cells is that of the
-        present state: so a cell's u is its slope of -log p times the old deviation.
+        J is in deviations of the cells at the last linearisation. The prior of a cell, a normal
+        that follows the tail (`CellPrior.normal`), is that of the present state. So u of a cell is
+        the slope of its prior, distance over variance, times the older deviation.
         """
         cell_stds = (self.log_cells - self._centre) * self._cell_std / self._variance
         present = np.concatenate([cell_stds, self._layer_stds])
@@ -157,7 +158,7 @@ class FullFit:
 
     def _move(self, step: Float) -> None:
         """Take a step, or so much of it that no log resistance moves by more than MAX_STEP_LOG."""
-        # A cell that would leave its limits goes there. The others take their whole step.
+        # A cell that would leave its limits goes to the limit, and does not shorten the whole step.
         log_cells = self.log_cells + self._cell_std * step[:-2]
         cells_step = np.minimum(np.maximum(log_cells, _LEAST_LOG_OHM), _MOST_LOG_OHM)
         cells_step -= self.log_cells
@@ -193,17 +194,20 @@ class FullFit:
         return float(self._weighted_residual @ self._weighted_residual) / self._current.size
 
     def _conclude(self) -> None:
-        """log_cells_std, and wires_log_std, by the last J and S.
+        """Posterior deviations of the cells: log_cells_std and wires_log_std, by the last J and S.
 
-        Without more, a cell's posterior deviation is s (1 - l)^1/2, with s that of its prior here,
-        and l its diagonal element of O^T O: the share of s^2 that the readings have removed. But
-        cells that may be touched unnoticed (`_find_unnoticed`) have a wider deviation s', and what
-        depends on them is less certain too. S grows by these cells: with H the columns of O that
-        are theirs, each times (s'^2 / s^2 - 1)^1/2, S' = L (1 + H H^T) L^T, and (Woodbury)
+        With s the deviation of a cell's prior, that of its posterior is s (1 - l)^1/2. l is the
+        cell's diagonal element of O^T O, the share of s^2 that the readings have removed. The part
+        from the layers is s times the length of the cell's two elements of O^T O with them.
+
+        That holds for cells whose prior can be believed. Those that may be touched unnoticed
+        (`_find_unnoticed`) get a wider deviation s' instead of s, and S becomes wider by them: with
+        H their columns of O, each times (s'^2 / s^2 - 1)^1/2, it is S' = L (1 + H H^T) L^T. So
+        neighbours, which share readings with them, become less certain too (Woodbury):
 
             J^T S'^-1 J = O^T O - O^T H (1 + H^T H)^-1 H^T O .
 
-        The second term is what is corrected. Then J's own columns grow to s' too.
+        The last term is the correction. After it, the columns of J that are theirs grow by s' / s.
         """
         cell_std = self._cell_std
         whitened = solve_lower(self._factor, self._slopes)
@@ -253,8 +257,8 @@ class FullFit:
 
     @property
     def lesson(self) -> Lesson:
-        """What the readings say of the layers."""
-        # At the mean of the belief, not at the layers that the fit has found.
+        """What the readings say of the layers, whatever the touched cells are."""
+        # The belief wants the residual at its mean, not at the layers that the fit has found.
         residual = self._residual + self._per_layer_std @ self._layer_stds
         # A touched cell is noise without limit; one at rest is known to its drift.
         touched = np.abs(self._prior.rise(self.log_cells)) > TOUCHED_STDS

@@ -112,7 +112,7 @@ class JointEstimator(Estimator):
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
-        # In a crowded frame, the force of many cells is as little known as the wires behind them.
+        # A crowded frame teaches nothing: other forces explain it as well as other wires do.
         if not (ports.fault or message or prior.is_crowded(fit.log_cells)):
             self._belief.after_fit(fit, ports)
         return self._solution(ports, fit, message)

@@ -359,8 +359,9 @@ class FewTouches:
         if self._touched is not None:
             slope, cell_volt = self._touched.own_slope(asked)
             port_ohm = self._touched.port_ohm
-        # A port cannot have less than its wires. A reading that shows less by noise, or because
-        # wires are shorter than believed, asks for a very hard touch, and not for a negative one.
+        # A port cannot have less resistance than its wires. Wires may be shorter than believed, so
+        # half of them is allowed for. A reading that shows still less, by noise, is taken as that:
+        # it asks for a very hard touch, and not for one of negative resistance.
         target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
         # One cell more is a change of rank 1: rho - target = slope / (1 / d + M), solved for 1 / d.
         added_ohm = slope / np.maximum(port_ohm[asked] - target_ohm, 1e-9) - cell_volt
@@ -381,8 +382,8 @@ class FewTouches:
     def explain(self) -> Touched | None:
         """The last steps, with wires known to their covariance only.
 
-        None if the readings reject these touches: they leave more than noise, or show less current
-        than touches of no other cell could explain.
+        None if the readings reject these touches: what these leave unexplained is more than noise,
+        or a port draws less current than the model, and no further touch makes it draw less.
         """
         if not self.cells.size:
             return self._nothing_touched()
@@ -413,7 +414,8 @@ class FewTouches:
             return None
         if self._residual[light].min(initial=0.0) < -DEMAND_STDS:
             return None
-        # Of a residual of covariance S, S^-1 times it is noise. The rest is wires, and the model's.
+        # Of a residual of covariance S, S^-1 times it is the noise of readings, of covariance 1.
+        # The rest is what the wires have of their own, which belongs to the model.
         modelled = self._current.copy()
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))
