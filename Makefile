@@ -22,6 +22,9 @@ endif
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEX := host/ohmskin/firmware
+NPM_LOCKS := firmware/second_sim/package-lock.json tools/page_lint/package-lock.json
+BIOME = $(firstword $(shell ls tools/page_lint/node_modules/@biomejs/cli-*/biome 2>/dev/null) false)
+PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers far orders desk force view \
@@ -47,7 +50,7 @@ setup-host: $(HOST_STAMP) ## install what the host alone needs (.venv)
 $(HOST_STAMP): pyproject.toml tools/setup.sh tools/constraints.txt
 	tools/setup.sh host
 
-$(STAMP): pyproject.toml tools/setup.sh tools/constraints.txt firmware/second_sim/package-lock.json
+$(STAMP): pyproject.toml tools/setup.sh tools/constraints.txt $(NPM_LOCKS)
 	tools/setup.sh all
 
 check: setup ## formatting, lint, types, generated files, docs
@@ -56,6 +59,9 @@ check: setup ## formatting, lint, types, generated files, docs
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports
 	$(BIN)/clang-format --dry-run -Werror $(C_FILES)
+	@if $(BIOME) --version >/dev/null 2>&1; then echo "biome check"; $(BIOME) check $(PAGE); \
+	else echo "check: biome is missing (npm: make setup), the page's JavaScript is not linted"; \
+		test "$$CI" != true && test -z "$$OHMSKIN_NO_SKIP"; fi
 	$(BIN)/python protocol/generate.py --check
 	$(BIN)/python docs/draw.py --check
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -63,10 +69,11 @@ check: setup ## formatting, lint, types, generated files, docs
 docs: setup ## build the pages of docs/ into build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-format: setup ## put Python and C++ sources into the common format
+format: setup ## put Python, C++ and JavaScript sources into the common format
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 	$(BIN)/clang-format -i $(C_FILES)
+	! $(BIOME) --version >/dev/null 2>&1 || $(BIOME) check --write $(PAGE)
 
 firmware: setup ## build the firmware for all boards
 	$(BIN)/pio run
@@ -170,4 +177,4 @@ clean: ## remove what was built
 	$(MAKE) -C firmware/sim clean
 
 distclean: clean ## remove .venv and PlatformIO's packages too
-	rm -rf .venv .pio firmware/second_sim/node_modules
+	rm -rf .venv .pio firmware/second_sim/node_modules tools/page_lint/node_modules

@@ -5,7 +5,7 @@
 #
 # host: .venv with the ohmskin package.
 # all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second
-# simulator, for tests) from npm, and the development tools.
+# simulator, for tests) and biome (for the page's JavaScript) from npm, and the development tools.
 # Installs only what is missing, and says what. Python packages are of the versions that were tested:
 # tools/constraints.txt.
 set -euo pipefail
@@ -80,14 +80,14 @@ pip_install() { # requirement
         --constraint tools/constraints.txt --editable "$1"
 }
 
-npm_install() { # folder
+npm_install() { # folder, what it is, what is skipped without it
     [[ $1/node_modules/.package-lock.json -nt $1/package-lock.json ]] && return
     if command -v npm >/dev/null; then
-        echo "setup: installing avr8js into $1/node_modules"
+        echo "setup: installing $2 into $1/node_modules"
         npm ci --prefix "$1" --ignore-scripts --no-audit --no-fund --fetch-retries=1 \
             --loglevel=error && return
     fi
-    echo "setup: without npm and its registry, tests in the second simulator are skipped"
+    echo "setup: without npm and its registry, $3"
 }
 
 case ${1:-} in
@@ -103,7 +103,8 @@ all)
             echo "setup: without Chromium (Ubuntu has a snap alone) tests of the page are skipped"
         command -v npm >/dev/null || apt_install nodejs npm || true
     fi
-    npm_install firmware/second_sim
+    npm_install firmware/second_sim avr8js "tests in the second simulator are skipped"
+    npm_install tools/page_lint biome "the page's JavaScript is not linted"
     make_venv
     pip_install '.[dev]'
     touch .venv/.stamp-host .venv/.stamp

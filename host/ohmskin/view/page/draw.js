@@ -109,7 +109,7 @@ export class HeatMap {
   }
 
   // The numbers: less often, because nobody reads sixty a second.
-  write(scan, scale, { values, std, touched }) {
+  write(scale, { values, std, touched }) {
     const context = fit(this.digits, this.width, this.height);
     const size = this.size;
     context.textAlign = "center";
@@ -137,7 +137,11 @@ export class HeatMap {
       context.fillText(text, middle, y + size * (withStd ? 0.4 : 0.5));
       if (withStd) {
         context.font = `10px ${FONT}`;
-        context.fillText(`±${written(scale.std(values[cell], std[cell]))}`, middle, y + size * 0.72);
+        context.fillText(
+          `±${written(scale.std(values[cell], std[cell]))}`,
+          middle,
+          y + size * 0.72,
+        );
       }
       context.globalAlpha = 1;
     }
@@ -226,7 +230,10 @@ export class History {
     context.strokeStyle = styleOf("--accent");
     context.lineWidth = 1.5;
     context.stroke();
-    for (const [edge, off, word] of [[top, (at) => at > 1, "above"], [bottom, (at) => at < 0, "below"]]) {
+    for (const [edge, off, word] of [
+      [top, (at) => at > 1, "above"],
+      [bottom, (at) => at < 0, "below"],
+    ]) {
       const beyond = known.filter((scan) => off(scale.position(scan[scale.plane][cell])));
       if (!beyond.length) continue;
       // Where the curve is off the scale: a thick edge, and the furthest value in words.

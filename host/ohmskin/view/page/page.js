@@ -71,10 +71,12 @@ find("open").addEventListener("submit", (event) => {
 });
 find("look").addEventListener("click", look);
 find("emulator").addEventListener("click", () => open("emulator://8x8?scene=moving"));
-onTheme(() => panels.forEach((panel) => panel.state && panel.rescale()));
+onTheme(() => {
+  for (const panel of panels.values()) if (panel.state) panel.rescale();
+});
 
 function frame(nowMs) {
-  panels.forEach((panel) => panel.frame(nowMs));
+  for (const panel of panels.values()) panel.frame(nowMs);
   requestAnimationFrame(frame);
 }
 

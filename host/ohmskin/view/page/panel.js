@@ -10,7 +10,9 @@ const TABLE_EVERY_MS = 1000;
 const MESSAGE_EVERY_MS = 2000; // it is spoken
 const QUANTITIES = { newtons: "force (N)", siemens: "conductance (µS)", ohms: "resistance (kΩ)" };
 const STATUS = {
-  opening: "connecting …", scanning: "scanning", gone: "not there, tried again every second",
+  opening: "connecting …",
+  scanning: "scanning",
+  gone: "not there, tried again every second",
   ended: "ended",
 };
 const MOVES = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
@@ -82,13 +84,19 @@ export class Panel {
     this.find(".close").setAttribute("aria-label", `Close ${port}`);
     const values = this.find(".value");
     values.id = `value-${number}`;
-    for (const [name, text] of [["raw", "raw reading"], ["estimate", "estimate"]]) {
+    for (const [name, text] of [
+      ["raw", "raw reading"],
+      ["estimate", "estimate"],
+    ]) {
       const canvas = this.find(`.${name} .cells`);
       canvas.tabIndex = 0;
       canvas.setAttribute("role", "application");
       canvas.setAttribute("aria-roledescription", "heat map");
-      canvas.setAttribute("aria-label", `Heat map of the ${text}: arrow keys choose a cell, ` +
-        "whose value is spoken; all values are in the table below");
+      canvas.setAttribute(
+        "aria-label",
+        `Heat map of the ${text}: arrow keys choose a cell, ` +
+          "whose value is spoken; all values are in the table below",
+      );
     }
   }
 
@@ -144,8 +152,10 @@ export class Panel {
 
   sayHovered(map) {
     if (map.hovered === null || map.hovered === undefined) return;
-    const value = map === this.estimate ? this.value(map.hovered)
-      : `${written(this.rawScale.show(this.scan.raw[map.hovered]))} ${this.rawScale.unit}`;
+    const value =
+      map === this.estimate
+        ? this.value(map.hovered)
+        : `${written(this.rawScale.show(this.scan.raw[map.hovered]))} ${this.rawScale.unit}`;
     say(map.cells.parentNode.querySelector(".hover"), `${this.place(map.hovered)}: ${value}`);
   }
 
@@ -165,7 +175,8 @@ export class Panel {
     const { rows, columns } = this.scan;
     const row = Math.floor(this.chosen / columns) + step[0];
     const column = (this.chosen % columns) + step[1];
-    if (row >= 0 && row < rows && column >= 0 && column < columns) this.choose(row * columns + column);
+    if (row >= 0 && row < rows && column >= 0 && column < columns)
+      this.choose(row * columns + column);
   }
 
   choose(cell) {
@@ -185,17 +196,26 @@ export class Panel {
     const status = STATUS[state.status];
     say(this.find(".status"), state.text ? `${status}: ${state.text}` : status);
     const board = state.board;
-    say(this.find(".board"), board ? `${board.board}, unit ${board.unit_id}, ${board.rows} × ` +
-      `${board.columns} cells, firmware ${board.version}` : "");
-    options(this.find(".method"), state.methods, state.method,
-      (name) => (name === state.force_method ? `${name} (calibrated)` : name));
+    say(
+      this.find(".board"),
+      board
+        ? `${board.board}, unit ${board.unit_id}, ${board.rows} × ` +
+            `${board.columns} cells, firmware ${board.version}`
+        : "",
+    );
+    options(this.find(".method"), state.methods, state.method, (name) =>
+      name === state.force_method ? `${name} (calibrated)` : name,
+    );
     const recording = this.find(".record");
     recording.textContent = state.recording ? "Stop recording" : "Record";
     recording.setAttribute("aria-pressed", Boolean(state.recording));
     this.enable(true);
     this.sayFile();
     const date = state.rest_date?.slice(0, 19).replace("T", " ");
-    say(this.find(".rest"), !date ? "not known: tare" : `${state.tared ? "tare" : "calibration"}\n${date}`);
+    say(
+      this.find(".rest"),
+      !date ? "not known: tare" : `${state.tared ? "tare" : "calibration"}\n${date}`,
+    );
     if (state.note) this.notice({ text: state.note });
     this.rescale();
   }
@@ -212,8 +232,12 @@ export class Panel {
   sayFile() {
     const { recording, recorded } = this.state;
     const scans = this.scan?.recorded ?? 0;
-    say(this.find(".file"), recording ? `recording to ${recording}: ${scans} scans`
-      : recorded && `last recording: ${recorded}`);
+    say(
+      this.find(".file"),
+      recording
+        ? `recording to ${recording}: ${scans} scans`
+        : recorded && `last recording: ${recorded}`,
+    );
   }
 
   notice({ text, good, refused }) {
@@ -224,7 +248,8 @@ export class Panel {
   }
 
   rescale() {
-    const withForce = this.state.force_method !== null && this.state.method === this.state.force_method;
+    const withForce =
+      this.state.force_method !== null && this.state.method === this.state.force_method;
     const there = Object.keys(QUANTITIES).filter((name) => withForce || name !== "newtons");
     const wanted = there.includes(this.quantity) ? this.quantity : there[0];
     options(this.find(".quantity"), there, wanted, (name) => QUANTITIES[name]);
@@ -257,7 +282,8 @@ export class Panel {
     const scan = this.scan;
     if (!scan || !this.state || this.element.parentNode === null) return;
     const sizes = `${this.raw.width} ${this.estimate.width} ${devicePixelRatio}`;
-    if (sizes !== this.sizes) [this.sizes, this.dirty, this.writtenMs, this.barsMs] = [sizes, true, 0, 0];
+    if (sizes !== this.sizes)
+      [this.sizes, this.dirty, this.writtenMs, this.barsMs] = [sizes, true, 0, 0];
     if (!this.dirty || !this.raw.width) return;
     this.dirty = false;
     const cells = scan.rows * scan.columns;
@@ -267,7 +293,9 @@ export class Panel {
     const scale = this.shownScale();
     const raw = { values: scan.raw, std: null, touched: scan.raw_touched };
     const estimate = {
-      values: scan[scale.plane], std: scan[`${scale.plane}_std`], touched: scan.touched,
+      values: scan[scale.plane],
+      std: scan[`${scale.plane}_std`],
+      touched: scan.touched,
     };
     this.raw.draw(scan, this.rawScale, raw, this.chosen);
     this.estimate.draw(scan, scale, estimate, this.chosen);
@@ -279,8 +307,8 @@ export class Panel {
     }
     if (nowMs - (this.writtenMs || 0) >= DIGITS_EVERY_MS || !this.writtenMs) {
       this.writtenMs = nowMs;
-      this.raw.write(scan, this.rawScale, raw);
-      this.estimate.write(scan, scale, estimate);
+      this.raw.write(this.rawScale, raw);
+      this.estimate.write(scale, estimate);
       this.write(scan, nowMs);
     }
     if (this.find(".values").open && nowMs - (this.tableMs || 0) >= TABLE_EVERY_MS) {
@@ -303,9 +331,11 @@ export class Panel {
       const latencyMs = nowMs + this.connection.clock.offsetMs - 1000 * scan.host_time_s;
       this.latencies.push(latencyMs);
       if (this.latencies.length > LATENCIES) this.latencies.shift();
-      this.element.dispatchEvent(new CustomEvent("drawn", {
-        detail: { scan: scan.scan, host_time_s: scan.host_time_s, nowMs, latencyMs },
-      }));
+      this.element.dispatchEvent(
+        new CustomEvent("drawn", {
+          detail: { scan: scan.scan, host_time_s: scan.host_time_s, nowMs, latencyMs },
+        }),
+      );
     };
     channel.port2.postMessage(0);
   }
@@ -320,7 +350,10 @@ export class Panel {
     this.find(".plot").setAttribute("aria-label", `Curve of cell ${this.place()} over ten seconds`);
     say(this.find(".rate"), `${scan.rate_hz.toFixed(1)} Hz`);
     say(this.find(".missed"), `${scan.missed} scans`);
-    say(this.find(".latency"), this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–");
+    say(
+      this.find(".latency"),
+      this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–",
+    );
     say(this.find(".shown"), `${(this.drawnAt.length / 2).toFixed(0)} a second`);
     say(this.find(".takes"), `${(1000 * scan.estimate_s).toFixed(1)} ms`);
     say(this.find(".chi2"), scan.chi2 === null ? "–" : scan.chi2.toPrecision(2));
@@ -332,8 +365,11 @@ export class Panel {
     const force = scan.force !== undefined;
     const rows = scan.contacts.map(([identity, row, column, amount, std]) => {
       const [value, spread] = force ? [amount, std] : [1e6 * amount, 1e6 * std];
-      return [identity, `${row.toFixed(1)}, ${column.toFixed(1)}`,
-        !(std <= amount) ? "uncertain" : `${written(value)} ± ${written(spread)}`];
+      return [
+        identity,
+        `${row.toFixed(1)}, ${column.toFixed(1)}`,
+        !(std <= amount) ? "uncertain" : `${written(value)} ± ${written(spread)}`,
+      ];
     });
     fill(this.find(".contacts tbody"), rows.length ? rows : [["–", "no contact", ""]]);
     this.sayFile();
@@ -343,20 +379,29 @@ export class Panel {
   table(scan, scale) {
     const table = this.find(".values table");
     const { rows, columns } = scan;
-    const cells = (row) => Array.from({ length: columns }, (_, column) => this.value(row * columns + column));
+    const cells = (row) =>
+      Array.from({ length: columns }, (_, column) => this.value(row * columns + column));
     const head = ["row", ...Array.from({ length: columns }, (_, column) => `column ${column}`)];
     if (!table.tHead || table.tHead.rows[0].cells.length !== columns + 1) {
       table.replaceChildren(table.createCaption(), table.createTHead(), table.createTBody());
-      table.tHead.insertRow().append(...head.map((text) => {
-        const cell = document.createElement("th");
-        cell.scope = "col";
-        cell.textContent = text;
-        return cell;
-      }));
+      table.tHead.insertRow().append(
+        ...head.map((text) => {
+          const cell = document.createElement("th");
+          cell.scope = "col";
+          cell.textContent = text;
+          return cell;
+        }),
+      );
     }
-    say(table.caption, `Estimate of each cell and its standard deviation: ${scale.name} [${scale.unit}], ` +
-      "renewed once a second");
-    fill(table.tBodies[0], Array.from({ length: rows }, (_, row) => [row, ...cells(row)]));
+    say(
+      table.caption,
+      `Estimate of each cell and its standard deviation: ${scale.name} [${scale.unit}], ` +
+        "renewed once a second",
+    );
+    fill(
+      table.tBodies[0],
+      Array.from({ length: rows }, (_, row) => [row, ...cells(row)]),
+    );
   }
 
   close() {

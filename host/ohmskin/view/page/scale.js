@@ -2,9 +2,20 @@
 // Fixed scales, never a scan's own: where a value lies on them, its colour, and how it is written.
 
 // Dark to light, of even steps in lightness ("rocket" of seaborn).
-const ANCHORS = ["03051a", "221331", "451c47", "691f55", "921c5b", "b91657", "d92847", "ed503e",
-  "f47d57", "f6a47c", "f7c9aa", "faebdd"].map((hex) => [0, 2, 4].map((at) =>
-  parseInt(hex.slice(at, at + 2), 16)));
+const ANCHORS = [
+  "03051a",
+  "221331",
+  "451c47",
+  "691f55",
+  "921c5b",
+  "b91657",
+  "d92847",
+  "ed503e",
+  "f47d57",
+  "f6a47c",
+  "f7c9aa",
+  "faebdd",
+].map((hex) => [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16)));
 const STEPS = 256;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -12,7 +23,8 @@ const RAMP = Array.from({ length: STEPS }, (_, step) => {
   const place = (step / (STEPS - 1)) * (ANCHORS.length - 1);
   const low = Math.min(Math.floor(place), ANCHORS.length - 2);
   return ANCHORS[low].map((from, k) =>
-    Math.round(from + (place - low) * (ANCHORS[low + 1][k] - from)));
+    Math.round(from + (place - low) * (ANCHORS[low + 1][k] - from)),
+  );
 });
 const COLOURS = RAMP.map((rgb) => `rgb(${rgb})`);
 const IS_LIGHT = RAMP.map(([r, g, b]) => 0.299 * r + 0.587 * g + 0.114 * b > 140);
@@ -38,24 +50,34 @@ const HIGH_S = 1e-3;
 const DECADES = Math.log10(HIGH_S / LOW_S);
 const logPosition = (siemens) => Math.log10(siemens / LOW_S) / DECADES;
 
-// factor: from the plane's unit to the one written. floor: a standard deviation below is certain.
+// What the page can show. plane: which values of a scan, in SI units. position: where a value lies on
+// the scale, 0 to 1. show, std: a value and its deviation in `unit`. floor: values that nothing touches
+// are near 0, so a deviation below this, in SI units, does not make them uncertain.
 const siemens = {
-  name: "conductance", unit: "µS", plane: "siemens", floor: 0.5e-6,
+  name: "conductance",
+  unit: "µS",
+  plane: "siemens",
+  floor: 0.5e-6,
   position: logPosition,
   show: (value) => 1e6 * value,
-  std: (value, std) => 1e6 * std,
+  std: (_value, std) => 1e6 * std,
   ticks: [1e-6, 1e-5, 1e-4, 1e-3],
 };
 const ohms = {
-  ...siemens, name: "resistance", unit: "kΩ",
+  ...siemens,
+  name: "resistance",
+  unit: "kΩ",
   show: (value) => 1e-3 / value,
   std: (value, std) => (1e-3 * std) / value ** 2,
 };
 const newtons = (top) => ({
-  name: "force", unit: "N", plane: "force", floor: 0.1,
+  name: "force",
+  unit: "N",
+  plane: "force",
+  floor: 0.1,
   position: (value) => value / top,
   show: (value) => value,
-  std: (value, std) => std,
+  std: (_value, std) => std,
   ticks: [0, 0.25, 0.5, 0.75, 1].map((share) => share * top),
 });
 
