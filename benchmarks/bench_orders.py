@@ -96,7 +96,8 @@ def main() -> int:
             for name in COPIED:
                 shutil.copytree(ROOT / name, copy / name)
             (copy / "firmware" / "test").mkdir()
-            for name in ("platformio.ini", "pyproject.toml", "firmware/reserve_r2.py"):
+            scripts = ("firmware/reserve_r2.py", "firmware/version.py")
+            for name in ("platformio.ini", "pyproject.toml", *scripts):
                 shutil.copy(ROOT / name, copy / name)
             frames = copy / "protocol" / "frames.toml"
             far = 'name = "far", value = 1, readings = ['

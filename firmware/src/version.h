@@ -4,8 +4,9 @@
 
 namespace ohmskin {
 
-constexpr uint8_t VERSION_MAJOR = 0;
-constexpr uint8_t VERSION_MINOR = 1;
-constexpr uint8_t VERSION_PATCH = 0;
+// The package's version (host/ohmskin/version.py): firmware/version.py defines the macros.
+constexpr uint8_t VERSION_MAJOR = OHMSKIN_VERSION_MAJOR;
+constexpr uint8_t VERSION_MINOR = OHMSKIN_VERSION_MINOR;
+constexpr uint8_t VERSION_PATCH = OHMSKIN_VERSION_PATCH;
 
 }  // namespace ohmskin

@@ -23,6 +23,7 @@ from ohmskin.errors import (
     RecordingError,
     TareRefused,
 )
+from ohmskin.version import VERSION
 
 if TYPE_CHECKING:
     from ohmskin.emulate.driver import SteppedSkin
@@ -72,7 +73,7 @@ __all__ = [
     "open",
     "open_all",
 ]
-__version__ = "0.1.0"
+__version__ = VERSION
 
 # Public names by the module that has them. A module is imported when one of its names is first
 # asked for: a program that only reads a board need not wait for scipy.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import ohmskin
 from command_line import Run, assert_one_line, well
 from ohmskin.cli import board as flash_command
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
@@ -86,7 +87,7 @@ def test_it_flashes_and_hears_from_the_board(
     attach(("/dev/ttyS0", other), (port, bridge))
     done = well(run("flash", *(each.format(port) for each in arguments)))
     assert f"flashing {kind} at {port}, 115200 baud" in done.out
-    assert f"{port}: {kind}, firmware 0.1.0, answers" in done.out
+    assert f"{port}: {kind}, firmware {ohmskin.__version__}, answers" in done.out
     # As Arduino's boards.txt has it.
     chip = "atmega2560 -c wiring" if kind == "megaatmega2560" else "atmega328p -c arduino"
     chip += " -x attempts=2" if kind == "nano" else ""  # the other speed is tried soon

@@ -3,6 +3,7 @@
 
 import pytest
 
+import ohmskin
 from firmware_helpers import BAUD_DEFAULT, BAUD_FAST, COMMANDS, OTHER_SCAN, VECTORS, reset
 from lockstep import CPU_HZ, DEFAULT_SCAN, Rig
 from ohmskin.link import framing, protocol
@@ -16,6 +17,8 @@ def test_boot_hello(rig: Rig) -> None:
     hello = only[1]
     assert hello["layout_crc"] == protocol.LAYOUT_CRC
     assert hello["board"] == rig.board
+    version = [hello[f"version_{part}"] for part in ("major", "minor", "patch")]
+    assert ".".join(map(str, version)) == ohmskin.__version__
     assert hello["settings"] == "defaults_blank"
     assert hello["reset_cause"] == ("power_on",)
     assert hello["baud"] == BAUD_DEFAULT

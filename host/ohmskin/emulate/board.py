@@ -27,6 +27,7 @@ from ohmskin.circuit.skin import DEFAULT_REF_OHM
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
+from ohmskin.version import VERSION
 
 # Readings of the skin: (time since the board was switched on [s], mode) -> (rows, columns, 4).
 RatioAt = Callable[[float, str], Float]
@@ -37,8 +38,9 @@ Sampled = Callable[[Float, float, float, float, str], Float]
 # Numbers of the firmware, by which `hello` answers as a real board does. That they are those of its
 # source is tested in tests/emulate/test_emulator.py.
 #
-# The version that hello says (firmware/src/version.h).
-VERSION: Final = {"version_major": 0, "version_minor": 1, "version_patch": 0}
+# The version that hello says: as a board's firmware, an emulated board has that of the package.
+_VERSION_FIELDS: Final = ("version_major", "version_minor", "version_patch")
+_VERSION: Final = dict(zip(_VERSION_FIELDS, map(int, VERSION.split(".")), strict=True))
 # The processor's clock on an Uno and a Mega 2560 [Hz] (Arduino's data sheets).
 CLOCK_HZ: Final = 16_000_000
 # The scan rate of a board that nobody has configured [Hz] (firmware/src/core/settings.h).
@@ -247,7 +249,7 @@ class EmulatedBoard:
         truth: dict[str, protocol.Value] = {
             **{name: self.settings[name] for name in _OF_HELLO},
             **self._plan,
-            **VERSION,
+            **_VERSION,
             "layout_crc": protocol.LAYOUT_CRC,
             "board": "emulated",
             "readings_per_cell": protocol.READINGS_PER_CELL,
