@@ -62,6 +62,7 @@ PAGES = [
         ),
         *sorted(DOCS.glob("*.md")),
         *sorted(ROOT.glob("examples/*.md")),
+        *sorted(ROOT.glob(".github/ISSUE_TEMPLATE/*.md")),
     )
 ]
 every_page = pytest.mark.parametrize("page", PAGES, ids=[page.path.name for page in PAGES])

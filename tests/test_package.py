@@ -2,6 +2,7 @@
 """The package as others get it: sdist, wheel made of it, a new environment, another folder."""
 
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -12,9 +13,11 @@ from email.message import Message
 from importlib.metadata import Distribution, distribution, distributions
 from pathlib import Path
 
+import yaml
 from markdown_it import MarkdownIt
 from packaging.requirements import Requirement
 
+import ohmskin
 from places import ROOT
 
 # The view needs the extra of its name.
@@ -128,6 +131,26 @@ def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_what_repeats_the_version_says_that_of_the_package() -> None:
+    """Package, firmware and emulated boards take it from host/ohmskin/version.py."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == ohmskin.__version__
+    newest = re.search(r"^## (\S+), ", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest is not None
+    assert newest[1] == ohmskin.__version__
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        said = re.findall(r"\bfirmware (\d+\.\d+\.\d+)", page.read_text())
+        assert set(said) <= {ohmskin.__version__}, page.name
+
+
+def test_the_citation_names_the_package_and_the_paper() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert (citation["title"], citation["license"]) == ("ohmskin", "Apache-2.0")
+    (paper,) = citation["references"]
+    assert paper["title"] in " ".join((ROOT / "docs/paper.md").read_text().replace("*", "").split())
+    assert [author["family-names"] for author in paper["authors"]] == ["Su", "Wu", "Wen", "Liu"]
+
+
 def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Path) -> None:
     build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path)
     run(*build, "-t", "sdist", place=ROOT)
@@ -137,7 +160,8 @@ def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Pat
         archive.extractall(tmp_path, filter="data")
     for needed in (
         *("firmware/src/main.cpp", "protocol/frames.toml", "platformio.ini", "Makefile"),
-        *("tests/data/README.md", "docs/calibrate.md", "tools/setup.sh", "LICENSE"),
+        *("tests/data/README.md", "docs/calibrate.md", "tools/setup.sh", "LICENSE", "CITATION.cff"),
+        ".github/ISSUE_TEMPLATE/bug.md",
     ):
         assert needed in names
     source = tmp_path / sdist.name.removesuffix(".tar.gz")
