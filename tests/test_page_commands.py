@@ -58,6 +58,7 @@ NOT_RUN = {
     "make setup": "installs packages",
     "make setup-host": "installs packages",
     "make test": "runs these tests",
+    "make test-arduino-gcc": "CI runs it",
     "make check": "CI runs it before these tests",
     "uv venv build/lowest": "makes an environment",
     "uv pip install --python build/lowest --resolution lowest-direct -e .[dev]": "installs them",
