@@ -18,7 +18,7 @@ from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
 from ohmskin.cli.stream import numbers
 from ohmskin.doctor.examine import examine
-from ohmskin.doctor.gather import gather, put_back
+from ohmskin.doctor.gather import gather_plate
 from ohmskin.doctor.plate import PlateExam, Tolerance
 from ohmskin.files import check_place, whole_file
 
@@ -58,12 +58,8 @@ def verify(
         check_place(Path(path), plate)
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
-    with terminal() as report, ohmskin.open(port, start=False) as device, put_back(device):
-        rows, columns = exam.plate.shape
-        rate_hz = device.info.rate_asked_mhz / 1000
-        # Far ends add nothing: a plate has its lines' potential at both ends.
-        device.configure(rows=rows, columns=columns, rate_hz=rate_hz, mode="near")
-        evidence = gather(device, report, seconds=seconds, clocks=True)
+    with terminal() as report, ohmskin.open(port, start=False) as device:
+        evidence = gather_plate(device, exam.plate.shape, report, seconds)
     evidence = replace(evidence, host_version=ohmskin.__version__, loss=loss)
     diagnosis = examine(evidence, exam.examine)
     page = as_object(port, diagnosis)

@@ -4,5 +4,5 @@
 `gather` reads a board, `examine` judges what was read. Both know no words: `ohmskin.cli.doctor`
 finds them.
 
-May import: `ohmskin.estimate` and what is below it.
+May import: `ohmskin.emulate`, `ohmskin.estimate` and what is below these.
 """

@@ -104,6 +104,19 @@ def gather(
     return evidence
 
 
+def gather_plate(
+    device: Device, shape: tuple[int, ...], report: Report, seconds: float
+) -> Evidence:
+    """What `examine` goes by, of a plate of so many rows and columns. Leaves the board as it was.
+
+    It is read in mode near: a line of a plate has one potential, so far ends show nothing more.
+    """
+    rate_hz = device.info.rate_asked_mhz / 1000
+    with put_back(device):
+        device.configure(rows=shape[0], columns=shape[1], rate_hz=rate_hz, mode="near")
+        return gather(device, report, seconds=seconds, clocks=True)
+
+
 @contextmanager
 def put_back(device: Device) -> Iterator[None]:
     """Let the board stand still, and configure it as before, however the body ends.
