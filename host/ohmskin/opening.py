@@ -85,7 +85,8 @@ def _device(text: str) -> Device:
     match url.scheme:
         case "":
             url.check_options("baud")
-            return Session(SerialLink(url.place), url.baud)
+            baud = url.baud  # which a wrong URL fails at, before a port is opened
+            return Session(SerialLink(url.place), baud)
         case "emulator":
             from ohmskin.emulate.urls import open_emulator
 
