@@ -10,16 +10,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import ohmskin
-from lockstep import LockstepSim, elf_of
+from lockstep import CPU_HZ, Rig
 from ohmskin.emulate import board as emulator
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import PortError
-from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
-from ohmskin.link.messages import Ack, BoardDecoder, Hello, Message, Scan, SelfTestReport
+from ohmskin.link.messages import BoardDecoder, Hello, Scan
 from ohmskin.link.session import configuration
 from places import ROOT
 from stepped import stepped
@@ -28,74 +27,44 @@ DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0}
 DEFAULT |= {"adc_prescaler": 32, "mode": 0}
 
 
-class Emulated(Closing):
-    """A board; `exchange` sends to it, lets time pass, and gives what it has sent."""
+class EmulatedSim:
+    """An emulated board, with as much of a `LockstepSim` as a `Rig` needs."""
 
     def __init__(self) -> None:
         self.board = EmulatedBoard(Scene().ratio, BoardSettings())
-        self._now_s = 0.0
+        self._cycles = 0
 
-    def exchange(self, octets: bytes, seconds: float) -> bytes:
+    def write(self, octets: bytes) -> None:
         self.board.receive(octets)
-        self._now_s += seconds
-        return self.board.advance(self._now_s)
+
+    def run_cycles(self, cycles: int) -> bytes:
+        self._cycles += cycles
+        return self.board.advance(self._cycles / CPU_HZ)
 
     def close(self) -> None:
         pass
 
 
-class Firmware(Closing):
-    """The built firmware in lock-step: simulated time passes only in `exchange`."""
-
-    def __init__(self, board: str) -> None:
-        self.sim = LockstepSim(board, elf_of(board))
-        self.sim.set_table(Scene().ratio(0.0))
-
-    def exchange(self, octets: bytes, seconds: float) -> bytes:
-        self.sim.write(octets)
-        return self.sim.run(seconds)
-
-    def close(self) -> None:
-        self.sim.close()
+def rig_of(board: str) -> Rig:
+    """An emulated board, or the built firmware, which reads the same skin."""
+    if board == "emulator":
+        return Rig(board, EmulatedSim())
+    rig = Rig(board)
+    rig.sim.set_table(Scene().ratio(0.0))
+    rig.run(0.02)
+    return rig
 
 
-class Host:
-    """Asks a board, and waits in the board's own time."""
+def hello_of(rig: Rig) -> Hello:
+    return Hello(**rig.hello())
 
-    def __init__(self, board: "Emulated | Firmware") -> None:
-        self._board = board
-        self._decoder = BoardDecoder()
-        self._sequence = 0
-        self.messages: list[Message] = []
-        self.run(0.02)
 
-    def run(self, seconds: float, octets: bytes = b"") -> list[Message]:
-        new = self._decoder.feed(self._board.exchange(octets, seconds), 0.0)
-        self.messages += new
-        return new
-
-    def send(self, frame_type: int, payload: bytes) -> str:
-        """The result in the ack of a frame, which may be none of the protocol's."""
-        self._sequence = (self._sequence + 1) & 0xFF
-        octets = framing.encode(frame_type, self._sequence, payload)
-        for _ in range(2000):
-            for message in self.run(0.002, octets):
-                if isinstance(message, Ack) and message.command_sequence == self._sequence:
-                    assert message.command == frame_type
-                    return message.result
-            octets = b""
-        raise TimeoutError("no ack within 4 s")
-
-    def ask(self, name: str, **values: protocol.Value) -> str:
-        frame = protocol.FRAMES[name]
-        return self.send(frame.id, frame.pack(**values))
-
-    def hello(self) -> Hello:
-        assert self.ask("get_hello") == "ok"
-        return [m for m in self.messages if isinstance(m, Hello)][-1]
-
-    def scans(self) -> list[Scan]:
-        return [m for m in self.messages if isinstance(m, Scan)]
+def answer(rig: Rig, frame_type: int, payload: bytes) -> str:
+    """The result in the ack of a frame, which may be none of the protocol's."""
+    rig.sim.write(framing.encode(frame_type, 0, payload))
+    result = rig.result_of(0)
+    assert rig.frames("ack")[-1]["command"] == frame_type
+    return result
 
 
 def asked_for(hello: Hello) -> dict[str, protocol.Value]:
@@ -175,21 +144,20 @@ def test_lines_beyond_the_skin_are_open() -> None:
 
 
 def test_saved_settings_outlive_a_reset_and_others_do_not() -> None:
-    board = Emulated()
-    host = Host(board)
-    assert host.ask("configure", **(DEFAULT | {"rows": 3})) == "ok"
-    assert host.ask("set_unit_id", unit_id=77) == "ok"
-    assert host.ask("save") == "ok"
-    assert host.ask("configure", **(DEFAULT | {"rows": 2})) == "ok"
-    assert host.ask("start") == "ok"
-    board.board.reset()
-    hello = host.hello()
+    rig = rig_of("emulator")
+    rig.must("configure", **(DEFAULT | {"rows": 3}))
+    rig.must("set_unit_id", unit_id=77)
+    rig.must("save")
+    rig.must("configure", **(DEFAULT | {"rows": 2}))
+    rig.must("start")
+    rig.sim.board.reset()
+    hello = hello_of(rig)
     assert (hello.rows, hello.unit_id, hello.settings) == (3, 77, "stored")
     assert (hello.scanning, hello.reset_cause) == (0, ("external",))
-    assert host.ask("load_defaults") == "ok"
-    assert (board.board.settings["rows"], board.board.settings["unit_id"]) == (8, 0)
-    board.board.reset()
-    assert host.hello().rows == 3
+    rig.must("load_defaults")
+    assert (hello_of(rig).rows, hello_of(rig).unit_id) == (8, 0)
+    rig.sim.board.reset()
+    assert hello_of(rig).rows == 3
 
 
 def test_a_large_skin_is_scanned_as_fast_as_it_can_be() -> None:
@@ -326,15 +294,14 @@ CONFIGURATIONS: list[dict[str, int]] = [
 @pytest.mark.simavr
 @pytest.mark.parametrize("board", ["uno", "megaatmega2560"])
 def test_emulator_and_firmware_answer_alike(board: str) -> None:
-    with Firmware(board) as firmware:
-        real, model = Host(firmware), Host(Emulated())
+    with rig_of(board) as real, rig_of("emulator") as model:
         results: dict[str, int] = {}
         for change in CONFIGURATIONS:
             wanted = DEFAULT | change
-            result = real.ask("configure", **wanted)
-            assert model.ask("configure", **wanted) == result, change
+            result = real.command("configure", **wanted)
+            assert model.command("configure", **wanted) == result, change
             results[result] = results.get(result, 0) + 1
-            kept, modelled = real.hello(), model.hello()
+            kept, modelled = hello_of(real), hello_of(model)
             assert asked_for(kept) == asked_for(modelled)
             assert (asked_for(kept) == wanted) >= (result == "ok"), change
             assert modelled.rate_hz == pytest.approx(kept.rate_hz, rel=0.002), change
@@ -345,52 +312,40 @@ def test_emulator_and_firmware_answer_alike(board: str) -> None:
         assert {"ok", "bad_rows", "bad_columns", "bad_rate"} < set(results)
         assert {"bad_settle", "bad_prescaler", "too_fast"} < set(results)
         for frame_type, payload in ODD_FRAMES:
-            answers = [host.send(frame_type, payload) for host in (real, model)]
+            answers = [answer(rig, frame_type, payload) for rig in (real, model)]
             assert answers[0] == answers[1] != "ok", (frame_type, payload)
         both_in_every_state(real, model)
 
 
-def both_in_every_state(real: Host, model: Host) -> None:
+def both_in_every_state(real: Rig, model: Rig) -> None:
     """Commands while scanning and after, whose answers and consequences must be the same."""
-    for host in (real, model):
-        assert host.ask("configure", **(DEFAULT | {"rows": 4, "columns": 3})) == "ok"
+    both = (real, model)
+    for rig in both:
+        rig.must("configure", **(DEFAULT | {"rows": 4, "columns": 3}))
     commands: list[tuple[str, dict[str, protocol.Value]]] = [
-        ("stop", {}),
-        ("start", {}),
-        ("start", {}),
+        *(("stop", {}), ("start", {}), ("start", {})),
         ("configure", DEFAULT | {"rows": 1}),
         ("configure", DEFAULT | {"rows": 0}),
-        ("load_defaults", {}),
-        ("self_test", {}),
-        ("set_baud", {"baud": 1_000_000}),
-        ("set_unit_id", {"unit_id": 0xFFFFFFFF}),
-        ("save", {}),
-        ("get_hello", {}),
-        ("stop", {}),
-        ("stop", {}),
-        ("self_test", {}),
-        ("load_defaults", {}),
-        ("get_hello", {}),
+        *(("load_defaults", {}), ("self_test", {}), ("set_baud", {"baud": 1_000_000})),
+        *(("set_unit_id", {"unit_id": 0xFFFFFFFF}), ("save", {}), ("get_hello", {})),
+        *(("stop", {}), ("stop", {}), ("self_test", {}), ("load_defaults", {}), ("get_hello", {})),
     ]
     for name, values in commands:
-        answers = [host.ask(name, **values) for host in (real, model)]
+        answers = [rig.command(name, **values) for rig in both]
         assert answers[0] == answers[1], (name, answers)
-        if name == "save":
-            real.run(0.3)
-            model.run(0.3)
-        told = [host.hello() for host in (real, model)]
+        for rig in both:
+            rig.run(0.3 if name == "save" else 0.0)
+        told = [hello_of(rig) for rig in both]
         for what in ("unit_id", "rows", "columns", "scanning", "baud", "ref_top_ohm"):
             assert getattr(told[0], what) == getattr(told[1], what), (name, what)
-    for host in (real, model):
-        found = host.scans()
-        assert len(found) > 20
-        assert [scan.missed for scan in found] == [0] * len(found)
-        assert found[0].number == 0
-        report = [m for m in host.messages if isinstance(m, SelfTestReport)][-1]
-        assert report.findings == ()
-        assert len(report.code_min) == len(report.code_max) == 8
+    for rig in both:
+        assert len(rig.scans) > 20
+        assert [scan.header["scan"] for scan in rig.scans] == list(range(len(rig.scans)))
+        report = rig.frames("self_test_report")[-1]
+        assert report["findings"] == ()
+        assert len(report["code_min"]) == len(report["code_max"]) == 8
     # The same skin reads the same, but for the instant of the hold: this one does not move.
-    np.testing.assert_array_equal(real.scans()[-1].codes, model.scans()[-1].codes)
+    np.testing.assert_array_equal(real.scans[-1].codes, model.scans[-1].codes)
 
 
 # ------------------------------------------------------------- any request, and what it changes
@@ -417,20 +372,20 @@ LIMITS = {
 
 
 @pytest.fixture(scope="module", params=["emulator", pytest.param("uno", marks=pytest.mark.simavr)])
-def host(request: pytest.FixtureRequest) -> Iterator[Host]:
-    with Emulated() if request.param == "emulator" else Firmware("uno") as board:
-        yield Host(board)
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with rig_of(request.param) as opened:
+        yield opened
 
 
 @settings(max_examples=500)
 @given(requests)
 @example(DEFAULT | {"rate_mhz": 0})
 @example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
-def test_any_configuration_is_taken_or_refused(host: Host, asked: dict[str, int]) -> None:
+def test_any_configuration_is_taken_or_refused(rig: Rig, asked: dict[str, int]) -> None:
     """Refused for its first fault and without a consequence, or kept as asked for."""
-    before = host.hello()
-    result = host.ask("configure", **asked)
-    after = host.hello()
+    before = hello_of(rig)
+    result = rig.command("configure", **asked)
+    after = hello_of(rig)
     fault = next((name for name, broken in LIMITS.items() if broken(asked)), None)
     if fault is not None:
         assert result == fault
@@ -449,11 +404,11 @@ def test_any_configuration_is_taken_or_refused(host: Host, asked: dict[str, int]
 @settings(max_examples=200)
 @given(st.lists(st.tuples(u8, st.binary(max_size=24)), max_size=10))
 def test_no_frame_upsets_the_emulator(sent: list[tuple[int, bytes]]) -> None:
-    host = Host(Emulated())
+    rig = rig_of("emulator")
     results = {member for member in protocol.ENUMS["result"].values if member != "busy"}
     for frame_type, payload in sent:
-        assert host.send(frame_type, payload) in results
-    assert host.hello().layout_crc == protocol.LAYOUT_CRC
+        assert answer(rig, frame_type, payload) in results
+    assert hello_of(rig).layout_crc == protocol.LAYOUT_CRC
 
 
 @pytest.mark.simavr
