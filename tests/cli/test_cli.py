@@ -23,7 +23,6 @@ from ohmskin.cli.stream import cell_table
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
-from ohmskin.link import session
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, LAYOUT_CRC
 from ohmskin.record.readings import estimate_file, load_readings
@@ -326,6 +325,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     "wrong size": (["info", "emulator://big"], ["8x8"]),
     "impossible rate": (["info", "emulator://8x8?rate=1000"], ["too_fast"]),
     "wrong line speed": (["info", "/dev/ttyACM99?baud=9600"], ["9600", "500000"]),
+    "a port without real time": (["emulate", "emulator://8x8?speed=0"], ["has real time"]),
     "wrong simulated board": (["info", "simavr://due"], ["due", "uno"]),
     "another protocol": (
         ["info", "emulator://4x4?foreign=257"],
@@ -407,9 +407,8 @@ def test_an_error_of_a_process_is_one_line(what: str, command: Command) -> None:
     assert_one_line(finish(command(*arguments)), *words)
 
 
-def test_a_silent_port(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "ATTEMPTS", session.ATTEMPTS[:1])
-    assert_one_line(run("info", "emulator://4x4?silent=1"), "silent", "ohmskin flash")
+def test_a_silent_port(run: Run) -> None:
+    assert_one_line(run("info", "emulator://4x4?silent=1&speed=0"), "silent", "ohmskin flash")
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])

@@ -42,12 +42,6 @@ def write(tmp_path: Path) -> Write:
     return table
 
 
-@pytest.fixture
-def benches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Boards in simulated time."""
-    monkeypatch.setattr(ohmskin, "open", lambda url, **_: stepped(url))
-
-
 def verified(run: Run, url: str, plate: str, *more: str) -> tuple[int, dict]:
     done = run("verify", url, plate, "--seconds", "1", "--json", "-", *more)
     assert done.err == ""

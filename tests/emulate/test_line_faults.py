@@ -48,9 +48,16 @@ def test_all_that_was_made_is_counted_and_all_that_came_is_the_truth(faults: str
     assert (stats.line.damaged > 300) == (faults != "drop=0.1")
 
 
-def test_a_served_board_may_be_closed_again() -> None:
-    with PtyServer(emulated("emulator://1x1")[0]) as server:
+def test_a_served_board_counts_what_nobody_takes_and_may_be_closed_again() -> None:
+    with PtyServer(emulated("emulator://8x8")[0]) as server:
+        server.serve(0.01)
+        assert server.lost_bytes == 0  # of a hello
+        server.board.receive(framing.encode(protocol.FRAMES["start"].id, 0, b""))
+        server.begin_s -= 10.0  # 900 scans are due
+        server.serve(0.01)
+        assert server.lost_bytes > 100_000
         server.close()
+        server.serve()  # does nothing any more
 
 
 def test_a_bad_line_at_a_port(pty_board: Serve) -> None:
