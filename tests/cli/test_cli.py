@@ -430,36 +430,39 @@ def test_without_arguments_there_is_help(run: Run) -> None:
 
 # ---------------------------------------------------------------------------------------- help
 
-OPTIONS = {
-    "ports": ["--json"],
-    "info": ["--json", "--self-test", "PORT"],
-    "configure": [
-        *("--rows", "--columns", "--rate", "--settle", "--adc", "--unit-id", "--defaults"),
-        *("--save", "PORT"),
-    ],
-    "flash": ["--port"],
-    "stream": [
-        *("--method", "--calibration", "--force", "--tare", "--json", "--scans", "--seconds"),
-        *("PORT", *METHODS),
-    ],
-    "view": ["--calibration", "--force", "--host", "--http-port", "--no-browser", "PORT"],
-    "calibrate": ["recording", "sensor", "table", "weights"],
-    "doctor": ["--calibration", "--wires", "--json", "PORT"],
-    "verify": ["--wires", "--seconds", "--picture", "--json", "--cell-percent", "PORT", "PLATE"],
-    "tare": ["--seconds", "--undo", "--force", "PORT"],
-    "estimate": ["--method", "--out", "--cold", *METHODS],
-    "record": ["--scans", "--seconds", "--tare", "--mark", "PORT", "FILE"],
-    "export": ["--begin", "--end", ".npz", ".csv"],
-    "emulate": ["--seconds", "ghost", "bitflip", *SKIN_FAULTS],
-    "demo": ["--seconds", "--port", "--picture"],
+# All that each command takes, or the commands of a group.
+TAKES = {
+    "ports": "--json",
+    "info": "PORT --json --self-test",
+    "configure": "PORT --rows --columns --rate --settle --adc --mode --unit-id --defaults --save",
+    "flash": "BOARD --port",
+    "stream": "PORT --method --calibration --force --tare --json --scans --seconds",
+    "view": "PORT --calibration --force --host --http-port --no-browser",
+    "tare": "PORT CALIBRATION --seconds --undo --force",
+    "doctor": "PORT --calibration --wires --press --into --json",
+    "verify": "PORT PLATE --wires --seconds --picture --json --cell-percent --reference-percent "
+    "--settling-lsb --loss",
+    "estimate": "READINGS --method --out --cold",
+    "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale",
+    "export": "RECORDING OUT --begin --end",
+    "emulate": "URL --seconds",
+    "demo": "--seconds --port --picture",
+    "calibrate": "recording table weights",
 }
+NAMES = {"stream": METHODS, "estimate": METHODS, "export": (".npz", ".csv")}
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("name", TAKES)
 def test_help_of_a_command(run: Run, name: str) -> None:
+    command = app.commands[name].load()
+    takes = sorted(getattr(command, "commands", ()))
+    for taken in command.params if not takes else ():
+        is_option = taken.param_type_name == "option"
+        takes += taken.opts if is_option else [taken.metavar or taken.name.upper()]
+    assert takes == TAKES[name].split()
     done = well(run(name, "--help"))
-    for option in OPTIONS[name]:
-        assert option.lower() in done.out.lower()
+    for word in (*takes, *NAMES.get(name, ())):
+        assert re.search(rf"(?<![\w-]){re.escape(word)}\b", done.out, re.IGNORECASE), word
     assert run(name, "-h").out == done.out
 
 
@@ -487,9 +490,9 @@ def test_shells_complete_commands_and_options(typed: str, wanted: str) -> None:
 
 def test_help_names_every_command(run: Run) -> None:
     done = well(run("--help"))
-    for name in OPTIONS:
+    for name in TAKES:
         assert f" {name} " in done.out
-    assert sorted(OPTIONS) == sorted(app.commands)
+    assert sorted(TAKES) == sorted(app.commands)
 
 
 @pytest.mark.parametrize(
