@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Final
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -21,24 +22,27 @@ from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 # What a program may want in its log: restarts and boards that go are warnings, missed scans infos.
 LOG = logging.getLogger("ohmskin")
 LOG.addHandler(logging.NullHandler())
-# A device that should scan and is silent for so long counts as lost [s].
-SILENCE_TIMEOUT_S = 5.0
-# Scans that are kept for an iterator that is slower than the board: 11 s at 90 Hz.
-QUEUE_SCANS = 1024
-# Times that a command is sent before the board counts as lost.
-COMMAND_TRIES = 3
+# A device that should scan and is silent for so long, and two scans, counts as lost [s]. Chosen: a
+# board that was reset is in its boot loader for 2 s, and then has to be started again.
+SILENCE_TIMEOUT_S: Final = 5.0
+# So many scans are kept for an iterator that is slower than the board. Chosen: 11 s at 90 Hz, which
+# is longer than a program's pause for a file or a picture.
+QUEUE_SCANS: Final = 1024
+# A command is sent so often before the board counts as lost. Chosen: a line that damages one frame
+# in a hundred loses three in a row once in a million.
+COMMAND_TRIES: Final = 3
 
 
 class Device(Closing):
     """A source of scans: a board, or a recording that is played. Made by `ohmskin.open`.
 
-    There are two ways to read, for two needs. Iterating gives every scan, in order, and tells which
-    are missing. `latest` gives the newest scan and skips the rest. Both may be used at once, from
-    several threads. ``with`` closes a device, and so does `close`.
+    There are two ways to read, for two needs. Iterating gives every scan, in order, and counts
+    those that are missing. `latest` gives the newest scan and skips the others. Both may be used at
+    once, from several threads. ``with`` closes a device, and so does `close`.
     """
 
-    # `Session` and `Replay` say how commands are done, and have the one thread that publishes
-    # scans. All other threads wait on `_changed`.
+    # `Session` and `Replay` do commands, each in its way, and have the one thread that publishes
+    # scans. All other threads wait on `_changed`, which also guards what is shared with it.
 
     def __init__(self, name: str, stats: BoardStats) -> None:
         self.name = name
@@ -49,12 +53,15 @@ class Device(Closing):
         self._report: SelfTestReport | None = None  # of the last self-test
         self._failure: OhmskinError | None = None  # why no more scans come
         self._newest: Scan | None = None  # until `latest` gives it
-        # By id, and weak: an iterator that is dropped unused takes its queue along.
+        # Of each iterator, by id. Weak, so that the queue of an iterator that nobody has any more
+        # goes with it, and is not filled for ever.
         self._queues: WeakValueDictionary[int, deque[Scan]] = WeakValueDictionary()
-        self._asked = False  # somebody has begun to read
-        self._commands = threading.RLock()  # held while commands that belong together are done
+        self._asked = False  # whether somebody has begun to read: a replay waits for that
+        # Held while commands that belong together are done, such as stop, configure and start.
+        self._commands = threading.RLock()
         self._want_scans = False
-        self._wanted: dict[str, protocol.Value] | None = None  # fields of the last `configure`
+        # The fields of the last `configure`, which a board that is reset forgets.
+        self._wanted: dict[str, protocol.Value] | None = None
 
     @property
     def info(self) -> Hello:
@@ -135,9 +142,10 @@ class Device(Closing):
             for _ in range(COMMAND_TRIES):
                 self._restore()
                 with self._changed:
-                    self._newest = None  # it is of another configuration
+                    self._newest = None  # it may be of another configuration
                 self._command("start")
-                # The hello of a reset that came in between was read before this ack.
+                # If the board was reset since `_restore`, it scans as it did when it was switched
+                # on. Its hello came before the answer to "start", so `info` says that by now.
                 if self._is_as_wanted():
                     break
                 self._command("stop")
@@ -217,7 +225,7 @@ class Device(Closing):
 
     @contextmanager
     def _paused(self) -> Iterator[None]:
-        """Hold the scan for commands that are refused meanwhile, and go on whatever they did."""
+        """Stop scanning for commands that a scanning board refuses, and go on however they end."""
         with self._commands:
             was_scanning = self._want_scans
             if was_scanning:
@@ -232,7 +240,7 @@ class Device(Closing):
         return self._wanted is None or configuration(self.info) == self._wanted
 
     def _restore(self) -> None:
-        """A board that was reset while it stood still has forgotten how to scan."""
+        """Configure a board again that was reset while it did not scan, and so has forgotten it."""
         for _ in range(COMMAND_TRIES):
             if self._is_as_wanted() or self._wanted is None:
                 return
@@ -244,7 +252,7 @@ class Device(Closing):
         """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
 
     def _refresh(self) -> Hello:
-        """Ask for `hello`, which comes before the answer."""
+        """Ask for `hello`. It comes before the answer to the command, so `info` is new then."""
         self._command("get_hello")
         return self.info
 
@@ -256,7 +264,10 @@ class Device(Closing):
                 self._fail(DeviceLost(f"{self.name} was closed"))
 
     def _publish(self, scan: Scan) -> None:
-        """Give a scan to all who read; what a slow iterator loses is missed before its next."""
+        """Give a scan to all who read.
+
+        An iterator that is too slow loses its oldest scan, which its next one counts as missed.
+        """
         if scan.missed:
             LOG.info("%s: missed %d scans before scan %d", self.name, scan.missed, scan.number)
         with self._changed:
@@ -270,7 +281,7 @@ class Device(Closing):
             self._changed.notify_all()
 
     def _run(self, work: Callable[[], None]) -> None:
-        """Do the work of the thread that publishes. Who waits gets to know what ends it."""
+        """Do the work of the thread that publishes. An error that ends it reaches all who wait."""
         try:
             work()
         except Exception as exc:
@@ -296,7 +307,7 @@ class Device(Closing):
 
 
 def configuration(board: Hello) -> dict[str, protocol.Value]:
-    """What `configure` would have to say for a board to scan as this one does."""
+    """The fields of the command `configure` that make a board scan as this one does."""
     asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
     same = ("rows", "columns", "adc_prescaler", "mode")
     return asked | {name: getattr(board, name) for name in same}
