@@ -45,7 +45,7 @@ def open_simavr(text: str) -> Session:
     :raises PortError: the URL is wrong, or the simulator or the firmware is not built.
     """
     url = PortUrl.of(text)
-    settings, baud = dict(url.options), url.baud
+    settings, baud = dict(url.options), url.baud  # read first: a simulator would have to be ended
     with url.blamed():
         scene = _scene(url, f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}")
         for name in (*_OF_SCENE, "baud"):
