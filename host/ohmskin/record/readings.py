@@ -54,6 +54,9 @@ MAX_ARRAY_BYTES: Final = 200_000_000
 # Cells of the largest skin. The estimators' matrices grow with the square: 4096 cells make 134 MB.
 MAX_CELLS: Final = 4096
 _NAMES: Final = tuple(ENUMS["reading"].values)
+# What may be given for each frame, and how many dimensions it has where it is given once.
+_ONCE_NDIM: Final = {"rest_ratio": 3, "nominal_top_wire_ohm": 0, "nominal_bottom_wire_ohm": 0}
+# The arrays that go out, in this order.
 _OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
 _OF_WIRES: Final = ("top_wire_ohm", "bottom_wire_ohm", "top_wire_ohm_std", "bottom_wire_ohm_std")
 _OF_FRAMES: Final = ("converged", "message", "chi2", "iterations", "seconds")
@@ -99,30 +102,28 @@ class Readings:
     @property
     def one_skin_per_frame(self) -> bool:
         """Whether rest or wires are given per frame: then each frame is of a skin of its own."""
-        wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
-        given = [(self.rest_ratio, 3), *((wire_ohm, 0) for wire_ohm in wires)]
-        return any(array is not None and array.ndim > ndim for array, ndim in given)
+        return any(np.ndim(getattr(self, name)) > ndim for name, ndim in _ONCE_NDIM.items())
 
     def knowledge(self, frame: int) -> SkinKnowledge:
         """What an estimator is told before it reads `frame`."""
-        wires = (self.nominal_top_wire_ohm, self.nominal_bottom_wire_ohm)
+        rest_ratio, top_ohm, bottom_ohm = (self._of_frame(name, frame) for name in _ONCE_NDIM)
         return SkinKnowledge(
             rows=self.ratio.shape[1],
             columns=self.ratio.shape[2],
             ref_top_ohm=self.ref_top_ohm,
             ref_bottom_ohm=self.ref_bottom_ohm,
             adc_bits=self.adc_bits,
-            rest_ratio=_of_frame(self.rest_ratio, frame, 3),
-            nominal_wire_ohm=WireOhm(*(_of_frame(wire_ohm, frame, 0) for wire_ohm in wires)),
+            rest_ratio=rest_ratio,
+            nominal_wire_ohm=WireOhm(top_ohm, bottom_ohm),
             reading_names=self.reading_names,
         )
 
-
-def _of_frame(array: Float | None, frame: int, ndim: int) -> Any:
-    """An array of `ndim` dimensions, or what one with frames before them holds of this frame."""
-    if array is None:
-        return None
-    return array[frame] if array.ndim > ndim else array[()]
+    def _of_frame(self, name: str, frame: int) -> Any:
+        """What an array says of this frame, be it given once or for each; None if not given."""
+        array = getattr(self, name)
+        if array is None:
+            return None
+        return array[frame] if array.ndim > _ONCE_NDIM[name] else array[()]
 
 
 def load_readings(path: PathName) -> Readings:
