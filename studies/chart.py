@@ -24,7 +24,7 @@ from ohmskin.record.readings import estimate_file
 from studies import published
 from studies.information import information_limit
 from studies.judge import Judged, judge_trial, pooled
-from studies.rows import Progress, as_csv, field_names, text_table
+from studies.rows import Progress, Steps, as_csv, field_names, text_table
 from studies.trials import PAPER_METHODS, Trial, random_trial, trial_of
 
 # The paper's methods read skins of so many cells at most: a frame of 9 takes them 0.1 s, one of 16
@@ -161,44 +161,27 @@ class Row:
 
 
 def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
-    """Run every method of the plan. `progress(done, frames)` is called after each frame.
+    """Run every method of the plan. `progress` is called after each method on each skin.
 
     Rows are in the order of the plan's sizes, bits and methods, then the paper's sweeps.
     """
-    count = _Count(progress, _frames(plan))
+    steps = Steps(_steps(plan), progress)
     with threadpool_limits(limits=1):
         rows = [
             row
             for size in plan.sizes
             for bits, trials in _of_each_resolution(size, plan)
-            for row in _random_rows(size, bits, trials, plan, count)
+            for row in _random_rows(size, bits, trials, plan, steps)
         ]
         for name in published.RMSE_MEGOHM:
-            rows += _sweep_rows(name, plan, count)
+            rows += _sweep_rows(name, plan, steps)
     return [*_with_front(rows), *_published_rows()]
 
 
-def _frames(plan: Plan) -> int:
+def _steps(plan: Plan) -> int:
     random = sum(len(plan.methods_for(size)) + len(plan.far_methods) for size in plan.sizes)
     conditions = sum(map(len, published.CONDITIONS_MEGOHM.values()))
-    return random * len(plan.bits) * plan.skins * plan.frames + len(plan.methods) * conditions * (
-        plan.repeats + 1
-    )
-
-
-class _Count:
-    """Frames done, over all that are to do."""
-
-    def __init__(self, progress: Progress | None, frames: int) -> None:
-        self._progress, self._frames, self._done = progress, frames, 0
-
-    def watch(self, frames: Float) -> Iterator[Float]:
-        """Pass frames on, and count those that are done."""
-        for frame in frames:
-            yield frame
-            self._done += 1
-            if self._progress is not None:
-                self._progress(self._done, self._frames)
+    return random * len(plan.bits) * plan.skins + len(plan.methods) * conditions
 
 
 def _row(parts: Iterable[Judged], **what: Any) -> Row:
@@ -238,7 +221,7 @@ def _of_each_resolution(size: Size, plan: Plan) -> Iterator[tuple[int | None, li
 
 
 def _random_rows(
-    size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, count: _Count
+    size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, steps: Steps
 ) -> list[Row]:
     near: dict[str, list[Judged]] = defaultdict(list)
     far: dict[str, list[Judged]] = defaultdict(list)
@@ -247,12 +230,14 @@ def _random_rows(
     for trial in trials:
         readings = trial.rounded(bits)
         for method in plan.methods_for(size):
-            answers = estimate_file(readings, method, watch=count.watch)
+            answers = estimate_file(readings, method)
             near[method].append(judge_trial(answers, trial, counted))
+            steps.done()
         readings = trial.rounded(bits, mode="far", wires_told=False)
         for method in plan.far_methods:
-            answers = estimate_file(readings, method, watch=count.watch)
+            answers = estimate_file(readings, method)
             far[method].append(judge_trial(answers, trial, counted))
+            steps.done()
     limits = _limits(trials, bits, plan.warm_up)
     place: dict[str, Any] = {"rows": size.rows, "columns": size.columns, "bits": bits}
     return [
@@ -290,15 +275,16 @@ def median_error(stds: Iterable[float]) -> float:
     return float(np.median(np.outer(list(stds), _NORMAL)))
 
 
-def _sweep_rows(name: str, plan: Plan, count: _Count) -> list[Row]:
+def _sweep_rows(name: str, plan: Plan, steps: Steps) -> list[Row]:
     """The paper's simulation with exact readings; rest readings and true wires are told."""
     by_method: dict[str, list[Judged]] = defaultdict(list)
     for pressed, rest in published.sweep(name):
         wire_ohm = (float(rest.top_wire_ohm[0, 0]), float(rest.bottom_wire_ohm[0, 0]))
         trial = trial_of(rest, [pressed] * (plan.repeats + 1), wire_ohm)
         for method in plan.methods:
-            answers = estimate_file(trial.readings, method, cold=True, watch=count.watch)
+            answers = estimate_file(trial.readings, method, cold=True)
             by_method[method].append(judge_trial(answers, trial, slice(1, None)))
+            steps.done()
     return [
         _row(parts, scene=name, rows=3, columns=3, bits=None, method=method)
         for method, parts in by_method.items()

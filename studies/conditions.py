@@ -26,7 +26,7 @@ from ohmskin.circuit.skin import (
     Skin,
     readings,
 )
-from ohmskin.emulate.faults import OPEN_OHM, joined_readings
+from ohmskin.emulate.faults import SkinFaults, joined_readings
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
@@ -105,13 +105,6 @@ def shorted_readings(skin: Skin, first: int, second: int) -> Float:
     """`circuit.readings`, electrodes `first` and `second` (rows first) joined by 0.1 ohm."""
     ends = np.arange(2 * sum(skin.shape))
     return joined_readings(skin, [(first, second)], ends)[..., :READINGS_PER_CELL]
-
-
-def cut(skin: Skin, layer: str, line: int, place: int = 0) -> Skin:
-    """`skin` with segment `place` of a row ("top") or column ("bottom") open; 0: all of it."""
-    wires = {"top": skin.top_wire_ohm.copy(), "bottom": skin.bottom_wire_ohm.copy()}
-    wires[layer][(line, place) if layer == "top" else (place, line)] = OPEN_OHM
-    return replace(skin, top_wire_ohm=wires["top"], bottom_wire_ohm=wires["bottom"])
 
 
 def _case(
@@ -286,20 +279,22 @@ def with_line_fault(skin: Skin, fault: str, place: tuple[int, int]) -> Float:
     row, column = place
     match fault.removesuffix(_SINCE_REST):
         case "row open":
-            return readings(cut(skin, "top", row))
+            faults = SkinFaults(open_row=row)
         case "column open":
-            return readings(cut(skin, "bottom", column))
+            faults = SkinFaults(open_column=column)
         case "row cut midway":
-            return readings(cut(skin, "top", row, columns // 2))
+            faults = SkinFaults(broken_row=(row, columns // 2))
         case "two rows shorted":
-            first = row % (rows - 1)
-            return shorted_readings(skin, first, first + 1)
+            faults = SkinFaults(short_rows=(row % (rows - 1), row % (rows - 1) + 1))
         case "two columns shorted":
-            first = rows + column % (columns - 1)
-            return shorted_readings(skin, first, first + 1)
+            first = column % (columns - 1)
+            faults = SkinFaults(short_columns=(first, first + 1))
         case "row shorted to column":
             return shorted_readings(skin, row, rows + column)
-    raise ValueError(f"no fault of lines '{fault}'")
+        case _:
+            raise ValueError(f"no fault of lines '{fault}'")
+    faults = replace(faults, ref_top=skin.ref_top_ohm, ref_bottom=skin.ref_bottom_ohm)
+    return faults.readings(faults.damaged(skin))
 
 
 # -------------------------------------------------------------------------------------- sweeps

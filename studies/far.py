@@ -34,7 +34,7 @@ from ohmskin.record.readings import estimate_file
 from studies import zero_potential
 from studies.drawing import INK, new_figure, png_of, prepare, write_plain_numbers
 from studies.judge import Answers, Judged, judge_trial, pooled
-from studies.rows import Progress, as_csv, field_names
+from studies.rows import Progress, Steps, as_csv, field_names
 from studies.trials import BEND, Trial, finger_trial, skin_at_rest, stretched, touch, trial_of
 
 if TYPE_CHECKING:
@@ -117,8 +117,9 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
     """All readouts under all conditions. `progress(done, conditions)` is called after each."""
     conditions = list(_conditions())
     rows: list[Row] = []
+    steps = Steps(len(conditions), progress)
     with threadpool_limits(limits=1):
-        for done, (sweep, scene, wire_ohm, bend) in enumerate(conditions, start=1):
+        for sweep, scene, wire_ohm, bend in conditions:
             trials = [
                 _trial(scene, wire_ohm, bend, plan.frames, seed) for seed in range(plan.skins)
             ]
@@ -128,8 +129,7 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
                         judge_trial(_read(readout, trial, bits), trial) for trial in trials
                     )
                     rows.append(_row(judged, sweep, scene, wire_ohm, bend, bits, readout))
-            if progress is not None:
-                progress(done, len(conditions))
+            steps.done()
     return rows
 
 

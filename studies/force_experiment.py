@@ -36,7 +36,7 @@ from ohmskin.link.protocol import MODES
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 from studies.press import PressModel
 from studies.published import FORCE_RMSE_N
-from studies.rows import Progress, field_names, text_table
+from studies.rows import Progress, Steps, field_names, text_table
 from studies.trials import PAPER_METHODS
 
 TRUTH: Final = "truth"
@@ -135,7 +135,7 @@ def measure(
     `progress(done, steps)` is called after each method on each skin.
     """
     total = sum(len(c.cells) * c.plan.seeds * len(c.methods) for c in comparisons)
-    done = 0
+    steps = Steps(total, progress)
     rows: list[Row] = []
     with threadpool_limits(limits=1):
         for comparison in comparisons:
@@ -157,9 +157,7 @@ def measure(
                         for regression in REGRESSIONS:
                             of_method = errors.setdefault((regression, method), [])
                             of_method.append(_errors(trial, rise, regression))
-                        done += 1
-                        if progress is not None:
-                            progress(done, total)
+                        steps.done()
                 means = {key: np.mean(skins, axis=0) for key, skins in errors.items()}
                 rows += _rows("curved" if curved else "flat", comparison, cells, frames, means)
     return rows

@@ -29,7 +29,7 @@ from studies.force_trial import (
     groups_of,
 )
 from studies.press import PressModel
-from studies.rows import Progress, text_table
+from studies.rows import Progress, Steps, text_table
 from studies.trials import knowledge_of, skin_at_rest
 
 SHAPE: Final = (2, 2)  # the paper's skin
@@ -85,7 +85,7 @@ def cross_talk(
     seeds: int, slow_seeds: int, progress: Progress | None = None
 ) -> tuple[ForceTrial, list[CrossTalk]]:
     """The first skin's series, and what all of them show; the paper's methods on fewer skins."""
-    total, done = seeds * len(FAST) + slow_seeds * len(SLOW), 0
+    steps = Steps(seeds * len(FAST) + slow_seeds * len(SLOW), progress)
     percents: dict[tuple[str, str], list[float]] = {}
     trials = [press_series(seed) for seed in range(seeds)]
     with threadpool_limits(limits=1):
@@ -99,9 +99,7 @@ def cross_talk(
                     percents.setdefault((regression, method), []).append(
                         100 * float(np.abs(false_n).max()) / SERIES_N
                     )
-                done += 1
-                if progress is not None:
-                    progress(done, total)
+                steps.done()
     return trials[0], [
         CrossTalk(*key, len(of_skins), round(float(np.mean(of_skins)), 3), round(max(of_skins), 3))
         for key, of_skins in percents.items()
@@ -170,7 +168,7 @@ def smallest_forces(plan: Detection, progress: Progress | None = None) -> list[S
         for method in plan.methods
         for scene in (ALONE, BESIDE)
     }
-    total, done = plan.seeds * 8, 0
+    steps = Steps(plan.seeds * 8, progress)
     with threadpool_limits(limits=1):
         for seed in range(plan.seeds):
             for scene in (ALONE, BESIDE):
@@ -183,9 +181,7 @@ def smallest_forces(plan: Detection, progress: Progress | None = None) -> list[S
                         )
                         margin = weakest - threshold
                         least_n[method, scene][seed, cell] = crossing_n(forces_n, margin)
-                    done += 1
-                    if progress is not None:
-                        progress(done, total)
+                    steps.done()
     return [
         SmallestForce(
             method,

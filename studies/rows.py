@@ -19,6 +19,19 @@ _Task = TypeVar("_Task")
 _Answer = TypeVar("_Answer")
 
 
+class Steps:
+    """So many steps, of which a progress bar is told when one is done."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self._total, self._progress, self._done = total, progress, 0
+
+    def done(self) -> None:
+        """One more."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._total)
+
+
 def in_processes(
     function: Callable[[_Task], _Answer],
     tasks: Sequence[_Task],
@@ -33,11 +46,11 @@ def in_processes(
     parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
     # Closed on whatever way out, so that no process goes on without a reader.
     answers: list[_Answer] = []
+    steps = Steps(len(tasks), progress)
     with closing(parallel(delayed(function)(task) for task in tasks)) as arriving:
         for answer in arriving:
             answers.append(answer)
-            if progress is not None:
-                progress(len(answers), len(tasks))
+            steps.done()
     return answers
 
 

@@ -85,11 +85,11 @@ def test_far_ends_read_the_same_frames(rows: list[Row]) -> None:
     assert "2x2 10 bit far" in {*chart.summary(rows).columns[0].cells}
 
 
-def test_progress_counts_every_frame() -> None:
+def test_progress_counts_every_method_on_every_skin() -> None:
     seen = list[tuple[int, int]]()
     plan = replace(TINY, methods=("ohm", "touch"), bits=(10,))
-    chart.measure(plan, lambda done, frames: seen.append((done, frames)))
-    total = (2 + 1) * 8 + 2 * 10 * 2  # touch at far ends as well
+    chart.measure(plan, lambda done, steps: seen.append((done, steps)))
+    total = (2 + 1) + 2 * 10  # touch at far ends as well, and ten conditions of the sweeps
     assert seen == [(done, total) for done in range(1, total + 1)]
 
 
