@@ -44,7 +44,7 @@ from served import Load, serve, served  # beside this file
 from studies.conditions import converted
 from studies.trials import NOISE_LSB, reference_trial, rounded
 
-BOARDS = 8
+BOARDS = 8  # that are read at once. Chosen.
 RATE_HZ = round(DEFAULT_RATE_HZ)
 NOISES = 10  # how often each frame is made, each time with other noise. Chosen.
 SETTLED_S = 5.0  # until a board's clock is known. Chosen.

@@ -50,12 +50,12 @@ from ohmskin.record.recorder import Recorder
 from served import Load, serve, served  # beside this file
 
 RATE_HZ = round(DEFAULT_RATE_HZ)
-# All of these are chosen: so much that two runs on a quiet machine differ little.
-DECODED_SCANS, DECODE_RUNS = 3000, 5
-CHUNK_BYTES = 4096  # of the stream that is decoded
-LATENCY_SCANS = 400
+# These are chosen: so much that two runs on a quiet machine differ little.
+DECODED_SCANS, DECODE_RUNS = 3000, 5  # scans that are decoded, and how often
+LATENCY_SCANS = 400  # scans whose latency is measured
 LOAD_S, LOAD_RUNS = 6.0, 3  # how long the load is measured, and how often
-RECORDED_S = 10.0  # of the recording whose size counts
+RECORDED_S = 10.0  # length of the recording whose size counts
+CHUNK_BYTES = 4096  # in which the decoder gets its bytes: as a session reads them
 
 # ------------------------------------------------------------------- the board, another process
 

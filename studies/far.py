@@ -58,10 +58,9 @@ BENDS: Final = (1.0, 1.1, 1.2, BEND, 1.5)
 BENT_OHM: Final = TOP_WIRE_OHM
 # A wire segment of a column over one of a row, in both sweeps.
 COLUMN_OVER_ROW: Final = BOTTOM_WIRE_OHM / TOP_WIRE_OHM
-# A fingertip's pressure, least and most: standard deviation [cells], and peak [S]. Both are those
-# of tests/data/far.
+# A fingertip's pressure: least and largest standard deviation, and peak. Those of tests/data/far.
 FINGER_CELLS: Final = (0.75, 0.9)
-FINGER_SIEMENS: Final = (3e-5, 1.5e-4)
+FINGER_SIEMENS: Final = (3e-5, 1.5e-4)  # as bench_fingers has it, too
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,8 @@ from studies.trials import knowledge_of, skin_at_rest
 
 SHAPE: Final = (2, 2)  # the paper's skin
 PRESSED_CELL: Final = 3  # number of the cell (2, 2), as in the paper's figure
-# The series lasts so long [s], and its press is so hard [N]: as in the paper's figure.
-SERIES_S: Final = 4.0
-SERIES_N: Final = 5.0
+SERIES_S: Final = 4.0  # how long the series is, as in the paper's figure
+SERIES_N: Final = 5.0  # how hard its press is, as in the paper's figure
 # The paper's methods see one frame of the series in so many. Chosen: a frame takes them 0.1 s.
 _SLOW_EVERY: Final = 10
 # Force of the touches beside [N], and the largest force that is tried. Chosen: the weight of 100 g,
@@ -44,10 +43,8 @@ _SLOW_EVERY: Final = 10
 TOUCH_N: Final = 1.0
 # The least force that is tried [N]. Chosen: below what any method tells from none.
 _LEAST_N: Final = 0.005
-# Share of the frames without a force that count as touched, and share of those with a force that
-# must. Chosen.
-FALSE_ALARMS: Final = 0.01
-DETECTED: Final = 0.99
+FALSE_ALARMS: Final = 0.01  # share of the frames without a force that count as touched. Chosen.
+DETECTED: Final = 0.99  # share of the frames with a force that must count as touched. Chosen.
 ALONE: Final = "alone"
 BESIDE: Final = "beside two touches"
 

@@ -22,15 +22,14 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.link.host_clock import SteppedClock
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.press import LEAVE_S, PressModel, robot_presses
-from studies.trials import SPREAD, knowledge_of, skin_at_rest
+from studies.trials import BEND, NOISE_LSB, SPREAD, knowledge_of, skin_at_rest, stretched
 
-NOISE_LSB: Final = 0.3  # as emulated boards have it
-WEIGHT_N: Final = 0.981  # 100 g
-FORCES_N: Final = (0.5, 8.0)  # the robot's
-BEND: Final = 1.35  # the wires of a curved skin over those of the flat one
-REST_FRAMES: Final = 180  # two seconds
-_WEIGHT_LANDS_S: Final = 0.5
-# Within a press, from its begin and to its end.
+WEIGHT_N: Final = 0.981  # a weight of 100 g, as in the paper's experiment
+FORCES_N: Final = (0.5, 8.0)  # the robot's least and largest. Chosen: the paper does not say.
+REST_FRAMES: Final = 180  # of the untouched skin: two seconds, as `ohmskin record --tare 2` takes
+_WEIGHT_LANDS_S: Final = 0.5  # until a weight presses in full. Chosen.
+# Frames of a press are read at random times, but not in this share of it at its begin and its end,
+# where there is hardly a force. Chosen.
 _INSIDE: Final = 0.02
 
 
@@ -38,8 +37,10 @@ _INSIDE: Final = 0.02
 class Plan:
     """How much is pressed and read.
 
-    seeds: skins. presses: of each cell in the calibration, frames_per_press: read in each, also in
-    the test. test_presses: of the robot, in each arrangement of weights.
+    seeds: skins.
+    presses: of each cell in the calibration.
+    test_presses: of the robot, in each arrangement of weights.
+    frames_per_press: read in each press, in the calibration and in the test.
     """
 
     seeds: int = 8
@@ -52,10 +53,13 @@ class Plan:
 class ForceTrial:
     """F frames of one skin, in order of time, and the truth behind them.
 
-    time_s (F,). ratio (F, R, C, 4): as read. rest_ratio (R, C, 4): mean of the readings of the
-    untouched skin. far_ratio, far_rest_ratio: the same in mode far. force_n, rise_siemens (F, R,
-    C): the truth. cell (F,): flat index of the cell that the robot presses. press (F,): number of
-    its press. group (F,): of the test, -1 in the calibration.
+    time_s: when each frame was read, (F,).
+    ratio, far_ratio: as read, in mode near and in mode far, (F, R, C, 4).
+    rest_ratio, far_rest_ratio: mean of the readings of the untouched skin, (R, C, 4).
+    force_n, rise_siemens: the truth, (F, R, C).
+    cell: flat index of the cell that the robot presses, (F,).
+    press: number of its press, (F,).
+    group: of the test, -1 in the calibration, (F,).
     """
 
     time_s: Float
@@ -114,9 +118,9 @@ class Choreography:
 
     def force(self, cell: int, times_s: Float, forces_n: Float) -> None:
         """Forces on one cell at these times, straight in between, which stay until the next."""
-        known_s, known_n = self._knots[cell]
-        known_s += [float(time_s) for time_s in times_s]
-        known_n += [float(force_n) for force_n in forces_n]
+        knots_s, knots_n = self._knots[cell]
+        knots_s += [float(time_s) for time_s in times_s]
+        knots_n += [float(force_n) for force_n in forces_n]
 
     def weights(self, cells: list[int], force_n: float) -> None:
         """Put weights on these cells, or take them off with 0 N, and wait."""
@@ -138,9 +142,10 @@ class Choreography:
 
     def bend(self) -> None:
         """From now on the wires are longer, by the same in a layer and each segment for itself."""
+        longer = stretched(self._skin, BEND)
         top, bottom = (
-            BEND * wire * np.exp(SPREAD * self.random.standard_normal(self.shape))
-            for wire in (self._skin.top_wire_ohm, self._skin.bottom_wire_ohm)
+            wire_ohm * np.exp(SPREAD * self.random.standard_normal(self.shape))
+            for wire_ohm in (longer.top_wire_ohm, longer.bottom_wire_ohm)
         )
         self._bend_s = self.now_s
         self._bent = replace(self._skin, top_wire_ohm=top, bottom_wire_ohm=bottom)

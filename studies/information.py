@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, Skin
+from ohmskin.emulate.scenes import REST_OHM
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.prior import (
     LAYER_STD,
@@ -43,11 +44,14 @@ from ohmskin.estimate.prior import (
     UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
 )
+from studies.trials import PRESSED
 
-# Of a pressed cell's log conductance: nine decades within one deviation either way is no knowledge.
+# Prior standard deviation of a pressed cell's log conductance: nine decades within one deviation
+# either way is no knowledge.
 PRESSED_STD: Final = 10.0
-# Where nobody says which cells are pressed: those that conduct so much more than a usual rest.
-PRESSED_SIEMENS: Final = 1.5e-6
+# Where nobody says which cells are pressed, those are that conduct so much: half as much again as a
+# usual cell at rest, as `trials` has it.
+PRESSED_SIEMENS: Final = PRESSED / REST_OHM
 
 
 def information_limit(

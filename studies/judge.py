@@ -34,10 +34,9 @@ Answers = Mapping[str, NDArray[Any]]
 # An error counts as stated if it is within so many standard deviations. Chosen: of normal errors,
 # 1 in 16,000 is outside.
 STATED_STDS: Final = 4.0
-# A frame is right if no error exceeds both of these: a share of the truth, and the least rise that
-# is called a touch [S]. Chosen: what a user would not notice.
-CLOSE_SHARE: Final = 0.05
-CLOSE_SIEMENS: Final = 0.5e-6
+# A frame is right if no error exceeds both of these. Chosen: what a user would not notice.
+CLOSE_SHARE: Final = 0.05  # of the true conductance
+CLOSE_SIEMENS: Final = 0.5e-6  # the least rise that is called a touch
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,22 +37,26 @@ import numpy as np
 
 from ohmskin.arrays import Float
 
-# A robot's press [s]: the pause before it, its rise (as long as its fall), and its hold.
-PAUSE_S: Final = (0.3, 0.9)
-RAMP_S: Final = 1.0
-HOLD_S: Final = 0.3
-# This long after its last press a cell's creep has faded to nanosiemens [s].
-LEAVE_S: Final = 2.5
+PAUSE_S: Final = (0.3, 0.9)  # before a press of the robot, least and most. Chosen.
+RAMP_S: Final = 1.0  # its rise, and its fall. Chosen: slow against the creep.
+HOLD_S: Final = 0.3  # how long it holds. Chosen.
+LEAVE_S: Final = 2.5  # after its last press: by then a cell's creep has faded to nanosiemens
 
 
 @dataclass(frozen=True)
 class PressModel:
     """The cells of one skin under force, by the equations of the module.
 
-    siemens_at_1n: k [S/N^b]. exponent: b. full_contact_siemens: full [S]. play_n: h [N]. creep: a.
-    creep_time_s: T. noise, drift: standard deviations of n and d. noise_time_s, drift_time_s: their
-    time constants. gain_spread, exponent_spread: those of ln k and ln b between cells. seed: of the
-    cells and of the noise. The first three and all times are above 0.
+    siemens_at_1n: k [S/N^b], above 0.
+    exponent: b, above 0.
+    full_contact_siemens: full [S], above 0.
+    play_n: h [N].
+    creep: a.
+    creep_time_s: T, above 0.
+    noise, drift: standard deviations of n and d.
+    noise_time_s, drift_time_s: their time constants, above 0.
+    gain_spread, exponent_spread: standard deviations of ln k and ln b between cells.
+    seed: of the cells and of the noise.
     """
 
     siemens_at_1n: float = 30e-6

@@ -44,11 +44,9 @@ NOISE_LSB: Final = 0.3
 BEND: Final = 1.35
 # Wires after a sudden change over those before. Chosen: harder than a bend.
 JUMP: Final = 1.5
-# A fingertip: standard deviation of its pressure [cells], range of its peaks [S], and how long its
-# way round a circle takes [frames]. Chosen: it covers some 15 cells, and moves on in each frame.
-FINGER_CELLS: Final = 0.7
-FINGER_SIEMENS: Final = (5e-5, 5e-4)
-FINGER_FRAMES: Final = 40
+FINGER_CELLS: Final = 0.7  # standard deviation of a fingertip's pressure. Chosen: some 15 cells.
+FINGER_SIEMENS: Final = (5e-5, 5e-4)  # least and largest peak of a fingertip. Chosen.
+FINGER_FRAMES: Final = 40  # a fingertip's way round its circle. Chosen: it moves in each frame.
 
 
 @dataclass(frozen=True, eq=False)

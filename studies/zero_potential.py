@@ -37,10 +37,10 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.link.codes import quantise, ratio_from_codes
 
-USUAL_SIEMENS: Final = 1e-3  # full scale: the hardest touch, 1 kohm
-LEAST_OHM: Final = 300.0  # no cell is believed to resist less
-ROUNDS: Final = 100  # of `solved`
-MOST_CHANGE: Final = 2.0  # of a cell in a round
+USUAL_SIEMENS: Final = 1e-3  # full scale of the converter: the hardest touch, 1 kohm
+LEAST_OHM: Final = 300.0  # no cell is believed to resist less. Chosen: below any touch.
+ROUNDS: Final = 100  # that `solved` takes at most. Chosen.
+MOST_CHANGE: Final = 2.0  # factor by which `solved` may change a cell in a round. Chosen.
 
 
 def currents(skin: Skin) -> Float:
