@@ -46,7 +46,7 @@ COMPRESSION_SHARE: Final = 0.2
 MAX_SPAN_S: Final = 6 * 3600.0
 # Both must have measured together for so long. Chosen: shorter stretches are alike by chance.
 MIN_OVERLAP_S: Final = 15.0
-# And for this share of the shorter one, for the same reason. Chosen.
+# And for this share of the shorter one. Chosen for the same reason.
 MIN_OVERLAP_SHARE: Final = 0.5
 # A smaller r is that of sessions that have nothing in common (tests/calibrate/test_alignment.py).
 MIN_CORRELATION: Final = 0.6

@@ -135,14 +135,15 @@ class Guide:
     DONE     anything                                nothing: all were read
     ======== ======================================= ==============================================
 
-    For certain: see `OnSkin`. Steady: with x (n,) the rises of the last `READING_S`, m their mean,
+    For certain: see `OnSkin`. A press is steady if, with the rises x (n,) of its cell in the last
+    `READING_S` and their mean m,
 
         v = mean((x[i+1] - x[i])^2) / 2             noise from scan to scan, without what is slower
         |mean of half 2 - mean of half 1| <= `MAX_CHANGE_SHARE` m + 2 sqrt(4 v / n)   no creep
         var(x) - v <= (`MAX_SCATTER_SHARE` m)^2                                       no wiggle
 
     v is von Neumann's (1941). 4 v / n is the variance of the difference of two means of n / 2 each,
-    so noise alone is taken for creep in one of twenty windows.
+    so noise alone is taken for creep in one of twenty windows at most.
     """
 
     def __init__(self, wanted: Sequence[Press]) -> None:

@@ -174,7 +174,7 @@ def _numbered(pressed: NDArray[np.intp], top: Float) -> NDArray[np.intp]:
 def _valleys(rise: Float) -> list[int]:
     """Where the presses of a run (n,) meet: at the least rise between two peaks.
 
-    Only peaks count on whose sides the rise falls by `VALLEY_LOG` before it is as high again.
+    A peak counts if the rise falls by `VALLEY_LOG` on both sides of it before it is as high again.
     """
     from scipy.signal import find_peaks
 
