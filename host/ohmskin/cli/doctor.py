@@ -3,7 +3,7 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -105,22 +105,18 @@ def terminal() -> Iterator[Report]:
     Elsewhere progress is of no use: each request to a person is printed, once.
     """
     console, said = Console(stderr=True, markup=False, highlight=False), {""}
+    status = console.status("connecting") if console.is_terminal else None
 
-    def print_once(step: Step, detail: Any) -> None:
-        _, request = words.step_in_words(step, detail)
-        if request not in said:
+    def report(step: Step, detail: Any) -> None:
+        doing, request = words.step_in_words(step, detail)
+        if status is not None:
+            status.update(f"{request}; {doing}" if request else doing)
+        elif request not in said:
             said.add(request)
             console.print(request)
 
-    def update(step: Step, detail: Any) -> None:
-        doing, request = words.step_in_words(step, detail)
-        status.update(f"{request}; {doing}" if request else doing)
-
-    if not console.is_terminal:
-        yield print_once
-        return
-    with console.status("connecting") as status:
-        yield update
+    with status or nullcontext():
+        yield report
 
 
 # ----------------------------------------------------------------------------------- the page

@@ -34,15 +34,8 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
+from ohmskin.doctor import limits
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
-from ohmskin.doctor.limits import (
-    ADC_ERROR_LSB,
-    ALL_STDS,
-    DEAD_SHARE,
-    MANY_STDS,
-    ONE_STDS,
-    ROUNDING_LSB,
-)
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -113,7 +106,8 @@ def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> LinesAndCells:
     shown = np.where(READING_SIGN > 0, rest.codes, largest_code - rest.codes)
     current = shown.mean(axis=2)
     # The converter's offset looks like a current, too.
-    offset_lsb = min(ADC_ERROR_LSB + ROUNDING_LSB, DARK_SHARE * float(np.median(current)))
+    usual = float(np.median(current))
+    offset_lsb = min(limits.ADC_ERROR_LSB + limits.ROUNDING_LSB, DARK_SHARE * usual)
     dark = current < max(DARK_LSB + DARK_NOISE * rest.noise_lsb, offset_lsb)
     open_lines, none = (dark.all(axis=1), dark.all(axis=0)), np.zeros_like(dark)
     if dark.all():
@@ -172,7 +166,7 @@ def _shorted(
     lines, ports = np.flatnonzero(judged.any(axis=1)), np.flatnonzero(judged.any(axis=0))
     current, siemens = current[np.ix_(lines, ports)], siemens[np.ix_(lines, ports)]
     apart_lsb = np.abs(current[:, None] - current[None, :]).max(axis=2)
-    alike = apart_lsb < ALIKE_LSB + ALL_STDS * std_lsb * 2**0.5
+    alike = apart_lsb < ALIKE_LSB + limits.ALL_STDS * std_lsb * 2**0.5
     level, few = np.median(siemens, axis=1), len(ports) < ALIKE_PORTS
     groups: list[list[int]] = []
     for line in range(len(lines)):
@@ -183,7 +177,7 @@ def _shorted(
         if len(others):
             rise = float(np.log(level[members].min()) - np.median(others))
             # Few ports may agree by chance: then the rise must stand out of the others' scatter.
-            is_short = rise > max(np.log(DOUBLED), ONE_STDS * few * float(np.std(others)))
+            is_short = rise > max(np.log(DOUBLED), limits.ONE_STDS * few * float(np.std(others)))
         if is_short:
             groups.append([int(lines[member]) for member in members])
     return groups
@@ -201,15 +195,15 @@ def _judge_cells(
     if judged.sum() >= MANY_CELLS:  # where cells at rest scatter widely, a touch is above that
         lower, middle = np.quantile(siemens[judged], (0.16, 0.5))  # one deviation apart
         spread = min(float(np.log(middle / lower)), MOST_SPREAD)
-        share = max(share, float(np.exp(MANY_STDS * spread)))
+        share = max(share, float(np.exp(limits.MANY_STDS * spread)))
     high: Bool = judged & (siemens > share * level)
     if not rest.moves and high.sum() < judged.sum() > 1:
         usual = float(np.median(siemens[judged & ~high]))
         hidden = np.logical_and.outer(high.any(axis=1), high.any(axis=0))
         # Cells of an untouched skin are known well. Their deviation also has what wrong references
         # would do to it, but that would do the same to all cells.
-        doubt = MANY_STDS * std if high.any() else 0.0
-        dead = np.asarray(judged & ~hidden & (siemens + doubt < DEAD_SHARE * usual))
+        doubt = limits.MANY_STDS * std if high.any() else 0.0
+        dead = np.asarray(judged & ~hidden & (siemens + doubt < limits.DEAD_SHARE * usual))
     if dead.any():
         percent = 100 * float(np.max(siemens[dead] / usual))
         diagnosis.add(Kind.DEAD_CELL, Place.of_cells(dead), percent_of_usual=percent)
@@ -234,7 +228,7 @@ def _reference_ratio(shown: Float, rest: Rest, diagnosis: Diagnosis) -> float:
     ratio_std = rest.std_lsb * 2**0.5 / (mean_lsb * len(shown) ** 0.5)
     top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
-    doubt = ONE_STDS * ratio_std + 2 * rest.offset_lsb / mean_lsb
+    doubt = limits.ONE_STDS * ratio_std + 2 * rest.offset_lsb / mean_lsb
     if abs(off) >= RATIO_TOLERANCE + doubt:
         nominal = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
         diagnosis.add(Kind.REFERENCE_RATIO, ratio=ratio, off_percent=100 * off, **nominal)

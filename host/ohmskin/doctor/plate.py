@@ -32,15 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import (
-    CONFIGURATIONS,
-    READING_OFFSET,
-    READING_SENSES_TOP,
-    READING_SIGN,
-    Skin,
-    port_resistance_ohm,
-    readings,
-)
+from ohmskin.circuit import skin as circuit
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import DEAD_SHARE, NOISY_LSB, PRESSED_LSB
@@ -131,12 +123,12 @@ class PlateExam:
             if examine_settling(usual, settled, diagnosis, self.tolerance.settling_lsb):
                 scans = settled
         knowledge = SkinKnowledge.of(scans.board, nominal_wire_ohm=self.wire_ohm)
-        shown = READING_SIGN * (scans.mean + 0.5 - FULL * READING_OFFSET)
+        shown = circuit.READING_SIGN * (scans.mean + 0.5 - FULL * circuit.READING_OFFSET)
         self.shown_lsb = self._in_order(shown, knowledge, diagnosis)
         knowledge = self._with_references(knowledge, diagnosis)
         as_is = self._examine_cells(_estimate(self.shown_lsb, knowledge), diagnosis)
-        ratio = readings(self._skin(as_is, knowledge))
-        self.predicted_lsb = FULL * READING_SIGN * (ratio - READING_OFFSET)
+        ratio = circuit.readings(self._skin(as_is, knowledge))
+        self.predicted_lsb = FULL * circuit.READING_SIGN * (ratio - circuit.READING_OFFSET)
         self._examine_lines(diagnosis)
 
     def _examine_signal(self, evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
@@ -176,10 +168,10 @@ class PlateExam:
         estimate = _estimate(self.shown_lsb, board)
         bad = np.logical_or(*self._open_and_bridged(estimate))
         siemens = np.where(bad, estimate.cell_siemens, self.plate)
-        port_ohm = port_resistance_ohm(self._skin(siemens, board))
+        port_ohm = circuit.port_resistance_ohm(self._skin(siemens, board))
         share = self.shown_lsb / FULL
-        top = share[..., READING_SENSES_TOP].mean(axis=2)
-        bottom = share[..., ~READING_SENSES_TOP].mean(axis=2)
+        top = share[..., circuit.READING_SENSES_TOP].mean(axis=2)
+        bottom = share[..., ~circuit.READING_SENSES_TOP].mean(axis=2)
         of_plate = 1 - top - bottom
         tells = (self.plate > 0) & ~bad & (of_plate > LOOP_SHARES[0]) & (of_plate < LOOP_SHARES[1])
         if not tells.any():
@@ -194,10 +186,10 @@ class PlateExam:
             diagnosis.add(Kind.REFERENCE_VALUE, most_percent=most, **values)
         return replace(board, ref_top_ohm=ohm[0], ref_bottom_ohm=ohm[1])
 
-    def _skin(self, siemens: Float, board: SkinKnowledge) -> Skin:
+    def _skin(self, siemens: Float, board: SkinKnowledge) -> circuit.Skin:
         """The plate with these cells, at this board."""
         top, bottom = (np.full(siemens.shape, ohm) for ohm in self.wire_ohm.both or (0.0, 0.0))
-        return Skin(siemens, top, bottom, board.ref_top_ohm, board.ref_bottom_ohm)
+        return circuit.Skin(siemens, top, bottom, board.ref_top_ohm, board.ref_bottom_ohm)
 
     def _open_and_bridged(self, estimate: Estimate) -> tuple[Bool, Bool]:
         """Cells whose resistor does not conduct, and cells that conduct without a resistor."""
@@ -242,7 +234,7 @@ class PlateExam:
     def _examine_lines(self, diagnosis: Diagnosis) -> None:
         """Add configurations whose readings are no straight line over what the circuit predicts."""
         most = self.tolerance
-        for k, name in enumerate(CONFIGURATIONS):
+        for k, name in enumerate(circuit.CONFIGURATIONS):
             lit = self.predicted_lsb[..., k] > most.offset_lsb  # an offset may clip others
             x, y = self.predicted_lsb[lit, k], self.shown_lsb[lit, k]
             if x.size and np.ptp(x) > LEAST_SPAN_LSB:
@@ -262,7 +254,7 @@ class PlateExam:
 
 def _estimate(shown_lsb: Float, knowledge: SkinKnowledge) -> Estimate:
     """What `joint` estimates from s."""
-    ratio = np.clip(READING_OFFSET + READING_SIGN * shown_lsb / FULL, 0.0, 1.0)
+    ratio = np.clip(circuit.READING_OFFSET + circuit.READING_SIGN * shown_lsb / FULL, 0.0, 1.0)
     return make_estimator("joint", knowledge).estimate(ratio)
 
 
