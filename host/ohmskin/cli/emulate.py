@@ -20,13 +20,11 @@ _OPTIONS: Final = {
     "Faults of the line (drop=0.1)": LINE_FAULTS,
     "Faults of the skin (open_row=3)": SKIN_FAULTS,
 }
-EPILOGS: Final = {
-    "emulate": "\n".join(
-        line
-        for title, options in _OPTIONS.items()
-        for line in (f"{title}:", *(f"- {name}: {text}" for name, text in options.items()))
-    )
-}
+EPILOG: Final = "\n".join(
+    line
+    for title, options in _OPTIONS.items()
+    for line in (f"{title}:", *(f"- {name}: {text}" for name, text in options.items()))
+)
 
 
 def emulate(

@@ -46,15 +46,14 @@ class _Command(TyperCommand):
         super().__init__(name, help=help_)
 
     def load(self) -> Any:
-        """The command itself, or the group of them. Its module may have EPILOGS for the help."""
+        """The command itself, or the group of them. Its module may have an EPILOG for the help."""
         assert self.name is not None
         module = import_module(f"ohmskin.cli.{self._module}")
         function, group = getattr(module, self.name), typer.Typer(add_completion=False)
         if isinstance(function, typer.Typer):
             group.add_typer(function, name=self.name)
         else:
-            epilog = getattr(module, "EPILOGS", {}).get(self.name)
-            group.command(self.name, epilog=epilog)(function)
+            group.command(self.name, epilog=getattr(module, "EPILOG", None))(function)
         return typer.main.get_group(group).commands[self.name]
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:

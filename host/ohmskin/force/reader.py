@@ -113,9 +113,9 @@ class _SharedKnowledge:
 
     def estimator(self, method: str, rest: Rest | Untouched | None) -> Estimator:
         """A new estimator that knows this rest, and the wires that the calibration knows."""
-        return make_estimator(method, self.at(rest))
+        return make_estimator(method, self.knowledge(rest))
 
-    def at(self, rest: Rest | Untouched | None) -> SkinKnowledge:
+    def knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
         """What a method is told of the skin, with this rest."""
         wires = NO_WIRES if self.calibration is None else self.calibration.nominal_wire_ohm
         return SkinKnowledge.of(self.board, None if rest is None else rest.ratio, wires)
@@ -147,14 +147,14 @@ class SkinReader:
         if calibration is not None:
             calibration.check(board, force=force)
         self.board = board
-        self._calibration = calibration
         self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
         self._shared = _SharedKnowledge(board, calibration, rest_ratio)
         self._begin()
 
     def another(self) -> SkinReader:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
-        other = SkinReader(self.board, self._calibration, method=self._wanted, force=True)
+        calibration = self._shared.calibration
+        other = SkinReader(self.board, calibration, method=self._wanted, force=True)
         other._shared = self._shared
         other._begin()
         return other
@@ -167,7 +167,8 @@ class SkinReader:
     @property
     def force_method(self) -> str | None:
         """The method that gives newtons: that of the calibration, if there is one."""
-        return None if self._calibration is None else self._calibration.method
+        calibration = self._shared.calibration
+        return None if calibration is None else calibration.method
 
     @property
     def has_forces(self) -> bool:
@@ -187,13 +188,13 @@ class SkinReader:
     @property
     def calibration(self) -> Calibration | None:
         """The calibration with the latest tare and the wires learned since; `save` keeps them."""
-        if self._calibration is None:
+        if self._shared.calibration is None:
             return None
         wires = (self._shared.last_estimator or self._estimator).wires()
-        calibration = replace(self._calibration, nominal_wire_ohm=wires)
+        calibration = replace(self._shared.calibration, nominal_wire_ohm=wires)
         rest = self.rest
         if isinstance(rest, Untouched):
-            rest = Rest.of(calibration.method, self._shared.at(rest), rest.date)
+            rest = Rest.of(calibration.method, self._shared.knowledge(rest), rest.date)
         return replace(calibration, tare=None if rest is calibration.rest else rest)
 
     def use(self, method: str) -> None:
@@ -257,8 +258,9 @@ class SkinReader:
         rise = self.rise(frame)
         force_n = force_n_std = np.full(rise.shape, np.nan)
         weights = np.maximum(rise, 0.0), frame.level_std
-        if self._calibration is not None and self.has_forces:
-            weights = force_n, force_n_std = self._calibration.model.predict(rise, frame.level_std)
+        calibration = self._shared.calibration
+        if calibration is not None and self.has_forces:
+            weights = force_n, force_n_std = calibration.model.predict(rise, frame.level_std)
         shown: dict[str, object] = {
             "force_n": force_n,
             "force_n_std": force_n_std,
