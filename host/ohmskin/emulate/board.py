@@ -68,25 +68,32 @@ _OF_HELLO: Final = ("unit_id", "rows", "columns", "mode", "adc_prescaler")
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """What a board is set to when it is switched on."""
+    """What a board is set to when it is switched on.
+
+    rows, columns: of the scan, and of the skin.
+    mode: which readings a scan takes of each cell.
+    rate_hz: scans a second [Hz]; None: 90, or as many as readings settle in if that is less.
+    unit_id: the skin's name.
+    """
 
     rows: int = 8
     columns: int = 8
     mode: str = "near"
-    rate_hz: float | None = None  # None: 90, or as fast as the converter runs if that is less
+    rate_hz: float | None = None
     unit_id: int = 0
 
 
 class EmulatedBoard:
     """A board whose skin reads `ratio_at(seconds, mode)`, shape (rows, columns, 4).
 
-    settings: those of the start; the skin has the same rows and columns, whatever the host
-    configures later. noise_lsb: standard deviation of the ADC's noise [LSB], before rounding. seed:
-    of the noise. sampled: what the converter reads of the skin; None: just that. says: fields of
-    `hello` that the board says in place of the truth, to see what a host makes of it.
+    settings: those of the start. The skin keeps their rows and columns, whatever a host configures.
+    noise_lsb: standard deviation of the converter's noise, before rounding [LSB].
+    seed: of the noise.
+    sampled: what the converter makes of the skin's readings; None: noise alone changes them.
+    says: fields of `hello` that the board says in place of the truth.
 
-    `settings` holds what is set now, in the fields of `configure` and `set_unit_id`; `says` and
-    `settings` may be changed at any time.
+    The attribute `settings` has what is set now: the fields of `configure` and `set_unit_id`. A
+    test of a host may change it, and `says`, at any time.
 
     :raises ValueError: a board cannot do that.
     """

@@ -21,12 +21,12 @@ from ohmskin.link.host_clock import HostClock
 from ohmskin.link.serial_port import READ_TIMEOUT_S
 from ohmskin.link.session import Session
 
-# The most bytes of commands that a pseudo-terminal gives at once: more than Linux keeps of them.
+# So many bytes of commands are taken from a pseudo-terminal at once: Linux keeps no more for us.
 _READ_BYTES: Final = 4096
 
 
 class _Running:
-    """A board that is switched on now. `begin_s`: when that was, on the clock [s]."""
+    """A board that is switched on now, by a clock. `begin_s`: when that was, on this clock [s]."""
 
     def __init__(self, board: EmulatedBoard, faults: LineFaults | None, clock: HostClock) -> None:
         self.board = board
@@ -75,7 +75,7 @@ class EmulatorLink(_Running):
             self._wake.notify_all()
 
     def _listen(self) -> float:
-        """Take what arrives from the board by now; returns now."""
+        """Take what arrives from the board by now; return the time since it was switched on [s]."""
         now_s = self._now_s()
         if self._closed or self._faults.vanished(now_s):
             raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
@@ -98,10 +98,11 @@ class SteppedSkin(Session):
     Whoever takes a scan lets time pass until the board has sent it, which takes as long as the
     machine needs to compute the scan. There is no thread, so every run of a program is the same.
     `host_time_s` of a scan is the time since the board was switched on.
+
+    link: one with a `SteppedClock`.
     """
 
     def __init__(self, link: EmulatorLink) -> None:
-        """link: one with a `SteppedClock`."""
         self._read_link = link.read
         super().__init__(link, clock=link.clock)
 
@@ -111,7 +112,7 @@ class SteppedSkin(Session):
         return self._clock.now_s()
 
     def step(self, seconds: float) -> None:
-        """Let time pass. What the board sends meanwhile is taken as by a program that waits.
+        """Let time pass. What the board sends meanwhile is received, and can be taken after that.
 
         :raises DeviceLost: the board went away.
         """
@@ -125,6 +126,7 @@ class SteppedSkin(Session):
         """Nothing has to end."""
 
     def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:
+        """See `Device._wait`. Reads meanwhile, because no thread does."""
         end_s = self.now_s + limit_s
         while not ready() and self._failure is None and self.now_s < end_s:
             self._run(lambda: self._take_next(end_s - self.now_s))
