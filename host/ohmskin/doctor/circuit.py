@@ -52,7 +52,8 @@ DARK_SHARE: Final = 0.08
 # Shorted lines.
 # [LSB] Mean readings of shorted lines differ by less, noise apart. Chosen: rounding is the same.
 ALIKE_LSB: Final = 0.05
-# [1] `matrix` finds shorted lines more conductive than others by this factor. Chosen: 2 is exact.
+# [1] `matrix` finds shorted lines more conductive than others by this factor. Chosen: between 1 and
+# 2, which sound lines and shorted ones have.
 DOUBLED: Final = 1.4
 # [ports] Lines do not agree in so many ports by chance. Chosen: cells scatter by 10 %.
 ALIKE_PORTS: Final = 5

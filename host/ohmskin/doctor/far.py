@@ -59,8 +59,8 @@ from ohmskin.link.protocol import ADC_BITS
 SPREAD: Final = 2 * SEGMENT_STD
 # [1] A, and with it A r, is known to this share. Chosen: what is left after ROUNDS.
 MODEL_STD: Final = 0.01
-# [rounds] Each makes the error of A smaller by the share of the wires in a port. Chosen: 2 kOhm a
-# segment need three.
+# [rounds] Each makes the error of A smaller by the share of the wires in a port. Chosen: enough for
+# 2 kOhm a segment (tests/doctor/test_far_doctor.py).
 ROUNDS: Final = 3
 # [chi-square] Two faults whose costs differ by less may be either. Chosen: two deviations, squared.
 ALIKE_COST: Final = 4.0

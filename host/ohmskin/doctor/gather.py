@@ -19,7 +19,7 @@ from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import latency_timer
 
-# [s] A person has this long to press all corners. Chosen: three times what it takes.
+# [s] A person has this long to read what to press, and to press twice. Chosen: with time to spare.
 WAIT_S: Final = 30.0
 # [looks] While corners are pressed, each settle time gets this many looks. Chosen: their scatter
 # shows how much the hand drifts.
