@@ -3,9 +3,12 @@
 
 import { colourAt, inkAt, isAbove, isHatched, isUncertain, written } from "./scale.js";
 
-const EDGE = 20; // px, for the numbers of rows and columns
-const TALLEST = 480;
-const MOST_COLUMNS = 12; // of more, numbers would touch: they are there on hover
+// Room at the edge of a map, for the numbers of rows and columns [px]. Chosen.
+const EDGE_PX = 20;
+// The largest width and height of a map [px]: two maps and the lists beside them fit on a laptop.
+const MAP_PX = 480;
+// Above this, the numbers in the cells would touch each other. They are shown on hover.
+const COLUMNS_WITH_NUMBERS = 12;
 const FONT = "system-ui, 'DejaVu Sans', sans-serif";
 
 // The context of a canvas of so many CSS pixels, cleared.
@@ -36,19 +39,19 @@ export class HeatMap {
   plan(rows, columns) {
     if (this.rows === rows && this.columns === columns && this.planned === this.width) return;
     [this.rows, this.columns, this.planned] = [rows, columns, this.width];
-    const width = Math.min(this.width - EDGE, TALLEST);
-    this.size = Math.max(4, Math.floor(Math.min(width / columns, TALLEST / rows)));
-    this.height = EDGE + this.size * rows;
+    const width = Math.min(this.width - EDGE_PX, MAP_PX);
+    this.size = Math.max(4, Math.floor(Math.min(width / columns, MAP_PX / rows)));
+    this.height = EDGE_PX + this.size * rows;
     for (const canvas of [this.cells, this.digits]) canvas.style.height = `${this.height}px`;
   }
 
   at(row, column) {
-    return [EDGE + column * this.size, EDGE + row * this.size];
+    return [EDGE_PX + column * this.size, EDGE_PX + row * this.size];
   }
 
   cellAt(x, y) {
-    const row = Math.floor((y - EDGE) / this.size);
-    const column = Math.floor((x - EDGE) / this.size);
+    const row = Math.floor((y - EDGE_PX) / this.size);
+    const column = Math.floor((x - EDGE_PX) / this.size);
     const inside = row >= 0 && row < this.rows && column >= 0 && column < this.columns;
     return inside ? row * this.columns + column : null;
   }
@@ -118,12 +121,12 @@ export class HeatMap {
     context.fillStyle = styleOf("--soft");
     const every = size < 16 ? 2 : 1;
     for (let row = 0; row < this.rows; row += every) {
-      context.fillText(row, EDGE / 2, EDGE + (row + 0.5) * size);
+      context.fillText(row, EDGE_PX / 2, EDGE_PX + (row + 0.5) * size);
     }
     for (let column = 0; column < this.columns; column += every) {
-      context.fillText(column, EDGE + (column + 0.5) * size, EDGE / 2);
+      context.fillText(column, EDGE_PX + (column + 0.5) * size, EDGE_PX / 2);
     }
-    if (size < 28 || this.columns > MOST_COLUMNS) return;
+    if (size < 28 || this.columns > COLUMNS_WITH_NUMBERS) return;
     for (let cell = 0; cell < values.length; cell++) {
       const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
       const middle = x + (size - 1) / 2;
@@ -151,7 +154,7 @@ export class HeatMap {
 export function drawBar(canvas, scale) {
   const width = canvas.clientWidth;
   const context = fit(canvas, width, 38);
-  const [left, right] = [EDGE, width - 26];
+  const [left, right] = [EDGE_PX, width - 26];
   const ramp = context.createLinearGradient(left, 0, right, 0);
   for (let stop = 0; stop <= 1; stop += 1 / 64) ramp.addColorStop(stop, colourAt(stop));
   context.fillStyle = ramp;
@@ -172,8 +175,11 @@ export function drawBar(canvas, scale) {
 
 const tickText = (scale, tick) => String(Number(scale.show(tick).toPrecision(3)));
 
+// Length of the curve of a cell [s]. Chosen.
 export const CURVE_S = 10;
-const KEPT = 1500; // scans: ten seconds at the fastest rate
+// Most scans that are kept for it, whatever their times say. Chosen: 150 a second, more than a
+// screen shows.
+const SCANS_KEPT = 1500;
 
 // The last ten seconds of all cells, so that another cell's are there when it is chosen.
 export class History {
@@ -186,7 +192,7 @@ export class History {
     if (newest && newest.siemens.length !== scan.siemens.length) this.scans = [];
     this.scans.push(scan);
     const oldest = scan.host_time_s - CURVE_S;
-    while (this.scans[0].host_time_s < oldest || this.scans.length > KEPT) this.scans.shift();
+    while (this.scans[0].host_time_s < oldest || this.scans.length > SCANS_KEPT) this.scans.shift();
   }
 
   draw(canvas, scale, cell) {

@@ -5,9 +5,10 @@ import { drawBar, HeatMap, History } from "./draw.js";
 import { scaleOf, TOPS_N, withStd, written } from "./scale.js";
 import { Connection } from "./wire.js";
 
+// How often numbers, the table and spoken messages change [ms]: nobody reads sixty a second.
 const DIGITS_EVERY_MS = 200;
 const TABLE_EVERY_MS = 1000;
-const MESSAGE_EVERY_MS = 2000; // it is spoken
+const MESSAGE_EVERY_MS = 2000;
 const QUANTITIES = { newtons: "force (N)", siemens: "conductance (µS)", ohms: "resistance (kΩ)" };
 const STATUS = {
   opening: "connecting …",
@@ -16,7 +17,10 @@ const STATUS = {
   ended: "ended",
 };
 const MOVES = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+// Scans whose latency is shown as their median: a second at 90 Hz.
 const LATENCIES = 90;
+// Frames that were drawn are counted over this time [ms].
+const DRAWN_MS = 2000;
 
 function options(select, names, chosen, text = (name) => name) {
   const wanted = names.map((name) => [String(name), text(name)]);
@@ -327,7 +331,7 @@ export class Panel {
       const nowMs = performance.now();
       channel.port1.close();
       this.drawnAt.push(nowMs);
-      while (this.drawnAt[0] < nowMs - 2000) this.drawnAt.shift();
+      while (this.drawnAt[0] < nowMs - DRAWN_MS) this.drawnAt.shift();
       const latencyMs = nowMs + this.connection.clock.offsetMs - 1000 * scan.host_time_s;
       this.latencies.push(latencyMs);
       if (this.latencies.length > LATENCIES) this.latencies.shift();
@@ -354,7 +358,7 @@ export class Panel {
       this.find(".latency"),
       this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–",
     );
-    say(this.find(".shown"), `${(this.drawnAt.length / 2).toFixed(0)} a second`);
+    say(this.find(".shown"), `${((1000 * this.drawnAt.length) / DRAWN_MS).toFixed(0)} a second`);
     say(this.find(".takes"), `${(1000 * scan.estimate_s).toFixed(1)} ms`);
     say(this.find(".chi2"), scan.chi2 === null ? "–" : scan.chi2.toPrecision(2));
     if (nowMs - (this.messageMs || 0) >= MESSAGE_EVERY_MS) {

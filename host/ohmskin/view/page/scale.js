@@ -16,6 +16,7 @@ const ANCHORS = [
   "f7c9aa",
   "faebdd",
 ].map((hex) => [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16)));
+// Colours between them: more than a screen can show apart.
 const STEPS = 256;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -27,6 +28,7 @@ const RAMP = Array.from({ length: STEPS }, (_, step) => {
   );
 });
 const COLOURS = RAMP.map((rgb) => `rgb(${rgb})`);
+// Whether dark ink is read better on a colour: its luma (ITU-R BT.601) against a chosen limit.
 const IS_LIGHT = RAMP.map(([r, g, b]) => 0.299 * r + 0.587 * g + 0.114 * b > 140);
 
 function step(position) {
@@ -45,14 +47,15 @@ export function written(value) {
   return value.toFixed(size < 9.995 ? 2 : size < 99.95 ? 1 : 0);
 }
 
+// The scale of conductances, in siemens: 1 MOhm, about an untouched cell, to 1 kOhm, a hard touch.
 const LOW_S = 1e-6;
 const HIGH_S = 1e-3;
 const DECADES = Math.log10(HIGH_S / LOW_S);
 const logPosition = (siemens) => Math.log10(siemens / LOW_S) / DECADES;
 
-// What the page can show. plane: which values of a scan, in SI units. position: where a value lies on
-// the scale, 0 to 1. show, std: a value and its deviation in `unit`. floor: values that nothing touches
-// are near 0, so a deviation below this, in SI units, does not make them uncertain.
+// What the page can show. plane: which values of a scan, in SI units. position: where a value lies
+// on the scale, 0 to 1. show, std: a value and its deviation in `unit`. floor: values that nothing
+// touches are near 0, so a deviation below this, in SI units, does not make them uncertain.
 const siemens = {
   name: "conductance",
   unit: "µS",

@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // The bytes of a scan (`Shown` of host/ohmskin/view/boards.py), and the websocket that brings them.
 
+// A connection that was lost is tried again after this time [ms].
 const AGAIN_MS = 1000;
+// How often the host is asked for its clock [ms], and how many answers are kept: clocks drift.
 const CLOCK_EVERY_MS = 1000;
 const CLOCKS = 16;
-const CLOSED = 4001; // the board was closed, and does not come back
+// The websocket's code for a board that was closed and does not come back (view/panel.py).
+const CLOSED = 4001;
 
 export const token = new URLSearchParams(location.search).get("token");
 
