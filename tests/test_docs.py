@@ -208,6 +208,12 @@ def test_tables_and_sessions_in_docstrings_stay_as_they_are() -> None:
     assert shown.endswith("\nend")
 
 
+def test_lines_that_describe_fields_are_a_list() -> None:
+    text = "What it is.\n\nx_ohm, y_ohm: first [ohm],\n    and more.\nz: last.\nA text: prose.\n"
+    shown = loaded("docstrings").indented(text)
+    assert "\n- `x_ohm, y_ohm`: first [ohm],\n  and more.\n- `z`: last.\n\nA text: prose." in shown
+
+
 @pytest.mark.browser
 def test_the_site_is_searched_from_the_disk_and_follows_the_scheme(tmp_path: Path) -> None:
     from playwright.sync_api import sync_playwright
