@@ -83,14 +83,16 @@ SEED = 7000  # of the first skin
 TIMED, LEARNED, BENT = 4, 6, 3
 FRAMES = 50  # of each skin whose wires are learned
 FILE_FRAMES = 40  # of each file of tests/data/far
-WARM_UP = 3  # frames of each skin whose time does not count
+# Frames of each skin that is timed: touched at random, and by fingertips. The first of them do not
+# count.
+TIMED_FRAMES, WARM_UP = (100, 150), 3
 # How often the same frames are timed: other work on the machine only adds, so the least counts.
 PASSES = 3
 # A wire segment of a row and of a column [ohm]: those of the random skins of tests/data/far.
 SEGMENT_OHM = (NOMINAL_WIRE_OHM, (150.0, 300.0))
 # Rises that each cell is calibrated with [S]. Chosen: from the lightest touch to the hardest.
 CALIBRATED_SIEMENS = np.geomspace(1e-5, 1e-3, 9)
-LEAST_SIEMENS = 1e-8  # a rise below this counts as this: it has a logarithm
+LEAST_SIEMENS = 1e-8  # a smaller rise counts as this one, because 0 has no logarithm
 
 
 # ------------------------------------------------------------------------------ scenes of ngspice
@@ -118,11 +120,12 @@ def errors(kind: str, mode: str, method: str, bits: int, frames: int) -> dict[st
 
 
 def times(part: Part) -> dict[str, float]:
-    random, finger, skins = part.of(97), part.of(147), range(part.of(TIMED))
+    random, finger = (WARM_UP + part.of(frames - WARM_UP) for frames in TIMED_FRAMES)
+    skins = range(part.of(TIMED))
     figures: dict[str, float] = {}
     by_kind = {
-        "random": [random_trial(8, 8, 8, WARM_UP + random, SEED + number) for number in skins],
-        "finger": [finger_trial(8, 8, WARM_UP + finger, SEED + number) for number in skins],
+        "random": [random_trial(8, 8, 8, random, SEED + number) for number in skins],
+        "finger": [finger_trial(8, 8, finger, SEED + number) for number in skins],
     }
     for kind, trials in by_kind.items():
         read = [{mode: untold(trial, mode) for mode in MODES} for trial in trials]
