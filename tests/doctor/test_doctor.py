@@ -188,6 +188,15 @@ def test_hum_is_told_from_the_other_mains_at_any_rate(rate: float) -> None:
         assert diagnosis.measured["noise_lsb"] < 0.6
 
 
+def test_both_mains_are_named_where_they_look_alike() -> None:
+    """At 110 scans/s both look like 50 Hz, and a scan of so short a settle time has one phase."""
+    for mains in ("50", "60"):
+        bench = stepped(f"emulator://1x1?hum={mains}&hum_lsb=2")
+        bench.configure(rate_hz=110, settle_us=20)
+        [finding] = examine(gather(bench)).findings
+        assert words_of(finding)["measured"].startswith("50 Hz or 60 Hz of amplitude 2.0 LSB")
+
+
 def test_hum_that_stands_still_shows_at_another_rate() -> None:
     for rate in (25, 50):
         read = evidence(f"emulator://8x8?rate={rate}&hum=50&hum_lsb=2")

@@ -269,7 +269,8 @@ def find_hum(scans: Look) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen.
 
     If both mains are found, one of them may be an alias of the other. The right one is that whose
-    readings have one phase. If this does not decide, both are named.
+    readings have one phase. This does not decide if all readings of a scan are taken at almost one
+    time. Then both are named.
     """
     if not np.ptp(scans.codes, axis=0).any():
         return None
