@@ -134,3 +134,17 @@ def test_the_definition_of_the_link_uses_its_reader_alone() -> None:
             "ohmskin.link.protocol",
             "ohmskin.link",
         }, path
+
+
+def test_every_function_of_the_trail_is_in_its_file() -> None:
+    rows = re.findall(r"^\| `([\w./]+)` \| `(.+?)` \|", (ROOT / "docs/trail.md").read_text(), re.M)
+    assert len(rows) > 40
+    for place, name in rows:
+        path = ROOT / place if place.startswith("firmware/") else HOST / place
+        text = path.read_text()
+        *owner, function = re.split(r"::|\.", name.removesuffix(")").partition("ISR(")[2] or name)
+        for word in (*owner, function):
+            assert re.search(rf"(?:\bdef |\bclass |\w |^  |::|ISR\(){word}\b", text, re.M), (
+                place,
+                name,
+            )
