@@ -28,10 +28,10 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
+from ohmskin.calibrate.regression import ForceRegression, fit_power
 from ohmskin.estimate.knowledge import NO_WIRES
 from ohmskin.estimate.methods import METHODS, VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
-from ohmskin.force.regression import ForceRegression, fit_power
 from ohmskin.link.protocol import MODES
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 from studies.press import PressModel

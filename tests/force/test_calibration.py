@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ohmskin.arrays import Float
+from ohmskin.calibrate.regression import ForceRegression
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
 from ohmskin.force.curve import POWER
-from ohmskin.force.regression import ForceRegression
 from ohmskin.link.codes import quantise, ratio_from_codes
 
 

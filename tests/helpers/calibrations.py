@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.calibrate.regression import ForceRegression
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.regression import ForceRegression
 
 NEWTON_SIEMENS = 20e-6  # of every cell, in these tests
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From presses of single cells to a calibration.
 
-`tables` reads forces, `alignment` finds the clocks' offset, `presses` the presses and the curves.
-`guide` leads a person who presses.
+`tables` reads forces from files, `alignment` finds the offset between two clocks, and `presses`
+finds the presses. `regression` learns the curves from them. `guide` leads a person who presses, and
+`rules` says what presses must be.
 """

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
+from ohmskin.calibrate.regression import ForceRegression
+from ohmskin.calibrate.rules import check_cell, check_cells_differ
 from ohmskin.calibrate.tables import ForceLog, PressTable
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.reader import now
-from ohmskin.force.regression import ForceRegression
-from ohmskin.force.rules import check_cell, check_cells_differ
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
 
@@ -245,8 +245,8 @@ class Calibrator:
     def calibration(self, presses: Presses) -> tuple[Calibration, str]:
         """The calibration, and which cells have no curve of their own.
 
-        Raises ValueError where the presses do not tell the curves: by the rules of `force.rules`,
-        or because the force does not grow with what the skin shows.
+        Raises ValueError where presses break one of `calibrate.rules`, and where the force does not
+        grow with what the skin shows: then they tell no curve.
         """
         regression = ForceRegression().fit(
             *(presses.cells, presses.rise, presses.force_n),

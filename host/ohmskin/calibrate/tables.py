@@ -35,8 +35,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.calibrate.rules import require_forces, require_rows
 from ohmskin.files import PathName, naming, read_bounded, save_table
-from ohmskin.force.rules import MAX_NUMBER, require_forces, require_rows
+from ohmskin.force.calibration import MAX_NUMBER
 from ohmskin.record.readings import MAX_CELLS
 
 # A larger file is not read. Chosen: an hour of a sensor at 1 kHz, with columns of other things.

@@ -17,6 +17,7 @@ from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
 from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step, still_wanted
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
+from ohmskin.calibrate.rules import check_cell, check_cells_differ, check_enough
 from ohmskin.calibrate.tables import (
     PRESS,
     ForceLog,
@@ -33,7 +34,6 @@ from ohmskin.errors import RecordingError
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
-from ohmskin.force.rules import check_cell, check_cells_differ, check_enough
 from ohmskin.link.device import Device, mean_ratio
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording

@@ -44,8 +44,7 @@ from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
-from ohmskin.force.curve import ForceModel
-from ohmskin.force.rules import MAX_NUMBER, require
+from ohmskin.force.curve import ForceModel, require
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import FRAMES, MODES
 from ohmskin.record.readings import MAX_CELLS
@@ -54,6 +53,9 @@ FORMAT: Final = "ohmskin calibration"
 SCHEMA: Final = 1
 # A larger file is not read: `MAX_CELLS` cells of 13 fields take about 1 MB.
 MAX_FILE_BYTES: Final = 4_000_000
+# No number of a file is larger. Chosen: far beyond any force, time or conductance in any unit, and
+# the slope of any power law in siemens; and sums of its square do not overflow.
+MAX_NUMBER: Final = 1e60
 # There are so many unit ids: the link has an integer for them.
 UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
 # The fields of the file, by where their values are kept: in the calibration itself, with their

@@ -33,7 +33,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.force.rules import require
 
 LINEAR: Final = "linear"
 POWER: Final = "power"
@@ -149,3 +148,13 @@ def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
     """d of the module [N]: how far the force is off if x is off by dx."""
     here = force_by(curve, x)
     return np.maximum(force_by(curve, x + dx) - here, here - force_by(curve, x - dx))
+
+
+def require(name: str, good: Bool, what: str) -> None:
+    """Raise ValueError, naming the first cell, unless all are good, (R, C).
+
+    what: the text says that the cell is this.
+    """
+    if not good.all():
+        row, column = (int(index) for index in np.argwhere(~good)[0])
+        raise ValueError(f"{name} of cell ({row}, {column}) is {what}")

@@ -13,6 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
@@ -81,9 +82,10 @@ class _SharedKnowledge:
 
     board: the one that scans the skin.
     calibration: gives newtons; None: there is none.
-    rests: the rests before each tare, oldest first. The last one is in force. None stands for
-        a rest that is not known.
-    last_estimator: that of the reader that has read last. It knows most of the wires.
+    rests: the rest that was there at first, or None if nobody has told it, and one for each tare
+        since. The last of them is the rest in force. An undone tare is taken out.
+    last_estimator: that of the reader that has read last. It has seen the most touches, and so
+        knows most of the wires.
     """
 
     def __init__(
@@ -93,18 +95,19 @@ class _SharedKnowledge:
         self.calibration = calibration
         self.rests: list[Rest | Untouched | None] = [None]
         self.last_estimator: Estimator | None = None
-        self._recorded: list[Float] = []  # the recorded tares that some reader has come to
-        self._lock = threading.Lock()  # held while a reader looks into them
+        self._recorded: list[Float] = []  # readings of the recorded tares that were taken
+        self._lock = threading.Lock()  # two readers may come to the same one in two threads
         if calibration is not None:
             self.rests = [calibration.rest, *filter(None, [calibration.tare])]
         elif rest_ratio is not None:
             self.rests = [Untouched(rest_ratio, now())]
 
     def take_recorded(self, ratio: Float) -> None:
-        """Take a recorded tare, once: several readers may come to it, one after the other.
+        """Take the tare that a played scan comes with, unless it was taken before.
 
-        Its array is looked for, and not equal numbers. An undone tare is recorded as another tare
-        with the numbers of the rest before it.
+        It was, for most scans: all scans from one recorded tare to the next come with the same
+        array, and several readers may read them. Arrays are compared by identity, because another
+        tare may have equal numbers: whoever undoes a tare records the rest before it once more.
         """
         with self._lock:
             if not any(ratio is recorded for recorded in self._recorded):
@@ -124,13 +127,14 @@ class _SharedKnowledge:
 class SkinReader:
     """Reads scan after scan of one skin: the same scans in the same order give the same forces.
 
-    board: the one that scans it. calibration: gives newtons, as long as the method is its own.
+    board: the one that scans it.
+    calibration: gives newtons, as long as the method is its own.
     method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
-    rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration. force: take
-    the calibration of another unit.
+    rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration.
+    force: take the calibration of another unit.
 
-    Of recorded tares (`Scan.rest_ratio`) and those taken by `tare`, the latest is the rest. Scans
-    are read by one thread; all else may be called from any thread.
+    The latest tare is the rest, whether `tare` took it or a played scan came with it
+    (`Scan.rest_ratio`). Scans are read by one thread; all else may be called from any thread.
 
     :raises ValueError: no such method, or other cells, another mode or unit than were calibrated.
     """
@@ -153,9 +157,7 @@ class SkinReader:
 
     def another(self) -> SkinReader:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
-        calibration = self._shared.calibration
-        other = SkinReader(self.board, calibration, method=self._wanted, force=True)
-        other._shared = self._shared
+        other = copy(self)  # what is shared stays shared
         other._begin()
         return other
 
@@ -193,13 +195,13 @@ class SkinReader:
         wires = (self._shared.last_estimator or self._estimator).wires()
         calibration = replace(self._shared.calibration, nominal_wire_ohm=wires)
         rest = self.rest
-        if isinstance(rest, Untouched):
+        if isinstance(rest, Untouched):  # a tare of this session; a file has its level, too
             rest = Rest.of(calibration.method, self._shared.knowledge(rest), rest.date)
         return replace(calibration, tare=None if rest is calibration.rest else rest)
 
     def use(self, method: str) -> None:
         """Go on with another method, from the next scan on. Raises ValueError for no such."""
-        self._shared.estimator(method, self.rest)
+        self._shared.estimator(method, self.rest)  # is made to raise here, and not at the scan
         self._wanted = method
 
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
@@ -209,7 +211,8 @@ class SkinReader:
 
         :raises TareRefused: something touches the skin.
         """
-        # By an estimator that has seen no touch: this one may be in the middle of one.
+        # A new estimator judges them. That of the scans begins each frame from the one before, and
+        # may be in the middle of a touch.
         touched = self._shared.estimator(self._wanted, self.rest).estimate(rest_ratio).touched
         if touched.any() and not force:
             remedy = "take everything off the skin, or force the tare if nothing is on it"
@@ -242,29 +245,35 @@ class SkinReader:
             raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
 
     def rise(self, frame: Estimate) -> Float:
-        """Level above rest, (R, C) [S; 1 for `voltage`]; above its median where rest is unknown."""
+        """Level above rest, (R, C) [S; 1 for `voltage`].
+
+        Where rest is unknown, the median cell of the frame stands in: most cells are untouched.
+        """
         at_rest = float(np.median(frame.level)) if self._rest_level is None else self._rest_level
         return np.asarray(frame.level - at_rest)
 
     def read(self, scan: Scan) -> ForceScan:
         """What a scan shows. Raises ValueError if it is of other cells, or of another mode."""
         self.check_mode(scan.mode)
-        if scan.rest_ratio is not None and scan.rest_ratio.shape == scan.codes.shape:
+        if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
-        if self._made_for != (self._wanted, self.rest):
+        if self._made_for != (self._wanted, self.rest):  # rests are equal if they are the same one
             self._make()
         frame = self.estimate(scan.ratio)
         self._shared.last_estimator = self._estimator
         rise = self.rise(frame)
         force_n = force_n_std = np.full(rise.shape, np.nan)
-        weights = np.maximum(rise, 0.0), frame.level_std
+        # Without newtons, contacts are summed and centred by what there is: the rise.
+        of_contacts = np.maximum(rise, 0.0), frame.level_std
         calibration = self._shared.calibration
         if calibration is not None and self.has_forces:
-            weights = force_n, force_n_std = calibration.model.predict(rise, frame.level_std)
+            force_n, force_n_std = calibration.model.predict(rise, frame.level_std)
+            of_contacts = force_n, force_n_std
+        contacts = self._tracker.update(scan.time_us, frame.touched, *of_contacts)
         shown: dict[str, object] = {
             "force_n": force_n,
             "force_n_std": force_n_std,
-            "contacts": self._tracker.update(scan.time_us, frame.touched, *weights),
+            "contacts": contacts,
             "estimate": frame,
         }
         return ForceScan(**(vars(scan) | shown))
@@ -276,12 +285,13 @@ class SkinReader:
 
     def _make(self) -> None:
         """Make the estimator for the method and the rest that are in force."""
-        method, rest = self._made_for = self._wanted, self.rest
+        method, rest = self._wanted, self.rest
+        self._made_for = method, rest
         self._estimator = self._shared.estimator(method, rest)
         self._rest_level: Float | None = None
         if isinstance(rest, Rest) and self.has_forces:
-            self._rest_level = rest.level
-        elif rest is not None:
+            self._rest_level = rest.level  # as it was when the curves were learned above it
+        elif rest is not None:  # what this method makes of it; noise may put that below 0
             self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
 
 
@@ -299,7 +309,7 @@ class CalibratedSkin(Closing):
         self.name = device.name
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # a reader takes one scan at a time
 
     @property
     def info(self) -> Hello:

@@ -88,7 +88,7 @@ class Replay(Device):
                 return
             match message:
                 case Scan():
-                    rest_ratio = tare.rest_ratio if tare and tare.mode == message.mode else None
+                    rest_ratio = tare.rest_ratio if tare and tare.is_of(message) else None
                     self._play_scan(replace(message, rest_ratio=rest_ratio))
                 case Hello():
                     self._hello = message

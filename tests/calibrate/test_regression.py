@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+from ohmskin.calibrate.regression import ForceRegression
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.force.curve import LINEAR, POWER, ForceModel
-from ohmskin.force.regression import ForceRegression
 from ohmskin.record.readings import estimate_file
 from studies.trials import skin_at_rest, trial_of
 

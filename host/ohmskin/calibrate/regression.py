@@ -50,6 +50,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.calibrate.rules import MIN_PRESSES, check_enough, require_forces, require_rows
 from ohmskin.force.curve import (
     LINEAR,
     MAX_EXPONENT,
@@ -60,7 +61,6 @@ from ohmskin.force.curve import (
     force_by,
     spread,
 )
-from ohmskin.force.rules import MIN_PRESSES, check_enough, require_forces, require_rows
 
 # The presses of a cell are split into so many parts, each held out once: none of them is empty.
 PRESS_FOLDS: Final = MIN_PRESSES

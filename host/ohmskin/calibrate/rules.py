@@ -25,9 +25,6 @@ from ohmskin.arrays import Bool, Float
 # A cell with fewer presses has no curve of its own. A curve has 2 coefficients, and 4 presses would
 # leave 2 degrees of freedom, for which Student's t has no finite variance.
 MIN_PRESSES: Final = 5
-# No number of a file is larger. Chosen: far beyond any force, time or conductance in any unit, and
-# the slope of any power law in siemens; and sums of its square do not overflow.
-MAX_NUMBER: Final = 1e60
 
 
 def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]:
@@ -59,13 +56,6 @@ def check_cells_differ(cells: set[tuple[int, int]], shape: tuple[int, int]) -> N
     if len(cells) == 1 and shape != (1, 1):
         remedy = "press at least one more, which tells how much cells differ"
         raise ValueError(f"all presses are on cell {min(cells)}: {remedy}")
-
-
-def require(name: str, good: Bool, what: str) -> None:
-    """Raise ValueError, naming the first cell, unless all are good, (R, C). what: a bad cell is."""
-    if not good.all():
-        row, column = (int(index) for index in np.argwhere(~good)[0])
-        raise ValueError(f"{name} of cell ({row}, {column}) is {what}")
 
 
 def require_rows(
