@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, BoardSettings, EmulatedBoard
-from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.driver import SteppedLink, SteppedSkin
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.link.host_clock import SteppedClock
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.press import LEAVE_S, PressModel, robot_presses
 from studies.trials import BEND, NOISE_LSB, SPREAD, knowledge_of, skin_at_rest, stretched
@@ -240,7 +239,7 @@ class OneFrameBoard:
         board = EmulatedBoard(
             lambda _time_s, _mode: self._ratio, settings, noise_lsb=NOISE_LSB, seed=seed
         )
-        self._board = SteppedSkin(EmulatorLink(board, clock=SteppedClock()))
+        self._board = SteppedSkin(SteppedLink(board))
 
     def read(self, time_s: float, skin: Skin) -> Float:
         """Readings (R, C, 4) of a frame begun at a time, or when the frame before is over."""

@@ -13,13 +13,12 @@ import pytest
 import ohmskin
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
-from ohmskin.emulate.driver import EmulatorLink, PtyServer, SteppedSkin
+from ohmskin.emulate.driver import PtyServer, SteppedLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, DeviceSilent, OhmskinError
 from ohmskin.link import framing, protocol, session
 from ohmskin.link.codes import quantise
-from ohmskin.link.host_clock import SteppedClock
 from ohmskin.link.serial_port import READ_TIMEOUT_S, SerialLink
 from ohmskin.link.session import Session
 from ports import Serve
@@ -130,7 +129,7 @@ def test_restarts_and_missed_scans_are_logged(caplog: pytest.LogCaptureFixture) 
     assert ("INFO", f"missed {scan.missed} scans before scan {scan.number}") in said
 
 
-class ResetAfterConfigure(EmulatorLink):
+class ResetAfterConfigure(SteppedLink):
     """Resets the board right after its first answer to `configure`."""
 
     resets, reset_due = 0, False
@@ -149,7 +148,7 @@ class ResetAfterConfigure(EmulatorLink):
 
 
 def test_a_reset_right_after_configure_does_not_undo_it() -> None:
-    link = ResetAfterConfigure(emulated("emulator://4x4")[0], clock=SteppedClock())
+    link = ResetAfterConfigure(emulated("emulator://4x4")[0])
     with SteppedSkin(link) as skin:
         skin.start()
         assert skin.configure(rows=2, rate_hz=77).rows == 2

@@ -191,6 +191,13 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
     assert live[30].force_n.tobytes() != untared[30].force_n.tobytes()
 
 
+def test_a_tare_is_on_the_clock_of_the_scans() -> None:
+    with ohmskin.open(f"{GHOST}&speed=0", calibration=of_scene("ghost")) as skin:
+        skin.latest()
+        for tare in (skin.tare(0.1, force=True), skin.undo_tare()):
+            assert tare.host_time_s == skin.device.now_s < 2
+
+
 @pytest.fixture
 def recorded(tmp_path: Path) -> Record:
     """A function that records so many scans of a ghost, and a tare before one of them."""

@@ -6,15 +6,14 @@ from dataclasses import replace
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.gather import gather
 from ohmskin.emulate.board import EmulatedBoard
-from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.driver import SteppedLink, SteppedSkin
 from ohmskin.emulate.urls import emulated
-from ohmskin.link.host_clock import SteppedClock
 
 
-def stepped_link(of: str | EmulatedBoard) -> EmulatorLink:
-    """A board, or that of an ``emulator://`` URL, by a clock that stands still."""
+def stepped_link(of: str | EmulatedBoard) -> SteppedLink:
+    """A board, or that of an ``emulator://`` URL, in stepped time."""
     board, _, faults = emulated(of) if isinstance(of, str) else (of, "", None)
-    return EmulatorLink(board, str(of), faults, SteppedClock())
+    return SteppedLink(board, str(of), faults)
 
 
 def stepped(of: str | EmulatedBoard) -> SteppedSkin:

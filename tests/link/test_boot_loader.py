@@ -9,29 +9,28 @@ from itertools import pairwise
 
 import pytest
 
-from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.driver import SteppedLink, SteppedSkin
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import DeviceSilent
-from ohmskin.link.host_clock import SteppedClock
 
 QUIET_S = 2.0  # from the opening of the port to the first question
 AGAIN_S = 6.0  # from a question to the next, so that a loader that has heard it is done
 AT_ONCE_S = 0.5
 
 
-class SilentLink(EmulatorLink):
+class SilentLink(SteppedLink):
     """A board that says nothing. asked_s: when it was asked, by the speed of the line."""
 
     resets_board = True
 
     def __init__(self) -> None:
         board, _, faults = emulated("emulator://1x1?silent=1")
-        super().__init__(board, "silent", faults, SteppedClock())
+        super().__init__(board, "silent", faults)
         self.baud = 0
         self.asked_s: dict[int, list[float]] = {}
 
     def write(self, octets: bytes) -> None:
-        self.asked_s.setdefault(self.baud, []).append(self.clock.now_s())
+        self.asked_s.setdefault(self.baud, []).append(self.now_s())
 
     def set_baud(self, baud: int) -> None:
         self.baud = baud

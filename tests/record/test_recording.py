@@ -101,6 +101,21 @@ def test_other_programs_read_it(path: Path, hello: Hello) -> None:
                 assert content["codes"] == expected.codes.reshape(-1).tolist()
 
 
+def test_all_that_a_stepped_skin_gave_is_on_one_clock(path: Path, run: Run) -> None:
+    """Its time has nothing to do with the machine's: three seconds of it pass at once."""
+    before_ns = time.time_ns()
+    port = "emulator://2x2?rate=50&speed=0"
+    well(run("record", port, str(path), "--tare", "1", "--mark", "begin", "--seconds", "3"))
+    recorded = load_recording(path)
+    begin_s, (tare,), (mark,) = recorded.scans[0].host_time_s, recorded.tares, recorded.marks
+    assert mark.host_time_s <= begin_s
+    assert tare.host_time_s == pytest.approx(begin_s + 1)
+    with path.open("rb") as file:
+        times_ns = [message.log_time for *_, message in make_reader(file).iter_messages()]
+    assert before_ns - 1e9 < min(times_ns) < before_ns + 60e9
+    assert max(times_ns) - min(times_ns) == pytest.approx(3e9, abs=0.1e9)
+
+
 def test_size_on_disk(path: Path, hello: Hello) -> None:
     """At most 40 kB/s for 8x8 at 90 Hz, half a second in each chunk."""
     board, _, _ = emulated("emulator://8x8?scene=moving&noise=1")

@@ -4,7 +4,6 @@
 import os
 import sys
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
@@ -69,9 +68,9 @@ def record(
         if force_port:
             sensor = stack.enter_context(ForceSensor(force_port, force_baud, force_scale))
             sensor.wait()
-        recorder = stack.enter_context(Recorder(file, skin.info))
+        recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
-            recorder.add(Mark(text, time.monotonic()))
+            recorder.add(Mark(text, recorder.now_s()))
         look = None
         if sensor is not None:
             _out.print(f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it")
@@ -151,7 +150,7 @@ def _take_marks(recorder: Recorder) -> None:
         while typed := os.read(sys.stdin.fileno(), 4096):
             *lines, text = (text + typed).split(b"\n")
             for line in lines:
-                recorder.add(Mark(line.decode(errors="replace").strip(), time.monotonic()))
+                recorder.add(Mark(line.decode(errors="replace").strip(), recorder.now_s()))
 
 
 def export(

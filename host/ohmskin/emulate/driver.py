@@ -2,13 +2,15 @@
 """Runs an emulated board, behind a line with faults: in this process, or at a pseudo-terminal.
 
 A program that opens ``emulator://`` gets a `Session` over an `EmulatorLink`, in real time. With
-``speed=0`` it gets a `SteppedSkin`: the same session and the same link, by a clock that stands
-still unless somebody waits.
+``speed=0`` it gets a `SteppedSkin` over a `SteppedLink`: the same, but time stands still unless
+somebody waits.
 """
 
+import math
 import os
 import select
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
@@ -17,7 +19,6 @@ from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
-from ohmskin.link.host_clock import HostClock
 from ohmskin.link.serial_port import READ_TIMEOUT_S
 from ohmskin.link.session import Session
 
@@ -26,21 +27,20 @@ _READ_BYTES: Final = 4096
 
 
 class _Running:
-    """A board that is switched on now, by a clock. `begin_s`: when that was, on this clock [s]."""
+    """A board that is switched on now. `begin_s`: when that was, on the host's clock [s]."""
 
-    def __init__(self, board: EmulatedBoard, faults: LineFaults | None, clock: HostClock) -> None:
+    def __init__(self, board: EmulatedBoard, faults: LineFaults | None) -> None:
         self.board = board
-        self.clock = clock
-        self.begin_s = clock.now_s()
+        self.begin_s = time.monotonic()
         self._faults = faults or LineFaults()
 
-    def _now_s(self) -> float:
+    def now_s(self) -> float:
         """The time since the board was switched on [s]."""
-        return self.clock.now_s() - self.begin_s
+        return time.monotonic() - self.begin_s
 
 
 class EmulatorLink(_Running):
-    """A running board as a `Link`. Its scans come when its clock says so."""
+    """A running board as a `Link`."""
 
     resets_board = False
 
@@ -49,9 +49,8 @@ class EmulatorLink(_Running):
         board: EmulatedBoard,
         name: str = "emulated board",
         faults: LineFaults | None = None,
-        clock: HostClock | None = None,
     ) -> None:
-        super().__init__(board, faults, clock or HostClock())
+        super().__init__(board, faults)
         self.name = name
         self._wake = threading.Condition()
         self._arrived = bytearray()  # what the host has not read yet
@@ -60,12 +59,16 @@ class EmulatorLink(_Running):
     def read(self, limit_s: float = READ_TIMEOUT_S) -> bytes:
         """See `Link.read`; waits for `limit_s` at most."""
         with self._wake:
-            end_s = self._now_s() + limit_s
+            end_s = self.now_s() + limit_s
             while (now_s := self._listen()) < end_s and not self._arrived:
                 due_s = min(end_s, self.board.next_scan_s or end_s)
-                self.clock.wait(self._wake, due_s - now_s)
+                self._pass(due_s - now_s)
             octets, self._arrived = bytes(self._arrived), bytearray()
             return octets
+
+    def _pass(self, limit_s: float) -> None:
+        """Wait, holding `_wake`, until the host writes something, or for `limit_s`."""
+        self._wake.wait(limit_s)
 
     def write(self, octets: bytes) -> None:
         """See `Link.write`."""
@@ -76,7 +79,7 @@ class EmulatorLink(_Running):
 
     def _listen(self) -> float:
         """Take what arrives from the board by now; return the time since it was switched on [s]."""
-        now_s = self._now_s()
+        now_s = self.now_s()
         if self._closed or self._faults.vanished(now_s):
             raise DeviceLost(f"{self.name} is gone: is the board still plugged in?")
         self._arrived += self.board.heard(self._faults, now_s)
@@ -92,24 +95,37 @@ class EmulatorLink(_Running):
             self._wake.notify_all()
 
 
+class SteppedLink(EmulatorLink):
+    """As `EmulatorLink`, but its time begins at 0 and passes only in `read`, which never waits."""
+
+    _stepped_s = 0.0
+
+    def now_s(self) -> float:
+        """See `_Running.now_s`."""
+        return self._stepped_s
+
+    def _pass(self, limit_s: float) -> None:
+        # A step that is smaller than the resolution of a float must not leave the time where it is:
+        # who waits for a time in a loop would wait for ever.
+        self._stepped_s = max(self._stepped_s + limit_s, math.nextafter(self._stepped_s, math.inf))
+
+
 class SteppedSkin(Session):
     """An emulated board whose time passes only while somebody waits for it: ``speed=0``.
 
     Whoever takes a scan lets time pass until the board has sent it, which takes as long as the
     machine needs to compute the scan. There is no thread, so every run of a program is the same.
     `host_time_s` of a scan is the time since the board was switched on.
-
-    link: one with a `SteppedClock`.
     """
 
-    def __init__(self, link: EmulatorLink) -> None:
-        self._read_link = link.read
-        super().__init__(link, clock=link.clock)
+    def __init__(self, link: SteppedLink) -> None:
+        self._stepped = link
+        super().__init__(link)
 
     @property
     def now_s(self) -> float:
         """The time since the board was switched on [s]."""
-        return self._clock.now_s()
+        return self._stepped.now_s()
 
     def step(self, seconds: float) -> None:
         """Let time pass. What the board sends meanwhile is received, and can be taken after that.
@@ -134,7 +150,7 @@ class SteppedSkin(Session):
 
     def _take_next(self, limit_s: float) -> None:
         # No step is longer than that of a thread that reads, because each looks for faults.
-        self._take(self._read_link(min(limit_s, READ_TIMEOUT_S)))
+        self._take(self._stepped.read(min(limit_s, READ_TIMEOUT_S)))
 
 
 class PtyServer(_Running, Closing):
@@ -151,7 +167,7 @@ class PtyServer(_Running, Closing):
             import tty
         except ImportError as exc:
             raise PortError("this system has no pseudo-terminals: use emulator:// itself") from exc
-        super().__init__(board, faults, HostClock())
+        super().__init__(board, faults)
         self.lost_bytes = 0
         self._closing, self._serving = False, threading.Lock()
         self._master, slave = os.openpty()
@@ -162,15 +178,15 @@ class PtyServer(_Running, Closing):
 
     def serve(self, seconds: float = float("inf")) -> None:
         """Serve for `seconds`, until `close`, or until the faults let the board vanish."""
-        end_s = self._now_s() + seconds
+        end_s = self.now_s() + seconds
         with self._serving:
-            while not self._closing and (now_s := self._now_s()) < end_s:
+            while not self._closing and (now_s := self.now_s()) < end_s:
                 if self._faults.vanished(now_s):
                     break
                 self._write(self.board.heard(self._faults, now_s))
                 wake_s = min(now_s + READ_TIMEOUT_S, end_s, self.board.next_scan_s or end_s)
-                if select.select([self._master], [], [], max(0.0, wake_s - self._now_s()))[0]:
-                    self._write(self.board.heard(self._faults, self._now_s()))
+                if select.select([self._master], [], [], max(0.0, wake_s - self.now_s()))[0]:
+                    self._write(self.board.heard(self._faults, self.now_s()))
                     self.board.receive(os.read(self._master, _READ_BYTES))
 
     def _write(self, octets: bytes) -> None:

@@ -10,12 +10,11 @@ from typing import Final
 
 from ohmskin.circuit.plate import load_plate
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
-from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
 from ohmskin.emulate.scenes import PlateScene, Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
-from ohmskin.link.host_clock import HostClock, SteppedClock
 from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
 from ohmskin.link.session import Session
 from ohmskin.link.url import PortUrl
@@ -35,8 +34,8 @@ def open_emulator(text: str) -> Session:
     """
     board, _, faults = emulated(text)
     if is_stepped(text):
-        return SteppedSkin(EmulatorLink(board, text, faults, SteppedClock()))
-    return Session(EmulatorLink(board, text, faults, HostClock()))
+        return SteppedSkin(SteppedLink(board, text, faults))
+    return Session(EmulatorLink(board, text, faults))
 
 
 def open_simavr(text: str) -> Session:

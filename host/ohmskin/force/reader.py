@@ -351,7 +351,8 @@ class CalibratedSkin(Closing):
         """
         rest_ratio = self.device.mean_ratio(seconds)
         self._reader.check_mode(self.info.mode)
-        return self._reader.tare(rest_ratio, force=force)
+        tare = self._reader.tare(rest_ratio, force=force)
+        return replace(tare, host_time_s=self.device.now_s)
 
     def undo_tare(self) -> Tare:
         """Return to the rest before the last tare. Returns that, for a `Recorder`.
@@ -360,7 +361,7 @@ class CalibratedSkin(Closing):
         """
         undone = self._reader.undo_tare()
         assert undone is not None  # a calibration has a rest
-        return undone
+        return replace(undone, host_time_s=self.device.now_s)
 
     def close(self) -> None:
         """Close the device. May be called again."""

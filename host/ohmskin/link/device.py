@@ -3,6 +3,7 @@
 
 import logging
 import threading
+import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -74,6 +75,11 @@ class Device(Closing):
         """Counts since the connection was made, as a copy."""
         with self._changed:
             return replace(self._stats, line=replace(self._stats.line))
+
+    @property
+    def now_s(self) -> float:
+        """The time by the clock of `Scan.host_time_s` [s]: `time.monotonic()`, unless stepped."""
+        return time.monotonic()
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan from now on; ``missed`` of each counts what was lost before it.

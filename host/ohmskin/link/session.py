@@ -22,7 +22,6 @@ from ohmskin.errors import (
 )
 from ohmskin.link import framing, protocol
 from ohmskin.link.device import COMMAND_TRIES, LOG, Device, configuration
-from ohmskin.link.host_clock import HostClock
 from ohmskin.link.messages import (
     Ack,
     BoardDecoder,
@@ -71,7 +70,6 @@ COMMAND_TIMEOUT_S = 1.0
 _SPEED_LOST_S = 2.5
 # It is asked again after so long: a boot loader that took the question for an upload is done then.
 _ASK_AGAIN_S = 6.5
-_MACHINE_CLOCK: Final = HostClock()
 _BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
 
 
@@ -82,8 +80,7 @@ def _size(of: Hello | Scan) -> str:
 class Session(Device):
     """A board at a `Link` that has said hello. One that is reset while it scans is started again.
 
-    baud: speed of the line to change to. clock: tells when scans came [s], for their
-    `host_time_s`.
+    baud: speed of the line to change to.
 
     :raises DeviceSilent: nothing that is a skin board answers.
     :raises ProtocolMismatch: the board was built from another protocol definition.
@@ -91,17 +88,14 @@ class Session(Device):
     :raises DeviceLost: the port went away meanwhile.
     """
 
-    def __init__(
-        self, link: Link, baud: int | None = None, clock: HostClock = _MACHINE_CLOCK
-    ) -> None:
+    def __init__(self, link: Link, baud: int | None = None) -> None:
         self._link = link
-        self._clock = clock
         self._decoder = BoardDecoder()
         super().__init__(link.name, self._decoder.stats)
         self._acks: dict[int, Ack] = {}  # by the sequence numbers of their commands
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0  # number of the last command
-        self._heard_s = clock.now_s()  # when a valid frame last came
+        self._heard_s = self.now_s  # when a valid frame last came
         self._begin_reading()
         try:
             self._connect()
@@ -191,7 +185,7 @@ class Session(Device):
 
     def _take(self, octets: bytes) -> None:
         """Act on what has arrived; ask a board that has been silent for too long."""
-        now_s = self._clock.now_s()
+        now_s = self.now_s
         with self._changed:
             messages = self._decoder.feed(octets, now_s)
             for message in messages:

@@ -44,6 +44,8 @@ class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed, removed, or the disk is full.
 
     board: what the board says of itself. It comes first; later, the newest that was added.
+    now_s: gives the time by the clock of `Scan.host_time_s` [s]. Whoever adds a mark asks it, so
+        that all messages are on one clock, also those of a skin whose time is stepped.
     tare: the newest that was added; None if none was.
     force: the newest that was added; None if none was.
     scans: how many were added.
@@ -56,8 +58,11 @@ class Recorder(Closing):
         more is written, and what was written before can be read.
     """
 
-    def __init__(self, path: PathName, board: Hello) -> None:
+    def __init__(
+        self, path: PathName, board: Hello, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
         self.path = Path(path)
+        self.now_s = now_s
         self.scans = self.missed = self.forces = 0
         self.size = 0
         self._readable = 0  # scans that are in the file
@@ -75,7 +80,7 @@ class Recorder(Closing):
             raise RecordingError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
         # Names of the file. Where there are fewer later, somebody has removed it.
         self._links = os.fstat(self._file.fileno()).st_nlink
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()  # from the host's clock to 1970
+        self._epoch_ns = time.time_ns() - round(1e9 * now_s())  # from this clock to 1970
         # `flush` ends a chunk long before it has this size.
         self._writer = Writer(self._file, chunk_size=LARGEST_RECORD_BYTES // 4)
         self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
@@ -112,7 +117,7 @@ class Recorder(Closing):
         :raises RecordingError: the file can no longer be written.
         """
         name = next(name for name, kind in KINDS.items() if isinstance(message, kind))
-        content = {"host_time_s": time.monotonic(), **vars(message)}
+        content = {"host_time_s": self.now_s(), **vars(message)}
         for array in {"codes", "rest_ratio"} & SCHEMAS[name].keys():
             readings = content[array]
             rows, columns, _ = readings.shape
@@ -246,6 +251,6 @@ def record(
             untouched.append(scan)
     finally:  # whatever ends the scans amid the tare
         if untouched:
-            recorder.add(Tare(mean_ratio(untouched), time.monotonic(), untouched[-1].mode))
+            recorder.add(Tare(mean_ratio(untouched), recorder.now_s(), untouched[-1].mode))
     for scan in coming:
         keep(scan)
