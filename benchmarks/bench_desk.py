@@ -3,8 +3,7 @@
 
     make bench-desk
 
-Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
-missed. Everything is simulated: the built firmware scans 8x8 skins at 90 Hz in simavr, with the
+Everything is simulated: the built firmware scans 8x8 skins at 90 Hz in simavr, with the
 preset `desk` of firmware/sim: sample, node and line capacitances; offset and gain of the converter
 up to 2 LSB, its bow up to 1.5, drawn anew for each of 10 skins; noise of 0.5 LSB. Each skin is at
 rest, then touched anew 24 times, up to 8 cells of 1 to 100 kohm; a touch stays for three scans, of
@@ -129,10 +128,5 @@ BARS = [
     )
 ]
 
-
-def main() -> int:
-    return run(__doc__, measure, BARS)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(__doc__, measure, BARS))

@@ -3,8 +3,7 @@
 
     make bench-far
 
-Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
-missed. Everything is simulated. Nobody is told the wires; rest readings are told, rounded as all
+Everything is simulated. Nobody is told the wires; rest readings are told, rounded as all
 readings are. `far`: readings a e b f. `near`: a b c d. Rounding takes the part of a code away, as a
 converter does, and estimators read the middle of its interval. What is measured how:
 
@@ -29,9 +28,6 @@ MODE_wires_METHOD       after 50 frames of up to 8 touches, on 12 skins of 8x8: 
                         segment [%]. Six have 100 and 200 ohm a segment, six 150 and 300, as the
                         `random` scenes; `_100_200`: the first six. Segments are spread by 10 %, so
                         whoever knows the middle of each layer is off by 6.7 %.
-far_wires_limit_percent what these frames allow: the same of normal errors with the deviations of
-                        the posterior at the truth, for whoever knows which cells are pressed, with
-                        the priors of `joint`. Two of the skins, one of each.
 MODE_bent_METHOD        wires 35 % above those at the calibration, rest readings and a force curve
                         of each cell unchanged: median error of a pressed cell's force over that of
                         the unbent skin. 3 skins of 8x8, 60 frames of up to 8 touches, in order. A
@@ -43,22 +39,18 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from bars import Bar, Part, at_least, at_most, run  # beside this file
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin, all_readings, end_admittance
-from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.prior import REST_STD, SEGMENT_STD, UNKNOWN_LAYER_STD
-from ohmskin.link.codes import ratio_std
-from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES
+from ohmskin.link.protocol import ADC_BITS, MODES
 from ohmskin.record.readings import Readings, estimate_file
-from studies.information import PRESSED_STD
 from studies.judge import judge_trial, pooled
 from studies.trials import (
     BEND,
@@ -161,14 +153,10 @@ def seconds(read: dict[str, Readings], name: str) -> Float:
 # ------------------------------------------------------------------------------- wires and forces
 
 
-def wire_trial(wire_ohm: tuple[float, float], number: int) -> Trial:
-    return random_trial(8, 8, 8, FRAMES, SEED + 100 + number, wire_ohm=wire_ohm)
-
-
 def wires(mode: str, method: str, kinds: Sequence[tuple[float, float]], skins: int) -> float:
     off = []
     for wire_ohm, number in itertools.product(kinds, range(skins)):
-        trial = wire_trial(wire_ohm, number)
+        trial = random_trial(8, 8, 8, FRAMES, SEED + 100 + number, wire_ohm=wire_ohm)
         out = estimate_file(untold(trial, mode), method)
         truth = trial.rest.top_wire_ohm, trial.rest.bottom_wire_ohm
         for name, ohm in zip(("top_wire_ohm", "bottom_wire_ohm"), truth, strict=True):
@@ -176,71 +164,36 @@ def wires(mode: str, method: str, kinds: Sequence[tuple[float, float]], skins: i
     return round(100 * float(np.median(np.concatenate(off))), 2)
 
 
-def wires_limit(frames: int) -> float:
-    """By central differences of exact readings: cells of each frame are integrated out."""
-    names = list(ENUMS["reading"].values)
-    chosen = [names.index(name) for name in MODES["far"]]
-    std = ratio_std(ADC_BITS)
-    stds = []
-    for number, wire_ohm in enumerate(SEGMENT_OHM):
-        trial = wire_trial(wire_ohm, number)
-        cells = trial.rest.cell_siemens.size
-        shared = np.kron(np.eye(2), np.full((cells, cells), UNKNOWN_LAYER_STD**2))
-        information = np.linalg.inv(shared + SEGMENT_STD**2 * np.eye(2 * cells))
-        for skin, pressed in list(zip(trial.frames, trial.pressed, strict=True))[:frames]:
-            logs = np.log([1 / skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm])
-
-            def read(log_ohm: Float, shape: tuple[int, ...] = logs.shape) -> Float:
-                cell, top, bottom = np.exp(log_ohm).reshape(shape)
-                of = Skin(1 / cell, top, bottom)
-                return np.asarray(all_readings(of, end_admittance(of))[..., chosen].ravel() / std)
-
-            steps = 1e-4 * np.eye(logs.size)
-            x = logs.ravel()
-            slopes = np.array([(read(x + step) - read(x - step)) / 2e-4 for step in steps]).T
-            by_cell, by_wire = slopes[:, :cells], slopes[:, cells:]
-            variance = np.where(pressed.ravel(), PRESSED_STD, REST_STD) ** 2
-            noise = by_cell * variance @ by_cell.T + np.eye(len(slopes))
-            information += by_wire.T @ np.linalg.solve(noise, by_wire)
-        stds.append(np.sqrt(np.linalg.inv(information).diagonal()))
-    normal = np.abs(np.random.default_rng(SEED).standard_normal((400, 1)))
-    return round(100 * float(np.median(normal * np.concatenate(stds))), 2)
-
-
 def force_n(rise_siemens: Float) -> Float:
     """The truth: 10 N at 1 mS, and less than linear, as contacts are."""
     return np.asarray(10.0 * (np.maximum(rise_siemens, 0.0) / 1e-3) ** 0.7)
 
 
-def estimated(estimator: Estimator, frames: Iterable[Float]) -> Float:
-    return np.array([estimator.estimate(ratio).cell_siemens for ratio in frames])
+def seen(trial: Trial, mode: str, method: str) -> Float:
+    """Cells (F, R, C) [S] as the method sees them, frames in order."""
+    return np.asarray(estimate_file(untold(trial, mode), method)["cell_siemens"])
 
 
-def curves(trial: Trial, mode: str, method: str) -> tuple[Float, Float]:
-    """Log of the rise that the estimator sees of each press (P, R, C), of its force (P, R, C)."""
-    rest, rows, columns = trial.rest, *trial.rest.shape
-    frames, force = [], []
-    for siemens in CALIBRATED_SIEMENS:
-        for cell in range(rows * columns):
-            pressed = rest.cell_siemens.copy()
-            pressed.flat[cell] += siemens
-            frames.append(replace(rest, cell_siemens=pressed))
-        force.append(np.full((rows, columns), np.log(force_n(siemens))))
-    read = untold(trial_of(rest, frames), mode)
-    siemens = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
-    pressed = siemens.reshape(-1, rows * columns, rows * columns).diagonal(axis1=1, axis2=2)
-    rise = pressed.reshape(-1, rows, columns) - rest.cell_siemens
-    return np.log(np.maximum(rise, LEAST_SIEMENS)), np.array(force)
+def curves(trial: Trial, mode: str, method: str) -> Float:
+    """Log of the rise that the method sees of each press of a cell alone, (P, R, C)."""
+    rest, cells = trial.rest, trial.rest.cell_siemens.size
+    presses = [
+        replace(rest, cell_siemens=rest.cell_siemens + siemens * one_cell)
+        for siemens in CALIBRATED_SIEMENS
+        for one_cell in np.eye(cells).reshape(cells, *rest.shape)
+    ]
+    of_presses = seen(trial_of(rest, presses), mode, method).reshape(-1, cells, cells)
+    pressed = of_presses.diagonal(axis1=1, axis2=2).reshape(-1, *rest.shape)
+    return np.log(np.maximum(pressed - rest.cell_siemens, LEAST_SIEMENS))
 
 
-def by_curve(rise_siemens: Float, curve: tuple[Float, Float]) -> Float:
+def by_curve(rise_siemens: Float, log_rises: Float) -> Float:
     """Forces (F, R, C) [N] by the curve of each cell, straight on beyond its ends."""
-    log_rise, force = np.log(np.maximum(rise_siemens, LEAST_SIEMENS)), np.empty_like(rise_siemens)
+    force, log_forces = np.empty_like(rise_siemens), np.log(force_n(CALIBRATED_SIEMENS))
     for cell in np.ndindex(*rise_siemens.shape[1:]):
-        at, x, y = log_rise[:, *cell], curve[0][:, *cell], curve[1][:, *cell]
-        part = np.clip(np.searchsorted(x, at), 1, x.size - 1)
-        slope = (y[part] - y[part - 1]) / (x[part] - x[part - 1])
-        force[:, *cell] = np.exp(y[part - 1] + slope * (at - x[part - 1]))
+        curve = make_interp_spline(log_rises[:, *cell], log_forces, k=1)
+        log_rise = np.log(np.maximum(rise_siemens[:, *cell], LEAST_SIEMENS))
+        force[:, *cell] = np.exp(curve(log_rise))
     return force
 
 
@@ -248,13 +201,12 @@ def bent(mode: str, method: str, skins: int) -> dict[str, float]:
     off: dict[float, list[Float]] = {1.0: [], BEND: []}
     for number in range(skins):
         trial = random_trial(8, 8, 8, 60, SEED + 200 + number)
-        curve, rest = curves(trial, mode, method), trial.rest.cell_siemens
+        log_rises, rest = curves(trial, mode, method), trial.rest.cell_siemens
         true_n = force_n(trial.cell_siemens - rest)
         for factor, shares in off.items():
             frames = [stretched(skin, factor) for skin in trial.frames]
-            read = untold(trial_of(trial.rest, frames), mode)
-            siemens = estimated(make_estimator(method, read.knowledge(0)), read.ratio)
-            force = by_curve(siemens - rest, curve)
+            siemens = seen(trial_of(trial.rest, frames), mode, method)
+            force = by_curve(siemens - rest, log_rises)
             share = force / np.where(trial.pressed, true_n, 1) - 1
             shares.append(np.abs(share)[trial.pressed])
     flat, moved = (np.quantile(np.concatenate(parts), [0.5, 0.9]) for parts in off.values())
@@ -300,14 +252,8 @@ def measure(part: Part) -> dict[str, Any]:
             percent = wires(mode, method, kinds, part.of(LEARNED))
             figures[f"{mode}_wires_{method}{name}_percent"] = percent
         figures |= bent(mode, method, part.of(BENT))
-    figures["far_wires_limit_percent"] = wires_limit(part.of(FRAMES))
     return figures
 
 
-def main() -> int:
-    bars = [bar for method in METHODS for bar in bars_of(method)]
-    return run(__doc__, measure, bars)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(__doc__, measure, [bar for method in METHODS for bar in bars_of(method)]))

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure what a user gets who knows no wires: fingertips, and the paper's method under noise.
+"""Measure what a user gets who knows no wires: fingertips.
 
     make bench-fingers
 
-Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
-missed. Everything is simulated, with the circuit that ngspice was compared with; readings have 10
+Everything is simulated, with the circuit that ngspice was compared with; readings have 10
 bits. Fingertips move in circles over 8x8 skins: the pressure of each is a Gaussian of 0.6 to 1.0
 cells with a peak of 30 to 150 uS, around those of tests/data/finger_8x8. `one`, `two`: so many
 fingertips at once, on 12 skins, 150 frames of each; `all`: both. Pressed cells conduct half as much
@@ -21,46 +20,27 @@ within_*        all cells of all these scenes: share within 1, 2 and 4 stated de
 stated_*        pressed cells: the median of what is stated over the median error.
 limit_*         90th percentile of the errors that one frame of them allows whoever knows which
                 cells are pressed: wires not told, and wires known exactly (studies/information.py).
-force_*         `touch`, scene "moving" of six skins, calibrated as examples/forces.py says: share
-                of the scans whose sum of forces is within 20 % of that of the true conductances.
-paper_*         2x2, noise of 0.3 LSB before rounding, 0 to 4 touches of 2 to 100 kohm, 150 frames:
-                share that converges; share of `regularized` within 1 % of `matrix`; median time of
-                a frame of `regularized` over that without noise.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-import ohmskin
 from bars import Bar, Part, at_least, at_most, run  # beside this file
-from ohmskin.calibrate.presses import Calibrator
-from ohmskin.calibrate.tables import load_press_table
-from ohmskin.circuit.skin import readings
-from ohmskin.emulate.scenes import BEGIN_S, Scene
-from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.methods import make_estimator
-from ohmskin.force.reader import SkinReader
-from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import estimate_file
-from places import ROOT  # tests/helpers
-from studies.conditions import converted
 from studies.information import information_limit
 from studies.judge import Judged, judge_trial, pooled
-from studies.trials import NOISE_LSB, NOMINAL_WIRE_OHM, Trial, finger_trial, skin_at_rest
+from studies.trials import NOMINAL_WIRE_OHM, Trial, finger_trial
 
-METHODS, PAPER = ("joint", "touch"), ("lsq", "regularized", "matrix")
+METHODS = ("joint", "touch")
 SEED = 5000  # of the first skin
 SKINS, FRAMES = 12, 150  # skins of one fingertip, and of two; frames of each
-SCENES, SCANS = 6, 270  # skins of the scene "moving" that are read as forces; scans of each
-PAPER_FRAMES = 150  # that the paper's methods read
 # Of each fingertip: standard deviation of its pressure [cells], and its peak [S]. Chosen: around
 # those of tests/data/finger_8x8.
 SIGMA_CELLS, PEAK_SIEMENS = (0.6, 1.0), (3e-5, 1.5e-4)
@@ -68,9 +48,6 @@ WIRE_OHM = (20.0, 1000.0)  # a segment of skins whose wires are mixed: a decade 
 # The first frames, in which wires are not learned yet, and the late ones, in which they are.
 FIRST, LATE = slice(0, 50), slice(100, None)
 TOUCHED_SIEMENS = 5e-6  # a frame touches if all its cells together rise by so much. Chosen.
-CALIBRATED_MM2 = 80.0  # of the indenter of examples/presses.csv
-PAPER_TOUCH_OHM = (2e3, 1e5)  # hardest and lightest touch of the 2x2 skins. Chosen.
-CLOSE_SHARE = 0.2  # a sum of forces is right within this share of the true one. Chosen.
 WITHIN_PERCENT = {1: 60, 2: 90, 4: 99}  # bars: cells within so many stated deviations
 
 
@@ -169,59 +146,6 @@ def of_limits(figures: Figures, skins: int) -> None:
             figures.put(f"limit_{name}_{word}_p90_percent", p90)
 
 
-def of_forces(figures: Figures, scenes: int) -> None:
-    table = load_press_table(ROOT / "examples" / "presses.csv")
-    close = []
-    for seed in range(scenes):
-        scene = Scene("moving", 8, 8, seed=seed)
-        with ohmskin.open(f"emulator://8x8?seed={seed}", start=False) as skin:
-            board = skin.info
-        rest = ratio_from_codes(quantise(scene.rest_ratio))
-        calibrator = Calibrator(board, rest, "touch", 1e-6 * CALIBRATED_MM2)
-        calibration, _ = calibrator.calibration(calibrator.presses_in_table(table))
-        reader = SkinReader(board, calibration)
-        at_rest = Scene("rest", 8, 8, seed=seed).skin(0.0).cell_siemens
-        for number in range(SCANS):
-            time_s = number / 90 + BEGIN_S
-            codes = quantise(scene.ratio(time_s))
-            scan = reader.read(Scan(codes, number, 11_111 * number, number / 90, 0))
-            rise = scene.skin(time_s).cell_siemens - at_rest
-            true_n, _ = calibration.model.predict(rise, np.zeros_like(rise))
-            close.append(abs(scan.force_n.sum() / true_n.sum() - 1) < CLOSE_SHARE)
-    figures.put("force_touch_within_20_percent", 100 * np.mean(close), 1)
-
-
-def of_paper(figures: Figures, frames: int) -> None:
-    """The paper's method, on noisy and on perfect readings of the same frames."""
-    random = np.random.default_rng(SEED)
-    low, high = np.log(PAPER_TOUCH_OHM)
-    seconds: defaultdict[str, list[float]] = defaultdict(list)
-    converged: defaultdict[str, list[bool]] = defaultdict(list)
-    close = []
-    for _ in range(frames):
-        skin = skin_at_rest(2, 2, random)
-        cells = skin.cell_siemens.copy()
-        places = random.permutation(4)[: random.integers(0, 5)]
-        cells.flat[places] = 1 / np.exp(random.uniform(low, high, places.size))
-        skin = replace(skin, cell_siemens=cells)
-        noisy = converted(readings(skin), random, NOISE_LSB)
-        known = SkinKnowledge(2, 2, adc_bits=ADC_BITS)
-        by = {method: make_estimator(method, known).estimate(noisy) for method in PAPER}
-        for method in ("lsq", "regularized"):
-            converged[method].append(by[method].converged)
-        off = np.abs(by["regularized"].cell_siemens / by["matrix"].cell_siemens - 1)
-        close.append(bool(off.max() < 0.01))
-        seconds["noisy"].append(by["regularized"].seconds)
-        perfect = make_estimator("regularized", known).estimate(converted(readings(skin)))
-        seconds["perfect"].append(perfect.seconds)
-    for method, of_frames in converged.items():
-        figures.put(f"paper_{method}_converged_percent", 100 * np.mean(of_frames), 1)
-    figures.put("paper_as_matrix_percent", 100 * np.mean(close), 1)
-    figures.put(
-        "paper_time_over_exact", np.median(seconds["noisy"]) / np.median(seconds["perfect"])
-    )
-
-
 def bars_of(method: str) -> list[Bar]:
     bars = [
         at_least(f"within_{n}_std_{method}_percent", share) for n, share in WITHIN_PERCENT.items()
@@ -243,27 +167,14 @@ def bars_of(method: str) -> list[Bar]:
     return bars
 
 
-def bars_of_all() -> list[Bar]:
-    bars = [bar for method in METHODS for bar in bars_of(method)]
-    bars.append(at_least("force_touch_within_20_percent", 95))
-    bars += [at_least(f"paper_{method}_converged_percent", 97) for method in PAPER[:2]]
-    return [*bars, at_least("paper_as_matrix_percent", 95), at_most("paper_time_over_exact", 1)]
-
-
 def measure(part: Part) -> dict[str, Any]:
     """All figures, as the JSON line has them."""
     figures = Figures()
     for method in METHODS:
         of_fingers(figures, method, part.of(SKINS))
     of_limits(figures, part.of(SKINS))
-    of_forces(figures, part.of(SCENES))
-    of_paper(figures, part.of(PAPER_FRAMES))
     return figures
 
 
-def main() -> int:
-    return run(__doc__, measure, bars_of_all())
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(__doc__, measure, [bar for method in METHODS for bar in bars_of(method)]))

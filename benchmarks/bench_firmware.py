@@ -4,8 +4,7 @@ machine's speed, and two runs give the same numbers.
 
     make bench-firmware
 
-Prints a table of bars and, as the last line, one JSON object with an entry for each board. The exit
-code is 1 when a bar is missed. What is measured how:
+The JSON object has an entry for each board. What is measured how:
 
 scan_hz, jitter_us    from the instants at which the converter holds the first reading of a scan,
                       at the 90 Hz setting, 8x8. Jitter is the largest deviation from a grid of

@@ -3,8 +3,7 @@
 
     make bench-force
 
-Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
-missed. Takes a little longer than the live run: 10 minutes, or `--minutes N`. All skins are
+Takes a little longer than the live run: 10 minutes, or `--minutes N`. All skins are
 simulated, 8x8. What is measured how:
 
 force_ms_*              median wall time of one scan, from codes to forces and contacts, one core,
@@ -33,7 +32,8 @@ import numpy as np
 import ohmskin
 from bars import at_least, at_most, run_minutes  # beside this file
 from ohmskin.arrays import Float
-from ohmskin.calibrate.presses import Calibrator, Presses
+from ohmskin.calibrate.presses import Calibrator
+from ohmskin.calibrate.tables import load_press_table
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import Calibration
@@ -41,6 +41,7 @@ from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recorder import Recorder
+from places import ROOT  # tests/helpers
 from served import Load, started  # beside this file
 from studies.trials import reference_trial, rounded
 
@@ -48,25 +49,14 @@ PRESSES = "presses_8x8"  # of tests/data
 FINGER = "emulator://8x8?scene=moving&seed=1"
 SCANS, WARM_UP = 360, 20  # scans that are timed; the first ones do not count
 RECORDED_S = 10.0  # of the live run
-# Of every cell: how it answers to force [S/N]. Chosen: 5 N conduct as a firm touch, 10 kohm.
-SIEMENS_PER_NEWTON = 20e-6
 
 
 def calibration(board: Hello, rest_ratio: Float, method: str) -> Calibration:
-    """Of a skin of which every cell answers alike: what a force costs does not depend on it."""
+    """By the example's presses: what a force costs does not depend on them."""
     wires = WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
     calibrator = Calibrator(board, rest_ratio, method, 1e-4, wires)
-    cells = np.repeat(np.arange(64), 6)
-    force_n = np.tile(np.arange(1.0, 7.0), 64)
-    presses = Presses(
-        cells=cells,
-        rise=SIEMENS_PER_NEWTON * force_n,
-        rise_std=np.full(cells.size, 1e-8),
-        force_n=force_n,
-        press=np.arange(cells.size),
-        shape=(8, 8),
-    )
-    return calibrator.calibration(presses)[0]
+    table = load_press_table(ROOT / "examples" / "presses.csv")
+    return calibrator.calibration(calibrator.presses_in_table(table))[0]
 
 
 def board_8x8() -> Hello:
@@ -163,9 +153,5 @@ def measure(minutes: float) -> dict[str, Any]:
     return scan_times() | live(minutes)
 
 
-def main() -> int:
-    return run_minutes(__doc__, measure, BARS, minutes=10.0, least_minutes=0.05)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_minutes(__doc__, measure, BARS, minutes=10.0, least_minutes=0.05))

@@ -2,13 +2,10 @@
 """Measure what importing the package and asking for its help cost, and when a demo says a word.
 
     make bench-import
-    .venv/bin/python benchmarks/bench_import.py --runs 25
 
 The processor time of a process is divided by that of one that imports what every host program needs
 anyway: numpy, scipy.linalg and serial. The programs take turns, and the median of the ratios' parts
 counts.
-Prints a table of bars and, as the last line, one JSON object. The exit code is 1 when a bar is
-missed.
 
 reference_ms    user and system time of `import numpy, scipy.linalg, serial` [ms]
 import_ratio    `import ohmskin`: names load their modules when they are first asked for
@@ -25,8 +22,9 @@ import subprocess
 import sys
 import time
 
-from bars import QUICK, at_most, finish, options  # beside this file
+from bars import Part, at_most, run  # beside this file
 
+RUNS = 9  # of each program. Chosen.
 REFERENCE = ("-c", "import numpy, scipy.linalg, serial")
 OPEN = "import ohmskin\nwith ohmskin.open('emulator://2x2') as skin: skin.latest()"
 PROGRAMS = {
@@ -58,24 +56,21 @@ def word_s(*arguments: str) -> float:
     return taken_s
 
 
-def main() -> int:
-    parser = options(__doc__)
-    parser.add_argument("--runs", type=int, default=9, help="of each program")
-    asked = parser.parse_args()
-    runs = asked.part.of(asked.runs)
+def measure(part: Part) -> dict[str, float]:
+    """All figures, as the JSON line has them."""
+    runs = part.of(RUNS)
     programs = {"reference": REFERENCE, **PROGRAMS}
     for arguments in programs.values():
         cpu_s(arguments)  # its first run compiles modules
     times = [{name: cpu_s(program) for name, program in programs.items()} for _ in range(runs)]
     median = {name: statistics.median(run[name] for run in times) for name in programs}
-    figures: dict[str, float | None] = {"reference_ms": round(1e3 * median["reference"], 1)}
+    figures = {"reference_ms": round(1e3 * median["reference"], 1)}
     figures |= {name: round(median[name] / median["reference"], 2) for name in PROGRAMS}
     words = [(word_s("-m", "ohmskin", "demo"), word_s("-c", "import numpy")) for _ in range(runs)]
     demo_s, numpy_s = map(statistics.median, zip(*words, strict=True))
     figures["word_ratio"] = round(demo_s / numpy_s, 2)
-    code = finish(figures, BARS)
-    return 0 if asked.part is QUICK else code
+    return figures
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(__doc__, measure, BARS))

@@ -14,6 +14,7 @@ readings: median and 90th percentile over pressed cells.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from places import ROOT
 
 ORDERS = ("a e b f", "e a f b", "a b e f", "a b h g", "a b g h")
 DESK = {"sample_pf": 14, "input_ohm": 10e3, "node_pf": 100, "line_pf": 30, "cell_pf": 2}
-COPIED = ("host", "protocol", "firmware/src", "firmware/sim", "tests/helpers", "benchmarks")
+FAR_READINGS = re.compile(r'(?<=name = "far", value = 1, readings = )\[.*?\]')  # in frames.toml
 
 
 def skins() -> list[tuple[Float, Float, Float]]:
@@ -56,7 +57,7 @@ def resistance(ratio: Float, names: tuple[str, ...]) -> Float:
     return np.asarray(voltage / (1 - of["a"] + of["b"]))
 
 
-def measure() -> int:
+def measure() -> None:
     """In a copy: print the errors of its order."""
     from lockstep import Rig
     from ohmskin.circuit.skin import Skin, all_readings, end_admittance
@@ -85,25 +86,16 @@ def measure() -> int:
         median, high = np.percentile(np.concatenate(parts), [50, 90])
         texts.append(f"{what} {median:5.2f} % {high:6.2f} %")
     print(f"{' '.join(names)}:  {',  '.join(texts)}", flush=True)
-    return 0
 
 
-def main() -> int:
+def main() -> None:
     part = options(__doc__).parse_args().part
     for order in ORDERS[:1] if part is QUICK else ORDERS:
         with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder)
-            for name in COPIED:
-                shutil.copytree(ROOT / name, copy / name)
-            (copy / "firmware" / "test").mkdir()
-            scripts = ("firmware/reserve_r2.py", "firmware/version.py")
-            for name in ("platformio.ini", "pyproject.toml", *scripts):
-                shutil.copy(ROOT / name, copy / name)
+            copy = Path(folder) / "ohmskin"
+            shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".*", "node_modules"))
             frames = copy / "protocol" / "frames.toml"
-            far = 'name = "far", value = 1, readings = ['
-            begin, end = frames.read_text().split(far)
-            names = str(order.split())[1:]
-            frames.write_text(begin + far + names + end.partition("]")[2])
+            frames.write_text(FAR_READINGS.sub(str(order.split()), frames.read_text()))
             path = ":".join(map(str, (copy / "host", copy, copy / "tests" / "helpers")))
             pio = str(Path(sys.executable).parent / "pio")
             for command in (
@@ -114,8 +106,7 @@ def main() -> int:
                 quiet = subprocess.DEVNULL if command[-1] != "measure" else None
                 environment = os.environ | {"PYTHONPATH": path}
                 subprocess.run(command, check=True, stdout=quiet, cwd=copy, env=environment)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(measure() if sys.argv[1:] == ["measure"] else main())
+    measure() if sys.argv[1:] == ["measure"] else main()

@@ -5,8 +5,7 @@
     .venv/bin/python benchmarks/bench_view.py --minutes 10
 
 The board, the server and headless Chromium are processes of their own on this machine; the board is
-at a pseudo-terminal, Chromium renders in software. Prints the load of the machine, a table of bars
-and, as the last line, one JSON object. The exit code is 1 when a bar is missed.
+at a pseudo-terminal, Chromium renders in software. Says at the end what the machine had to do.
 
 latency_ms_p50, _p99   from when the last byte of a scan was read (`Scan.host_time_s`) until the
                        page has handed the frame with it to the compositor: the message that a
@@ -80,13 +79,16 @@ def measure(minutes: float) -> dict[str, Any]:
     """All figures, as the JSON line has them."""
     from playwright.sync_api import sync_playwright
 
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        sys.exit("needs Chromium, which 'make setup' installs")
     with ExitStack() as stack:
         _, port = stack.enter_context(started("emulate", SCENE))
         view = ("view", port, "--http-port", "0", "--no-browser")
         server, url = stack.enter_context(started(*view))
         playwright = stack.enter_context(sync_playwright())
         browser = playwright.chromium.launch(
-            executable_path=shutil.which("chromium"),
+            executable_path=chromium,
             args=[] if os.geteuid() else ["--no-sandbox"],
         )
         stack.callback(browser.close)
@@ -110,6 +112,7 @@ def measure(minutes: float) -> dict[str, Any]:
     print(
         f"{missed} missed by the host, longest latency {latency_ms.max():.0f} ms", file=sys.stderr
     )
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores", file=sys.stderr)
     return {
         "minutes": round(seconds / 60, 2),
         "latency_ms_p50": round(float(np.median(latency_ms)), 1),
@@ -134,15 +137,5 @@ BARS = (
 )
 
 
-def main() -> int:
-    if not shutil.which("chromium"):
-        print("needs Chromium, which 'make setup' installs", file=sys.stderr)
-        return 2
-    print(f"load at the beginning: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
-    code = run_minutes(__doc__, measure, BARS, minutes=1.0, least_minutes=0.1)
-    print(f"load at the end: {os.getloadavg()[0]:.1f}", file=sys.stderr)
-    return code
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_minutes(__doc__, measure, BARS, minutes=1.0, least_minutes=0.1))
