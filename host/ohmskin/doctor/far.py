@@ -32,15 +32,17 @@ The readings alone do not determine n segments. They are taken to scatter about 
     cost(r) = |(u - A r) / s|^2 + |(r - m) / (SPREAD m)|^2
 
 With m free, this gives the segments of a sound line. With the usual m of the layer, and one segment
-that may have any resistance, it finds a bad segment. If no r fits, the far end is at fault; also if
-u = k w fits clearly better, with k from 0 to 1: so reads a far end that is not connected. If what
-the circuit says of another line's far end fits, the ends are swapped.
+that may have any resistance, it finds a bad segment.
+
+A far end is at fault if no r fits, or if u = k w fits clearly better, with k from 0 to 1. That is
+what a node shows that is not connected: it keeps the voltage of the cell before (k = 1), unless the
+converter's sample capacitor brings along that of the near end, which is read before (down to
+k = 0). Two ends are swapped if what the circuit says of the other line's end fits.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -53,14 +55,14 @@ from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import SEGMENT_STD
-from ohmskin.link.protocol import ADC_BITS
+from ohmskin.link.protocol import ADC_BITS, LARGEST_CODE
 
 # [1] Segments of a line scatter by this share of their mean. Chosen: twice what estimators expect.
 SPREAD: Final = 2 * SEGMENT_STD
 # [1] A, and with it A r, is known to this share. Chosen: what is left after ROUNDS.
 MODEL_STD: Final = 0.01
-# [rounds] Each makes the error of A smaller by the share of the wires in a port. Chosen: enough for
-# 2 kOhm a segment (tests/doctor/test_far_doctor.py).
+# [rounds] Each multiplies the error of A by the share of the wires in a port's resistance. Chosen:
+# enough for 2 kOhm a segment (tests/doctor/test_far_doctor.py).
 ROUNDS: Final = 3
 # [chi-square] Two faults whose costs differ by less may be either. Chosen: two deviations, squared.
 ALIKE_COST: Final = 4.0
@@ -69,35 +71,17 @@ ALIKE_COST: Final = 4.0
 MOST_LINE_OHM: Final = 50e3
 
 
-@dataclass(frozen=True, eq=False)
-class LayerReadings:
-    """What the readings say of the wires of a layer, by the symbols of this module.
-
-    current_share: A, (L, n, n).
-    loss_ohm: u, (L, n) [ohm].
-    std_ohm: s, (L, n) [ohm].
-    floating_ohm: w, (L, n) [ohm].
-    """
-
-    current_share: Float
-    loss_ohm: Float
-    std_ohm: Float
-    floating_ohm: Float
-
-    @cached_property
-    def weighed(self) -> Float:
-        """A^T / s^2, (L, n, n): times A or u, the two sides of the normal equations."""
-        return (self.current_share / self.std_ohm[..., None] ** 2).swapaxes(1, 2)
-
-
 class FarReadings:
-    """Mean readings of mode far, of the rows and columns that are kept. kept: their numbers.
+    """Mean readings of mode far, without the rows and columns that are left out (`examine_far`).
 
-    shape: number of rows and columns.
-    cell_siemens: the cells, (R, C) [S]: first as if wires had no resistance, then by `layers`.
+    shape: number of rows and columns that are kept.
+    loss_std_floating: u, s and w of rows (3, R, C), and of columns (3, C, R) [ohm].
+    cell_siemens: the cells, (R, C) [S]; first as if wires had no resistance, later as
+        `current_shares` corrects them.
     """
 
     def __init__(self, rest: Rest, kept: list[list[int]]) -> None:
+        """kept: numbers of the rows, and of the columns, that are kept."""
         self._refs, ratio = (rest.board.ref_top_ohm, rest.board.ref_bottom_ohm), rest.ratio
         # A far node that floats keeps the voltage of the cell that was read before. A scan goes
         # down one column after the other.
@@ -106,46 +90,47 @@ class FarReadings:
         ratio = ratio[np.ix_(*kept)]
         self.shape = ratio.shape[0], ratio.shape[1]
         near = circuit.as_near(ratio, "aebf")
+        # At least 1e-9 S, which no code shows: losses are divided by it.
         self._current = np.maximum(circuit.current_from_ratio(near, *self._refs), 1e-9)
         a, e, b, f = np.moveaxis(ratio, -1, 0)
         loss = np.stack([a - e, f - b])
-        # A loss is the difference of two readings, and A r is not known exactly.
+        # A loss is the difference of two readings, and the A r that explains it is not exact.
         std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * loss)
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
-        self._loss_std_floating = np.stack([loss, std, floating], axis=1) / self._current
+        rows, columns = np.stack([loss, std, floating], axis=1) / self._current
+        self.loss_std_floating = rows, columns.swapaxes(1, 2)
         board = SkinKnowledge(*self.shape, *self._refs, rest.board.adc_bits)
         self._matrix = make_estimator("matrix", board)
         self.cell_siemens = self._matrix.estimate(near).cell_siemens
 
-    def layers(self, wire_ohm: Float) -> tuple[LayerReadings, LayerReadings]:
-        """Rows and columns, if the segments are `wire_ohm` (2, R, C). Corrects the cells for these.
+    def current_shares(self, wire_ohm: Float) -> tuple[Float, Float]:
+        """A of rows and of columns, if the segments are `wire_ohm` (2, R, C). Corrects the cells.
 
-        `matrix` knows no wires. So it is given the readings of a skin without them: of ports that
-        have less resistance by what the wires add.
+        `matrix` takes wires for a part of the cells. So it is given what a skin without wires would
+        read: each port without the resistance that the wires add to it.
         """
         refs_ohm = sum(self._refs)
         of_wires = circuit.PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
         of_wires -= circuit.PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
+        # At least 1 ohm: in a short, noise may make less than nothing of what is left.
         port_ohm = np.maximum(1 / self._current - refs_ohm - of_wires.reshape(self.shape), 1.0)
         ratio = circuit.ratio_from_current(1 / (port_ohm + refs_ohm), *self._refs)
         self.cell_siemens = self._matrix.estimate(ratio).cell_siemens
         wired = circuit.PortCircuit(self.cell_siemens, *wire_ohm)
-        rows, columns = self._loss_std_floating
-        return (
-            LayerReadings(wired.line_current(0), *rows),
-            LayerReadings(wired.line_current(1), *columns.swapaxes(1, 2)),
-        )
+        return wired.line_current(0), wired.line_current(1)
 
     def ends(self, wire_ohm: Float) -> tuple[Float, Float]:
         """What u of each line would be if the far end of another line were read for it [ohm].
 
-        This is what the circuit says of swapped ends, if the segments are `wire_ohm` (2, R, C).
-        Of rows (R, R, C), of columns (C, C, R): the end that is read, the line, its port.
+        The circuit says this, if the segments are `wire_ohm` (2, R, C). It is how swapped ends are
+        found. Axes: the line whose end is read, the line whose u it is, its ports. So the shapes
+        are (R, R, C) of rows, and (C, C, R) of columns.
         """
         rows, lines = self.shape[0], sum(self.shape)
         admittance = circuit.end_admittance(circuit.Skin(self.cell_siemens, *wire_ohm))
         by_line = circuit.impedance_of(admittance, rows)[0][:lines]
-        # Potential of each end, near and then far, while a unit current goes through each port.
+        # Potential of each end while a current of 1 goes through each port (R, C). All near ends
+        # come first, rows and then columns, and then all far ends.
         ends = circuit.port_difference(by_line, rows).T.reshape(-1, *self.shape)
         row, column = np.indices(self.shape)
         at_row, at_column = ends[row, row, column], ends[rows + column, row, column]
@@ -166,200 +151,220 @@ class Fit(NamedTuple):
     cost: Float
 
 
-def _fit(layer: LayerReadings, mean_ohm: Float, prior: Float) -> Fit:
-    """The segments of least cost |(u - A r) / s|^2 + (r - mean)^T prior (r - mean).
-
-    mean_ohm: mean of the segments, (..., 1, 1) [ohm].
-    prior: inverse of their covariance before the readings, (..., n, n) [1 / ohm^2].
-
-    A cost above the number of readings, less one, shows that the model is wrong by more than s
-    says. The covariance is widened by as much.
-    """
-    covariance = np.linalg.inv(layer.weighed @ layer.current_share + prior)
-    expected = prior.sum(axis=-1, keepdims=True) * mean_ohm
-    ohm = covariance @ (layer.weighed @ layer.loss_ohm[..., None] + expected)
-    off = (layer.loss_ohm - (layer.current_share @ ohm)[..., 0]) / layer.std_ohm
-    away = ohm - mean_ohm
-    cost = np.sum(off**2, axis=-1) + np.sum(away * (prior @ away), axis=(-1, -2))
-    misfit = np.maximum(cost / max(ohm.shape[-2] - 1, 1), 1.0)
-    return Fit(ohm[..., 0], covariance * misfit[..., None, None], cost)
-
-
-def fit_alike(layer: LayerReadings) -> Fit:
-    """Segments that scatter about the mean of their line. The mean may be anything."""
-    count = layer.loss_ohm.shape[1]
-    # What each segment has if all are equal. It scales the cost in place of m, which is near it.
-    pull = (layer.weighed @ layer.loss_ohm[..., None]).sum(axis=1)
-    precision = (layer.weighed @ layer.current_share).sum(axis=(1, 2))
-    equal_ohm = (pull / precision[:, None])[..., None]
-    scale = (SPREAD * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
-    # This matrix takes the mean out of r, so that only differences from it cost something.
-    return _fit(layer, equal_ohm, scale * (np.eye(count) - 1 / count))
-
-
-def fit_one_bad(layer: LayerReadings, usual_ohm: float) -> Fit:
-    """Segments that scatter about the usual one of the layer, but for one, which may be anything.
-
-    There are n + 1 fits of each line, (n + 1, L): the k-th segment is the free one in the k-th fit,
-    and none is in the last.
-    """
-    count = layer.loss_ohm.shape[1]
-    bound = (1 - np.eye(count + 1, count))[:, None, None]  # 0: this segment is free
-    prior = (SPREAD * usual_ohm) ** -2.0 * np.eye(count) * bound
-    return _fit(layer, np.full((1, 1, 1), usual_ohm), prior)
-
-
 class _Layer:
-    """The rows (axis 0) or the columns (axis 1) that are kept, and what was found of their wires.
+    """The rows (axis 0) or the columns (axis 1) that are kept, and what is found of their wires.
 
     numbers: the numbers of its lines.
     across: the numbers of the lines that cross them.
-    measured: which lines have wires that are measured, (L,).
+    shorts: groups of its lines that are shorted, by number.
+    loss_ohm, std_ohm, floating_ohm: u, s and w, (L, n) [ohm].
+
+    `fit_lines` sets the others:
+
+    current_share: A, (L, n, n).
+    fit: segments of each line that scatter about the line's own mean. Where one bad segment
+        explains a line, `report_wires` replaces them.
     lost: which lines have a far end at fault, (L,).
-    fit: segments of all lines.
+    measured: which lines have a fit that counts, (L,): neither lost nor shorted.
+    usual_ohm: the usual segment: the median of the measured lines [ohm].
     """
 
     def __init__(
-        self, axis: int, kept: list[list[int]], shorts: list[list[int]], readings: LayerReadings
+        self, axis: int, kept: list[list[int]], shorts: list[list[int]], loss_std_floating: Float
     ) -> None:
         self.axis, self.numbers, self.across = axis, kept[axis], kept[1 - axis]
-        self.readings, self.shorts = readings, shorts
+        self.loss_ohm, self.std_ohm, self.floating_ohm = loss_std_floating
+        self.shorts = shorts
+
+    def fit_lines(self, current_share: Float) -> None:
+        """Fit the segments of all lines, and find the lines whose far end is at fault."""
+        self.current_share = current_share
+        # A^T / s^2, (L, n, n): times A and times u, it gives both sides of the normal equations.
+        self._weighed = (current_share / self.std_ohm[..., None] ** 2).swapaxes(1, 2)
+        self.fit = self._fit_alike()
         # A shorted line has currents of others in its wire, so that u = A r does not hold.
-        shorted = [n for group in shorts for n in group]
-        self.measured = alone = ~np.isin(self.numbers, shorted)
-        self.fit = fit_alike(readings)
+        alone = ~np.isin(self.numbers, [n for group in self.shorts for n in group])
         least_cost = self.fit.cost
-        if len(alone) > 2:  # else no line is usual
-            one_bad = fit_one_bad(readings, self.usual_ohm)
+        if len(alone) > 2:  # of two lines, nobody can say which is usual
+            one_bad = self._fit_one_bad(self._median_ohm(alone))
             least_cost = np.minimum(least_cost, one_bad.cost.min(axis=0))
-        # A connected end costs less than MANY_STDS^2 a reading, and not clearly more than if it
-        # floated.
+        # A connected end costs less than MANY_STDS^2 a reading; and it costs less than a floating
+        # one would, or hardly more: both costs are small where wires lose little.
         most_of_any = MANY_STDS**2 * max(len(self.across) - 1, 1)
         most_cost = np.minimum(most_of_any, MANY_STDS**2 + self._floating_cost())
         too_much = np.abs(self.fit.ohm.sum(axis=1)) > MOST_LINE_OHM
-        at_fault = (least_cost > most_cost) | too_much
-        self.measured, self.lost = alone & ~at_fault, alone & at_fault
+        self.lost = alone & ((least_cost > most_cost) | too_much)
+        self.measured = alone & ~self.lost
+        self.usual_ohm = self._median_ohm(self.measured)
+
+    def _fit(self, mean_ohm: Float, prior: Float) -> Fit:
+        """The segments of least cost |(u - A r) / s|^2 + (r - mean)^T prior (r - mean).
+
+        mean_ohm: mean of the segments, (..., 1, 1) [ohm].
+        prior: inverse of their covariance before the readings, (..., n, n) [1 / ohm^2].
+
+        A right model costs about n - 1: n readings and n segments' prior, less n segments and one
+        mean, or one bad segment, that are free. A higher cost shows that the model is wrong by more
+        than s says. The covariance is widened by as much.
+        """
+        covariance = np.linalg.inv(self._weighed @ self.current_share + prior)
+        expected = prior.sum(axis=-1, keepdims=True) * mean_ohm
+        ohm = covariance @ (self._weighed @ self.loss_ohm[..., None] + expected)
+        off = (self.loss_ohm - (self.current_share @ ohm)[..., 0]) / self.std_ohm
+        away = ohm - mean_ohm
+        cost = np.sum(off**2, axis=-1) + np.sum(away * (prior @ away), axis=(-1, -2))
+        misfit = np.maximum(cost / max(ohm.shape[-2] - 1, 1), 1.0)
+        return Fit(ohm[..., 0], covariance * misfit[..., None, None], cost)
+
+    def _fit_alike(self) -> Fit:
+        """Segments that scatter about the mean of their line. The mean may be anything."""
+        # What each segment has if all of a line are equal: one unknown a line, by least squares. It
+        # is near m, and stands for it in SPREAD m: so the cost stays a square.
+        both_sides = (self._weighed @ self.loss_ohm[..., None]).sum(axis=1)
+        precision = (self._weighed @ self.current_share).sum(axis=(1, 2))
+        equal_ohm = (both_sides / precision[:, None])[..., None]
+        per_square_ohm = (SPREAD * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
+        # This matrix takes the mean out of r, so that only differences from it cost something.
+        count = len(self.across)
+        return self._fit(equal_ohm, per_square_ohm * (np.eye(count) - 1 / count))
+
+    def _fit_one_bad(self, usual_ohm: float) -> Fit:
+        """Segments that scatter about the usual one of the layer, but for one that may be anything.
+
+        There are n + 1 fits of each line, (n + 1, L): the k-th segment is the free one in the k-th
+        fit, and none is in the last.
+        """
+        count = len(self.across)
+        bound = (1 - np.eye(count + 1, count))[:, None, None]  # 0: this segment is free
+        prior = (SPREAD * usual_ohm) ** -2.0 * np.eye(count) * bound
+        return self._fit(np.full((1, 1, 1), usual_ohm), prior)
 
     def _floating_cost(self) -> Float:
         """Cost (L,) of the readings, if the far ends float: |(u - k w) / s|^2, of the best k."""
-        std_ohm = self.readings.std_ohm
-        u, w = self.readings.loss_ohm / std_ohm, self.readings.floating_ohm / std_ohm
+        u, w = self.loss_ohm / self.std_ohm, self.floating_ohm / self.std_ohm
         k = np.sum(w * u, axis=1) / np.maximum(np.sum(w * w, axis=1), 1e-30)
         return np.asarray(np.sum((u - np.clip(k, 0, 1)[:, None] * w) ** 2, axis=1))
 
-    @property
-    def usual_ohm(self) -> float:
-        """The usual mean of a line's segments: the median of the lines, of measured ones if any."""
-        ohm = self.fit.ohm[self.measured] if self.measured.any() else self.fit.ohm
-        return max(float(np.median(ohm.mean(axis=1))), 1.0)
+    def _median_ohm(self, lines: Bool) -> float:
+        """Median of the mean segments of these lines, by mask; of all lines if it is empty."""
+        ohm = self.fit.ohm[lines] if lines.any() else self.fit.ohm
+        return max(float(np.median(ohm.mean(axis=1))), 1.0)  # 1 ohm: a prior is divided by it
 
     @property
     def wire_ohm(self) -> Float:
         """Segments (L, n); the usual ones where a line is not measured."""
         return np.maximum(np.where(self.measured[:, None], self.fit.ohm, self.usual_ohm), 0.0)
 
-    def place(self, lines: Any) -> Place:
-        """Lines of this layer, by index or mask."""
-        return Place.of_lines(self.axis, np.array(self.numbers)[lines])
+    def place(self, lines: Iterable[int]) -> Place:
+        """Lines of this layer, by index."""
+        return Place.of_lines(self.axis, (self.numbers[line] for line in lines))
 
     def report_shorts(self, diagnosis: Diagnosis) -> None:
-        """Say which shorted lines are joined at their far ends, and not at their near ends.
+        """Add shorted lines that are joined at their far ends, and not at their near ends.
 
-        Either way, the current of a port divides among the lines. Joined at near ends, a line
-        carries the current of its own cells, up to these. Joined at far ends, it also carries that
-        of the other lines' cells, through all its segments. So it loses more: what it loses is
-        compared with the mean of both.
+        Joined anywhere, N lines share the current of a port, so that each has 1/N of it. If they
+        are joined at their near ends, this flows up to the crossing: through so many segments on
+        average as A says. If they are joined at their far ends, the port's line also carries the
+        current of the N - 1 others, through all of its segments. The limit is midway.
         """
         for group in self.shorts:
-            line, others = self.numbers.index(group[0]), len(group) - 1
-            near = float(self.readings.current_share[line].sum(axis=1).mean())  # in segments
-            far = near + others * len(self.across)
-            loss_ohm = self.readings.loss_ohm[line].mean() * len(group)
-            if loss_ohm > self.usual_ohm * (near + far) / 2:
+            line = self.numbers.index(group[0])
+            near_segments = float(self.current_share[line].sum(axis=1).mean())
+            far_segments = near_segments + (len(group) - 1) * len(self.across)
+            loss_ohm = len(group) * self.loss_ohm[line].mean()
+            if loss_ohm > self.usual_ohm * (near_segments + far_segments) / 2:
                 diagnosis.add(Kind.SHORT_FAR, Place.of_lines(self.axis, group))
 
     def report_ends(self, ends_ohm: Float, dead: Bool, diagnosis: Diagnosis) -> None:
         """Add far ends that do not show their lines.
 
-        ends_ohm: what `FarReadings.ends` gives for this layer. dead: dead cells, (R, C).
+        ends_ohm: what `FarReadings.ends` gives for this layer.
+        dead: dead cells, (R, C).
         """
-        self.lost &= [not self.report_broken(n, dead, diagnosis) for n in range(len(self.lost))]
-        off = (self.readings.loss_ohm - ends_ohm) / self.readings.std_ohm
-        chi2 = np.mean(off**2, axis=2)
-        np.fill_diagonal(chi2, np.inf)
+        for line in lines_of(self.lost):
+            self.lost[line] = not self._report_broken(line, dead, diagnosis)
+        off = (self.loss_ohm - ends_ohm) / self.std_ohm
+        chi2 = np.mean(off**2, axis=2)  # axes: the line whose end may be read, the line
+        np.fill_diagonal(chi2, np.inf)  # its own end has been judged
         swapped = self.lost & (chi2.min(axis=0) < MANY_STDS**2)
         for kind, lines in ((Kind.SWAPPED_FAR, swapped), (Kind.OPEN_FAR, self.lost & ~swapped)):
             if lines.any():
-                diagnosis.add(kind, self.place(lines))
+                diagnosis.add(kind, self.place(lines_of(lines)))
 
-    def report_broken(self, line: int, dead: Bool, diagnosis: Diagnosis) -> bool:
-        """Whether all cells of a line are dead from some cell on. If its far end is lost, too, its
-        yarn is broken there: this is added, and explains these dead cells.
+    def _report_broken(self, line: int, dead: Bool, diagnosis: Diagnosis) -> bool:
+        """Whether the yarn of a line is broken, whose far end is lost.
+
+        It is if all cells from some crossing on are dead. It is added, and explains these cells.
         """
-        in_line = np.take(dead, self.numbers[line], axis=self.axis)[self.across]
+        number = self.numbers[line]
+        in_line = np.take(dead, number, axis=self.axis)[self.across]
         alive = np.flatnonzero(~in_line)
         beyond = self.across[alive[-1] + 1 :] if alive.size else []
-        if beyond and self.lost[line]:
-            explained = np.zeros_like(dead)
-            np.moveaxis(explained, self.axis, 0)[self.numbers[line], beyond] = True
-            values = {"between": (self.across[alive[-1]], beyond[0])}
-            place, cells = self.place([line]), Place.of_cells(explained)
-            diagnosis.findings.append(Finding(Kind.BROKEN_YARN, place, values, cells))
-        return bool(beyond)
+        if not beyond:
+            return False
+        explained = np.zeros_like(dead)
+        np.moveaxis(explained, self.axis, 0)[number, beyond] = True
+        values = {"between": (self.across[alive[-1]], beyond[0])}
+        place, cells = self.place([line]), Place.of_cells(explained)
+        diagnosis.findings.append(Finding(Kind.BROKEN_YARN, place, values, cells))
+        return True
 
     def report_wires(self, nominal_ohm: float | None, diagnosis: Diagnosis) -> None:
-        """Add the wire of each measured line, and lines that are clearly not as they should be.
+        """Add lines that are clearly not as they should be, and the wire of each measured line.
 
-        All lines together are compared with `nominal_ohm`, if it is known. Each line is compared
-        with the usual one, unless one bad segment explains it better: then this is added. Of two
-        lines, nobody can say which is usual.
+        All lines together are compared with `nominal_ohm`, if it is known. Then each line is
+        compared with the usual one, unless one bad segment explains it.
         """
-        measured: list[int] = np.flatnonzero(self.measured).tolist()
+        measured = list(lines_of(self.measured))
         if nominal_ohm and measured:
             self._compare(measured, nominal_ohm, diagnosis)
-        one_bad, usual_ohm = fit_one_bad(self.readings, self.usual_ohm), self.usual_ohm
-        for line in measured if len(self.measured) > 2 else ():
-            if not self._report_segment(line, one_bad, usual_ohm, diagnosis):
-                self._compare([line], usual_ohm, diagnosis)
+        if len(self.measured) > 2:  # of two lines, nobody can say which is usual
+            one_bad = self._fit_one_bad(self.usual_ohm)
+            for line in measured:
+                if not self._report_segment(line, one_bad, diagnosis):
+                    self._compare([line], self.usual_ohm, diagnosis)
         for line in measured:
             ohm, covariance = self.fit.ohm[line], self.fit.covariance[line]
             whole = float(ohm.sum()), float(covariance.sum()) ** 0.5
             segments = ohm.tolist(), (covariance.diagonal() ** 0.5).tolist()
             diagnosis.lines.append(LineWire(self.place([line]), *whole, *segments))
 
-    def _report_segment(
-        self, line: int, one_bad: Fit, usual_ohm: float, diagnosis: Diagnosis
-    ) -> bool:
-        """Whether one bad segment explains a line clearly better than anything else does.
+    def _report_segment(self, line: int, one_bad: Fit, diagnosis: Diagnosis) -> bool:
+        """Whether one bad segment explains a line. Then it is added, and its fit is the line's.
 
-        Then it is added, and the line takes the segments of that fit.
-        one_bad: what `fit_one_bad` gives of all lines.
+        It does if it explains the line clearly better than usual segments alone do, and as well as
+        a line of another mean; and if it adds a share to the line that counts.
+
+        one_bad: what `_fit_one_bad` gives of all lines.
         """
         costs, none_bad_cost = one_bad.cost[:-1, line], one_bad.cost[-1, line]
-        # Several segments may explain the line. The nearest one has the crimp in it, or is the
-        # nearest to it: contacts fail more often than yarn.
+        # Readings at rest hardly tell where in the line it is: these segments explain it alike. The
+        # nearest one is named first, since it has the crimp in it, or is nearest to that. Crimps
+        # fail more often than yarn.
         candidates = np.flatnonzero(costs < costs.min() + ALIKE_COST)
         k = int(candidates[0])
-        more_ohm = float(one_bad.ohm[k, line, k]) - usual_ohm
-        clear = costs[k] < min(self.fit.cost[line] + ALIKE_COST, none_bad_cost - MANY_STDS**2)
-        if not clear or more_ohm < CHANGED_SHARE * len(self.across) * usual_ohm:
+        more_ohm = float(one_bad.ohm[k, line, k]) - self.usual_ohm
+        explains = costs[k] < min(self.fit.cost[line] + ALIKE_COST, none_bad_cost - MANY_STDS**2)
+        if not explains or more_ohm < CHANGED_SHARE * len(self.across) * self.usual_ohm:
             return False
         self.fit.ohm[line] = one_bad.ohm[k, line]
         self.fit.covariance[line] = one_bad.covariance[k, line]
-        values = {"more_ohm": more_ohm, "std_ohm": float(one_bad.covariance[k, line, k, k]) ** 0.5}
+        std_ohm = float(one_bad.covariance[k, line, k, k]) ** 0.5
+        # Between which lines it is. Before the first one is the electrode, -1.
         between = self.across[k - 1] if k else -1, self.across[candidates[-1]]
-        kind = Kind.BAD_SEGMENT if k else Kind.BAD_CRIMP
-        diagnosis.add(kind, self.place([line]), between=between, **values)
+        kind, place = Kind.BAD_SEGMENT if k else Kind.BAD_CRIMP, self.place([line])
+        diagnosis.add(kind, place, between=between, more_ohm=more_ohm, std_ohm=std_ohm)
         return True
 
-    def _compare(self, lines: Any, segment_ohm: float, diagnosis: Diagnosis) -> None:
+    def _compare(self, lines: list[int], segment_ohm: float, diagnosis: Diagnosis) -> None:
         """Add lines, by index, if their median is clearly not that of segments of `segment_ohm`."""
         ohm = float(np.median(self.fit.ohm[lines].sum(axis=1)))
         std_ohm = float(np.median(self.fit.covariance[lines].sum(axis=(1, 2)) ** 0.5))
         usual_ohm = len(self.across) * segment_ohm
-        # Two sound lines differ, since segments scatter; and both were measured, the usual one as a
-        # median of all lines, whose variance is pi / 2 of that of a mean.
+        # Two sound lines differ, since segments scatter.
         scatter_ohm = (2 / len(self.across)) ** 0.5 * SEGMENT_STD * max(ohm, usual_ohm)
+        # Both were measured, the usual one as the median of all L lines. The variance of a median
+        # is pi / 2 times that of a mean, which has 1 / L of a line's.
         both_std_ohm = (1 + np.pi / 2 / len(self.measured)) ** 0.5 * std_ohm
         doubt_ohm = FEW_STDS * float(np.hypot(both_std_ohm, scatter_ohm))
         if abs(ohm - usual_ohm) > CHANGED_SHARE * usual_ohm + doubt_ohm:
@@ -370,11 +375,13 @@ class _Layer:
 def near_ends(rest: Rest) -> Rest:
     """What mode near would have read of a skin that was read in mode far.
 
-    Readings c and d are those of b and a with the drive reversed: c = 1 - b, d = 1 - a. But there
-    the converter's errors would have the other sign, so here they do not cancel: `offset_lsb`.
+    Mode near also reads c and d, with the drive reversed. On an exact board, c = 1 - b and
+    d = 1 - a, so that is what they are taken for. But on a real board they have the converter's
+    offset with the other sign, which cancels in the mean of all four. Here it does not cancel:
+    `offset_lsb`.
     """
     a, _, b, _ = np.moveaxis(rest.codes, -1, 0)
-    codes = np.stack([a, b, 2**ADC_BITS - 1 - b, 2**ADC_BITS - 1 - a], axis=-1)
+    codes = np.stack([a, b, LARGEST_CODE - b, LARGEST_CODE - a], axis=-1)
     board = replace(rest.board, mode="near")
     return replace(rest, board=board, codes=codes, offset_lsb=2 * ADC_ERROR_LSB)
 
@@ -382,16 +389,20 @@ def near_ends(rest: Rest) -> Rest:
 def segments_of(lines: Sequence[LineWire]) -> WireOhm | None:
     """Segment of each layer [ohm]: the median of its lines, so that one bad line does not count.
 
-    None if it is not known of both layers. The deviation is the mean of both layers', and not less,
-    because what is wrong with the model is wrong in both.
+    None if it is not known of both layers. The deviation is the mean of both layers', and not less
+    as of two measurements, because what is wrong with the model is wrong in both.
     """
-    means, stds = [0.0, 0.0], [np.inf, np.inf]
-    for axis, name in enumerate(("rows", "columns")):
-        if layer := [line for line in lines if getattr(line.place, name)]:
-            ohm, std_ohm = np.median([(line.ohm, line.std_ohm) for line in layer], axis=0).tolist()
-            means[axis] = ohm / len(layer[0].segment_ohm)
-            stds[axis] = std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5
-    return WireOhm(means[0], means[1], sum(stds) / 2) if max(stds) <= KNOWN_STD else None
+    segment_ohm, log_stds = [], []
+    for name in ("rows", "columns"):
+        layer = [line for line in lines if getattr(line.place, name)]
+        if not layer:
+            return None
+        ohm, std_ohm = np.median([(line.ohm, line.std_ohm) for line in layer], axis=0).tolist()
+        segment_ohm.append(ohm / len(layer[0].segment_ohm))
+        # The variance of a median is pi / 2 times that of a mean.
+        log_stds.append(std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5)
+    top, bottom = segment_ohm
+    return WireOhm(top, bottom, sum(log_stds) / 2) if max(log_stds) <= KNOWN_STD else None
 
 
 def examine_far(
@@ -411,12 +422,14 @@ def examine_far(
         left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
         kept.append([n for n in range(len(is_open)) if n not in left_out])
     readings = FarReadings(rest, kept)
+    layers = [
+        _Layer(axis, kept, near.shorts[axis], loss_std_floating)
+        for axis, loss_std_floating in enumerate(readings.loss_std_floating)
+    ]
     wire_ohm: Float = np.zeros((2, *readings.shape))
     for _ in range(ROUNDS):
-        layers = [
-            _Layer(axis, kept, near.shorts[axis], of_layer)
-            for axis, of_layer in enumerate(readings.layers(wire_ohm))
-        ]
+        for layer, current_share in zip(layers, readings.current_shares(wire_ohm), strict=True):
+            layer.fit_lines(current_share)
         wire_ohm = np.stack([layers[0].wire_ohm, layers[1].wire_ohm.T])
     ends_ohm = readings.ends(wire_ohm)
     for layer, ends, nominal in zip(layers, ends_ohm, nominal_ohm or (None, None), strict=True):
