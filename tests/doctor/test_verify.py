@@ -88,7 +88,7 @@ FAULTS = {
     "rows": (swapped(PLATE, 0, 0, 7), "", "swapped_lines", "rows 0, 7"),
     "references": (PLATE, "&ref_top=31000", "reference_value", "reference resistors"),
     "noise": (PLATE, "&noise=2", "adc_noise", "converter"),
-    "hum": (PLATE, "&hum=50", "hum", None),
+    "hum": (PLATE, "&hum=50", "hum", "whole skin"),
     "slow": (PLATE, "&tau_us=10", "settling", None),
     "lost": (PLATE, "&drop=0.05", "loss", "line"),
     "damaged": (PLATE, "&bitflip=0.00005", "damaged", "line"),

@@ -39,11 +39,12 @@ from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
+from ohmskin.link.protocol import LARGEST_CODE
 
-# Open lines. A line that draws this little current is dark.
-# [LSB] Rounding alone shows no current as less than this. Chosen: a code, less some noise.
-DARK_LSB: Final = 0.7
-# [1] Noise adds this share of its deviation, since no code is below zero: 1 / sqrt(2 pi) of it.
+# Open lines. A port is dark if what it shows may be no current, but noise, rounding or offset.
+# [1] Noise shows as a current of this share of its deviation, since no code is below zero: the mean
+# of what is above zero of normal noise is 1 / sqrt(2 pi) of its deviation.
 DARK_NOISE: Final = 0.4
 # [1] At most this share of the usual current is taken for offset. Chosen: no sound line draws that
 # little.
@@ -69,10 +70,6 @@ TOUCHED_SHARE: Final = 2.0
 MANY_CELLS: Final = 8
 # [log] Cells at rest scatter by less: a wider scatter is of touches. Chosen: four times 10 %.
 MOST_SPREAD: Final = 0.4
-# [ohm] A saturated cell has less, besides its wires. Chosen: near the 300 of the hardest touch.
-SHORTED_OHM: Final = 350.0
-# [1] Wires to a cell are above nominal by less than this factor. Chosen: segments scatter by 10 %.
-WIRE_SPREAD: Final = 1.15
 
 # Reference resistors.
 # [1] The ratio of two sound ones is off by less. Chosen: two of 1 % make 2 %, and some for ageing.
@@ -103,13 +100,12 @@ def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> LinesAndCells:
     While something moves on the skin, shorted lines and dead cells are not judged: the means are
     those of no one skin, in which lines could be alike or cells be dead.
     """
-    largest_code = (1 << rest.board.adc_bits) - 1
-    shown = np.where(READING_SIGN > 0, rest.codes, largest_code - rest.codes)
+    shown = np.where(READING_SIGN > 0, rest.codes, LARGEST_CODE - rest.codes)
     current = shown.mean(axis=2)
     # The converter's offset looks like a current, too.
     usual = float(np.median(current))
     offset_lsb = min(limits.ADC_ERROR_LSB + limits.ROUNDING_LSB, DARK_SHARE * usual)
-    dark = current < max(DARK_LSB + DARK_NOISE * rest.noise_lsb, offset_lsb)
+    dark = current < max(limits.ROUNDING_LSB + DARK_NOISE * rest.noise_lsb, offset_lsb)
     open_lines, none = (dark.all(axis=1), dark.all(axis=0)), np.zeros_like(dark)
     if dark.all():
         diagnosis.add(Kind.NOTHING_CONDUCTS, one_cell=dark.size == 1)
@@ -178,7 +174,7 @@ def _shorted(
         if len(others):
             rise = float(np.log(level[members].min()) - np.median(others))
             # Few ports may agree by chance: then the rise must stand out of the others' scatter.
-            is_short = rise > max(np.log(DOUBLED), limits.ONE_STDS * few * float(np.std(others)))
+            is_short = rise > max(np.log(DOUBLED), limits.FEW_STDS * few * float(np.std(others)))
         if is_short:
             groups.append([int(lines[member]) for member in members])
     return groups
@@ -211,7 +207,10 @@ def _judge_cells(
     rows, columns = siemens.shape
     top, bottom = rest.wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
-    saturated = high & (siemens * (WIRE_SPREAD * path_ohm + SHORTED_OHM) > 1)
+    # A short is seen through its wires, which may be above nominal by as much as is no fault. No
+    # touch makes the cell itself conduct as well.
+    most_ohm = (1 + limits.CHANGED_SHARE) * path_ohm + 1 / HIGHEST_TOUCH_SIEMENS
+    saturated = high & (siemens * most_ohm > 1)
     if saturated.any():
         place, ohm = Place.of_cells(saturated), float(np.max(1 / siemens[saturated]))
         diagnosis.add(Kind.SATURATED_CELL, place, cell_ohm=ohm, rest_megohm=1e-6 / level)
@@ -229,7 +228,7 @@ def _reference_ratio(shown: Float, rest: Rest, diagnosis: Diagnosis) -> float:
     ratio_std = rest.std_lsb * 2**0.5 / (mean_lsb * len(shown) ** 0.5)
     top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
-    doubt = limits.ONE_STDS * ratio_std + 2 * rest.offset_lsb / mean_lsb
+    doubt = limits.FEW_STDS * ratio_std + 2 * rest.offset_lsb / mean_lsb
     if abs(off) >= RATIO_TOLERANCE + doubt:
         nominal = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
         diagnosis.add(Kind.REFERENCE_RATIO, ratio=ratio, off_percent=100 * off, **nominal)

@@ -5,9 +5,7 @@ from typing import Final
 
 # How many standard deviations a value must be off before it is a finding. The more values are
 # looked at, the further off one of them is by chance. The shares are those of normal errors.
-# [deviations] Of one value: one of 370 is that far off.
-ONE_STDS: Final = 3.0
-# [deviations] Of some ten values, such as lines: one of 2,000 is that far off.
+# [deviations] Of one value, or of some ten such as lines: one of 2,000 is that far off.
 FEW_STDS: Final = 3.5
 # [deviations] Of hundreds of values, such as cells or segments: one of 1.7 million is.
 MANY_STDS: Final = 5.0
@@ -20,8 +18,8 @@ ADC_ERROR_LSB: Final = 2.0
 # [LSB] Rounding to a code is off by up to half of one. Hum of a smaller amplitude is not reported,
 # and scatter is taken to be at least this, since rounding may hide it.
 ROUNDING_LSB: Final = 0.5
-# [LSB] A board with more noise in its usual cell is noisy. Chosen: nearly twice that of a sound
-# one.
+# [LSB] A board with more noise in its usual cell is noisy, and so is a single line or cell with
+# more. Chosen: nearly twice that of a sound one.
 NOISY_LSB: Final = 0.8
 # [LSB] Readings of pressed cells and of plates that change by more with a longer settle time have
 # not settled. Chosen: they show some 400, and 1 % of that is no fault.

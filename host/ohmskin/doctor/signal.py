@@ -9,20 +9,19 @@ symbol shape           meaning
 N, M   ()              scans, readings of one
 y      (N, R, C, 4)    codes [LSB]
 t      (N,)            board time of the scans' starts [s]
-d      (R, C, 4)       time of each reading since its scan's start [s]
 w      (N,)            Hann window over its sum: what is slow does not leak to the mains
 c(f)   (R, C, 4)       2 sum_n w_n (y_n - mean) exp(-2 pi i f t_n) [LSB]
 P(f)   ()              power: mean of |c(f)|^2 over all M readings [LSB^2]
+a      (R, C, 4)       hum: |a| is the amplitude of its sine at each reading [LSB]
+m      ()              overlap of a sine and its mirror image at negative frequency [1]
 ====== =============== =====================================================================
 
-Hum of amplitude a has |c(f)| = a at every reading. Noise of deviation s alone has the power
-4 s^2 sum w^2. Hum is found where P is far above that of the noise and above that of frequencies
+Far from half the scan rate, m is 0 and c(f) = a. Noise of deviation s alone has the power
+P = 4 s^2 sum w^2. Hum is found where P is far above that of the noise and above that of frequencies
 beside it, and where the amplitude is large enough to matter.
 
-One reading at scan rate r sees the frequency f as |f - k r|, with k the nearest whole number, so
-that two mains may look alike. But the readings of one scan are taken at different times, and with
-the right f their c(f) exp(-2 pi i f d) have one phase. Mains that are seen at almost 0 Hz look like
-drift.
+One reading at scan rate r sees the frequency f as |f - k r|, with k the nearest whole number. So
+two mains may look alike, and mains that are seen at almost 0 Hz look like drift.
 """
 
 from collections.abc import Sequence
@@ -36,7 +35,8 @@ from numpy.typing import ArrayLike, NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
-from ohmskin.link.clock import reading_offsets_s, slot_s
+from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
+from ohmskin.link.clock import slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import CONSTANTS
@@ -82,24 +82,19 @@ HUM_OVER_NOISE: Final = 10.0
 HUM_OVER_BESIDE: Final = 3.0
 # [1 / duration] Frequencies beside a tone. A Hann window's main lobe ends at 2 (Harris 1978).
 BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)
-# [1] If two mains differ by less than this factor in how much of them has one phase, they may be
-# one, which is seen twice. Chosen: noise changes it by less.
-IN_PHASE: Final = 1.5
-# [1] From this |m|^2 on, a sine and its mirror image cannot be told apart. Chosen: their difference
-# is divided by 1 - |m|^2, and its noise with it.
+# [1] From this |m|^2 on, a sine and its mirror image cannot be separated. Chosen: what separates
+# them divides noise by 1 - |m|^2, too.
 OVERLAP: Final = 0.5
 # [Hz] Mains that are seen slower than this, plus 4 / duration, look like drift. Chosen: skins drift
 # in seconds.
 STILL_HZ: Final = 0.5
 
 # Noise.
-# [LSB] Noise of a sound board before rounding. Chosen: as of emulated boards.
-ADC_NOISE_LSB: Final = 0.3
-# [LSB] Rounding adds the deviation of a value that may be anywhere within a code.
-SOUND_NOISE_LSB: Final = (ADC_NOISE_LSB**2 + 1 / 12) ** 0.5
-# [LSB] A noisy line or cell has more. Chosen: above NOISY_LSB, as the worst of many is judged.
-NOISY_CELL_LSB: Final = 1.0
-# [1] It also has this factor over the usual noise. Chosen: three times the power.
+# [LSB] A sound board has this noise: that of emulated converters, and the deviation of rounding,
+# which is that of a value that may be anywhere within a code.
+SOUND_NOISE_LSB: Final = (DEFAULT_NOISE_LSB**2 + 1 / 12) ** 0.5
+# [1] A noisy line or cell has more than NOISY_LSB, and more than the usual cell by this factor.
+# Chosen: three times the power, which no cell of a sound board has by chance.
 NOISY_SHARE: Final = 1.7
 
 # What moves or has not settled.
@@ -159,8 +154,9 @@ class Look:
     @property
     def hidden_hz(self) -> tuple[float, ...]:
         """Mains that these scans cannot show [Hz]: all of them, if the scans are few."""
-        seconds = float(np.ptp(self.time_s)) if len(self.codes) >= LEAST_SCANS else 0.0
-        return _hidden_hz(self.board.rate_hz, seconds)
+        if len(self.codes) < LEAST_SCANS:
+            return MAINS_HZ
+        return _hidden_hz(self.board.rate_hz, float(np.ptp(self.time_s)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +197,7 @@ class Hum:
 
     mains_hz: which mains, or both where they cannot be told apart [Hz].
     frequency_hz: where it was found [Hz].
-    amplitude: c of each reading, (R, C, 4) [LSB].
+    amplitude: a of each reading, or what can be seen of it, (R, C, 4) [LSB].
     lsb: root mean square of the amplitudes of all readings [LSB].
     """
 
@@ -216,10 +212,10 @@ def examine_signal(
 ) -> tuple[float, Bool]:
     """Add hum and noise. Returns the noise of a reading without hum [LSB], and which cells moved.
 
-    other: a look at another scan rate. It may show a hum that stands still in the first one.
+    other: a look at another scan rate. Mains that `scans` cannot show are looked for in it, too.
 
-    Noise is that of the usual cell, after hum and what moves slowly are taken out. While something
-    moves, noise is not judged: readings of a touched cell change for another reason.
+    The noise is that of the usual cell, without hum and without what moves slowly. It is not judged
+    while something moves, because readings of a touched cell change for another reason.
     """
     hum, hidden_hz = find_hum(scans), scans.hidden_hz
     without_hum = scans.codes - scans.mean
@@ -232,7 +228,7 @@ def examine_signal(
     moved = _moved(without_hum, variance)
     if other is not None and hidden_hz and hum is None and not moved.any():
         hum = find_hum(other)
-        hidden_hz = tuple(each for each in hidden_hz if each in other.hidden_hz)
+        hidden_hz = tuple(hz for hz in hidden_hz if hz in other.hidden_hz)
     report_hum(hum, scans.board.rate_hz, diagnosis)
     diagnosis.measured["hum_not_visible"] = list(hidden_hz)
     if len(scans.codes) >= LEAST_SCANS and not moved.any():
@@ -254,12 +250,13 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 
     scatter_lsb: deviation of the codes, rounding included.
 
-    Noise makes codes round up and down, and then their mean is better than a code. Normal noise of
-    deviation s before rounding leaves a bias of up to exp(-2 pi^2 s^2) / pi in the mean; without
-    noise, the deviation of rounding stays, 1 / sqrt(12) [Widrow, Kollar: Quantization Noise, 2008].
+    Noise makes codes round up and down, and then their mean is better than a code. With s the
+    deviation of the noise before rounding, normal noise leaves a bias of exp(-2 pi^2 s^2) / pi at
+    most [Widrow, Kollar: Quantization Noise, 2008]. The deviation of rounding alone, 1 / sqrt(12),
+    is taken to fall with s as that bias does.
     """
-    before = np.maximum(np.square(scatter_lsb) - 1 / 12, 0.0)
-    return np.asarray(np.exp(-2 * np.pi**2 * before) / 12**0.5)
+    noise_variance_lsb2 = np.maximum(np.square(scatter_lsb) - 1 / 12, 0.0)  # s^2
+    return np.asarray(np.exp(-2 * np.pi**2 * noise_variance_lsb2) / 12**0.5)
 
 
 # ----------------------------------------------------------------------------------------- hum
@@ -268,39 +265,24 @@ def rounding_std_lsb(scatter_lsb: ArrayLike) -> Float:
 def find_hum(scans: Look) -> Hum | None:
     """The mains hum in the scans; None if there is none, or none can be seen.
 
-    If both mains are found, one of them may be an alias of the other. The right one is that whose
-    readings have one phase. This does not decide if all readings of a scan are taken at almost one
-    time. Then both are named.
+    At some scan rates both mains look alike, and are found. Then both are named: whoever reads it
+    knows which of them the building has.
     """
     if not np.ptp(scans.codes, axis=0).any():
-        return None
+        return None  # readings that never change have no power, by which `_hum_at` divides
     visible_hz = [mains_hz for mains_hz in MAINS_HZ if mains_hz not in scans.hidden_hz]
     hums = [hum for hum in (_hum_at(mains_hz, scans) for mains_hz in visible_hz) if hum is not None]
-    if len(hums) < 2:
-        return hums[0] if hums else None
-    offsets_s = reading_offsets_s(scans.board)
-
-    def in_phase_lsb(hum: Hum) -> float:
-        """The part of its amplitude that has the same phase in all readings."""
-        turn = np.exp(-2j * np.pi * hum.frequency_hz * offsets_s)
-        return float(np.abs(np.mean(scans.amplitude(hum.frequency_hz) * turn)))
-
-    weaker, stronger = sorted(hums, key=in_phase_lsb)
-    if in_phase_lsb(stronger) > IN_PHASE * in_phase_lsb(weaker):
-        return stronger
-    return replace(hums[0], mains_hz=MAINS_HZ)
+    if len(hums) == 2:
+        return replace(hums[0], mains_hz=MAINS_HZ)
+    return hums[0] if hums else None
 
 
 def report_hum(hum: Hum | None, rate_hz: float, diagnosis: Diagnosis) -> None:
     """Add a hum, if there is one. rate_hz: at which the board scans."""
     diagnosis.measured["hum_lsb"] = 0.0 if hum is None else round(hum.lsb, 2)
     if hum is not None:
-        by_cell = np.sqrt(np.mean(np.abs(hum.amplitude) ** 2, axis=2))
-        # The worst cell is named if it has twice as much as others.
-        worst = (by_cell == by_cell.max()) & (by_cell > 2 * np.median(by_cell))
         diagnosis.add(
             Kind.HUM,
-            Place.of_cells(worst),
             mains_hz=hum.mains_hz,
             amplitude_lsb=hum.lsb,
             most_lsb=ROUNDING_LSB,
@@ -312,24 +294,24 @@ def report_hum(hum: Hum | None, rate_hz: float, diagnosis: Diagnosis) -> None:
 def _hum_at(mains_hz: float, scans: Look) -> Hum | None:
     """Hum near one of the mains; None if it is too weak to matter, or does not stand out.
 
-    A sine a is seen as c = a + m conj(a), because near half the scan rate the sine and its mirror
-    image at negative frequency overlap by m. Solved for a, this gives the sine. If m is close to 1,
-    only that part of the sine is seen that happens to be at the scans' times: half of its power on
-    average.
+    Near half the scan rate, a sine and its mirror image overlap by m: c = a + m conj(a). Solved for
+    a, this is a = (c - m conj(c)) / (1 - |m|^2). Where |m| is close to 1, this cannot be solved:
+    scans meet the sine at the same places of each wave, so that only a part of it is seen, c / 2.
+    Over all phases, the mean of |c|^2 is 2 |a|^2 there.
     """
     hz = max((mains_hz + off for off in MAINS_SEARCH_HZ), key=scans.power)
-    power, sine = scans.power(hz), scans.amplitude(hz)
-    mirror = complex(scans.window @ np.exp(-4j * np.pi * hz * scans.time_s))
-    if abs(mirror) ** 2 >= OVERLAP:
-        share, sine = 0.5, sine / 2
+    power, c = scans.power(hz), scans.amplitude(hz)
+    m = complex(scans.window @ np.exp(-4j * np.pi * hz * scans.time_s))
+    if abs(m) ** 2 >= OVERLAP:
+        sine, of_power = c / 2, 1 / 2
     else:
-        sine = (sine - mirror * np.conj(sine)) / (1 - abs(mirror) ** 2)
-        share = float(np.mean(np.abs(sine) ** 2)) / power
+        sine = (c - m * np.conj(c)) / (1 - abs(m) ** 2)
+        of_power = float(np.mean(np.abs(sine) ** 2)) / power  # |a|^2 over |c|^2
     of_noise = 4 * float(np.mean((scans.codes - scans.mean) ** 2) * np.sum(scans.window**2))
-    lsb = max(share * (power - of_noise), 0.0) ** 0.5
-    seconds = np.ptp(scans.time_s)
-    beside = np.median([scans.power(hz + away / seconds) for away in BESIDE])
-    over_noise = power > of_noise * (1 + HUM_OVER_NOISE / sine.size**0.5)
+    lsb = max(of_power * (power - of_noise), 0.0) ** 0.5
+    beside_hz = hz + np.array(BESIDE) / np.ptp(scans.time_s)
+    beside = np.median([scans.power(at_hz) for at_hz in beside_hz])
+    over_noise = power > of_noise * (1 + HUM_OVER_NOISE / c.size**0.5)
     if lsb > ROUNDING_LSB and over_noise and power > HUM_OVER_BESIDE * beside:
         return Hum((mains_hz,), hz, sine, lsb)
     return None
@@ -345,8 +327,8 @@ def _hidden_hz(rate_hz: float, seconds: float) -> tuple[float, ...]:
 
     seconds: how long the look takes. A longer one tells slower aliases from drift.
     """
-    least_hz = STILL_HZ + 4 / max(seconds, 1e-3)
-    return tuple(each for each in MAINS_HZ if _seen_hz(each, rate_hz) < least_hz)
+    least_hz = STILL_HZ + 4 / max(seconds, 1e-3)  # the scans of a broken file may take no time
+    return tuple(hz for hz in MAINS_HZ if _seen_hz(hz, rate_hz) < least_hz)
 
 
 # --------------------------------------------------------------------------- noise, what moves
@@ -372,13 +354,13 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
     cell_lsb: noise of each cell, (R, C).
     """
     usual = float(np.median(cell_lsb))
-    limit = max(NOISY_CELL_LSB, NOISY_SHARE * usual)
+    most_lsb = max(NOISY_LSB, NOISY_SHARE * usual)
     row_lsb, column_lsb = np.median(cell_lsb, axis=1), np.median(cell_lsb, axis=0)
-    place, lsb = Place(lines_of(row_lsb > limit), lines_of(column_lsb > limit)), usual
+    place, lsb = Place(lines_of(row_lsb > most_lsb), lines_of(column_lsb > most_lsb)), usual
     if place != WHOLE_SKIN:
         lsb = float(max(row_lsb.max(), column_lsb.max()))
-    elif (cell_lsb > limit).any():
-        place, lsb = Place.of_cells(cell_lsb > limit), float(cell_lsb.max())
+    elif (cell_lsb > most_lsb).any():
+        place, lsb = Place.of_cells(cell_lsb > most_lsb), float(cell_lsb.max())
     if place != WHOLE_SKIN or usual > NOISY_LSB:
         diagnosis.add(Kind.NOISE, place, noise_lsb=lsb, sound_lsb=SOUND_NOISE_LSB)
 
@@ -389,11 +371,12 @@ def _examine_noise(cell_lsb: Float, diagnosis: Diagnosis) -> None:
 def second_look(board: Hello) -> dict[str, Any] | None:
     """`settle_us` and `rate_hz` of a second look; None if it could show nothing new.
 
-    The settle time is longer, so that readings change if they have not settled. The rate is one at
-    which no mains stands still, so that a hum shows that the first look hides.
+    The settle time is longer, so that readings change if they have not settled. The rate is another
+    one, at which no mains is seen at almost 0 Hz: so a hum shows that the first look cannot show.
+    Without either, the second look shows nothing new.
     """
     readings = board.rows * board.columns * board.readings_per_cell
-    # A longer settle time makes slots longer, and scans slower.
+    # A longer settle time makes slots longer, and so scans slower: this much is left for it.
     spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
     most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))
     least_us = LONGER_FAR_US if board.mode == "far" else LEAST_LONGER_US
@@ -402,8 +385,9 @@ def second_look(board: Hello) -> dict[str, Any] | None:
         return None
     slot_us = 1e6 * slot_s(board) + longer_us - board.settle_us
     fastest_hz = min(1e6 / (readings * slot_us), board.rate_hz)
+    # Some rate between these shows every mains far from 0 Hz. A much slower one gives fewer scans.
     rates_hz = np.linspace(0.7, 1.0, 31) * fastest_hz
-    best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(each, rate_hz) for each in MAINS_HZ))
+    best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(hz, rate_hz) for hz in MAINS_HZ))
     rate_hz = max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
     return {"settle_us": longer_us, "rate_hz": rate_hz}
 
@@ -420,11 +404,13 @@ def examine_settling(
         return False
     change = np.abs(usual.mean - settled.mean)
     scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
-    in_mean = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
-    clear = change - ALL_STDS * np.maximum(scatter, ROUNDING_LSB) * in_mean
+    # The deviation of a difference of two means is that of a scan times this.
+    per_scatter = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
+    clear = change - ALL_STDS * np.maximum(scatter, ROUNDING_LSB) * per_scatter
     diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
     cells = (clear > most_lsb).any(axis=2)
     if cells.any():
+        # Where most cells have not settled, a list of them would say less.
         place = WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells)
         values = settling_values(usual, settled, float(change.max()))
         diagnosis.add(Kind.SETTLING, place, most_lsb=most_lsb, pressed=False, **values)
@@ -434,11 +420,15 @@ def examine_settling(
 def settling_values(usual: Look, settled: Look, change_lsb: float) -> dict[str, float]:
     """What describes a change with a longer settle time: change, both times, and the time required.
 
-    A node comes nearer to its final voltage by the factor exp(-t / tau) in each slot t. Within a
-    scan it swings by S from slot to slot, and e of that is left: tau = t / ln(S / e). It is settled
-    when half of what `UNSETTLED_LSB` allows is left, which takes tau ln(2 S / UNSETTLED_LSB).
+    change_lsb: the largest change.
+
+    From slot to slot, a node swings by S. In a slot of t seconds, what it lacks to its final
+    voltage falls by the factor exp(-t / tau). So at the slot's end the change e = S exp(-t / tau)
+    is still to come, from which tau = t / ln(S / e). The time required leaves half of
+    UNSETTLED_LSB: tau ln(2 S / UNSETTLED_LSB).
     """
     swing = float(np.ptp(settled.mean, axis=2).max())
+    # Noise and a hand may change readings by more than a swing leaves: the log must stay above 0.
     remnant = min(change_lsb, 0.9 * swing)
     slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
     needed_us = usual.board.settle_us + 1e6 * slot_s(usual.board) * (slots - 1)
