@@ -50,8 +50,9 @@ MIN_OVERLAP_S: Final = 15.0
 MIN_OVERLAP_SHARE: Final = 0.5
 # A smaller r is that of sessions that have nothing in common (tests/calibrate/test_alignment.py).
 MIN_CORRELATION: Final = 0.6
-# Where another offset has more than this share of the best G, neither can be trusted. Of simulated
-# sessions (tests/calibrate/test_alignment.py), irregular ones have up to 0.14, even ones from 0.74.
+# Where another offset has more than this share of the best G, neither can be trusted. In simulated
+# sessions (tests/calibrate/test_alignment.py) the second-best offset has up to 0.14 of it where
+# presses are irregular, and from 0.74 on where they repeat evenly.
 MAX_SECOND_SHARE: Final = 0.7
 # Two sums of products that differ by less than this share are the same but for the FFT's rounding.
 _ROUNDING_SHARE: Final = 1e-9
@@ -100,7 +101,7 @@ def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
         least = f"their best correlation is {likeness[best]:.2f}, less than {MIN_CORRELATION:g}"
         raise ValueError(f"scans and force log fit at no offset: {least}: are they of one session?")
     _check_unique(r, score, best)
-    lag = best + _vertex(score, best) - (y.size - 1)
+    lag = best + _vertex(score, best) - (y.size - 1)  # the first one is 1 - Y
     return Alignment(
         offset_s=float(time_s[0] - log.time_s[0] + lag * GRID_STEP_S),
         correlation=float(r[best]),
@@ -129,11 +130,11 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
     level = between_gaps(grid_s, time_s - time_s[0], compressed)
     is_level = np.isfinite(level)
     # Gaps are left out of the Gaussian's weights: nothing is made up inside them.
-    weighted, weight = (
-        gaussian_filter1d(values, SMOOTHING_S / GRID_STEP_S, mode="constant")
-        for values in (np.where(is_level, level, 0.0), is_level.astype(np.float64))
+    weighted_sum, weight_sum = (
+        gaussian_filter1d(on_grid, SMOOTHING_S / GRID_STEP_S, mode="constant")
+        for on_grid in (np.where(is_level, level, 0.0), is_level.astype(np.float64))
     )
-    smooth = weighted / np.where(is_level, weight, 1.0)
+    smooth = weighted_sum / np.where(is_level, weight_sum, 1.0)
     inside = binary_erosion(is_level, np.ones(3))  # a difference needs both neighbours
     return np.where(inside, np.gradient(smooth, GRID_STEP_S), 0.0), inside
 
@@ -168,11 +169,14 @@ def correlations(x: Float, in_x: Bool, y: Float, in_y: Bool) -> tuple[Float, Flo
 
 
 def _check_unique(r: Float, score: Float, best: int) -> None:
-    """Raise ValueError if there is a peak as good beside the best one, which ends at half its r."""
+    """Raise ValueError if another peak is nearly as good as that of the best lag.
+
+    The peak of the best lag reaches, on both sides, to the next lag whose r is below half of its r.
+    """
     ends = np.concatenate([[0], np.flatnonzero(r < 0.5 * r[best]), [r.size]])
     after = int(np.searchsorted(ends, best, side="right"))
     others = score.copy()
-    others[ends[after - 1] : ends[after]] = 0.0
+    others[ends[after - 1] : ends[after]] = 0.0  # the peak itself
     second = int(np.argmax(others))
     if others[second] > MAX_SECOND_SHARE * score[best]:
         away_s = abs(second - best) * GRID_STEP_S

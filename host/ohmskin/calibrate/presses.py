@@ -115,19 +115,20 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
 
     rise = history.rise.reshape(scans, -1)
     pressed = _pressed(rise, history.touched.reshape(scans, -1))
-    # Scans without a pressed cell get some value here. They are of no press, and left out below.
+    # Where no cell is pressed, `_NOTHING` is the index of the last cell. Such scans get its rise,
+    # but they are of no press, and so are left out below.
     every = np.arange(scans)
-    top = rise[every, pressed]
-    press = _numbered(pressed, top)
+    pressed_rise = rise[every, pressed]
+    press = _numbered(pressed, pressed_rise)
     others = rise.copy()
     others[every, pressed] = -np.inf
-    shared = (press != _NOTHING) & (others.max(axis=1) > SECOND_SHARE * top)
+    shared = (press != _NOTHING) & (others.max(axis=1) > SECOND_SHARE * pressed_rise)
     good = (press != _NOTHING) & ~shared & has_force
     if not good.any():
         raise ValueError("no cell is pressed alone while the force is known")
     return Presses(
         cells=pressed[good],
-        rise=top[good],
+        rise=pressed_rise[good],
         rise_std=history.rise_std.reshape(scans, -1)[every, pressed][good],
         # Below zero is the sensor's noise: `ForceLog` refuses more than that.
         force_n=np.maximum(force_n[good] - zero_n, 0.0),
@@ -145,27 +146,33 @@ def _pressed(rise: Float, touched: Bool) -> NDArray[np.intp]:
     """
     from scipy.ndimage import binary_closing
 
-    top = rise.argmax(axis=1)
-    pressed = np.full(top.size, _NOTHING, dtype=np.intp)
-    for cell in np.unique(top):
-        of_cell = (top == cell) & touched[:, cell]
-        # Closing fills short gaps. Without the padding, it would empty the first and last scans.
+    strongest = rise.argmax(axis=1)
+    pressed = np.full(strongest.size, _NOTHING, dtype=np.intp)
+    for cell in np.unique(strongest):
+        of_cell = (strongest == cell) & touched[:, cell]
+        # Closing fills gaps shorter than its structure. Without the padding, it would empty the
+        # first and last scans.
         padded = np.pad(of_cell, FLICKER_SCANS + 1)
         closed = binary_closing(padded, np.ones(FLICKER_SCANS + 1))
+        # Scans of a gap that show another cell stay that cell's, whichever of them comes first.
         pressed[closed[FLICKER_SCANS + 1 : -FLICKER_SCANS - 1] & (pressed == _NOTHING)] = cell
         pressed[of_cell] = cell
     return pressed
 
 
-def _numbered(pressed: NDArray[np.intp], top: Float) -> NDArray[np.intp]:
-    """Number of the press that each scan is of, or `_NOTHING`."""
+def _numbered(pressed: NDArray[np.intp], pressed_rise: Float) -> NDArray[np.intp]:
+    """Number of the press that each scan is of, or `_NOTHING`.
+
+    pressed: index of the cell that is pressed in each scan, or `_NOTHING`, (n,).
+    pressed_rise: the rise of that cell, (n,).
+    """
     press = np.full(pressed.size, _NOTHING, dtype=np.intp)
     number = 0
     changes = np.flatnonzero(np.diff(pressed)) + 1
     for run in np.split(np.arange(pressed.size), changes):
         if pressed[run[0]] == _NOTHING or run.size < MIN_PRESS_SCANS:
             continue
-        for part in np.split(run, _valleys(top[run])):
+        for part in np.split(run, _valleys(pressed_rise[run])):
             press[part] = number
             number += 1
     return press
@@ -180,6 +187,7 @@ def _valleys(rise: Float) -> list[int]:
 
     floor = _NOISE_SHARE * float(rise.max())
     height = np.log(np.maximum(rise, floor))
+    # The padding is the untouched skin before and after: a run may begin or end with a peak.
     peaks, _ = find_peaks(np.pad(height, 1, constant_values=np.log(floor)), prominence=VALLEY_LOG)
     peaks -= 1
     return [int(before + height[before:after].argmin()) for before, after in pairwise(peaks)]
@@ -194,6 +202,8 @@ class Calibrator:
     method: the one by which forces will be read.
     indenter_area_m2: area that the skin is pressed with [m^2].
     nominal_wire_ohm: what is known of its wires.
+
+    Made from these:
 
     estimator: of this method, for this skin.
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
@@ -249,7 +259,9 @@ class Calibrator:
         grow with what the skin shows: then they tell no curve.
         """
         regression = ForceRegression().fit(
-            *(presses.cells, presses.rise, presses.force_n),
+            cells=presses.cells,
+            rise=presses.rise,
+            force_n=presses.force_n,
             shape=presses.shape,
             rise_std=presses.rise_std,
             press=presses.press,

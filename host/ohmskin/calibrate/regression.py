@@ -156,7 +156,7 @@ def _curve_of_skin(rows: _Rows) -> Curve:
     is_one_cell = np.unique(rows.cell).size == 1
     if is_one_cell:
         trial = _Trial(rows, rows.press, PRESS_FOLDS)
-    else:  # it is for cells that were not fitted, so their error counts
+    else:  # whole cells are held out: what counts is the error on cells that nobody pressed
         trial = _Trial(rows, rows.cell, MAX_CELL_FOLDS)
     grows = _is_clear(trial.gain_of_growing(), SCATTER_ERRORS)
     curve = trial.best(grows, of_skin=True)
@@ -169,13 +169,19 @@ def _curve_of_skin(rows: _Rows) -> Curve:
 
 
 def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
-    """The curves that cells have of their own, by flat index."""
+    """The curves that cells have of their own, by flat index.
+
+    A cell has none if it was pressed less than `MIN_PRESSES` times, if its forces or its rises are
+    all the same, or if its force falls with its rise.
+    """
     trials = {}
     for cell in np.unique(rows.cell).tolist():
         of_cell = _Rows(*(column[rows.cell == cell] for column in rows))
         varied = np.ptp(of_cell.force) > 0 and np.ptp(of_cell.x) > 0
         if varied and np.unique(of_cell.press).size >= MIN_PRESSES:
             trials[cell] = _Trial(of_cell, of_cell.press, PRESS_FOLDS)
+    # How presses scatter is decided once, by the groups of all cells. (The first, empty list is for
+    # the case that there is no trial.)
     gains = np.concatenate([[], *(trial.gain_of_growing() for trial in trials.values())])
     grows = _is_clear(gains, SCATTER_ERRORS)
     curves = {cell: trial.best(grows) for cell, trial in trials.items()}
@@ -206,7 +212,7 @@ def fit_power(
     from scipy.optimize import minimize_scalar
 
     unit = float(x.max())
-    if unit <= 0 or np.unique(x[x > 0]).size < 2:
+    if unit <= 0 or np.unique(x[x > 0]).size < 2:  # through one point goes a law of any exponent
         return None
     z = np.maximum(x, 0.0) / unit
     weight = np.ones_like(x) / v
@@ -218,7 +224,7 @@ def fit_power(
     def sum_of_squares(exponent: float) -> float:
         return float(weight @ (force - scale(exponent) * z**exponent) ** 2)
 
-    # The deepest minimum on the grid is refined.
+    # The deepest minimum on the grid is refined between its neighbours.
     best = int(np.argmin([sum_of_squares(exponent) for exponent in exponents]))
     if best in (0, exponents.size - 1):
         return None
@@ -229,22 +235,20 @@ def fit_power(
         return None
     logs = np.log(np.where(z > 0, z, 1.0))
     jacobian = np.column_stack([z**b, a * z**b * logs]) * np.sqrt(weight)[:, None]
-    # From a per unit^b to a per S^b: a_S = a unit^-b.
+    # a is in N / unit^b here, and a' = a unit^-b in N / S^b. These are the derivatives of (a', b)
+    # by (a, b). The inverse is `pinv`, because rises near 0 add nothing to J^T J: if all but one
+    # are near 0, it is singular.
     to_si = np.array([[unit**-b, -a * unit**-b * np.log(unit)], [0.0, 1.0]])
     covariance = to_si @ np.linalg.pinv(jacobian.T @ jacobian) @ to_si.T
     covariance *= _square(force - a * z**b, weight, 2)
     a_std, b_std = np.sqrt(np.diag(covariance)).tolist()
     both_std = a_std * b_std
-    return Curve(
-        *(POWER, a * unit**-b, a_std),
-        exponent=b,
-        exponent_std=b_std,
-        correlation=float(np.clip(covariance[0, 1] / both_std, -1, 1)) if both_std else 0.0,
-    )
+    rho = float(np.clip(covariance[0, 1] / both_std, -1, 1)) if both_std else 0.0
+    return Curve(POWER, a * unit**-b, a_std, exponent=b, exponent_std=b_std, correlation=rho)
 
 
 def _square(residual: Float, weight: Float, coefficients: int) -> float:
-    """s^2 of residuals (n,); 0 where a training fold has too few rows to tell it."""
+    """s^2 of residuals (n,); 0 where the rows are too few to tell it, as in parts of a trial."""
     freedom = residual.size - coefficients
     return float(weight @ residual**2) / freedom if freedom > 0 else 0.0
 
@@ -255,21 +259,23 @@ _FITS: Final = {LINEAR: fit_line, POWER: fit_power}
 class _Trial:
     """Compares the four candidates by their errors on rows that were held out.
 
-    A candidate is a pair: the kind of curve, and whether scatter grows. A candidate that could not
-    be fitted while some group was held out has no errors, and is left out.
+    A candidate is a pair: the kind of curve, and whether scatter grows. The rows are split into
+    parts. Each part is held out once: candidates are fitted to the other rows, and have errors on
+    these. One that could not be fitted every time has no errors, and is left out.
 
-    of: (n,); rows with the same value are a group, and are held out together.
+    rows: what the curve is learned from.
+    alike: a number for each row, (n,), of its press or cell. Rows of one number are a group, which
+        is held out as a whole: they are alike, and would tell a curve what it is tested with.
     parts: the groups are split into at most so many parts.
     """
 
-    def __init__(self, rows: _Rows, of: NDArray[np.intp], parts: int) -> None:
+    def __init__(self, rows: _Rows, alike: NDArray[np.intp], parts: int) -> None:
         self._rows = rows
-        self._group = np.unique(of, return_inverse=True)[1]
+        self._group = np.unique(alike, return_inverse=True)[1]
         self._groups = int(self._group.max()) + 1
         self._floor_n = FLOOR_SHARE * float(rows.force.max())  # F0
         self._v = {False: np.ones_like(rows.force), True: rows.force**2 + self._floor_n**2}
-        self._errors: dict[tuple[str, bool], Float] = {}
-        self._likelihoods: dict[tuple[str, bool], Float] = {}  # logarithms, of each group
+        self._errors: dict[tuple[str, bool], Float] = {}  # of each row [N], by candidate
         parts = min(parts, self._groups)
         # Shuffled, because forces often rise from press to press: a part that is held out must not
         # be all of the large ones.
@@ -283,7 +289,6 @@ class _Trial:
                     error[out] = rows.force[out] - np.maximum(force_by(curve, rows.x[out]), 0.0)
             if np.isfinite(error).all():
                 self._errors[kind, grows] = error
-                self._likelihoods[kind, grows] = self._log_likelihood(error, self._v[grows])
 
     def best(self, grows: bool, *, of_skin: bool = False) -> Curve | None:
         """The curve of the kind that predicts held-out groups better; None where no curve rises.
@@ -296,47 +301,53 @@ class _Trial:
         if curve is None:
             return None
         coefficients = 2 if curve.kind == POWER else 1
-        # 1. in the module: rss / (n - p) times (n - p) / (n - p - 2).
+        # Numbers are those of the module's list. 1: in s^2 times Student's factor, n - p cancels.
         freedom = rows.x.size - coefficients
         square = float(np.sum((rows.force - force_by(curve, rows.x)) ** 2 / v)) / (freedom - 2)
-        by_rise = float(np.mean(spread(curve, rows.x, rows.dx) ** 2 / v))  # 2.
+        by_rise = float(np.mean(spread(curve, rows.x, rows.dx) ** 2 / v))  # 2
         s = float(np.sqrt(max(square - by_rise, 0.0)))
         error = self._errors.get((curve.kind, grows), np.full_like(v, np.nan))
         held_out_s = _rms(error / np.sqrt(v))
-        if of_skin:  # 3.
-            s = float(np.maximum(s, held_out_s))  # NaN stays
-        elif self._groups < rows.x.size:
+        if of_skin:  # 3, of cells; `maximum` lets NaN stay, where no error is known
+            s = float(np.maximum(s, held_out_s))
+        elif self._groups < rows.x.size:  # 3, of presses of several rows; Student's factor by them
             freedom = self._groups - coefficients
             s = float(np.maximum(s, held_out_s * np.sqrt(freedom / (freedom - 2))))
         s0, s1 = (s * self._floor_n, s) if grows else (s, 0.0)
         return replace(curve, residual_std=s0, residual_share=s1, held_out_rmse=_rms(error))
 
     def gain_of_growing(self) -> Float:
-        """How much growing scatter raises the log likelihood of each group; empty if unknown."""
+        """How much growing scatter raises the log likelihood of each group; empty if unknown.
+
+        Each way of scattering is tried with the kind of curve that is the better one under it.
+        """
         constant, growing = ((self._kinds(grows)[0], grows) for grows in (False, True))
         if constant not in self._errors or growing not in self._errors:
             return np.empty(0)
-        return self._likelihoods[growing] - self._likelihoods[constant]
+        return self._log_likelihood(*growing) - self._log_likelihood(*constant)
 
     def _kinds(self, grows: bool) -> list[str]:
         """The kinds to try, the better one first; a line if no kind has errors to compare."""
         tried = [kind for kind in _FITS if (kind, grows) in self._errors]
         if len(tried) == 2:
-            gain = self._likelihoods[POWER, grows] - self._likelihoods[LINEAR, grows]
+            gain = self._log_likelihood(POWER, grows) - self._log_likelihood(LINEAR, grows)
             return [POWER, LINEAR] if _is_clear(gain, 1) else tried
         return tried or [LINEAR]
 
-    def _log_likelihood(self, error: Float, v: Float) -> Float:
-        """l of the module's equation, the mean of each group."""
+    def _log_likelihood(self, kind: str, grows: bool) -> Float:
+        """l of the module's equation for a candidate, the mean over the rows of each group."""
+        error, v = self._errors[kind, grows], self._v[grows]
         least = _LEAST_SHARE**2 * float(np.mean(self._rows.force**2 / v))
         v = v * max(float(np.mean(error**2 / v)), least)
         of_rows = -0.5 * np.log(v) - 0.5 * error**2 / v
         return np.asarray(np.bincount(self._group, of_rows) / np.bincount(self._group))
 
 
-def _is_clear(gain: Float, errors: float) -> bool:
-    """Whether the mean is above 0 by so many standard errors."""
-    return gain.size > 1 and bool(gain.mean() > errors * gain.std(ddof=1) / np.sqrt(gain.size))
+def _is_clear(gain: Float, standard_errors: float) -> bool:
+    """Whether the mean of gains (groups,) is above 0 by so many of its standard errors."""
+    if gain.size < 2:  # one gain has no standard error
+        return False
+    return bool(gain.mean() > standard_errors * gain.std(ddof=1) / np.sqrt(gain.size))
 
 
 def _rms(values: Float) -> float:

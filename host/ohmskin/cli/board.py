@@ -42,7 +42,8 @@ REBOOT_S: Final = 5.0
 # It is looked for so often meanwhile [s]. Chosen: short beside 3 s.
 _RETRY_S: Final = 0.2
 
-_out = Console(soft_wrap=True)
+# Where commands print what people read. No line is broken, so that a pipe gets messages whole.
+TERMINAL: Final = Console(soft_wrap=True)
 
 Port = Annotated[str, Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
 Wires = Annotated[str, Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
@@ -76,8 +77,8 @@ def ports(as_json: Annotated[bool, Option("--json", help="one JSON array")] = Fa
     table = Table("port", "board", "description", box=None)
     for port in there:
         table.add_row(port.path, port.board or "?", port.description)
-    _out.print(table if there else "no serial ports: is the board plugged in?")
-    _out.print(
+    TERMINAL.print(table if there else "no serial ports: is the board plugged in?")
+    TERMINAL.print(
         "without a board: emulator://8x8?scene=ghost, simavr://uno?scene=ghost, replay://FILE.mcap"
     )
 
@@ -104,9 +105,9 @@ def info(
         taken = [f"{name} {low} to {high}" for name, low, high in ranges if low <= high]
         table.add_row("codes", ", ".join(taken))
         table.add_row("findings", ", ".join(findings) or "none")
-    _out.print(table)
+    TERMINAL.print(table)
     for finding in findings:
-        _out.print(f"[red]{finding}[/]: {ENUMS['finding'].docs[finding]}")
+        TERMINAL.print(f"[red]{finding}[/]: {ENUMS['finding'].docs[finding]}")
     if findings:
         raise SystemExit(1)
 
@@ -165,7 +166,7 @@ def configure(
             skin.save()
     done = f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, mode {now.mode}, settle time "
     kept = "saved" if save else "until its next reset"
-    _out.print(f"{done}{now.settle_us} us or more, {kept}")
+    TERMINAL.print(f"{done}{now.settle_us} us or more, {kept}")
 
 
 def flash(
@@ -181,7 +182,7 @@ def flash(
     packages = _ROOT / ".pio" / "core"  # where `make setup` puts them
     environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
     for baud, command in _uploads(board, port).items():
-        _out.print(f"flashing {board} at {port}, {baud} baud", markup=False)
+        TERMINAL.print(f"flashing {board} at {port}, {baud} baud", markup=False)
         if not subprocess.run(command, env=environment | os.environ).returncode:
             break
     else:
@@ -189,7 +190,7 @@ def flash(
     hello = _answer(port)
     if hello.board != ("uno" if board == "nano" else board):  # the same chip, and the same wiring
         raise OhmskinError(f"{port} answers as '{hello.board}', not as {board}: flash that one")
-    _out.print(f"{port}: {board}, firmware {hello.version}, answers", markup=False)
+    TERMINAL.print(f"{port}: {board}, firmware {hello.version}, answers", markup=False)
 
 
 def _uploads(board: str, port: str) -> dict[int, list[str]]:

@@ -8,7 +8,6 @@ from typing import Annotated, Final
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from typer import Argument, Option
 
@@ -26,11 +25,10 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli.board import Port, Wires, wires_of
+from ohmskin.cli.board import TERMINAL, Port, Wires, wires_of
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import cell_table
 from ohmskin.ctrl_c import until_ctrl_c
-from ohmskin.errors import RecordingError
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
@@ -50,7 +48,6 @@ calibrate = typer.Typer(
     no_args_is_help=True,
     help="Learn forces from presses of single cells: a calibration file (.json).",
 )
-_out = Console(soft_wrap=True)
 
 
 # -------------------------------------------------------------------------------- the commands
@@ -77,7 +74,7 @@ def weights(
     kept = _KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         shape = skin.info.rows, skin.info.columns
-        only, again = (_cells(text, shape) for text in (cells, " ".join(redo or ())))
+        only, again = _cells(cells, shape), _cells(" ".join(redo or ()), shape)
         wanted = [
             Press(cell, force_n)
             for cell in only or np.ndindex(shape)
@@ -90,19 +87,19 @@ def weights(
             every = [*read, *missing]
             check_enough(len(every), [press.force_n for press in every])
             check_cells_differ({press.cell for press in every}, shape)
-        _out.print(f"take everything off the skin: its rest is measured, {TARE_S:g} s")
+        TERMINAL.print(f"take everything off the skin: its rest is measured, {TARE_S:g} s")
         calibrator = calibrator_of(skin.info, skin.mean_ratio(TARE_S))
         with naming(kept.path):
             calibrator.presses_in_table(kept.table)  # raises ValueError for another skin's
         if again:
             kept.keep(kept.table[[press.cell not in again for press in kept.presses]])
         rest_us = 1e6 * calibrator.rest_level
-        _out.print(f"rest: {rest_us.min():.2f} to {rest_us.max():.2f} microsiemens")
+        TERMINAL.print(f"rest: {rest_us.min():.2f} to {rest_us.max():.2f} microsiemens")
         left = _guided(skin, calibrator, kept, missing, len(wanted)) if missing else 0
     if left:
         command = "the same command without --redo" if again else "the same command"
         done = f"{len(wanted) - left} of {len(wanted)} presses are in {kept.path}"
-        _out.print(f"{done}: {command} goes on", markup=False)
+        TERMINAL.print(f"{done}: {command} goes on", markup=False)
         raise typer.Exit(130)  # what a shell says of Ctrl-C
     _from_table(calibrator, kept.table, kept.path, out)
 
@@ -128,10 +125,10 @@ def recording(
     """
     calibrator_of = _options(out, method, indenter_mm2, wires, recording, forces)
     given = load_recording(recording)
-    if not given.scans:
-        raise RecordingError(f"{recording}: no scan in it")
     log = None if forces is None else load_force_log(forces)
     with naming(recording):
+        if not given.scans:
+            raise ValueError("no scan in it")
         if log is None and not given.forces:
             raise ValueError("no force in it: say --forces LOG.csv")
         if any(scan.mode != given.hellos[-1].mode for scan in given.scans):
@@ -196,7 +193,7 @@ def tare(
             skin.tare(seconds, force=force)
             done = f"tared, largest force before it {largest_n:.3f} +- {std_n:.3f} N"
         skin.calibration.save(calibration)
-    _out.print(f"{calibration}: {done}", markup=False)
+    TERMINAL.print(f"{calibration}: {done}", markup=False)
 
 
 # ---------------------------------------------------------------------- what they have in common
@@ -259,21 +256,25 @@ def _finish(
     calibration.save(out)
     model = calibration.model
     if note:
-        _out.print(note)
+        TERMINAL.print(note)
     if not model.pooled.all():
         errors = np.char.mod("%.2f", model.held_out_rmse), np.char.mod(" (%d)", presses.counts)
         texts = np.where(model.pooled, "-", np.char.add(*errors)).tolist()
         title = "held-out error [N], of so many presses, of cells' own curves"
-        _out.print(cell_table(texts, title))
+        TERMINAL.print(cell_table(texts, title))
     if message:
         error_n = model.held_out_rmse[model.pooled].max()  # NaN where one cell alone was pressed
-        _out.print(message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else ""))
+        TERMINAL.print(
+            message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else "")
+        )
     top, bottom, log_std = calibration.nominal_wire_ohm
     if log_std is not None:
-        _out.print(f"wires, as presses tell: {top:.0f}, {bottom:.0f} Ohm, +- {100 * log_std:.0f} %")
+        TERMINAL.print(
+            f"wires, as presses tell: {top:.0f}, {bottom:.0f} Ohm, +- {100 * log_std:.0f} %"
+        )
     elif top is None or bottom is None:
-        _out.print("wires are not told (--wires): forces' standard deviations are wide")
-    _out.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
+        TERMINAL.print("wires are not told (--wires): forces' standard deviations are wide")
+    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 
 
 # -------------------------------------------------------------------------------- with weights
@@ -316,7 +317,7 @@ def _guided(
     guide, rest = Guide(missing), calibrator.rest_level
     done, last_line = total - len(missing), ""
     columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
-    bar = Progress(*columns, console=_out, transient=True, disable=not _out.is_terminal)
+    bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
     task = bar.add_task("", total=total)
     with bar:
         for scan in until_ctrl_c(iter(skin.latest, None)):
@@ -325,11 +326,11 @@ def _guided(
             if step.wanted is not None and step.rise is not None:
                 kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
                 done += 1
-                _out.bell()
+                TERMINAL.bell()
             line, now = _step_in_words(step)
             if line and line != last_line:
                 counted = f"{done} of {total}: " if step.rise is not None else ""
-                _out.print(counted + line, markup=False, highlight=False)
+                TERMINAL.print(counted + line, markup=False, highlight=False)
                 last_line = line
             bar.update(task, completed=done, description=now)
             if step.state is State.DONE:

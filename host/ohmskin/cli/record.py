@@ -20,13 +20,15 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli.board import Port, Scans, Seconds, asked_for
+from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
-from ohmskin.estimate.methods import METHODS
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import check_place
-from ohmskin.force.reader import SkinReader
+from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
@@ -39,7 +41,6 @@ from ohmskin.record.recording import export as export_recording
 # person who starts the command still takes a hand away in the first second.
 FORCE_TARE_S: Final = 2.0
 
-_out = Console(soft_wrap=True)
 _T = TypeVar("_T")
 
 
@@ -73,29 +74,27 @@ def record(
             recorder.add(Mark(text, recorder.now_s()))
         look = None
         if sensor is not None:
-            _out.print(f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it")
-            if _out.is_terminal:
+            TERMINAL.print(
+                f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it"
+            )
+            if TERMINAL.is_terminal:
                 display = PressDisplay(recorder)
-                live = Live(get_renderable=display.picture, console=_out, transient=True)
+                live = Live(get_renderable=display.picture, console=TERMINAL, transient=True)
                 stack.enter_context(live)
                 look = display.look
         if sys.stdin is not None and sys.stdin.isatty():
             # A thread, because the end of the recording must not wait for a line.
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
-            recording.record(
-                *(skin, recorder, asked_for(until_ctrl_c(skin), scans, seconds)),
-                tare_s=tare_s,
-                sensor=sensor,
-                beside=look,
-            )
+            given = asked_for(until_ctrl_c(skin), scans, seconds)
+            recording.record(skin, recorder, given, tare_s=tare_s, sensor=sensor, beside=look)
         except DeviceLost as exc:
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
     done = f"{recorder.scans} scans, missed {recorder.missed}, {recorder.size} bytes"
     if sensor is not None:
         done += f", {recorder.forces} forces"
         done += f", {sensor.damaged} lines that are no numbers" if sensor.damaged else ""
-    _out.print(f"{file}: {done}", markup=False)
+    TERMINAL.print(f"{file}: {done}", markup=False)
 
 
 def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
@@ -114,7 +113,7 @@ class PressDisplay:
     def __init__(self, recorder: Recorder) -> None:
         self.counts = np.zeros((recorder.board.rows, recorder.board.columns), dtype=np.intp)
         self._recorder = recorder
-        self._reader: SkinReader | None = None
+        self._estimator: Estimator | None = None  # there is none before the rest is known
         self._on = OnSkin()
         self._looked_s = float("-inf")
 
@@ -124,18 +123,19 @@ class PressDisplay:
         if tare is None or scan.host_time_s - self._looked_s < DISPLAY_EVERY_S:
             return
         self._looked_s = scan.host_time_s
-        if self._reader is None:
-            self._reader = SkinReader(self._recorder.board, rest_ratio=tare.rest_ratio)
+        if self._estimator is None:
+            knowledge = SkinKnowledge.of(self._recorder.board, tare.rest_ratio)
+            self._estimator = make_estimator(DEFAULT_METHOD, knowledge)
         if tare.is_of(scan):
-            frame = self._reader.estimate(scan.ratio)
-            pressed = pressed_cells(self._reader.rise(frame), frame.touched)
+            frame = self._estimator.estimate(scan.ratio)
+            pressed = pressed_cells(frame.level - self._estimator.rest_level(), frame.touched)
             if self._on.see(scan.host_time_s, pressed) and len(self._on.cells) == 1:
                 self.counts[self._on.cells[0]] += 1
 
     def picture(self) -> Group:
         """All of it, for a terminal."""
         force, pressed = self._recorder.force, ", ".join(map(str, self._on.cells))
-        now = "touch nothing yet" if self._reader is None else f"pressed: {pressed or 'none'}"
+        now = "touch nothing yet" if self._estimator is None else f"pressed: {pressed or 'none'}"
         force_n = float("nan") if force is None else force.force_n
         head = f"{self._recorder.scans} scans   force {force_n:.2f} N   {now}"
         return Group(
@@ -147,6 +147,7 @@ def _take_marks(recorder: Recorder) -> None:
     """Lines typed at the terminal become marks, for as long as the recording can be written."""
     text = b""
     with suppress(OhmskinError, OSError):  # the file is full: the scans' loop says so
+        # `sys.stdin` has a lock, which this thread would hold for ever: Python could not end then.
         while typed := os.read(sys.stdin.fileno(), 4096):
             *lines, text = (text + typed).split(b"\n")
             for line in lines:
@@ -167,7 +168,7 @@ def export(
         scans = export_recording(given, out, begin_s, end_s)
     except RecordingError as exc:
         raise RecordingError(f"{recording}: {exc}") from exc
-    _out.print(f"{out}: {scans} scans", markup=False)
+    TERMINAL.print(f"{out}: {scans} scans", markup=False)
     if given.cut_off:
         print(f"{recording} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
 
@@ -183,10 +184,10 @@ def estimate(
     answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))
     save_arrays(out, answers)
     frames = len(answers["converged"])
-    _out.print(
+    TERMINAL.print(
         f"{out}: {frames} frames, {int(answers['converged'].sum())} converged, "
         f"median {1e3 * float(np.median(answers['seconds'])):.2f} ms a frame"
     )
     for message, count in Counter(answers["message"].tolist()).most_common(8):
         if message:
-            _out.print(f"  {count} of {frames}: {message}")
+            TERMINAL.print(f"  {count} of {frames}: {message}")

@@ -69,12 +69,12 @@ def stream(
         raise ValueError("say either --method or --calibration: a calibration has its own method")
     loaded = None if calibration is None else load_calibration(calibration)
     with ohmskin.open(port) as skin:
-        board = skin.info
         reader = None
         if method != "none":
-            reader = SkinReader(board, loaded, method=method, force=force)
-        if tare_s and reader is not None:
-            reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
+            reader = SkinReader(skin.info, loaded, method=method, force=force)
+            if tare_s:
+                # Without a calibration the rest is unknown, and cells may seem touched.
+                reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
         with ends_by_ctrl_c():
             given = asked_for(skin, scans, seconds)
             if as_json:

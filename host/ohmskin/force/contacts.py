@@ -2,6 +2,7 @@
 """Contacts: touched cells that adjoin are one thing on the skin, followed from scan to scan."""
 
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Final
 
 import numpy as np
@@ -60,7 +61,7 @@ class ContactTracker:
     def __init__(self) -> None:
         # By identity: a contact that is remembered, and the time of the last scan that had it [us].
         self._remembered: dict[int, tuple[Contact, int]] = {}
-        self._last_identity = 0
+        self._new_identities = count(1)
         self._before_us = 0  # the time of the scan before
 
     def update(
@@ -76,9 +77,7 @@ class ContactTracker:
         contacts = _unnumbered(touched, force_n, force_n_std)
         identities = _identities(contacts, [contact for contact, _ in self._remembered.values()])
         for index, contact in enumerate(contacts):
-            if index not in identities:
-                self._last_identity += 1
-            identity = identities.get(index, self._last_identity)
+            identity = identities.get(index) or next(self._new_identities)
             contacts[index] = replace(contact, identity=identity)
         self._remembered |= {contact.identity: (contact, time_us) for contact in contacts}
         return tuple(sorted(contacts, key=lambda contact: contact.identity))
@@ -103,9 +102,9 @@ def _unnumbered(touched: Bool, force_n: Float, force_n_std: Float) -> list[Conta
     """The contacts of a scan, with the identity 0."""
     from scipy.ndimage import center_of_mass, label
 
-    labels, count = label(touched, structure=_EIGHT_NEIGHBOURS)
+    labels, number_of_contacts = label(touched, structure=_EIGHT_NEIGHBOURS)
     contacts = []
-    for number in range(1, count + 1):
+    for number in range(1, number_of_contacts + 1):
         cells = labels == number
         total_n, std_n = float(force_n[cells].sum()), float(force_n_std[cells].sum())
         # A touch that is too light for its curve has no force: then all its cells count alike.

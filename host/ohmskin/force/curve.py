@@ -103,19 +103,21 @@ class ForceModel:
         naming the cell, for a shape or a value that cannot be.
         """
         x, dx = np.asarray(rise, dtype=np.float64), np.asarray(rise_std, dtype=np.float64)
+        shape = self.kind.shape
         for name, array in (("rise", x), ("rise_std", dx)):
-            if array.shape != (shape := self.kind.shape):
+            if array.shape != shape:
                 raise ValueError(f"{name} has shape {array.shape}, this calibration {shape}")
         require("rise", np.isfinite(x), "not finite")
         require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
-        by_rise = spread(self, x, np.nan_to_num(dx))
+        by_rise = spread(self, x, np.nan_to_num(dx))  # where dx is NaN, so is the answer, below
         above = np.maximum(x, 0.0)
         logarithm = np.log(np.where(above > 0, above, 1.0))
         powered = above**self.exponent
         by_slope = np.where(self.kind == POWER, powered, x) * self.slope_std
         by_exponent = self.slope * powered * logarithm * self.exponent_std
-        # J K J^T. The slope of a power law is that at 1 S, far from any press: where its error is
-        # large, so is that of the exponent, and the two nearly cancel.
+        # J K J^T; the exponent of a linear cell has no error. The slope of a power law is that at
+        # 1 S, far from any press: where its error is large, so is that of the exponent, and the two
+        # nearly cancel. Rounding may then leave less than 0.
         by_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
         reported_n = np.maximum(force_by(self, x), 0.0)
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2

@@ -64,7 +64,7 @@ class ForceScan(Scan):
 
 @dataclass(frozen=True, eq=False)
 class Untouched:
-    """The untouched skin as it was read, before any method has judged it.
+    """The untouched skin as a tare has read it: a method makes a `Rest` of it.
 
     ratio: its mean readings, (R, C, 4) [1].
     date: when they were taken, ISO 8601.
@@ -82,15 +82,13 @@ class _SharedKnowledge:
 
     board: the one that scans the skin.
     calibration: gives newtons; None: there is none.
-    rests: the rest that was there at first, or None if nobody has told it, and one for each tare
-        since. The last of them is the rest in force. An undone tare is taken out.
+    rests: the rest of the calibration, or None where there is no calibration; after it, one rest
+        for each tare that was not undone. The last of them is the rest in force.
     last_estimator: that of the reader that has read last. It has seen the most touches, and so
         knows most of the wires.
     """
 
-    def __init__(
-        self, board: Hello, calibration: Calibration | None, rest_ratio: Float | None
-    ) -> None:
+    def __init__(self, board: Hello, calibration: Calibration | None) -> None:
         self.board = board
         self.calibration = calibration
         self.rests: list[Rest | Untouched | None] = [None]
@@ -99,8 +97,6 @@ class _SharedKnowledge:
         self._lock = threading.Lock()  # two readers may come to the same one in two threads
         if calibration is not None:
             self.rests = [calibration.rest, *filter(None, [calibration.tare])]
-        elif rest_ratio is not None:
-            self.rests = [Untouched(rest_ratio, now())]
 
     def take_recorded(self, ratio: Float) -> None:
         """Take the tare that a played scan comes with, unless it was taken before.
@@ -130,7 +126,6 @@ class SkinReader:
     board: the one that scans it.
     calibration: gives newtons, as long as the method is its own.
     method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
-    rest_ratio: readings (R, C, 4) of the untouched skin, where there is no calibration.
     force: take the calibration of another unit.
 
     The latest tare is the rest, whether `tare` took it or a played scan came with it
@@ -145,14 +140,13 @@ class SkinReader:
         calibration: Calibration | None = None,
         *,
         method: str = "",
-        rest_ratio: Float | None = None,
         force: bool = False,
     ) -> None:
         if calibration is not None:
             calibration.check(board, force=force)
         self.board = board
         self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
-        self._shared = _SharedKnowledge(board, calibration, rest_ratio)
+        self._shared = _SharedKnowledge(board, calibration)
         self._begin()
 
     def another(self) -> SkinReader:
@@ -235,22 +229,10 @@ class SkinReader:
 
         return Tare(rest_ratio, time.monotonic(), self.board.mode)
 
-    def estimate(self, ratio: Float) -> Estimate:
-        """What readings (R, C, 4) show, without forces. Raises ValueError for other cells."""
-        return self._estimator.estimate(ratio)
-
     def check_mode(self, mode: str) -> None:
         """Raise ValueError if the board scans in another mode now."""
         if mode != self.board.mode:
             raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
-
-    def rise(self, frame: Estimate) -> Float:
-        """Level above rest, (R, C) [S; 1 for `voltage`].
-
-        Where rest is unknown, the median cell of the frame stands in: most cells are untouched.
-        """
-        at_rest = float(np.median(frame.level)) if self._rest_level is None else self._rest_level
-        return np.asarray(frame.level - at_rest)
 
     def read(self, scan: Scan) -> ForceScan:
         """What a scan shows. Raises ValueError if it is of other cells, or of another mode."""
@@ -259,9 +241,11 @@ class SkinReader:
             self._shared.take_recorded(scan.rest_ratio)
         if self._made_for != (self._wanted, self.rest):  # rests are equal if they are the same one
             self._make()
-        frame = self.estimate(scan.ratio)
+        frame = self._estimator.estimate(scan.ratio)
         self._shared.last_estimator = self._estimator
-        rise = self.rise(frame)
+        # Where rest is unknown, the median cell stands in for it: most cells are untouched.
+        at_rest = np.median(frame.level) if self._rest_level is None else self._rest_level
+        rise = np.asarray(frame.level - at_rest)
         force_n = force_n_std = np.full(rise.shape, np.nan)
         # Without newtons, contacts are summed and centred by what there is: the rise.
         of_contacts = np.maximum(rise, 0.0), frame.level_std
@@ -288,7 +272,7 @@ class SkinReader:
         method, rest = self._wanted, self.rest
         self._made_for = method, rest
         self._estimator = self._shared.estimator(method, rest)
-        self._rest_level: Float | None = None
+        self._rest_level: Float | None = None  # (R, C) [S; 1 for `voltage`]; None: unknown
         if isinstance(rest, Rest) and self.has_forces:
             self._rest_level = rest.level  # as it was when the curves were learned above it
         elif rest is not None:  # what this method makes of it; noise may put that below 0

@@ -51,7 +51,7 @@ _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
 # Boards that agree in all of these read the same skin: method, rest and tare stay good.
 _skin_of: Final = attrgetter(
-    *("unit_id", "rows", "columns", "mode", "ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+    "unit_id", "rows", "columns", "mode", "ref_top_ohm", "ref_bottom_ohm", "adc_bits"
 )
 
 
@@ -69,11 +69,13 @@ class Shown(NamedTuple):
     message: bytes
 
 
-def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, **more: Any) -> Shown:
+def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any]) -> Shown:
     """What the page is sent of a scan.
 
-    raw: what `ohm` makes of the near electrodes' readings: it has ghosts, which the page compares
-    with the scan's own estimate. more: further fields of the header.
+    raw: what `ohm` makes of the near electrodes' readings: it has ghosts, which the page shows
+        beside the scan's own estimate.
+    has_forces: whether the scan's forces are newtons.
+    more: further fields of the header.
     """
     estimate = scan.estimate
     planes: dict[str, Float | Bool] = {
@@ -103,14 +105,15 @@ def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, **more: Any) -> Sho
 
 
 def _number(value: float) -> float | None:
-    """As JSON has it, which knows no NaN."""
+    """The number, or null in JSON, which has no NaN and no infinity."""
     return value if math.isfinite(value) else None
 
 
 class _Recording(Closing):
     """Records `skin` in a thread of its own, until it is closed or the board is gone.
 
-    ended: is called, from that thread, when the file is whole. text: then says how it went.
+    ended: is called, from that thread, when the file is whole.
+    text: how it went; empty for as long as it goes on.
     """
 
     def __init__(self, skin: Device, recorder: Recorder, ended: Callable[[], None]) -> None:
@@ -124,7 +127,7 @@ class _Recording(Closing):
         trouble = ""
         try:
             with self.recorder as recorder:
-                # By the host's clock, which says what had come when somebody ended it.
+                # Scans that came before somebody ended it are kept, also if they still wait.
                 in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, skin)
                 record(skin, recorder, in_time)
         except OhmskinError as exc:
@@ -142,8 +145,13 @@ class _Recording(Closing):
 class ViewedBoard(Closing):
     """The board at `port`, whether it is there or not.
 
-    All methods but `state` may wait for the board. calibrations: the one of its unit is taken; with
-    `force`, that of any unit. folder: where recordings go.
+    Its thread opens the board and reads it, over and over: see `_work`. The page calls the other
+    methods from its own threads; all but `state` may wait for the board.
+
+    port: a serial port or a URL.
+    calibrations: the first that fits the board gives its forces.
+    folder: where recordings go.
+    force: a calibration of another unit fits, too.
     """
 
     def __init__(
@@ -160,6 +168,8 @@ class ViewedBoard(Closing):
         self._recording: _Recording | None = None
         self.watchers: set[Callable[[], None]] = set()
         """They are called, from any thread, when `shown` or `state` may be new."""
+        # Held by commands that read or change both the rest and the recording: a recording begins
+        # with the tare that is in force, and takes each later one.
         self._commands = threading.Lock()
         self.closing = threading.Event()
         """Is set when `close` is called."""
@@ -248,6 +258,7 @@ class ViewedBoard(Closing):
         return f"marked: {text}"
 
     def _there(self) -> tuple[Device, SkinReader]:
+        """The open board and its reader. Raises DeviceLost where it is not open."""
         skin, reader = self._skin, self._reader
         if skin is None or reader is None:
             raise DeviceLost(f"{self.port} is not there")
@@ -255,6 +266,7 @@ class ViewedBoard(Closing):
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
+        """Do a command, unless another is being done: that is refused, and not waited for."""
         if not self._commands.acquire(blocking=False):
             raise OhmskinError("one thing at a time: the last one is not done yet")
         try:
@@ -264,6 +276,7 @@ class ViewedBoard(Closing):
             self._changed()
 
     def _running(self) -> _Recording | None:
+        """The recording that goes on; None where the last one has ended, or none was begun."""
         recording = self._recording
         return None if recording is None or recording.text else recording
 
@@ -274,11 +287,17 @@ class ViewedBoard(Closing):
         return recording is not None
 
     def _new_file(self, unit_id: int) -> Path:
+        """A name by date, time and unit; a number ends it where two begin in one second."""
         name = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
         paths = (self._folder / f"{name}{f'-{n}' if n > 1 else ''}.mcap" for n in count(1))
         return next(path for path in paths if not path.exists())
 
     def _work(self) -> None:
+        """Read the board, and try again whenever it is gone, until `close` is called.
+
+        A recording that has been played is at its end, and is not played again. A defect of ours
+        ends the thread, too, and the page says so.
+        """
         while not self.closing.is_set():
             try:
                 self._follow()
@@ -293,12 +312,14 @@ class ViewedBoard(Closing):
             self.closing.wait(AGAIN_S)
 
     def _say(self, status: str, text: str = "") -> None:
+        """status: "scanning", "gone" (it is tried again) or "ended"; at first it is "opening"."""
         if status != self._status:
             LOG.warning("%s: %s %s", self.port, status, text)
         self._status, self._text = status, text
         self._changed()
 
     def _follow(self) -> None:
+        """Open the board, and show its scans until `close`. Raises what its device raises."""
         with opening.open(self.port) as skin:
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
@@ -309,14 +330,16 @@ class ViewedBoard(Closing):
                     self.shown = None
                     # An estimate takes a good part of a core: none is made while nobody looks.
                     if self.watchers:
+                        force_scan = reader.read(scan)  # the method may be another from now on
                         near_ratio = as_near(scan.ratio, scan.reading_names)
-                        self.shown = _shown(
-                            *(reader.read(scan), raw.estimate(near_ratio), reader.has_forces),
-                            method=reader.method,
-                            missed=skin.stats.missed,
-                            rate_hz=skin.info.rate_hz,
-                            recorded=0 if running is None else running.recorder.scans,
-                        )
+                        more = {
+                            "method": reader.method,
+                            "missed": skin.stats.missed,
+                            "rate_hz": skin.info.rate_hz,
+                            "recorded": 0 if running is None else running.recorder.scans,
+                        }
+                        ghosts = raw.estimate(near_ratio)
+                        self.shown = _shown(force_scan, ghosts, reader.has_forces, more)
                     self._say("scanning")
             finally:
                 self._skin = None
@@ -325,7 +348,11 @@ class ViewedBoard(Closing):
                     recording.close()
 
     def _reader_of(self, skin: Device) -> SkinReader:
-        """A board that is there again is read as before, with method and tare."""
+        """The reader of this board: a board that is there again is read as before, tare and all.
+
+        Otherwise calibrations are tried in their order. Where none fits, there are no forces, and
+        the page notes why the last calibration does not fit.
+        """
         board, before = skin.info, self._reader
         if before is not None and _skin_of(before.board) == _skin_of(board):
             return before
