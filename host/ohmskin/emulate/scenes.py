@@ -67,6 +67,7 @@ class Scene:
     is not in `ratio`: `EmulatedBoard` adds it.
     begin_s: when touches begin [s]; None: as `SCENES` says.
 
+    `rest` is the untouched skin, without faults: another of the same size may take its place.
     `moves`: whether touches change after they have begun.
 
     :raises ValueError: no such scene or time, or a skin too small for the scene or the faults.
@@ -101,7 +102,7 @@ class Scene:
         def spread(middle: float) -> Float:
             return middle * np.exp(_SPREAD_SHARE * random.standard_normal((rows, columns)))
 
-        self._rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
+        self.rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
         self._touches = self._place(random)
         self._still_ratio = lru_cache(
             lambda at_s, mode: self.faults.readings(self.skin(at_s), mode)
@@ -110,7 +111,7 @@ class Scene:
     @property
     def rest_ratio(self) -> Float:
         """Exact readings of the untouched skin, shape (rows, columns, 4)."""
-        return self.faults.readings(self.faults.damaged(self._rest))
+        return self.faults.readings(self.faults.damaged(self.rest))
 
     def skin(self, time_s: float) -> Skin:
         """Every resistance of the skin at a time."""
@@ -120,12 +121,12 @@ class Scene:
             touch = self._corners(time_s)
         else:
             touch = self._finger(time_s) if self.moves else self._touches
-        touched = replace(self._rest, cell_siemens=self._rest.cell_siemens + touch)
+        touched = replace(self.rest, cell_siemens=self.rest.cell_siemens + touch)
         return self.faults.damaged(touched)
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
         """Cells, (rows, columns), to which a touch adds as much as a cell has at rest, 1 uS."""
-        rest_siemens = self.faults.damaged(self._rest).cell_siemens
+        rest_siemens = self.faults.damaged(self.rest).cell_siemens
         return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= 1 / REST_OHM)
 
     def ratio(self, time_s: float, mode: str = "near") -> Float:
@@ -167,25 +168,6 @@ class Scene:
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
         away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
         return np.asarray(_FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_STD_CELLS**2)))
-
-
-class PlateScene(Scene):
-    """A scene on a plate of known resistors, in place of a skin: its wires have no resistance.
-
-    siemens: conductances of the resistors, (rows, columns) [S]. The others are as those of `Scene`.
-    """
-
-    def __init__(
-        self,
-        siemens: Float,
-        name: str = "rest",
-        *,
-        seed: int = 0,
-        faults: SkinFaults | None = None,
-        begin_s: float | None = None,
-    ) -> None:
-        super().__init__(name, *siemens.shape, seed=seed, faults=faults, begin_s=begin_s)
-        self._rest = Skin(siemens, np.zeros_like(siemens), np.zeros_like(siemens))
 
 
 def _two_of(count: int) -> tuple[int, int]:

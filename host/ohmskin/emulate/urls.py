@@ -8,11 +8,14 @@ here, and those of faults, which `faults` defines.
 import re
 from typing import Final
 
+import numpy as np
+
 from ohmskin.circuit.plate import load_plate
+from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
-from ohmskin.emulate.scenes import PlateScene, Scene
+from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
 from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
@@ -98,10 +101,12 @@ def _scene(url: PortUrl, size: str, faults: SkinFaults | None = None) -> Scene:
         raise ValueError(f"a size is as 8x8, from 1x1 to {most_rows}x{most_columns}, not '{size}'")
     name, begin_s = url.options.get("scene", "rest"), url.number_if_given("begin")
     seed = url.number("seed", 0)
-    if "plate" not in url.options:
-        return Scene(name, rows, columns, seed=seed, faults=faults, begin_s=begin_s)
-    plate = load_plate(url.options["plate"])
-    if plate.shape != (rows, columns):
-        cells = "x".join(map(str, plate.shape))
-        raise ValueError(f"the plate has {cells} cells, the skin {rows}x{columns}")
-    return PlateScene(plate, name, seed=seed, faults=faults, begin_s=begin_s)
+    scene = Scene(name, rows, columns, seed=seed, faults=faults, begin_s=begin_s)
+    if "plate" in url.options:
+        plate = load_plate(url.options["plate"])
+        if plate.shape != (rows, columns):
+            cells = "x".join(map(str, plate.shape))
+            raise ValueError(f"the plate has {cells} cells, the skin {rows}x{columns}")
+        no_wires = np.zeros_like(plate)
+        scene.rest = Skin(plate, no_wires, no_wires)
+    return scene
