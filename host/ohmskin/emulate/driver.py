@@ -138,9 +138,6 @@ class SteppedSkin(Session):
     def _begin_reading(self) -> None:
         """Nothing reads by itself."""
 
-    def _end_reading(self) -> None:
-        """Nothing has to end."""
-
     def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:
         """See `Device._wait`. Reads meanwhile, because no thread does."""
         end_s = self.now_s + limit_s

@@ -42,7 +42,7 @@ class Device(Closing):
     once, from several threads. ``with`` closes a device, and so does `close`.
     """
 
-    # `Session` and `Replay` do commands, each in its way, and have the one thread that publishes
+    # `Session` and `Replay` do commands, each in its way, and begin the one thread that publishes
     # scans. All other threads wait on `_changed`, which also guards what is shared with it.
 
     def __init__(self, name: str, stats: BoardStats) -> None:
@@ -63,6 +63,7 @@ class Device(Closing):
         self._want_scans = False
         # The fields of the last `configure`, which a board that is reset forgets.
         self._wanted: dict[str, protocol.Value] | None = None
+        self._publisher: threading.Thread | None = None
 
     @property
     def info(self) -> Hello:
@@ -264,6 +265,8 @@ class Device(Closing):
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""
+        if self._publisher is not None:
+            self._publisher.join()
         with self._changed:
             self._newest = None
             if self._failure is None or isinstance(self._failure, RecordingEnded):
@@ -285,6 +288,11 @@ class Device(Closing):
                     queue[0] = replace(queue[0], missed=queue[0].missed + lost)
                     self._stats.overflowed += 1
             self._changed.notify_all()
+
+    def _begin_thread(self, work: Callable[[], None], name: str) -> None:
+        """Begin the thread that publishes. Its work must end soon after `close` was called."""
+        self._publisher = threading.Thread(target=self._run, args=(work,), name=name, daemon=True)
+        self._publisher.start()
 
     def _run(self, work: Callable[[], None]) -> None:
         """Do the work of the thread that publishes. An error that ends it reaches all who wait."""

@@ -111,12 +111,7 @@ class Session(Device):
             raise
 
     def _begin_reading(self) -> None:
-        work, name = (self._read,), f"read {self.name}"
-        self._thread = threading.Thread(target=self._run, args=work, name=name, daemon=True)
-        self._thread.start()
-
-    def _end_reading(self) -> None:
-        self._thread.join()
+        self._begin_thread(self._read, f"read {self.name}")
 
     def _connect(self) -> None:
         """Wait for hello, by whichever attempt it comes."""
@@ -143,10 +138,9 @@ class Session(Device):
                 with suppress(OhmskinError):  # it may be gone already
                     self._send("stop")
             self._closing = True
-            self._end_reading()
+            super().close()
             self._link.close()
         self._want_scans = False
-        super().close()
 
     def _send(self, name: str, **values: protocol.Value) -> int:
         """Send a command and return its sequence number; nothing waits for the answer."""

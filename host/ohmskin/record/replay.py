@@ -15,7 +15,6 @@ start and stop, which let the replay run and pause, raise `CommandRefused`.
 `ohmskin.record.recording.load_recording` has them.
 """
 
-import threading
 import time
 from dataclasses import replace
 from typing import Final
@@ -53,9 +52,7 @@ class Replay(Device):
         self._running = self._closing = False
         # Of the scan before: when it was due here, and when it had been recorded [s].
         self._last: tuple[float, float] | None = None
-        work, named = (self._play,), f"play {path}"
-        self._thread = threading.Thread(target=self._run, args=work, name=named, daemon=True)
-        self._thread.start()
+        self._begin_thread(self._play, f"play {path}")
 
     def _command(self, name: str, **values: protocol.Value) -> None:
         """Start or stop.
@@ -76,9 +73,8 @@ class Replay(Device):
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join()
-        self._messages.close()
         super().close()
+        self._messages.close()
 
     def _play(self) -> None:
         """The work of the replay's thread: publish one message after the other, each when due."""
