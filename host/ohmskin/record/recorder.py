@@ -35,9 +35,6 @@ from ohmskin.record.recording import (
 # Messages are kept for so long before they are written. A recording that is killed lacks them, and
 # what came while they were written. Chosen: together less than half a second.
 FLUSH_EVERY_S: Final = 0.4
-# A record of an MCAP file begins with a byte for its kind and eight for its length (MCAP's
-# specification, "Records").
-_HEAD_BYTES: Final = 9
 
 
 class Recorder(Closing):
@@ -65,7 +62,7 @@ class Recorder(Closing):
         self.now_s = now_s
         self.scans = self.missed = self.forces = 0
         self.size = 0
-        self._readable = 0  # scans that are in the file
+        self._readable = 0  # scans that are in the file for certain
         self.board = board
         self.tare: Tare | None = None
         self.force: ForceSample | None = None
@@ -171,13 +168,6 @@ class Recorder(Closing):
             try:
                 yield
             except OSError as exc:
-                with suppress(OSError), self.path.open("rb") as file:
-                    # A chunk and the index after it are written together. If the chunk is whole,
-                    # and only the index cut off, the scans in the chunk can be read.
-                    file.seek(self.size)
-                    chunk_bytes = int.from_bytes(file.read(_HEAD_BYTES)[1:], "little")
-                    if self.size + _HEAD_BYTES + chunk_bytes <= os.fstat(file.fileno()).st_size:
-                        self._readable = self.scans
                 self.failure = RecordingError(
                     f"{self.path}: recording ended: {exc.strerror or exc}; {self._readable} scans "
                     "are in the file and can be read"
