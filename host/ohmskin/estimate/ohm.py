@@ -3,9 +3,10 @@
 
 This neglects all other paths through the skin, and all wires.
 
-Symbols: I (R, C) port current per Vdd [S], R = R_top + R_bottom [ohm], g (R, C) cells [S].
+Symbols: I (R, C) port current per Vdd [S], g (R, C) cells [S], R_s = R_top + R_bottom [ohm], both
+reference resistors in series.
 
-    g = 1 / (1/I - R) = I / (1 - I R) ,    std(g) = (dg/dI) std(I) = (1 + g R)^2 std(I)
+    g = 1 / (1/I - R_s) = I / (1 - I R_s) ,    std(g) = (dg/dI) std(I) = (1 + g R_s)^2 std(I)
 
 This is the paper's naive estimate. It sees ghosts: three pressed corners of a rectangle make the
 fourth look pressed. `voltage` is the paper's baseline for forces: it reads a force from the mean
@@ -23,14 +24,14 @@ from ohmskin.estimate.port_readings import PortReadings
 
 
 def conductance_from_current(current_siemens: Float, ref_ohm: float) -> Float:
-    """g = I / (1 - I R) [S], (R, C). I is first clipped to what cells within their bounds draw."""
+    """g = I / (1 - I R_s) [S], (R, C). I is first clipped to what cells in their bounds draw."""
     least, most = port_current(MIN_CELL_SIEMENS, ref_ohm), port_current(MAX_CELL_SIEMENS, ref_ohm)
     current = np.clip(current_siemens, least, most)
     return np.clip(current / (1.0 - current * ref_ohm), MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
 
 
 def port_current(cell_siemens: float, ref_ohm: float) -> float:
-    """I = g / (1 + g R) per Vdd [S]: the current through one cell and both references."""
+    """I = g / (1 + g R_s) per Vdd [S]: the current through one cell and both references."""
     return cell_siemens / (1.0 + cell_siemens * ref_ohm)
 
 

@@ -15,7 +15,8 @@ b_k      (n,)      reading k where no current flows: 0 or 1                     
 c        (R, C)    half of the current that floating lines draw from a port       S
 a, b     (R, C)    potentials of the near ends of row and column                  V/Vdd
 e, f     (R, C)    potentials of the far ends of row and column                   V/Vdd
-D        (R, C)    voltage between the sensed ends, e - f                         V/Vdd
+U        (R, C)    voltage between the sensed ends, e - f                         V/Vdd
+R_s                both reference resistors in series, R_top + R_bottom           ohm
 u        (R, C)    current of the port, were there no wires up to its far ends    S
 p_r, p_c (R, C)    what the wires of row and column lose per current              ohm
 ======== ========= ============================================================== =========
@@ -44,7 +45,7 @@ lines draw from the row:
 **Far ends.** Nothing draws current from a far end. So its potential differs from that of the near
 end by what the wires of the line lose, and
 
-    u = I / (D + R I) ,  R = R_top + R_bottom ,    p_r = (a - e) / I ,    p_c = (f - b) / I .
+    u = I / (U + R_s I) ,    p_r = (a - e) / I ,    p_c = (f - b) / I .
 
 In mode far, a node is read at one supply only. An offset of all readings, and lines that charge,
 move a and b alike, but neither moves I. So a and b are not taken as they are read, but as the
@@ -100,17 +101,6 @@ class NearReadings(NamedTuple):
     offset_ratio: Float
 
 
-class BestThree(NamedTuple):
-    """The three of a cell's four readings that agree best.
-
-    disagreement_ratio: root of the mean square of what they disagree [V/Vdd].
-    current: what these three show [S].
-    """
-
-    disagreement_ratio: float
-    current: float
-
-
 class NearEnds:
     """Reads the currents at the near ends of the lines. per_cell: n, readings of a cell there."""
 
@@ -129,12 +119,13 @@ class NearEnds:
         self._node = [0, 1, 1, 0][:n]
 
     def read(self, ratio: Float) -> NearReadings:
-        """Currents and residuals of checked readings (R, C, m), of all m names of this skin."""
+        """Currents and residuals of checked readings (R, C, m), one for each name of this skin."""
         ratio = as_near(ratio, self._names)[..., : self.per_cell]
         signal = ratio - self._at_no_current
         current: Float = signal @ self._slope_ohm / self.square_ohm
         residual = signal - current[..., None] * self._slope_ohm
-        # A with D and B with C: the readings of a node. In mode far, A with B for both nodes.
+        # Of each cell, the mean of the residuals of a node: A with D, and B with C. In mode far,
+        # A with B for both nodes.
         of_nodes = 0.5 * (residual[..., :2] + residual[..., :-3:-1]).reshape(-1, 2)
         middle = len(of_nodes) // 2
         offset = np.partition(of_nodes.T, middle)[self._node, middle]  # faster than median
@@ -150,17 +141,21 @@ class NearEnds:
         charging = near.residual @ self._into_row  # c
         return np.asarray(charging * np.clip(share, -1.0, 1.0))
 
-    def best_three(self, ratio: Float) -> BestThree:
-        """Of the four readings (4,) that a cell has in mode near."""
+    def best_three(self, ratio: Float) -> tuple[float, float]:
+        """What the three readings show that agree best, of the four (4,) of a cell in mode near.
+
+        How far they disagree, as `Spread.rms` of one current in three readings [V/Vdd], and their
+        current [S].
+        """
         threes = []
         for left_out in range(READINGS_PER_CELL):
             kept = np.arange(READINGS_PER_CELL) != left_out
             slope, signal = self._slope_ohm[kept], (ratio - self._at_no_current)[kept]
             current = float(slope @ signal / (slope @ slope))
             residual = signal - slope * current
-            degrees = kept.sum() - 1  # three readings, one current
-            threes.append(BestThree(float(residual @ residual / degrees) ** 0.5, current))
-        return min(threes)
+            degrees = kept.sum() - 1  # three residuals, of which the current has taken one
+            threes.append((float(residual @ residual / degrees) ** 0.5, current))
+        return min(threes, key=lambda three: three[0])
 
 
 class FarReadings(NamedTuple):
@@ -194,9 +189,9 @@ class FarEnds:
             node_ratio(ratio, self._names, node) if is_sensed else potential
             for node, is_sensed, potential in zip("ef", self.sensed, near_end, strict=True)
         )
-        apart = np.maximum(row_end - column_end, 0.0)  # D
+        apart = np.maximum(row_end - column_end, 0.0)  # U
         whole = apart + sum(self._ref_ohm) * current
-        # By d u / d I = D / (D + R I)^2 and d u / d D = - I / (D + R I)^2.
+        # By d u / d I = U / (U + R_s I)^2 and d u / d U = - I / (U + R_s I)^2.
         std = np.sqrt(apart**2 * near.std**2 + variance * current**2) / whole**2
         drop = np.stack([near_end[0] - row_end, column_end - near_end[1]])
         return FarReadings(PortCurrents(current / whole, std), current, drop)

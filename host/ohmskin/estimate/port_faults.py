@@ -11,17 +11,17 @@ A frame is at fault, and its answer not to be relied on, where
   law: a row is shorted to a column;
 - two lines that differed at rest draw the same current from every other line, and all of it more
   than at rest: their electrodes are shorted. Or they did so at rest already, and more than the
-  other lines. A finger between two lines makes them alike for a moment. So lines that frames have
-  shown apart must be alike for `ALIKE_FRAMES`;
+  other lines. A finger between two lines makes them alike for a moment. So lines that a frame has
+  shown apart must be alike in `ALIKE_FRAMES` of the frames that are compared after it;
 - a line showed no current at rest, though others did;
 - the far end of a line has a potential that is not between those of the near ends: it is open, or
   it belongs to another line.
 
 A check answers with words, and with no words where nothing is wrong. What frames have shown of
-pairs of lines is the only state here; `LinePairs.tell` changes it, and nothing else does.
+pairs of lines is the only state here; only `LinePairs.compare` and `reset` change it.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +42,12 @@ MOST_CELLS_RATIO: Final = 0.016
 # The same for one cell: if it is more, this cell is at fault. Chosen: about twice as much, because
 # one of many cells is the worst even on a sound skin.
 ONE_CELL_RATIO: Final = 0.03
-# In noise, a cell at fault also disagrees by more than so many times the median cell. Chosen: one
-# more than `FAULT_STDS`, as the median cell is not the noisiest.
+# In noise, a cell at fault also disagrees by more than so many times the median cell. What
+# disagrees by less is as good as a sound cell: so three readings of a cell may, and agree. Chosen:
+# one more than `FAULT_STDS`, as the median cell is not the noisiest.
 ONE_CELL_TIMES: Final = 6.0
-# Three readings of a cell agree if they disagree by less than so many standard deviations of
-# rounding. Chosen: 1.2 LSB, more than rounding alone can make of them.
+# Without noise, three readings of a cell agree if they disagree by less than so many standard
+# deviations of rounding. Chosen: 1.2 LSB, more than rounding alone can make of them.
 AGREE_STDS: Final = 4.0
 # Share of a port's current at rest by which it may drift, up or down. Chosen: three deviations of
 # the drift that `prior.REST_STD` expects.
@@ -54,8 +55,8 @@ DRIFT_SHARE: Final = 0.15
 # Two lines are alike if none of their currents differ by more standard deviations. Chosen: joined
 # electrodes give the same code, or differ by noise, and one code is 3.5 deviations of rounding.
 SAME_STDS: Final = 3.4
-# Lines that frames have shown apart are shorted if they are alike for so many frames: three seconds
-# at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
+# Lines that a frame has shown apart are shorted if no frame shows them apart while so many are
+# compared: three seconds at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
 ALIKE_FRAMES: Final = 270
 # Lines that were shorted at rest already drew more than this times the median line. Chosen: more
 # than lines at rest scatter, and less than the double that two lines in one draw.
@@ -66,60 +67,57 @@ WIRE_SHARE: Final = 0.5
 _LINES: Final = ("row", "column")  # By axis: rows are counted by axis 0 of an array of ports.
 
 
-class Mended(NamedTuple):
-    """Currents without the readings that contradict the others of their cell.
-
-    fault: what could not be mended, or empty.
-    """
-
-    ports: PortCurrents
-    fault: str
-
-
 class Contradictions:
     """Checks whether the readings of a cell agree, and leaves out one that is stuck."""
 
     def __init__(self, near_ends: NearEnds, ratio_std: float) -> None:
         self._near_ends, self._ratio_std = near_ends, ratio_std
-        self._degrees = near_ends.per_cell - 1
         self._has_four = near_ends.per_cell == 4
         # The multiplexers at far ends double the capacitance that charges.
         charging = 1.0 if self._has_four else 2.0
         self._most_cells, self._one_cell = charging * MOST_CELLS_RATIO, charging * ONE_CELL_RATIO
 
-    def mended(self, near: NearReadings, spread: Spread, ports: PortCurrents) -> Mended:
-        """ports: the currents of these readings, which stay as they are."""
-        typical = (spread.median_square / self._degrees) ** 0.5
+    def mended(
+        self, near: NearReadings, spread: Spread, ports: PortCurrents
+    ) -> tuple[PortCurrents, str]:
+        """The currents without stuck readings; and what could not be mended, in words, or empty.
+
+        ports: the currents of these readings. Their arrays are not written into.
+        """
+        typical = spread.median_rms
         if typical > self._most_cells:
-            text = f"the readings of most cells disagree, by {100 * typical:.0f} % of Vdd"
-            return Mended(ports, text)
-        limit = max(self._one_cell, ONE_CELL_TIMES * typical)
-        if spread.square.max() <= self._degrees * limit**2:
-            return Mended(ports, "")
+            return ports, f"the readings of most cells disagree, by {100 * typical:.0f} % of Vdd"
         current, std, fault = ports.current.copy(), ports.std.copy(), ""
-        for index in np.flatnonzero(spread.square > self._degrees * limit**2):
-            cell = np.unravel_index(index, spread.square.shape)
+        limit = max(self._one_cell, ONE_CELL_TIMES * typical)
+        agree = max(AGREE_STDS * self._ratio_std, ONE_CELL_TIMES * typical)
+        for index in np.flatnonzero(spread.rms > limit):
+            cell = np.unravel_index(index, spread.rms.shape)
             if self._has_four:
-                best = self._near_ends.best_three(near.ratio[cell])
-                agree = max(AGREE_STDS * self._ratio_std, ONE_CELL_TIMES * typical)
-                if best.disagreement_ratio < agree:
-                    current[cell] = best.current
-                    # In three readings, offsets and what lines draw do not cancel. Chosen: this
-                    # doubles the deviation.
+                disagreement, current_of_three = self._near_ends.best_three(near.ratio[cell])
+                if disagreement < agree:
+                    current[cell] = current_of_three
+                    # The cell's own deviation has the stuck reading in it, so it goes by the best
+                    # cell's. In three readings, offsets and what lines draw do not cancel. Chosen:
+                    # twice that of the best cell.
                     std[cell] = 2.0 * std.min()
                     continue
-            by = 100 * float(spread.square[cell] / self._degrees) ** 0.5
+            by = 100 * spread.rms[cell]
+            # One is enough for a message: the last.
             fault = f"{cell_of(index, current)}: its readings disagree by {by:.0f} % of Vdd"
-        return Mended(PortCurrents(current, std), fault)
+        return PortCurrents(current, std), fault
 
 
 class LinePairs:
-    """Tells which rows (axis 0), or which columns (axis 1), read alike though they did not at rest.
+    """Finds rows (axis 0), or columns (axis 1), that read alike though they did not at rest.
 
-    Two shorted lines are one node, so their currents from every other line are the same. It is told
-    what frames show, and then says which pairs have been alike for long enough to be shorted. The
-    lines `high` (lines,) that it is asked about are those with more current at all of their ports
-    than before: a short adds to all of them.
+    Two shorted lines are one node, so their currents from every other line are the same. `compare`
+    compares all pairs of lines in a frame. It counts, for each pair, the frames that were compared
+    since one has shown this pair apart. Frames that are not worth it (`needs_frame`) neither add to
+    a count nor end it, so short touches of the same two lines add up.
+
+    high (lines,): which lines have more current at all of their ports than without a short, as a
+    short adds to all of them. For a frame that is: than the line at rest; at rest: than the median
+    line.
     """
 
     def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
@@ -133,8 +131,8 @@ class LinePairs:
     def reset(self) -> None:
         """Forget the frames before.
 
-        Until a frame has shown two lines apart, they count as if they had always been alike: the
-        first frame may name a short that was there when reading began.
+        Until a frame has shown two lines apart, their count is as if they had always been alike:
+        the first frame may name a short that was there when reading began.
         """
         self._alike_frames: NDArray[np.intp] = np.full((self._lines, self._lines), ALIKE_FRAMES)
         self._is_shorted = np.zeros((self._lines, self._lines), dtype=bool)
@@ -142,27 +140,29 @@ class LinePairs:
     def were_shorted_at_rest(self, high: Bool) -> str:
         """The first pair of the lines `high` that was alike at rest already, in words, or empty.
 
-        Few lines have no median that two of them do not move. Lines with few ports may be alike by
-        chance.
+        Two of fewer than four lines would move the median that they are compared with. Lines with
+        fewer than three ports may be alike by chance.
         """
         if self._lines < 4 or self._ports < 3:
             return ""
         return self._first(self._rest_apart < SAME_STDS, high)
 
-    def need_telling(self, high: Bool) -> bool:
-        """Whether a frame with these lines `high` is worth telling: comparing all pairs takes long.
+    def needs_frame(self, high: Bool) -> bool:
+        """Whether a frame with these lines `high` is worth comparing: all pairs take long.
 
-        A pair needs two high lines. But while some pair counts as alike, a frame may show it apart.
-        Lines with fewer than three ports may be alike by chance.
+        A short shows in two high lines. Without them a frame is still compared while the count of
+        some pair is full: the frame may show this pair apart. Lines with fewer than three ports may
+        be alike by chance.
         """
-        all_seen_apart = self._alike_frames.max() < ALIKE_FRAMES
-        return self._ports >= 3 and not (all_seen_apart and np.count_nonzero(high) < 2)
+        no_count_is_full = self._alike_frames.max() < ALIKE_FRAMES
+        return self._ports >= 3 and not (no_count_is_full and np.count_nonzero(high) < 2)
 
-    def tell(self, now: PortCurrents) -> None:
-        """Take what a frame shows of all pairs."""
+    def compare(self, now: PortCurrents) -> None:
+        """Count in a frame for all pairs of lines."""
         apart = self._apart(now)
-        # A pair can be found if it differed at rest by clearly more than this frame's noise. This
-        # frame may be too noisy to tell the others from shorted ones, so they count as apart.
+        # A pair can be judged if it differed at rest by clearly more than this frame's noise. Other
+        # pairs would look shorted in a frame so noisy. They are taken as apart, and the frame ends
+        # their count.
         noisier = max(self._largest_std(now) / self._rest_std, 1.0)
         apart[self._rest_apart <= 2 * SAME_STDS * noisier] = np.inf
         # Two shorted lines may differ by more than the limit in a noisy frame. So only a difference
@@ -171,7 +171,7 @@ class LinePairs:
         self._is_shorted = (apart < SAME_STDS) & (self._alike_frames >= ALIKE_FRAMES)
 
     def shorted(self, high: Bool) -> str:
-        """The first pair of the lines `high` that is shorted, by what was told; or empty."""
+        """The first pair of the lines `high` that is shorted, by the frames compared; or empty."""
         return self._first(self._is_shorted, high)
 
     def _first(self, is_alike: Bool, high: Bool) -> str:
@@ -230,7 +230,11 @@ class SkinFaults:
         return ""
 
     def find(self, now: PortCurrents) -> str:
-        """The first fault that a frame's currents show. The frame is told to the pairs of lines."""
+        """The first fault that a frame's currents show, in words, or empty.
+
+        Only a frame without a short to a column or a loss is compared for shorted lines, and its
+        columns only if no rows are shorted.
+        """
         fault = self._short(now)
         if fault or self._rest is None:
             return fault
@@ -239,8 +243,8 @@ class SkinFaults:
         is_higher = now.current > (1.0 + DRIFT_SHARE) * self._rest.current
         for axis, pairs in enumerate(self._pairs):
             high = np.asarray(is_higher.all(axis=1 - axis))
-            if pairs.need_telling(high):
-                pairs.tell(now)
+            if pairs.needs_frame(high):
+                pairs.compare(now)
                 if pair := pairs.shorted(high):
                     return f"{pair} read alike as they did not at rest: shorted?"
         return ""

@@ -21,11 +21,11 @@ offsets of the board are fitted, too, one for two readings: n / 2 of them, share
 
     v_cell = sum_k residual_k^2 / (n - 1 - n / (2 RC)) .
 
-**Noise, and what stays.** Residuals have three causes: noise; lines that charge; the converter's
-curve. Noise changes from frame to frame, the other two stay while nothing moves. The difference
-of the residuals of two frames has twice the variance of noise, and nothing of what stays. Where
-v_n, so measured, is much less than v, most of a disagreement stays. Of that, most is taken from
-the current (`port_currents`), and a share of it counts as error:
+**Noise, and what stays.** Residuals have three causes: noise; lines that charge; a converter that
+is not linear. Noise changes from frame to frame, the other two stay while nothing moves. The
+difference of the residuals of two frames has twice the variance of noise, and nothing of what
+stays. Where v_n, so measured, is much less than v, most of a disagreement stays. Of that, most is
+taken from the current (`port_currents`), and a share of it counts as error:
 
     v_I = v_n + STAYING_SHARE^2 max(0, v_cell - v_n) .
 
@@ -37,7 +37,9 @@ round independently as soon as it has the variance of rounding: v = 2 s^2. Betwe
 
     s_I^2 = v_I / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2 .
 
-This is exact at both ends; between them, s_I is 1.0 to 1.2 times too large.
+This is exact at both ends; between them, s_I is 1.0 to 1.2 times too large. (The code has
+`Variances.noise` in place of v. They differ only where v_n is used for noise. There both are above
+2 s^2, and the last term is 0.)
 """
 
 from typing import Final, NamedTuple
@@ -63,14 +65,14 @@ STAYING_SHARE: Final = 0.12
 class Spread(NamedTuple):
     """How far the readings of the cells of one frame disagree.
 
-    square: sum of the squares of a cell's residuals (R, C) [V^2/Vdd^2].
-    median_square: that of the median cell.
+    rms: root of the mean square of a cell's residuals, over n - 1 (R, C) [V/Vdd].
+    median_rms: that of the median cell [V/Vdd].
     by_cell: v_cell (R, C).
     usual: v, the mean over all usual cells.
     """
 
-    square: Float
-    median_square: float
+    rms: Float
+    median_rms: float
     by_cell: Float
     usual: float
 
@@ -78,7 +80,7 @@ class Spread(NamedTuple):
 class Variances(NamedTuple):
     """Variances of a reading, from one frame and the one before it.
 
-    noise: v_n, or v where noise cannot be told from what stays.
+    noise: v_n, or v where v_n is not known, or not much less than v.
     error: v_I, what counts as error of a current (R, C).
     """
 
@@ -91,9 +93,11 @@ class ReadingNoise:
 
     def __init__(self, knowledge: SkinKnowledge, per_cell: int, square_ohm: float) -> None:
         """per_cell: n. square_ohm: sum_k R_k^2 [ohm^2]."""
-        self.degrees = per_cell - 1
+        self._degrees = per_cell - 1
         cells = knowledge.rows * knowledge.columns
-        self._free_degrees = max(self.degrees - per_cell / (2.0 * cells), 0.5)
+        # What v_cell divides by. A single cell in mode far has nothing left but its offset: 0.
+        # Chosen: half a degree, so that nothing is divided by 0.
+        self._mean_degrees = max(self._degrees - per_cell / (2.0 * cells), 0.5)
         self._ratio_std, self._rounding = knowledge.ratio_std, knowledge.ratio_std**2
         # v where readings round independently: rounding, and as much noise.
         self._independent = 2.0 * self._rounding
@@ -101,9 +105,10 @@ class ReadingNoise:
         self._staying_share = np.full((knowledge.rows, knowledge.columns), STAYING_SHARE)
         if per_cell == 2:
             # Mode far reads a and e of all ports in one pass, and b and f in the next. Before the
-            # first pass the board waits for the scan to begin, and the lines settle at the first
-            # port. Before the second pass they do not. So there they move b but not a, and nothing
-            # cancels in the current: all of this port's disagreement counts.
+            # first pass the board waits for the scan to begin, and meanwhile the lines settle at
+            # the first port. Before the second pass they have no time to. So the charging lines
+            # move b of the first port, but not its a, and nothing cancels in its current: all of
+            # its disagreement counts.
             self._staying_share[0, 0] = 1.0
         self.reset()
 
@@ -119,15 +124,23 @@ class ReadingNoise:
         """How far readings of these residuals (R, C, n) disagree."""
         square = np.einsum("ijk,ijk->ij", residual, residual)
         median = _median(square)
-        by_cell = square / self._free_degrees
-        level = max(self._rounding, median / _MEDIAN_CHI2[self.degrees])
+        by_cell = square / self._mean_degrees
+        # The limit goes by the median cell, because one cell that is far off does not move it. The
+        # median cell itself is always within the limit, so there is always a usual cell.
+        level = max(self._rounding, median / _MEDIAN_CHI2[self._degrees])
         usual = by_cell[by_cell <= USUAL_STDS**2 * level]
-        return Spread(square, median, by_cell, float(usual.sum()) / usual.size)  # faster than mean
+        return Spread(
+            rms=np.sqrt(square / self._degrees),
+            median_rms=(median / self._degrees) ** 0.5,
+            by_cell=by_cell,
+            usual=float(usual.sum()) / usual.size,  # faster than mean
+        )
 
-    def explains(self, spread: Spread) -> bool:
-        """Whether rounding and a converter's noise can be all that makes readings disagree.
+    def shows_nothing_staying(self, spread: Spread) -> bool:
+        """Whether v is so small that nothing can be recognised as staying, whatever v_n is.
 
-        v_n is at least 2 s^2. If that is not much less than v, nothing can be told to stay.
+        `variances` takes v_n for 2 s^2 at least, and something stays only where v_n is less than
+        `NOISE_SHARE` of v. So nothing can where v is up to 2 s^2 / `NOISE_SHARE`.
         """
         return self._independent >= NOISE_SHARE * spread.usual
 
@@ -137,7 +150,7 @@ class ReadingNoise:
             return np.inf
         change = residual - self._residual
         square = np.einsum("ijk,ijk->ij", change, change)
-        return _median(square) / (2.0 * _MEDIAN_CHI2[self.degrees])
+        return _median(square) / (2.0 * _MEDIAN_CHI2[self._degrees])
 
     def of_mean(self, ratio: Float) -> float:
         """v_n of readings (R, C, n) at rest: 0 in a mean of many scans, inf (unknown) in one scan.
@@ -147,10 +160,10 @@ class ReadingNoise:
         code = ratio / (self._ratio_std * 12**0.5) - 0.5  # a step of width w has variance w^2 / 12
         return 0.0 if np.abs(code - np.rint(code)).max() > 0.01 else np.inf
 
-    def variances(self, spread: Spread, changing: float) -> Variances:
-        """Noise, and what counts as error. changing: v_n, inf where it is not known."""
+    def variances(self, spread: Spread, v_n: float) -> Variances:
+        """Noise, and what counts as error. v_n: as measured; inf where it is not known."""
         # Codes that do not change are no proof of readings without error: they are rounded.
-        noise = max(changing, self._independent)
+        noise = max(v_n, self._independent)
         if noise < NOISE_SHARE * spread.usual:
             staying = np.maximum(spread.by_cell - noise, 0.0)
             return Variances(noise, noise + self._staying_share**2 * staying)
@@ -162,12 +175,14 @@ class ReadingNoise:
         return np.sqrt(variances.error / self._square_ohm + alike * self._alike_std**2)
 
     def between_ends(self, variances: Variances) -> Float:
-        """Variance of the difference between readings at two ends of mode far, (R, C) [V^2/Vdd^2].
+        """Variance of the difference between both ends of a line in mode far, (R, C) [V^2/Vdd^2].
 
-        Noise of both readings adds up. What stays has moved both near readings of a cell by the
-        same d. Their residuals are d each, and with one degree of freedom this is a variance of
-        2 d^2. The difference has d once, so it has half of that variance. It has at least the
-        rounding of two readings.
+        Noise of both ends adds up. What stays moves both near readings of a cell by the same d. So
+        their two residuals are d, and with one degree of freedom v_cell has 2 d^2 of it. Of that,
+        `error` - `noise` is the share that counts (`STAYING_SHARE`; all of it at port (0, 0)). The
+        far reading may be moved by d as well, but not the potential of the near end, which
+        `port_currents` takes from the current. So the difference has d once: half of that share.
+        It has at least the rounding of two readings.
         """
         staying = np.maximum(variances.error - variances.noise, 0.0)
         return np.maximum(2.0 * variances.noise + 0.5 * staying, 2.0 * self._rounding)
@@ -175,8 +190,10 @@ class ReadingNoise:
     def offset_std(self, spread: Spread, offset_ratio: float) -> float:
         """Standard deviation of the offset that far ends may have against near ends [V/Vdd].
 
-        What near ends a and b have in common may be an offset of all readings, which far ends have
-        as well, or be of lines that charge, which far ends have not. This covers both.
+        What near ends a and b have in common, `offset_ratio`, may be an offset of all readings,
+        which far ends have as well, or be of lines that charge, which far ends have not. This
+        covers both. v is added because this offset is the median of the cells. A single cell
+        disagrees with it by its own, and its far ends may do so as well.
         """
         return float((spread.usual + offset_ratio * offset_ratio) ** 0.5)
 

@@ -36,8 +36,8 @@ class PortReadings:
 
     drop_ohm: what the wires of row and of column lose per current of the port (2, R, C) [ohm].
     drop_std: standard deviation of drop_ohm, for rows and columns alike (R, C) [ohm].
-    drop_shift: how much an offset of the far ends, of one standard deviation, would add to drop_ohm
-        of rows and take from that of columns (R, C) [ohm].
+    drop_shift: what an offset of the far ends of one standard deviation would add to drop_ohm of
+        rows, and take from that of columns (R, C) [ohm].
     """
 
     ratio: Float
@@ -91,12 +91,15 @@ class PortReader:
         self._faults.reset()
 
     def read(self, ratio: Float, *, in_order: bool = False) -> PortReadings:
-        """Currents of checked readings (R, C, m), and what is wrong with them.
+        """Currents of checked readings (R, C, m), m for each cell, and what is wrong with them.
 
-        in_order: True for live frames: what has changed since the one before is noise. False for
-        readings at rest, which may be one scan or the mean of many.
+        in_order: True for live frames: how the residuals have changed since the frame before is
+        noise. False for readings at rest, which may be one scan or the mean of many. `find` counts
+        these for a frame, too: reset after them.
         """
         near = self._read_near(ratio, in_order=in_order)
+        # `find` is not called where another fault is known: such a frame must not count as one that
+        # shows lines alike, or apart.
         fault = near.fault or self._rest_fault or self._faults.find(near.ports)
         if not any(self.far):
             return PortReadings(ratio, *near.ports, fault)
@@ -115,25 +118,22 @@ class PortReader:
         )
 
     def _read_near(self, ratio: Float, *, in_order: bool) -> NearPorts:
-        """Currents by the near ends, less what lines that charge add, if readings show any.
+        """Currents by the near ends, less what lines that charge add, if readings may show that.
 
-        Where rounding and noise explain how far readings disagree, there is nothing to correct, and
-        the correction would only add noise.
+        Where readings disagree so little that nothing can be recognised as staying, no line is seen
+        to charge, and the correction would only add noise. Where they disagree by more, it is made
+        whatever the cause: in a frame that is only noisy, too.
         """
-        near = self._near_ends.read(ratio)
-        current, noise = near.current, np.inf
-        spread = self._noise.spread(near.residual)
-        if not self._noise.explains(spread):
+        near, noise = self._near_ends.read(ratio), self._noise
+        current, v_n = near.current, np.inf  # inf: not known
+        spread = noise.spread(near.residual)
+        if not noise.shows_nothing_staying(spread):
             current = current - self._near_ends.charging(near)
-            noise = (
-                self._noise.of_change(near.residual)
-                if in_order
-                else self._noise.of_mean(near.ratio)
-            )
-        variances = self._noise.variances(spread, noise)
+            v_n = noise.of_change(near.residual) if in_order else noise.of_mean(near.ratio)
+        variances = noise.variances(spread, v_n)
         if in_order:
-            self._noise.keep(near.residual)
-        ports = PortCurrents(current, self._noise.current_std(variances))
-        mended = self._contradictions.mended(near, spread, ports)
-        offset = float(near.offset_ratio[0])
-        return NearPorts(*mended, spread, variances, offset)
+            noise.keep(near.residual)
+        ports = PortCurrents(current, noise.current_std(variances))
+        ports, fault = self._contradictions.mended(near, spread, ports)
+        # In mode far, both near ends have the same offset. Mode near does not use it.
+        return NearPorts(ports, fault, spread, variances, float(near.offset_ratio[0]))
