@@ -55,6 +55,8 @@ def solve_positive(system: Float, right: Float) -> Float:
 
     One that rounding has made indefinite is mended as in `cholesky`, with the same error.
     """
+    if not len(system):  # LAPACK takes no empty one
+        return np.zeros_like(right)
     _, solution, failed = lapack.dposv(system, right, lower=1)
     return solve(cholesky(system), right) if failed else np.asarray(solution)
 

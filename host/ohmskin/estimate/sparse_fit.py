@@ -16,13 +16,15 @@ v      (RC, RC) voltage over cell e per current through port p, cells touched   
 x      (k,)     log conductances of the k cells in the model, others are at rest   log S
 I      (RC,)    port currents per Vdd                                              S
 s      (RC,)    their noise: of the readings, of cells at rest and wires           S
-r      (RC,)    residual (I_read - I) / s                                          1
+r      (RC,)    residual (I_read - I) / s, I_read the measured currents            1
 J      (k, RC)  dI / dx / s                                                        1
 A      (k, k)   J J^T and the precision of the prior of x                          1
 W      (m, n)   dI / dw / s P^1/2, w the log wire resistances, P their covariance, 1
                 at the m ports they matter to; n = 2RC + 2
 S      (m, m)   covariance of r at these ports with wires in it, 1 + W W^T         1
 ====== ======== ================================================================== ==========
+
+H, M and v are voltages per ampere, hence in ohms; in the code they are called `..._volt`.
 
 The untouched skin is solved once. Added conductances are a change of rank k (Woodbury):
 
@@ -47,14 +49,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, port_difference, wire_current
-from ohmskin.circuit.small import (
-    cholesky,
-    gram,
-    inverse,
-    solve,
-    solve_lower,
-    solve_positive,
-)
+from ohmskin.circuit.small import cholesky, gram, inverse, solve, solve_lower, solve_positive
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
@@ -75,15 +70,16 @@ Cells = NDArray[np.intp]
 
 # `make ablate` tries half, twice and none of each number; docs/estimate.md says what each earns.
 
-# Touches a row and column, on average, that are still few; a fingertip covers more.
+# Touches for each line, on average, that are still few; a fingertip covers more.
 MAX_TOUCHES_PER_LINE: Final = 0.5
 # A reading that shows more current than the model by so many deviations asks for its cell.
 DEMAND_STDS: Final = 4.0
-# A cell that asks for less than this share of the most in its row and column is a ghost of that.
+# A cell that would have to add less than this share of the largest in its row, or of the largest in
+# its column, is a ghost of these.
 RIVAL_SHARE: Final = 0.5
 # Wires matter to a reading if they may move it by more than this share of its noise.
 HEAVY_SHARE: Final = 0.1
-_HIGHEST_LOG_SIEMENS: Final = float(np.log(MAX_CELL_SIEMENS))
+_MAX_LOG_SIEMENS: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
 class RestNetwork(PortCircuit):
@@ -92,7 +88,6 @@ class RestNetwork(PortCircuit):
     cell_siemens: the cells, (RC,).
     port_volt, sense_volt: H by the driven and by the sensed ends of the ports, (cells, ports).
     cell_volt: M, (RC, RC).
-    own_...: their diagonals, each cell at its own port; own_slope: -d rho / d g there, (RC,).
     """
 
     def __init__(
@@ -110,22 +105,21 @@ class RestNetwork(PortCircuit):
         if any(far):
             sensed = self.sense_current.reshape(-1, siemens.size) / siemens
             self.sense_volt = port_difference(sensed, self.rows).T
-        # Currents through cells, by voltages inserted in series with them: with A = sqrt(g) (1 +
-        # sqrt(g) K sqrt(g))^-1 sqrt(g) they are A - A E^T Z E A, of which E A is `per_potential`.
+        # in_series[e, f]: current through cell e per volt inserted in series with cell f. While the
+        # electrodes are held, it is B = sqrt(g) (1 + sqrt(g) K sqrt(g))^-1 sqrt(g). As they float,
+        # it is B - B E^T Z E B, where B E^T is `per_potential`, and Z E B is `lines * siemens`.
+        # (K, E and Z as in `circuit.skin`.)
         in_series = inverse(self.factor)
         in_series *= np.sqrt(siemens) * np.sqrt(siemens)[:, None]
         in_series -= self.per_potential @ (lines * siemens)
-        # A current forced through cell f acts as 1 / g_f volts per ampere in series with it
-        # (Norton). Over the cell itself that voltage stands as well.
+        # One ampere forced through cell f makes 1 / g_f volts over it, if no current can leave the
+        # cell. As it can, the cell acts as a source of 1 / g_f volts (Norton), which drives
+        # in_series[:, f] / g_f through all cells, against the voltages that are counted here.
         self.cell_volt = -in_series / siemens / siemens[:, None]
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
-        self.own_port_volt = self.port_volt.diagonal()
-        self.own_sense_volt = self.sense_volt.diagonal()
-        self.own_slope = self.own_port_volt * self.own_sense_volt
-        self.own_cell_volt = self.cell_volt.diagonal()
 
     def by_wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
-        """d rho / d log r of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC).
+        """d rho / dw of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC).
 
         cell_current, sense_current: of a current through the driven ends, and the sensed ends.
         """
@@ -144,7 +138,7 @@ class RestNetwork(PortCircuit):
 
 
 class TouchedNetwork:
-    """A `RestNetwork` with conductances `added` (k,) > 0 [S] at `cells` (k,).
+    """A `RestNetwork` with conductances `added` (k,) > 0 [S] at `cells` (k,), k >= 0.
 
     port_ohm: rho, (RC,).
     volt, sense_volt: v of the touched cells by the driven, and by the sensed ends, (k, RC).
@@ -166,25 +160,27 @@ class TouchedNetwork:
     def own_slope(self, cells: Cells) -> tuple[Float, Float]:
         """-d rho / d g of some cells, each at its own port; and the diagonal of the touched M."""
         rest, coupling = self._rest, self._rest.cell_volt[self._cells[:, None], cells]
-        drawn = solve_positive(self._system, coupling)
-        port = rest.own_port_volt[cells] - (coupling * self._drawn[:, cells]).sum(axis=0)
-        slope = port * port
-        if any(rest.far):
-            sensed = (coupling * self._sense_drawn[:, cells]).sum(axis=0)
-            slope = port * (rest.own_sense_volt[cells] - sensed)
-        return slope, rest.own_cell_volt[cells] - (coupling * drawn).sum(axis=0)
+        at_rest = rest.port_volt, rest.sense_volt, rest.cell_volt
+        by_forced = solve_positive(self._system, coupling)  # q, of currents forced through cells
+        drawn = self._drawn[:, cells], self._sense_drawn[:, cells], by_forced
+        volt, sense_volt, cell_volt = (
+            volts[cells, cells] - (coupling * q).sum(axis=0)
+            for volts, q in zip(at_rest, drawn, strict=True)
+        )
+        return volt * sense_volt, cell_volt
 
     def cell_current(self, ports: Cells) -> tuple[Float, Float]:
         """Currents through all cells per current through some ports, (m, RC): driven, sensed."""
-        rest, between = self._rest, self._rest.cell_volt[self._cells]
+        rest, cell_volt_of_touched = self._rest, self._rest.cell_volt[self._cells]
         siemens = rest.cell_siemens.copy()
         siemens[self._cells] += self._added
         current: Float = rest.port_volt.T[ports]
-        current -= self._drawn.T[ports] @ between
+        current -= self._drawn.T[ports] @ cell_volt_of_touched
         current *= siemens
         if not any(rest.far):
             return current, current
-        return current, (rest.sense_volt.T[ports] - self._sense_drawn.T[ports] @ between) * siemens
+        sensed = rest.sense_volt.T[ports] - self._sense_drawn.T[ports] @ cell_volt_of_touched
+        return current, sensed * siemens
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +236,8 @@ class SparseFit:
         self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), far=belief.far)
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         siemens = net.cell_siemens[:, None]
-        # dI / d log r is I^2 times d rho / d log r: of cells v v' g, of wires by Tellegen likewise.
+        # By the log of a resistance, the slope of I is I^2 times that of rho, but for the sign. For
+        # a cell that of rho is v v' g, for wires likewise (Tellegen).
         by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
         currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
         by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
@@ -252,21 +249,21 @@ class SparseFit:
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""
-        # Small changes of the wires are corrected in each frame (`explain`), to first order. Larger
-        # ones need a new solution. Readings of two far ends have no wires of their own lines in
-        # them, so there a change has to be larger before it matters.
+        # Small changes of what is believed of the wires are corrected in each frame (`explain`), to
+        # first order. Larger ones need a new solution. Readings of two far ends have no wires of
+        # their own lines in them, so there a change has to be larger before it matters.
         least_log = 0.5 * (LAYER_STD if all(self.belief.far) else SEGMENT_STD)
         if np.abs(self.belief.log_layers - self.log_layers).max() > least_log:
             self._solve_rest()
         frame = FewTouches(self, ports)
-        # Never from the frame before: that keeps cells in the model that no reading asks for.
+        # Never from the frame before: cells would stay in the model that no reading asks for.
         frame.converge(np.zeros(0, dtype=np.intp), np.zeros(0))
         for _ in range(MAX_ITERATIONS):
             asked, added_siemens = frame.asked_for()
             if not asked.size:
                 return frame if frame.cells.size <= self.most else None
             cells = np.concatenate([frame.cells, asked])
-            # Twice as many may be in the model for a while: ghosts among them leave again.
+            # Twice as many may be in the model for a while: some are ghosts, and these leave again.
             if cells.size > 2 * self.most:
                 return None
             log_siemens = np.log(self.net.cell_siemens[asked] + added_siemens)
@@ -285,8 +282,9 @@ class FewTouches:
     def __init__(self, skin: SparseFit, ports: PortReadings) -> None:
         self._skin = skin
         self._measured, self._reading_std = ports.current.ravel(), ports.current_std.ravel()
-        # s, approximately: cells at rest and wires have moved an untouched skin's currents.
-        self._approximate_std = np.sqrt(self._reading_std**2 + skin.model_variance)
+        # s of ports whose own cell is at rest. At first it is approximate: cells at rest and wires
+        # move the currents as in an untouched skin. `explain` makes it anew for these touches.
+        self._untouched_std = np.sqrt(self._reading_std**2 + skin.model_variance)
         self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.ref_ohm
         self.steps = 0
 
@@ -295,45 +293,49 @@ class FewTouches:
         skin = self._skin
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
-        self._std = self._approximate_std
-        self._touched: TouchedNetwork | None = None
-        self._current = skin.current
-        if cells.size:
-            added = self._siemens - skin.net.cell_siemens[cells]
-            self._touched = TouchedNetwork(skin.net, cells, added)
-            self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
-            # A touched cell explains its own port, so nothing else has to be noise there.
-            self._std = self._approximate_std.copy()
-            self._std[cells] = self._reading_std[cells]
+        added = self._siemens - skin.net.cell_siemens[cells]
+        self._touched = TouchedNetwork(skin.net, cells, added)
+        self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
+        self._compare()
+
+    def _compare(self) -> None:
+        """s and r of the present model."""
+        # A touched cell explains its own port, so nothing but the readings has to be noise there.
+        self._std = self._untouched_std.copy()
+        self._std[self.cells] = self._reading_std[self.cells]
         self._residual = (self._measured - self._current) / self._std
 
     def converge(self, cells: Cells, log_siemens: Float) -> None:
-        """Steps from here until none matters; cells that fall back to rest leave."""
+        """Steps from here until none matters; cells that fall back to rest leave.
+
+        If steps still matter after `MAX_ITERATIONS`, it ends all the same: `asked_for` and
+        `explain` judge what there is.
+        """
         self._place(cells, np.maximum(log_siemens, self._skin.least_log_siemens[cells]))
         for _ in range(MAX_ITERATIONS):
             if not self.cells.size:
                 return
             slopes = self._slopes()
             moved, is_last = self._stepped(slopes @ slopes.T, slopes @ self._residual)
-            moved = np.minimum(moved, _HIGHEST_LOG_SIEMENS)
+            moved = np.minimum(moved, _MAX_LOG_SIEMENS)
             stays = moved > self._skin.least_log_siemens[self.cells]
             self._place(self.cells[stays], moved[stays])
             if is_last and stays.all():
                 return
 
     def _slopes(self) -> Float:
-        """J, (k, RC): dI / dx = I^2 v v' g."""
-        assert self._touched is not None
+        """J, (k, RC): dI / dx = I^2 v v' g, with v' by the sensed ends."""
         slopes = self._touched.volt * self._touched.sense_volt
         return np.asarray(slopes * self._siemens[:, None] * (self._current**2 / self._std))
 
     def _stepped(self, system: Float, pull: Float) -> tuple[Float, bool]:
         """x after a step, (k,), and whether that is the last that matters.
 
-        system: J J^T, (k, k), onto which the precision of the prior is added: it becomes A.
+        system: J J^T, (k, k). It is written into: it becomes A, by the precision of the prior.
         pull: J r, (k,).
         """
         centre, variance = self._skin.prior.normal(-self.log_siemens, self.cells)
+        # `centre` is the log resistance at rest: minus the log conductance.
         from_rest, precision = self.log_siemens + centre, 1.0 / variance
         system.ravel()[:: self.cells.size + 1] += precision
         step = solve_positive(system, pull - from_rest * precision)
@@ -345,28 +347,26 @@ class FewTouches:
     def asked_for(self) -> tuple[Cells, Float]:
         """Cells that readings ask for, and what each, alone, would have to add [S].
 
-        A current above the model's by `DEMAND_STDS` asks for its cell. Of these only such count
-        that add at least `RIVAL_SHARE` of the most in their row and column: a ghost adds less, as
-        its current passes three touches in series.
+        A current above the model's by `DEMAND_STDS` asks for its cell. Of these cells, one counts
+        if it would add at least `RIVAL_SHARE` of the largest in its row, and of the largest in its
+        column. A ghost would add less, as its current passes three touches in series.
         """
-        skin, net = self._skin, self._skin.net
+        skin = self._skin
         asks = self._residual > DEMAND_STDS
         asks[self.cells] = False
         asked = asks.nonzero()[0]
         if not asked.size:
             return asked, np.zeros(0)
-        slope, cell_volt, port_ohm = net.own_slope[asked], net.own_cell_volt[asked], net.port_ohm
-        if self._touched is not None:
-            slope, cell_volt = self._touched.own_slope(asked)
-            port_ohm = self._touched.port_ohm
+        slope, cell_volt = self._touched.own_slope(asked)
         # A port cannot have less resistance than its wires. Wires may be shorter than believed, so
         # half of them is allowed for. A reading that shows still less, by noise, is taken as that:
         # it asks for a very hard touch, and not for one of negative resistance.
         target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
         # One cell more is a change of rank 1: rho - target = slope / (1 / d + M), solved for 1 / d.
-        added_ohm = slope / np.maximum(port_ohm[asked] - target_ohm, 1e-9) - cell_volt
+        missing_ohm = np.maximum(self._touched.port_ohm[asked] - target_ohm, 1e-9)
+        added_ohm = slope / missing_ohm - cell_volt
         added_siemens = 1.0 / np.maximum(added_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
-        by_cell = np.zeros(net.shape)
+        by_cell = np.zeros(skin.net.shape)
         by_cell.ravel()[asked] = added_siemens
         rival = np.maximum(by_cell.max(axis=1, keepdims=True), by_cell.max(axis=0)).ravel()[asked]
         counts = added_siemens >= RIVAL_SHARE * rival
@@ -382,15 +382,18 @@ class FewTouches:
     def explain(self) -> Touched | None:
         """The last steps, with wires known to their covariance only.
 
-        None if the readings reject these touches: what these leave unexplained is more than noise,
-        or a port draws less current than the model, and no further touch makes it draw less.
+        None if the readings reject these touches. They do so at ports where wires matter (heavy) by
+        their chi-square. Elsewhere (light) they do so if a port draws less current than the model,
+        because no further touch makes it draw less. Light ports that draw more have had their say
+        in `find`: there, the strongest of them would have added its cell.
         """
         if not self.cells.size:
             return self._nothing_touched()
         # Where wires matter, S^-1 weighs the readings; elsewhere their noise does, which is cheap.
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
-        wires = self._sharpened(ports)
+        self._untouched_std, wires = self._sharpened(ports)
+        self._compare()
         covariance = gram(wires, onto=np.eye(ports.size, order="F"))
         factor = cholesky(covariance)
         # What the wires have been learned to be since the untouched skin was solved.
@@ -401,11 +404,11 @@ class FewTouches:
             heavy_slopes, light_slopes = slopes[:, ports], slopes[:, light]
             # With L L^T = S: J S^-1 J^T, and J S^-1 r.
             whitened = solve_lower(factor, heavy_slopes.T)
-            system = light_slopes @ light_slopes.T + whitened.T @ whitened
+            system = light_slopes @ light_slopes.T + whitened.T @ whitened  # A, after `_stepped`
             pull = light_slopes @ self._residual[light] + solve_lower(factor, residual) @ whitened
             moved, is_last = self._stepped(system, pull)
             least = self._skin.least_log_siemens[self.cells]
-            self._place(self.cells, np.minimum(np.maximum(moved, least), _HIGHEST_LOG_SIEMENS))
+            self._place(self.cells, np.minimum(np.maximum(moved, least), _MAX_LOG_SIEMENS))
             if is_last:
                 break
         residual = self._residual[ports] - offset
@@ -454,12 +457,11 @@ class FewTouches:
         heavy[self.cells] = True
         return heavy
 
-    def _sharpened(self, ports: Cells) -> Float:
-        """W at these ports. Their s, from here on, is that of the touched network.
+    def _sharpened(self, ports: Cells) -> tuple[Float, Float]:
+        """s of all ports (RC,), at these ports by the touched network; and W at these ports.
 
-        There it has the drift of cells at rest alone: wires are in S.
+        At these ports, s has the drift of cells at rest alone: wires are in S.
         """
-        assert self._touched is not None
         skin, net = self._skin, self._skin.net
         currents, sensed = self._touched.cell_current(ports)
         square = self._current[ports] ** 2
@@ -467,10 +469,9 @@ class FewTouches:
         by_cell[:, self.cells] = 0.0
         by_cell *= skin.prior.std
         model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
-        self._std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
-        self._std[self.cells] = self._reading_std[self.cells]
-        self._approximate_std = self._std
-        self._residual = (self._measured - self._current) / self._std
+        std = self._std.copy()
+        std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
+        std[self.cells] = self._reading_std[self.cells]
         by_wire = net.by_wires_of(ports, currents, sensed)
-        by_wire *= -(square / self._std[ports])[:, None]
-        return skin.belief.per_std(by_wire)
+        by_wire *= -(square / std[ports])[:, None]
+        return std, skin.belief.per_std(by_wire)
