@@ -155,7 +155,7 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
         cell, top, bottom = log_ohm.reshape(3, 3, 4)
         rho = port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom)))
         residual = (ports.current.ravel() - 1 / (rho.ravel() + 6e4)) / ports.current_std.ravel()
-        off, square = log_ohm[12:] - nominal, prior.rise(log_ohm[:12]) ** 2
+        off, square = log_ohm[12:] - nominal, prior.rise_stds(log_ohm[:12]) ** 2
         of_cells = np.where(square < 1, square, 1 + np.log(square))
         return float(np.sum(residual**2) + of_cells.sum() + off @ inverse @ off)
 

@@ -9,7 +9,7 @@ symbol shape     meaning                                                        
 p, s   (n,)      what the line lost per current of its ports, and its deviation     ohm
 c      (n, n)    current through its segments, per current of these ports           1
 q      (n,)      what segments like the layer's mean, as believed, would lose       ohm
-t      (2,)      factor by which each layer exceeds what is believed                1
+t      (2,)      mean segment of each layer, over what is believed of it            1
 o      scalar    offset of far ends against near ones, over its deviation           1
 h      (n,)      what an offset of one deviation adds to p: I changes by port       ohm
 m      scalar    reference: mean segment of the layer, as first seen                ohm
@@ -74,7 +74,7 @@ class MeasuredWires(WireBelief):
         log_cells: those that the fit starts from will do: c and q need no more than a model of the
         frame that is nearly right.
         """
-        self._measure(self.circuit(log_cells), ports)
+        self._measure(self.circuit(log_cells, self.log_layers), ports)
 
     def _measure(self, circuit: PortCircuit, ports: PortReadings) -> tuple[float, float]:
         """The layers of one frame, from an approximate circuit of it; o and the variance of o."""
@@ -82,8 +82,10 @@ class MeasuredWires(WireBelief):
         factors, covariance = self._factors(circuit, ports)
         for layer in (0, 1):
             if self.far[layer]:
+                # By noise, t may come out as 0 or less, which has no log.
                 factor = max(factors[layer], np.exp(-MAX_STEP_LOG))
-                # The frame's variance of log t is cov t / t^2. A scalar Kalman step in logs:
+                # The frame's variance of log t is cov t / t^2. A scalar Kalman step in logs. It
+                # neglects that both t share the error of o:
                 kept = 1.0 / (1.0 + variance[layer] * factor**2 / covariance[layer, layer])
                 measured = self.log_layers[layer] + np.log(factor)
                 logs[layer] += (1 - kept) * (measured - logs[layer])
@@ -101,8 +103,8 @@ class MeasuredWires(WireBelief):
         Raises LinAlgError for readings so exact that nothing is left of these differences.
         """
         weight = ports.drop_std**-2.0
-        # The 1 of o is o^2 in the cost. Those of t are next to nothing: with them a frame without
-        # current, or a layer that is not sensed, can still be solved.
+        # The 1 of o is o^2 in the cost. The 1 of t stays only for a layer that is not sensed, whose
+        # t nobody uses: without it, there were no inverse.
         normal, right = np.eye(3), np.zeros(3)
         for layer, sign in ((0, 1.0), (1, -1.0)):
             if not self.far[layer]:
@@ -133,7 +135,7 @@ class MeasuredWires(WireBelief):
         if not self._is_news(fit.log_cells):
             return
         self._lesson_cells = fit.log_cells
-        circuit = self.circuit(fit.log_cells)
+        circuit = self.circuit(fit.log_cells, self.log_layers)
         offset = self._measure(circuit, ports)
         variance = np.diagonal(self._root) ** 2
         most = np.diagonal(self._prior_covariance)
@@ -147,8 +149,9 @@ class MeasuredWires(WireBelief):
     def _segments_of(
         self, layer: int, circuit: PortCircuit, ports: PortReadings, offset: tuple[float, float]
     ) -> Float:
-        """Segments of a layer, (R, C) [ohm], from this frame and all lessons before; `_own_std`.
+        """Segments of a layer, (R, C) [ohm], from this frame and all lessons before.
 
+        It adds the frame to the L and l of the layer's lines, and sets the layer's `_own_std`.
         offset: o and its variance, in this frame.
         """
         if abs(self.log_layers[layer] - self._log_reference[layer]) > SEGMENT_STD:
@@ -162,12 +165,12 @@ class MeasuredWires(WireBelief):
         reference_ohm = np.exp(self._log_reference[layer])
         slopes = reference_ohm * circuit.line_current(layer)  # m c, (lines, ports, segments)
         heavy = slopes * weight[..., None]
-        information, pull = self._information[layer]
+        information, pull = self._information[layer]  # L and l, which are written into
         information += np.matmul(heavy.transpose(0, 2, 1), slopes)
         pull += np.einsum("lpk,lp->lk", heavy, drop)
         variance = SEGMENT_STD**2
         inverse = np.linalg.inv(np.eye(len(information[0])) + variance * information)
-        # (1 + v L)^-1 l, and (1 + v L)^-1 L 1.
+        # (1 + v L)^-1 l, and (1 + v L)^-1 L 1, of each line.
         of_pull, of_ones = np.matmul(
             inverse, np.stack([pull, information.sum(axis=2)], axis=2)
         ).transpose(2, 0, 1)

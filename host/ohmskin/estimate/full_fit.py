@@ -35,7 +35,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
@@ -86,9 +85,8 @@ class FullFit:
 
     def _evaluate(self) -> None:
         """The circuit at the present state."""
-        cell_siemens = np.exp(-self.log_cells).reshape(self._belief.shape)
-        wires = np.exp(self._belief.log_layers_off(self._layer_stds))
-        self._circuit = PortCircuit(cell_siemens, *wires, far=self._belief.far)
+        log_layers = self._belief.log_layers_off(self._layer_stds)
+        self._circuit = self._belief.circuit(self.log_cells, log_layers)
         self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
         self._residual = (self._current - self._modelled) * self._weight
         self._centre, self._variance = self._prior.normal(self.log_cells)
@@ -104,8 +102,9 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J and S for the present state.
 
-        N is kept until a resistance has moved by more than `SEGMENT_STD`: it says what segments may
-        have of their own, which is not known better than that. W is the dearest of all slopes.
+        W takes longest of all slopes. So N is kept until a log resistance may have moved by more
+        than `SEGMENT_STD`, 10 %. That changes W by about 10 %, and what segments have of their own
+        is not known as well as that.
         """
         if self._moved_log > SEGMENT_STD:
             self._moved_log = 0.0
@@ -126,7 +125,11 @@ class FullFit:
         return slopes, cholesky(gram(slopes, onto=self._noise.copy(order="F")))
 
     def _minimise(self) -> None:
-        """Steps until one is small. Each is first tried with the slopes of the one before."""
+        """Steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
+
+        Each is first tried with the slopes of the one before. The circuit is not evaluated after
+        the last move: `modelled`, `misfit` and `log_wires` are what the last step has forecast.
+        """
         self._linearise()
         step, moved_stds = self._step()
         while self.iterations < MAX_ITERATIONS:
@@ -136,18 +139,18 @@ class FullFit:
                 return
             self._evaluate()
             step, moved_stds = self._step()
-            # Old slopes are a little wrong, so they may end the fit by a smaller step only.
+            # Old slopes are a little wrong, so by them a step must be half as small to be the last.
             if moved_stds >= 0.5 * CLOSE_STDS:
                 self._linearise()
                 step, moved_stds = self._step()
         self.message = f"not converged in {MAX_ITERATIONS} iterations"
 
     def _step(self) -> tuple[Float, float]:
-        """u' - u by the slopes there are, and the most deviations it moves of a reading, or cell.
+        """The step u' - u, and the largest move it makes, in deviations of a reading or of a cell.
 
-        J is in deviations of the cells at the last linearisation. The prior of a cell, a normal
-        that follows the tail (`CellPrior.normal`), is that of the present state. So u of a cell is
-        the slope of its prior, distance over variance, times the older deviation.
+        J is in deviations that cells had at the last linearisation, but their prior, a normal that
+        follows the tail (`CellPrior.normal`), is that of the present state. Its slope is (x -
+        centre) / present variance. So u of a cell is this slope times the older deviation.
         """
         cell_stds = (self.log_cells - self._centre) * self._cell_std / self._variance
         present = np.concatenate([cell_stds, self._layer_stds])
@@ -196,18 +199,21 @@ class FullFit:
     def _conclude(self) -> None:
         """Posterior deviations of the cells: log_cells_std and wires_log_std, by the last J and S.
 
-        With s the deviation of a cell's prior, that of its posterior is s (1 - l)^1/2. l is the
-        cell's diagonal element of O^T O, the share of s^2 that the readings have removed. The part
-        from the layers is s times the length of the cell's two elements of O^T O with them.
+        With c the deviation of a cell's prior, that of its posterior is c (1 - l)^1/2. (c is that
+        of the normal in use: for a touched cell, its distance from rest.) l is the cell's diagonal
+        element of O^T O, the share of c^2 that the readings have removed. If the truth of a layer
+        is one deviation off, the fit's u of the cell is off by their element of O^T O. The layers
+        are independent, so the part from both is c times the length of these two elements.
 
         That holds for cells whose prior can be believed. Those that may be touched unnoticed
-        (`_find_unnoticed`) get a wider deviation s' instead of s, and S becomes wider by them: with
-        H their columns of O, each times (s'^2 / s^2 - 1)^1/2, it is S' = L (1 + H H^T) L^T. So
-        neighbours, which share readings with them, become less certain too (Woodbury):
+        (`_find_unnoticed`) get a wider deviation c' instead of c. The fit stays as it is. S becomes
+        wider by them: with H their columns of O, each times (c'^2 / c^2 - 1)^1/2, it is S' = L (1 +
+        H H^T) L^T. So neighbours, which share readings with them, become less certain too
+        (Woodbury):
 
             J^T S'^-1 J = O^T O - O^T H (1 + H^T H)^-1 H^T O .
 
-        The last term is the correction. After it, the columns of J that are theirs grow by s' / s.
+        The last term is the correction. After it, the columns of J that are theirs grow by c' / c.
         """
         cell_std = self._cell_std
         whitened = solve_lower(self._factor, self._slopes)
@@ -229,39 +235,42 @@ class FullFit:
         self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:
-        """Cells that the prior holds at rest and that may be touched; their deviation s' (RC,).
+        """Cells that the prior holds at rest and that may be touched; their deviation c' (RC,).
 
-        A cell stays at rest when the readings ask for less than the prior asks against it. That may
-        be a touch all the same: small for the readings, because much else conducts there, but not
-        small for the cell.
+        A cell stays at rest if the prior pulls it towards rest more than the readings pull it away.
+        It may be touched all the same: a touch that is small for the readings, because much else
+        conducts there, need not be small for the cell.
 
         learned: l, the share of the prior's variance that the readings have removed, (RC,).
         """
         prior = self._prior
-        rise = prior.expected - self.log_cells
-        at_rest = np.abs(rise) < prior.std
+        fitted_log = prior.expected - self.log_cells  # by how much the fit has it above rest
+        at_rest = np.abs(fitted_log) < prior.std
         # What the readings alone say. The fit is the product of two normals, the prior and theirs.
-        # So it has moved the cell by l times the rise that they show, of variance s^2 (1 - l) / l.
+        # So it has moved the cell by l times the rise that they show, of variance c^2 (1 - l) / l.
         share = np.maximum(learned, 1e-9)
-        rise = rise / share
+        rise_log = fitted_log / share
         rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
         if prior.is_crowded(self.log_cells):
             # Between many touched cells hardly any current is that of one at rest. That it is at
             # rest is then the prior's opinion alone, and it may have any force.
-            unnoticed, rise = at_rest, np.maximum(rise, UNLIMITED_STD)
+            unnoticed, rise_log = at_rest, np.maximum(rise_log, UNLIMITED_STD)
         else:
-            # The rise is more than noise, and within two deviations it may be one that matters.
-            unnoticed = at_rest & (rise + 2 * rise_std > HIDDEN_LOG) & (rise > rise_std)
-        unnoticed_std = rise + rise_std
+            # Within two deviations, the rise may be one that matters; and it is more than noise.
+            unnoticed = at_rest & (rise_log + 2 * rise_std > HIDDEN_LOG) & (rise_log > rise_std)
+        # A normal about rest, of a deviation that reaches as far as the rise that the readings show
+        # and one deviation of it further. Where they show next to nothing, it is very wide.
+        unnoticed_std = rise_log + rise_std
+        # No deviation becomes narrower.
         return unnoticed & (unnoticed_std > self._cell_std), unnoticed_std
 
     @property
     def lesson(self) -> Lesson:
         """What the readings say of the layers, whatever the touched cells are."""
-        # The belief wants the residual at its mean, not at the layers that the fit has found.
+        # The belief wants the residual at its own mean, not at the layers that the fit has found.
         residual = self._residual + self._per_layer_std @ self._layer_stds
         # A touched cell is noise without limit; one at rest is known to its drift.
-        touched = np.abs(self._prior.rise(self.log_cells)) > TOUCHED_STDS
+        touched = np.abs(self._prior.rise_stds(self.log_cells)) > TOUCHED_STDS
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
         _, factor = self._factorised(cell_std)
         return Lesson(self._per_layer_std, residual, factor)

@@ -10,8 +10,8 @@ standard deviation that says how much of it is prior:
   the frames before have revealed.
 
 The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
-few touches that explain the frame (`sparse_fit`). If no few touches do, as under a fingertip, they
-begin at the cells that `matrix` finds.
+few touches that `sparse_fit` finds. If no few touches lead to the readings, as under a fingertip,
+they begin at the cells that `matrix` finds.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
 few touches. Where they do not explain the frame, its answer is that of `joint`. Without rest
@@ -88,8 +88,9 @@ class JointEstimator(Estimator):
         try:
             return self._answer(ports)
         except np.linalg.LinAlgError:
-            # Nonsense in exact readings of far ends does this: noise alone keeps `far_wires` from
-            # dividing by 0. No other readings are known to. Each cell is answered as if alone.
+            # Nonsense in exact readings of far ends does this, because only noise prevents that
+            # `far_wires` divides by 0. No other readings are known to. Each cell is answered as if
+            # alone. No model was fitted: chi2 only compares readings with their own current.
             return Solution(
                 cell_siemens=conductance_from_current(ports.current, self.knowledge.ref_ohm),
                 cell_siemens_std=np.full(self._shape, MAX_CELL_SIEMENS),
@@ -101,7 +102,8 @@ class JointEstimator(Estimator):
         """The answer for one frame: a few touches for `touch`, else the fit of all resistances."""
         prior = self._prior_of(ports)
         touches = None
-        # Under a finger that stays, few touches explain no frame: trying costs time.
+        # Trying takes time, and under a finger that stays, few touches explain no frame. So they
+        # are not tried after a fit with many.
         if self._finder is not None and self._touches <= self._finder.most:
             touches = self._finder.find(ports)
         if touches is not None and (touched := self._explained_by(touches, ports)):
@@ -123,14 +125,11 @@ class JointEstimator(Estimator):
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
         belief = self._belief
-        if isinstance(fit, FullFit):
-            wires = belief.wires(fit.log_wires)
-        else:
-            wires = belief.wires_without_fit(fit.log_wires)
+        wires_of = belief.wires if isinstance(fit, FullFit) else belief.wires_without_fit
+        wires = wires_of(fit.log_wires)
+        stds = fit.log_cells_std, fit.wires_log_std, belief.layer_std()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
-        std, std_down = siemens_std(
-            -fit.log_cells, fit.log_cells_std, fit.wires_log_std, belief.layer_std(), series_ohm
-        )
+        std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
         # A model that misses the readings by more than their noise is wrong by as much more.
         wider = max(1.0, fit.misfit) ** 0.5
         return Solution(
@@ -165,47 +164,54 @@ class JointEstimator(Estimator):
     def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
         """Log resistances of the cells to start from, (RC,).
 
-        They are the touched cells that explain the frame. Where these do not, they are what
-        `matrix` finds: without wires, cells come out a little too soft, and from there a fit does
-        not reach the distant answer of one hard touch behind long wires.
+        They are those of the touches that `find` found, even if `explain` rejected them. Where it
+        found none, they are what `matrix` finds. That neglects wires, so its cells come out a
+        little too soft. This is wanted: from softer cells, the fit does not fall into the wrong
+        minimum of one hard touch behind long wires.
         """
         if touches is not None:
             return touches.log_cells
         # To start from, cells that miss each reading by one deviation are near enough.
         tolerance = float(ports.current.size)
         fit = CellFit(ports, self.knowledge.ref_ohm, self._cells_before, tolerance)
-        self._cells_before = None if fit.message else fit.cell
-        siemens = np.minimum(fit.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
+        self._cells_before = None if fit.message else fit.best.cell
+        siemens = np.minimum(fit.best.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
+        # No cell starts at more resistance than at rest.
         return np.minimum(-np.log(siemens), prior.expected)
 
     def _prior_of(self, ports: PortReadings) -> CellPrior:
-        """From the rest readings; without them from the level of this frame, or of a lower one.
+        """What is expected of the cells of this frame, by the rest readings if there are any."""
+        before, rest_ratio = self._prior, self.knowledge.rest_ratio
+        if rest_ratio is None:
+            prior = self._prior_by_level(ports)
+        else:
+            prior = before or self._prior_by_rest(self._reader.read(rest_ratio))
+        if prior is not before:
+            self._prior = prior
+            # Where wires hide even cells at rest, no few touches are sure. Then there is no finder,
+            # and all frames start from `matrix`.
+            if self._rest_wires_log_std <= REST_STD:
+                self._finder = SparseFit(prior, self._belief, self.knowledge.ref_ohm)
+        return prior
+
+    def _prior_by_level(self, ports: PortReadings) -> CellPrior:
+        """All cells at the level of this frame, or of one before it with a lower level.
 
         A level is one number for all cells: what has always been pressed is not taken for rest, as
         it would be cell by cell.
         """
-        rest_ratio, ref_ohm = self.knowledge.rest_ratio, self.knowledge.ref_ohm
-        if rest_ratio is None:
-            log_ohm, before = -np.log(rest_level(ports.current, ref_ohm)), self._prior
-            # Touches only raise a level. So the lowest one that was seen is nearest to rest.
-            if before is not None and log_ohm <= before.expected[0]:
-                return before
-            cells = ports.current.size
-            expected, std = np.full(cells, log_ohm), np.full(cells, UNKNOWN_REST_STD)
-        elif self._prior is not None:
-            return self._prior
-        else:
-            expected, std = self._at_rest(self._reader.read(rest_ratio))
-        self._prior = CellPrior(expected, std)
-        # Where wires hide even cells at rest, no few touches are sure: all frames are for `joint`.
-        if self._rest_wires_log_std <= REST_STD:
-            self._finder = SparseFit(self._prior, self._belief, ref_ohm)
-        return self._prior
+        log_ohm, before = -np.log(rest_level(ports.current, self.knowledge.ref_ohm)), self._prior
+        # Touches only raise a level. So the lowest one, of most ohms, is nearest to rest.
+        if before is not None and log_ohm <= before.expected[0]:
+            return before
+        cells = ports.current.size
+        return CellPrior(np.full(cells, log_ohm), np.full(cells, UNKNOWN_REST_STD))
 
-    def _at_rest(self, ports: PortReadings) -> tuple[Float, Float]:
-        """Log resistances of the untouched cells, and how well they are known: the same fit.
+    def _prior_by_rest(self, ports: PortReadings) -> CellPrior:
+        """Log resistances of the untouched cells, and how well they are known: by the same fit.
 
-        Made again about their median: many cells a little wrong would weigh more than readings.
+        Its prior has all cells alike. It is made again about the median of what was found, because
+        a level that is wrong for many cells by a little would weigh more than the readings.
         """
         level = rest_level(ports.current, self.knowledge.ref_ohm)
         log_cells: Float = np.full(ports.current.size, -np.log(level))
@@ -217,7 +223,8 @@ class JointEstimator(Estimator):
             log_cells = fit.log_cells
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
-        return log_cells, np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
+        std = np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
+        return CellPrior(log_cells, std)
 
 
 class TouchEstimator(JointEstimator):

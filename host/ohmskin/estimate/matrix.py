@@ -28,7 +28,7 @@ Levenberg-Marquardt, on the cells that no bound holds, scaled by max(g, 1e-7 S).
 I is far from linear in g: the reference resistors limit it. The port conductance G = 1 / rho is
 nearly linear in g. So far from the solution, r is the residual of G, carried over to the current,
 
-    r (1 + G_read R) / (1 + G R) ,   R = R_top + R_bottom ,
+    r (1 + G_read R_s) / (1 + G R_s) ,   R_s = R_top + R_bottom ,
 
 and a lone cell is solved in one step.
 
@@ -117,17 +117,18 @@ class MatrixEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         fit = CellFit(ports, self.knowledge.ref_ohm, self._previous)
         # A frame that did not converge is a poor start for the next one.
-        self._previous = None if fit.message else fit.cell
+        cell = fit.best.cell
+        self._previous = None if fit.message else cell
         return Solution(
-            cell_siemens=fit.cell,
+            cell_siemens=cell,
             cell_siemens_std=fit.cell_std(),
-            chi2=self._chi2(ports, fit.current.reshape(fit.cell.shape)),
+            chi2=self._chi2(ports, fit.best.current.reshape(cell.shape)),
             iterations=fit.iterations,
             message=fit.message,
         )
 
 
-class _Trial(NamedTuple):
+class Trial(NamedTuple):
     """Cells, and how they explain the frame.
 
     cell: g (R, C) [S].
@@ -148,7 +149,9 @@ class CellFit:
     """One frame's minimisation. It starts from the cells of the frame before, or from those of
     `ohm` if they are nearer, and ends where no step lowers the chi-square by `tolerance`.
 
-    iterations: how many steps it took. message: why it did not converge, or empty.
+    best: the cells with the least chi-square so far; in the end, the answer.
+    iterations: how many steps it took.
+    message: why it did not converge, or empty.
     """
 
     def __init__(
@@ -162,7 +165,7 @@ class CellFit:
         self._current_std = ports.current_std.ravel()
         self._ref_ohm, self._tolerance = ref_ohm, tolerance
         self._far_chi2 = _FAR_CHI2 * self._target.size
-        # 1 / (1 + G_read R), of a current that the most conductive cell allows.
+        # 1 / (1 + G_read R_s), of a current that the most conductive cell allows.
         feasible = np.minimum(self._target, port_current(MAX_CELL_SIEMENS, ref_ohm))
         self._target_share = 1.0 - feasible * ref_ohm
         self.iterations = 0
@@ -174,33 +177,25 @@ class CellFit:
         self._move_to(trial)
         self.message = self._run()
 
-    @property
-    def cell(self) -> Float:
-        """g (R, C) [S]."""
-        return self._at.cell
-
-    @property
-    def current(self) -> Float:
-        """I of the model (RC,) [S]."""
-        return self._at.current
-
-    def _try(self, cell: Float) -> _Trial:
+    def _try(self, cell: Float) -> Trial:
+        """How these cells (R, C) [S] explain the frame."""
         port_ohm, impedance = solve_ports(cell)
         current = 1.0 / (port_ohm.ravel() + self._ref_ohm)
         residual = (self._target - current) / self._current_std
-        return _Trial(cell, impedance, current, residual, float(residual @ residual))
+        return Trial(cell, impedance, current, residual, float(residual @ residual))
 
-    def _move_to(self, trial: _Trial) -> None:
-        self._at, self._is_linearised = trial, False
+    def _move_to(self, trial: Trial) -> None:
+        """Go on from these cells. Their slopes are made when they are needed: often never."""
+        self.best, self._is_linearised = trial, False
         self._scale = np.maximum(trial.cell.ravel(), SCALE_FLOOR_SIEMENS)
 
     def _linearise(self) -> None:
-        """Slopes at the present cells, if they have not been made there already."""
+        """J^T J and J^T r at the present cells, if they have not been made there already."""
         if self._is_linearised:
             return
         self._is_linearised = True
-        current, residual = self._at.current, self._at.residual
-        jacobian = voltage_squared(self._at.impedance, len(self.cell))
+        current, residual = self.best.current, self.best.residual
+        jacobian = voltage_squared(self.best.impedance, len(self.best.cell))
         jacobian *= (current**2 / self._current_std)[:, None]
         jacobian *= self._scale[None, :]
         self._gradient: Float = residual @ jacobian
@@ -208,13 +203,15 @@ class CellFit:
         self._far_gradient: Float = (residual * stretch) @ jacobian
         self._normal: Float = jacobian.T @ jacobian
         self._diagonal = np.diagonal(self._normal).copy()
+        # Rounding of J^T J is relative to its largest element: the ridge must not drown in it.
+        self._ridge = max(_RIDGE, 1e-14 * float(self._diagonal.max()))
 
     def _run(self) -> str:
         """Minimise; returns why not converged, or an empty string."""
         damping = 0.0
-        is_far = self._at.chi2 > self._far_chi2
+        is_far = self.best.chi2 > self._far_chi2
         while self.iterations < MAX_ITERATIONS:
-            if self._at.chi2 < self._tolerance:  # no step can lower it by more
+            if self.best.chi2 < self._tolerance:  # no step can lower it by more
                 return ""
             self.iterations += 1
             self._linearise()
@@ -222,13 +219,14 @@ class CellFit:
             # Which cells a bound holds is worth finding out near the solution only.
             cell = self._stepped(gradient, damping, 1 if is_far else _BOUND_ROUNDS)
             if cell is not None:
-                gain = float((cell - self.cell).ravel() / self._scale @ self._gradient)
+                # By so much the step lowers the chi-square, as far as it is quadratic.
+                gain = float((cell - self.best.cell).ravel() / self._scale @ self._gradient)
                 # Where no cells explain the readings, rounding of a large chi-square counts.
-                tolerance = max(self._tolerance, 1e-9 * self._at.chi2)
+                tolerance = max(self._tolerance, 1e-9 * self.best.chi2)
                 if abs(gain) < tolerance and damping <= _LIGHT_DAMPING and not is_far:
                     return ""
                 trial = self._try(cell)
-                if trial.chi2 < self._at.chi2:
+                if trial.chi2 < self.best.chi2:
                     self._move_to(trial)
                     damping = 0.0 if damping <= _LIGHT_DAMPING else damping / 10
                     is_far = is_far and trial.chi2 > self._far_chi2
@@ -249,11 +247,11 @@ class CellFit:
         a bound are held there, and the step is solved again for the others, in so many rounds.
         None: the system is not positive definite to working precision.
         """
-        cell = self.cell.ravel()
+        cell = self.best.cell.ravel()
         lowest = (MIN_CELL_SIEMENS - cell) / self._scale
         highest = (MAX_CELL_SIEMENS - cell) / self._scale
         normal = self._normal.copy()
-        normal.ravel()[:: len(cell) + 1] += damping * self._diagonal + self._ridge()
+        normal.ravel()[:: len(cell) + 1] += damping * self._diagonal + self._ridge
         held = ((lowest >= 0) & (gradient <= 0)) | ((highest <= 0) & (gradient >= 0))
         step = np.zeros_like(cell)
         for _ in range(rounds):
@@ -276,22 +274,18 @@ class CellFit:
                 break
             held |= crossing
         stepped = np.clip(cell + step * self._scale, MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
-        return np.asarray(stepped.reshape(self.cell.shape), dtype=np.float64)
-
-    def _ridge(self) -> float:
-        # Rounding of J^T J is relative to its largest element.
-        return max(_RIDGE, 1e-14 * float(self._diagonal.max()))
+        return np.asarray(stepped.reshape(self.best.cell.shape), dtype=np.float64)
 
     def cell_std(self) -> Float:
         """Root of the diagonal of (J^T J + ridge)^-1 [S], shape (R, C)."""
         self._linearise()
         system = self._normal.copy()
-        system.ravel()[:: len(self._diagonal) + 1] += self._ridge()
+        system.ravel()[:: len(self._diagonal) + 1] += self._ridge
         factor, failed = lapack.dpotrf(system, lower=1, overwrite_a=1)
         if failed:
-            return np.full(self.cell.shape, MAX_CELL_SIEMENS)  # nothing is known
+            return np.full(self.best.cell.shape, MAX_CELL_SIEMENS)  # nothing is known
         inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
         # A residual above the noise says that the model is wrong by that much.
-        misfit = max(1.0, self._at.chi2 / len(self._scale)) ** 0.5
+        misfit = max(1.0, self.best.chi2 / len(self._scale)) ** 0.5
         std = misfit * self._scale * np.sqrt(np.diagonal(inverse))
-        return np.asarray(std.reshape(self.cell.shape), dtype=np.float64)
+        return np.asarray(std.reshape(self.best.cell.shape), dtype=np.float64)

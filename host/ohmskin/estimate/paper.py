@@ -217,7 +217,7 @@ class PaperEstimator(Estimator):
             answers.append(self._afresh(ratio, 1.0 / current - knowledge.ref_ohm))
             if not answers[-1].is_good_start:
                 fit = CellFit(replace(ports, current=current), knowledge.ref_ohm, None)
-                answers.append(self._afresh(ratio, 1.0 / fit.cell))
+                answers.append(self._afresh(ratio, 1.0 / fit.best.cell))
         # A good one if there is any; of several, the one that gives the readings best.
         answer = min(answers, key=lambda one: (not one.is_good_start, one.misfit_ratio))
         self._previous = answer if answer.is_good_start else None
@@ -323,15 +323,14 @@ class Optimum:
     """What Ipopt returned.
 
     x: the states (4N, 5N), one a row.
-    bound_multipliers, constraint_multipliers: for a warm start of the next frame.
+    multipliers: of bounds and of constraints, as Ipopt takes them for a warm start.
     iterations: how many Ipopt took.
     status: how it ended, in Ipopt's words.
     success: whether Ipopt calls that a success, and all numbers are finite.
     """
 
     x: Float
-    bound_multipliers: Float
-    constraint_multipliers: Float
+    multipliers: dict[str, Float]
     iterations: int
     status: str
     success: bool
@@ -404,33 +403,26 @@ class Program:
         ratio: readings (R, C, 4) [V/Vdd]. reference_megohm: top, bottom. previous: the optimum that
         x is from, if it is of the frame before.
         """
-        arguments = dict(self._bounds)
-        if previous is not None:
-            arguments["lam_x0"] = previous.bound_multipliers
-            arguments["lam_g0"] = previous.constraint_multipliers
+        multipliers = {} if previous is None else previous.multipliers
         solver = self._solvers[step.start if previous is None else "before"]
         # Column-major: rows run fastest, then columns.
         y = ratio.transpose(1, 0, 2).ravel()
-        result = solver(
-            x0=x.ravel(), p=np.concatenate([y, reference_megohm, step.weights]), **arguments
-        )
+        parameters = np.concatenate([y, reference_megohm, step.weights])
+        result = solver(x0=x.ravel(), p=parameters, **self._bounds, **multipliers)
         report = solver.stats()
         states = np.array(result["x"]).reshape(x.shape)
         is_finite = bool(np.isfinite(states).all())
         return Optimum(
             x=states if is_finite else x,
-            bound_multipliers=np.array(result["lam_x"]).ravel(),
-            constraint_multipliers=np.array(result["lam_g"]).ravel(),
+            multipliers={f"{name}0": np.array(result[name]).ravel() for name in ("lam_x", "lam_g")},
             iterations=int(report["iter_count"]),
             status=str(report["return_status"]) or "Invalid_Number_Detected",
             success=bool(report["success"]) and is_finite,
         )
 
 
-@lru_cache(maxsize=4)
-def program_for(rows: int, columns: int) -> Program:
-    """The program for this size, built once in a process."""
-    return Program(rows, columns)
+# The program for a size, built once in a process, because building takes long.
+program_for = lru_cache(maxsize=4)(Program)
 
 
 def _make_solver(problem: dict[str, Any], more: dict[str, Any]) -> Any:

@@ -56,7 +56,8 @@ CLOSE_STDS: Final = 0.5
 MAX_CHI2: Final = 1.5
 # The longest step of a fit, a factor of 4.5; a frame with a cell that differs by more is news.
 MAX_STEP_LOG: Final = 1.5
-# Where errors are skewed, a stated deviation is that of the end of so many, divided by as many.
+# Where errors are skewed, the deviation stated is the distance to the limit of so many deviations,
+# divided by as many.
 REACH_STDS: Final = 2.0
 
 
@@ -76,13 +77,13 @@ class CellPrior:
     expected: Float
     std: Float
 
-    def rise(self, log_ohm: Float) -> Float:
+    def rise_stds(self, log_ohm: Float) -> Float:
         """How far a cell conducts more than at rest, in deviations."""
         return (self.expected - log_ohm) / self.std
 
     def touches(self, log_ohm: Float) -> int:
         """Number of touched cells."""
-        return int(np.count_nonzero(self.rise(log_ohm) > TOUCHED_STDS))
+        return int(np.count_nonzero(self.rise_stds(log_ohm) > TOUCHED_STDS))
 
     def is_crowded(self, log_ohm: Float) -> bool:
         """Whether as many of these cells (RC,) are touched as under fingertips."""
@@ -153,12 +154,14 @@ def siemens_std(
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
-    # Wires are normal in their log: at the limit they are exp(reach layer_std) - 1 off, not
-    # reach layer_std, and the part that comes from them grows by that ratio.
+    # The cell conducts most if its wires resist most. Wires are normal in their log: at this limit
+    # they are exp(reach layer_std) - 1 above their mean, not reach layer_std, and the part that
+    # comes from them grows by that ratio. At the other limit they are off by less than reach
+    # layer_std, so there the first order is enough.
     wider = np.expm1(REACH_STDS * layer_std) / (REACH_STDS * layer_std)
     up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * wires_log_std**2)
-    # d log u = share of r in r + series times d log r, so at the limits u is (1 +- off) u. Then
-    # r + series is (r + series) / (1 +- off), of which what is left is r.
+    # d log u = - r / (r + series) d log r. So at the limits the current is (1 +- off) u, and the
+    # whole resistance is (r + series) / (1 +- off). Without series, that is the cell's.
     off_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)
     off_up, off_down = up_std * off_per_std, np.minimum(log_std * off_per_std, 1.0 - 1e-6)
     lowest_ohm = (cell_ohm - off_up * series_ohm) / (1.0 + off_up)

@@ -6,19 +6,21 @@ Symbols
 ====== ========== =============================================================== ==========
 symbol shape      meaning                                                         unit
 ====== ========== =============================================================== ==========
+R, C              number of rows and of columns
 m      (2,)       log of the mean segment of each layer: top, bottom              log ohm
-C      (2, 2)     its covariance; C0 before any frame
+V      (2, 2)     its covariance; V0 before any frame
 s      scalar     deviation of a segment from its layer's mean, each by itself    log ohm
 L      (2, 2RC)   ones: which segments are of which layer
-P      (2RC, 2RC) covariance of the log segments, L^T C L + s^2
-J      (m, 2RC)   slope of m readings by the log segments, over their noise       1
-N      (m, m)     covariance of these readings' noise, cells of unknown force in it
-S      (m, m)     covariance of these readings, N + J P J^T
-z      (m,)       residual of these readings at the mean                          1
+P      (2RC, 2RC) covariance of the log segments, L^T V L + s^2
+J      (n, 2RC)   slope of n readings by the log segments, over their noise       1
+N      (n, n)     covariance of these readings, were the layers known: of their   1
+                  noise, of cells, and of what segments have of their own
+S      (n, n)     covariance of these readings, N + J L^T V L J^T                 1
+z      (n,)       residual of these readings at the mean                          1
 ====== ========== =============================================================== ==========
 
 P^1/2 has a column for each segment's own deviation, and two for what the segments of the layers
-share: s and L^T C^1/2.
+share: s and L^T V^1/2.
 
 There are two beliefs, and `joint` asks both the same: `before_fit`, what this frame and those
 before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`, below, knows near ends
@@ -27,15 +29,16 @@ fit. `MeasuredWires` (`far_wires`) knows far ends: they show the wires before th
 
 A lesson of `LearnedWires` is one step of a Kalman filter,
 
-    m += C L J^T S^-1 z ,     C -= C L J^T S^-1 J L^T C .
+    m += V L J^T S^-1 z ,     V -= V L J^T S^-1 J L^T V .
 
 The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
-its step starts from m and C as they were before the touch. What its readings alone say is
+its step starts from m and V as they were before the touch. What its readings alone say of m is the
+information A, the inverse of a covariance:
 
-    A = L J^T N^-1 J L^T = C^-1/2 (1 - X)^-1 X C^-1/2 ,     X = C^1/2 L J^T S^-1 J L^T C^1/2 .
+    A = L J^T N^-1 J L^T = V^-1/2 (1 - X)^-1 X V^-1/2 ,     X = V^1/2 L J^T S^-1 J L^T V^1/2 .
 
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
-cells as noise without limit. After a lesson C grows back towards C0: a skin bends. What single
+cells as noise without limit. After a lesson V grows back towards V0: a skin bends. What single
 segments have of their own is not learned: frames of near ends say too little of it.
 """
 
@@ -61,11 +64,11 @@ from ohmskin.estimate.prior import (
 
 
 class Lesson(NamedTuple):
-    """What the m readings of one frame say of the wires.
+    """What n readings of one frame say of the wires.
 
-    per_layer_std: J L^T C^1/2, (m, 2).
-    residual: z, at the mean of the belief, (m,).
-    factor: Cholesky factor of S, (m, m), the touched cells in it as noise without limit.
+    per_layer_std: J L^T V^1/2, (n, 2).
+    residual: z, (n,).
+    factor: Cholesky factor of S, (n, n).
     """
 
     per_layer_std: Float
@@ -114,7 +117,7 @@ class WireBelief(ABC):
         self.shape, self.far = shape, far
         *ohms, log_std = wires
         layer_std = UNKNOWN_LAYER_STD if None in ohms else LAYER_STD
-        # C0 in two parts that are independent: the mean of both logs, and half of their difference.
+        # V0 in two parts that are independent: the mean of both logs, and half of their difference.
         # Whoever has measured wires (`log_std`) has measured both in series, so their difference
         # stays as open as before. No measurement is believed to be better than 1 %.
         half_apart = 0.5 * layer_std**2
@@ -132,7 +135,7 @@ class WireBelief(ABC):
         self._believe(self._nominal, root)
 
     def _believe(self, log_layers: Float, root: Float) -> None:
-        """Take these for m and C^1/2."""
+        """Take these for m and V^1/2."""
         self.log_layers, self._root = log_layers, root
         self._without_fit: SkinWires | None = None
 
@@ -171,10 +174,10 @@ class WireBelief(ABC):
         log_std = float(np.linalg.norm(self._root.sum(axis=0)) / 2)
         return WireOhm(float(top), float(bottom), log_std)
 
-    def circuit(self, log_cells: Float) -> PortCircuit:
-        """The skin with these log resistances of its cells (RC,), and the wires of its layers."""
+    def circuit(self, log_cells: Float, log_layers: Float) -> PortCircuit:
+        """The skin with these logs of its cells (RC,), and of its layers' segments (2,)."""
         cell_siemens = np.exp(-log_cells).reshape(self.shape)
-        return PortCircuit(cell_siemens, *np.exp(self.log_layers), far=self.far)
+        return PortCircuit(cell_siemens, *np.exp(log_layers), far=self.far)
 
     @property
     def mean(self) -> Float:
@@ -186,18 +189,18 @@ class WireBelief(ABC):
         return float(np.hypot(*self._root.T).max())
 
     def per_layer_std(self, slopes: Float) -> Float:
-        """J L^T C^1/2, (m, 2), from slopes by the layers' logs, J L^T (m, 2)."""
+        """J L^T V^1/2, (n, 2), from slopes by the layers' logs, J L^T (n, 2)."""
         return slopes @ self._root
 
     def per_std(self, slopes: Float) -> Float:
-        """J P^1/2, (m, 2RC + 2), from J (m, 2RC): by what segments have, by what layers share."""
+        """J P^1/2, (n, 2RC + 2), from J (n, 2RC): by what segments have, by what layers share."""
         root = np.empty((len(slopes), slopes.shape[1] + 2))
         np.multiply(slopes, SEGMENT_STD, out=root[:, :-2])
         root[:, -2:] = self.per_layer_std(slopes.reshape(len(slopes), 2, -1).sum(axis=2))
         return root
 
     def log_layers_off(self, layer_stds: Float) -> Float:
-        """Logs of the layers (2,) that are so many deviations off: m + C^1/2 `layer_stds` (2,)."""
+        """Logs of the layers (2,) that are so many deviations off: m + V^1/2 `layer_stds` (2,)."""
         return self.log_layers + self._root @ layer_stds
 
     def log_wires_off(self, layer_stds: Float, segment_stds: Float) -> Float:
@@ -208,7 +211,7 @@ class WireBelief(ABC):
         return common + off_layer
 
     def moved_since(self, log_layers: Float, per_layer_std: Float) -> Float:
-        """What readings have moved since m was `log_layers` (2,): J L^T (m - log_layers), (m,)."""
+        """What readings have moved since m was `log_layers` (2,): J L^T (m - log_layers), (n,)."""
         return np.asarray(per_layer_std @ solve_lower(self._root, self.log_layers - log_layers))
 
     def segment_ohm(self, log_wires: Float) -> Float:
@@ -229,10 +232,10 @@ class WireBelief(ABC):
         return SkinWires(segments, segments * self.segment_std(), path.ravel())
 
     def wires_without_fit(self, log_wires: Float) -> SkinWires:
-        """The same of a fit that took the wires as believed.
+        """The same of a fit that took the wires as believed, `log_wires` (2RC,).
 
-        Such fits come one after the other, so the first one's wires are kept until the belief
-        changes.
+        Until the belief changes, all such answers have the wires of the first one. That one may be
+        of the frame that taught the belief, so it has the wires from before this lesson.
         """
         if self._without_fit is None:
             self._without_fit = wires = self.wires(log_wires)
@@ -269,7 +272,10 @@ class LearnedWires(WireBelief):
             self.take(fit.lesson, replace_last=not is_news)
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
-        """One Kalman step. replace_last: from where the last lesson started, which is forgotten."""
+        """One Kalman step.
+
+        replace_last: undo the last lesson first, by a step from where that lesson started.
+        """
         if not replace_last:
             self._before_lesson = self.log_layers, self._root
         per_layer_std, residual, factor = lesson
@@ -277,15 +283,15 @@ class LearnedWires(WireBelief):
         if len(residual) < 2:
             return
         # The lesson is in deviations of the belief that the fit had, but the step may start from an
-        # older one. So what the readings alone say is found first, in logs: weights are L J^T N^-1,
-        # and the information is A. X is gain per_layer_std.
+        # older one. So what the readings alone say is found first, in logs: `weights` are
+        # L J^T N^-1, and `information` is A. X is `gain @ per_layer_std`.
         gain = solve(factor, per_layer_std).T
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(2) - gain @ per_layer_std) @ gain
         information = weights @ per_layer_std @ per_log
         before, root = self._before_lesson
-        # z is the residual at the mean that the fit had. At the mean before, it differs by what the
-        # mean has moved since.
+        # z is the residual at the mean that the fit had, which is `self.log_layers`. At the mean
+        # that the step starts from, the residual differs by what the mean has moved since.
         pull = weights @ residual + information @ (self.log_layers - before)
         covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + information)
         log_layers = before + covariance @ pull
