@@ -156,7 +156,7 @@ def step_in_words(step: Step, detail: Any) -> tuple[str, str]:
 def guidance(presses: CornerScans) -> tuple[str, str]:
     """What is pressed meanwhile, and where to press next."""
     cells = " ".join(map(str, sorted(presses.wanted)))
-    request = f"{'now' if presses.again else 'press firmly, at once:'} {cells}"
+    request = f"{'now' if presses.read else 'press firmly, at once:'} {cells}"
     if presses.hold:
         return "hold still", request
     return f"pressed: {' '.join(map(str, presses.pressed)) or 'nothing'}", request

@@ -39,8 +39,9 @@ presses. With w the sum of W over all segments, a Gauss-Newton step is
 
     dy = w^T S^-1 r / (w^T S^-1 w) ,
 
-and a weak prior keeps y near 0. Free are the three corners and their neighbours, since a fingertip
-may press these as well. If the residual is larger than S says, the deviation of y is widened.
+and a prior of deviation UNLIMITED_STD keeps y finite where readings say nothing of it. The three
+corners and their neighbours are free, since a fingertip may press these as well. If the residual is
+larger than S says, the deviation of y is widened.
 """
 
 from collections import defaultdict
@@ -68,10 +69,7 @@ from ohmskin.link.protocol import ADC_BITS
 Corners = tuple[Cell, Cell, Cell]
 
 
-# Standard deviations before the readings.
-# [log] All wires may have changed by a factor of seven. Chosen: readings decide.
-BEFORE_STD: Final = 2.0
-# [log] An untouched cell drifts by this in the seconds since rest was read. Chosen: a fifth of
+# [log] Deviation of an untouched cell since rest was read, some seconds ago. Chosen: a fifth of
 # REST_STD, which is for hours.
 DRIFT_STD: Final = 0.01
 
@@ -81,11 +79,10 @@ PRESSED_SIEMENS: Final = 2e-5
 # [1] No other cell conducts more than this share of the weakest corner: else it is pressed, too.
 # Chosen: three fingers press alike.
 FOURTH_SHARE: Final = 0.5
-# [1] Corners with less than this share of the most scans were pressed in passing. Chosen: both
-# wanted rectangles are held for as long.
+# [1] Corners were pressed in passing if they are pressed in less than this share of a look's scans,
+# or of the scans of the corners that were held the longest. Chosen: two of one look cannot both
+# have more.
 HELD_SHARE: Final = 0.5
-# [scans] Fewer scans of a look at pressed corners do not count. Chosen: the hand moved in it.
-LEAST_HELD: Final = 5
 
 # The fit. Its steps are at most MAX_ITERATIONS and no longer than MAX_STEP_LOG, as in estimators.
 # [log] The step that is shorter is the last. Chosen: far below any deviation.
@@ -103,6 +100,7 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
     are taken out of them.
     """
     skin = matrix.knowledge
+    # Port and references in series; finite, though a port may show no current.
     loop_ohm = (1 / np.maximum(PortReader(skin).read(ratio).current, 1e-9)).ravel()
     std_siemens = current_std(2.0**-ADC_BITS, skin.ref_top_ohm, skin.ref_bottom_ohm)
     log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
@@ -111,6 +109,9 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
 
 def suggested_corners(rows: int, columns: int) -> Corners:
     """Where to press: far from the electrodes, where wires are long, and apart from each other.
+
+    The sides are the last line of each layer and one that is nearly half of the skin before it. On
+    a small skin it is at least two lines before, so that fingers have room, or line 0.
 
     :raises ValueError: a skin of one row or column has no rectangle.
     """
@@ -121,9 +122,9 @@ def suggested_corners(rows: int, columns: int) -> Corners:
 
 
 def moved_across(corners: Corners) -> Corners:
-    """The other two with the fourth corner, in place of the one between them.
+    """The fourth corner between the other two, in place of the one that was between them.
 
-    The currents then go through other wires.
+    The wires that these three show are those of the rectangle's other two sides.
     """
     _, beside, below = corners
     return (below[0], beside[1]), below, beside
@@ -139,7 +140,7 @@ def pressed_corners(siemens: Float) -> Corners | None:
     if len(level) < 4 or level[2] < PRESSED_SIEMENS or level[3] > FOURTH_SHARE * level[2]:
         return None
     cells = [divmod(int(cell), siemens.shape[1]) for cell in order[:3]]
-    for corner, beside, below in permutations(cells):
+    for corner, beside, below in permutations(cells):  # they come by conductance, not by place
         if beside[0] == corner[0] and below[1] == corner[1]:
             return corner, beside, below
     return None
@@ -151,8 +152,7 @@ class CornerScans:
     wanted: the corners to press next.
     pressed: all cells that the last scan shows pressed.
     hold: whether these are three corners, which should be held still until they have been read.
-    again: whether the first three corners have been read.
-    done: whether the second three have been read, too.
+    read: the corners that have been read: any three first, then the next ones, and all is done.
 
     :raises ValueError: a skin of one row or column has no rectangle.
     """
@@ -160,28 +160,33 @@ class CornerScans:
     def __init__(self, board: Hello) -> None:
         self.wanted = suggested_corners(board.rows, board.columns)
         self.pressed: tuple[Cell, ...] = ()
-        self.hold = self.again = self.done = False
+        self.read: list[Corners] = []
+        self.hold = False
         self._board = board
         self._matrix = make_estimator("matrix", SkinKnowledge.of(board))
         self._codes: defaultdict[Corners, list[Float]] = defaultdict(list)
-        self._last: Corners | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether corners have been read twice."""
+        return len(self.read) > 1
 
     def take(self, scan: Scan) -> None:
         """Keep a scan if three corners are pressed in it, and nothing else is.
 
-        Corners that were held for NOISE_S are read. Then `wanted` is the fourth corner with two of
-        them. Corners that were read before may stay pressed meanwhile: they need no holding.
+        Corners that were held for NOISE_S are read, and `wanted` becomes those across. As long as
+        the ones just read stay pressed, their scans are kept, too, but nobody is asked to hold.
         """
         siemens = self._siemens(scan.codes)
         self.pressed = Place.of_cells(siemens > PRESSED_SIEMENS).cells
         corners = pressed_corners(siemens)
-        self.hold = corners is not None and corners != self._last
+        self.hold = corners is not None and corners not in self.read[-1:]
         if corners is None:
             return
         self._codes[corners].append(scan.codes.astype(np.float64))
         if self.hold and len(self._codes[corners]) >= NOISE_S * self._board.rate_hz:
-            self.hold, self.again, self.done = False, True, self.again
-            self._last, self.wanted = corners, moved_across(corners)
+            self.read.append(corners)
+            self.hold, self.wanted = False, moved_across(corners)
 
     def _siemens(self, codes: ArrayLike) -> Float:
         """Conductances (R, C) [S]; zeros for another size: the board was reset meanwhile."""
@@ -196,7 +201,7 @@ class CornerScans:
         looks: by turns as usual and with the longer time. A hand drifts alike in both, and the
         scatter among looks of one kind shows by how much.
         """
-        # By corners: the means of each look as usual, and of those with the longer time.
+        # By corners: the means of each look as usual, and of each one with the longer time.
         means: defaultdict[Corners, list[list[Float]]] = defaultdict(lambda: [[], []])
         for turn, look in enumerate(looks):
             held = defaultdict(list)
@@ -204,22 +209,22 @@ class CornerScans:
                 if corners := pressed_corners(self._siemens(codes)):
                     held[corners].append(codes)
             for corners, scans in held.items():
-                if len(scans) >= LEAST_HELD:
+                if look is not None and len(scans) >= HELD_SHARE * len(look.codes):
                     means[corners][turn % 2].append(np.mean(scans, axis=0))
-        in_both = [of_corners for of_corners in means.values() if min(map(len, of_corners)) >= 2]
-        usual, settled = looks[:2] if in_both else (None, None)
-        if usual is None or settled is None:
-            return
+        # Of each of the corners: the change of their readings, noise and drift apart, and as it is.
         changes = []
-        for of_corners in in_both:
-            before, after = (np.mean(turns, axis=0) for turns in of_corners)
-            variance = sum(np.var(turns, axis=0, ddof=1) / len(turns) for turns in of_corners)
-            change = np.abs(after - before).max()
-            changes.append((change - FEW_STDS * np.max(variance) ** 0.5, change))
-        clear, most = map(float, max(changes))
-        diagnosis.measured["settling_pressed_lsb"] = round(max(clear, 0.0), 2)
-        if clear > PRESSED_LSB:
-            values = settling_values(usual, settled, most)
+        for of_corners in means.values():
+            if min(map(len, of_corners)) > 1:  # one look of a kind shows no scatter
+                before, after = (np.mean(turns, axis=0) for turns in of_corners)
+                variance = sum(np.var(turns, axis=0, ddof=1) / len(turns) for turns in of_corners)
+                change = np.abs(after - before).max()
+                changes.append((change - FEW_STDS * np.max(variance) ** 0.5, change))
+        if not changes or looks[0] is None or looks[1] is None:
+            return
+        clear_lsb, change_lsb = map(float, max(changes))
+        diagnosis.measured["settling_pressed_lsb"] = round(max(clear_lsb, 0.0), 2)
+        if clear_lsb > PRESSED_LSB:
+            values = settling_values(looks[0], looks[1], change_lsb)
             diagnosis.add(Kind.SETTLING_PRESSED, most_lsb=PRESSED_LSB, pressed=True, **values)
 
     def measure(self, rest: Rest) -> list[WireShare]:
@@ -230,8 +235,8 @@ class CornerScans:
         for corners, codes in self._codes.items():
             if len(codes) < HELD_SHARE * most:
                 continue
-            # A hand trembles. This evens rounding out. But it is no noise of the mean, because all
-            # readings follow it alike.
+            # A hand trembles. So codes round up and down, as with noise, and rounding leaves less
+            # in the mean. But trembling adds no noise to it, since all readings follow it alike.
             scatter_lsb = np.maximum(np.std(codes, axis=0), rest.noise_lsb)
             variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1)
             std_lsb = np.sqrt(variance + rest.noise_lsb**2 / len(codes))
@@ -244,6 +249,7 @@ class CornerScans:
         """Cells that may be pressed, (R, C): the corners, and their neighbours for wide fingertips.
 
         The fourth corner and its neighbours are not among them, since its current tells the wires.
+        A corner is free even if it is a neighbour of the fourth, as on the smallest skin.
         """
         rows, columns = np.indices((self._board.rows, self._board.columns))
         *near, near_fourth = (
@@ -265,17 +271,19 @@ def shares_of(measured: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
     """
     if not measured:
         return []
-    y, std = (np.array([one[at] for one in measured]) for at in (1, 2))
-    mean, mean_std = float(np.average(y, weights=std**-2.0)), float(np.sum(std**-2.0) ** -0.5)
-    alike = bool(np.all(np.abs(y - mean) < FEW_STDS * std))
+    logs, log_stds = (np.array([one[at] for one in measured]) for at in (1, 2))
+    weights = log_stds**-2.0
+    mean, mean_std = float(np.average(logs, weights=weights)), float(np.sum(weights) ** -0.5)
+    alike = bool(np.all(np.abs(logs - mean) < FEW_STDS * log_stds))
 
-    def share(y: float, std: float, may_differ: bool, place: Place = WHOLE_SKIN) -> WireShare:
-        clear = abs(y) > max(float(np.log(1 + CHANGED_SHARE)), FEW_STDS * std)
-        is_known, times = std <= KNOWN_STD, float(np.exp(y))
-        return WireShare(place, times, times * std, is_known, may_differ and is_known and clear)
+    def share_at(place: Place, log: float, log_std: float, may_differ: bool) -> WireShare:
+        least = max(float(np.log(1 + CHANGED_SHARE)), FEW_STDS * log_std)
+        is_known, share = log_std <= KNOWN_STD, float(np.exp(log))
+        differs = may_differ and is_known and abs(log) > least
+        return WireShare(place, share, share * log_std, is_known, differs)
 
-    lines = [share(y, std, not alike, Place((row,), (col,))) for (row, col), y, std in measured]
-    return [share(mean, mean_std, alike), *lines]
+    lines = [share_at(Place((i,), (j,)), y, std, not alike) for (i, j), y, std in measured]
+    return [share_at(WHOLE_SKIN, mean, mean_std, alike), *lines]
 
 
 def _pressed_fit(
@@ -289,35 +297,38 @@ def _pressed_fit(
     """
     shape, free = free.shape, free.ravel()
     (rest_ohm, rest_std, untouched), (port_ohm, port_std, touched) = rest, pressed
-    log_share = 0.0
-    lift = np.where(free, touched - untouched, 0.0)
-    variance = np.where(free, UNLIMITED_STD, DRIFT_STD) ** 2
+    log_share = 0.0  # y
+    lift = np.where(free, touched - untouched, 0.0)  # p, first as if wires were nominal
+    variance = np.where(free, UNLIMITED_STD, DRIFT_STD) ** 2  # V
     for _ in range(MAX_ITERATIONS):
         top, bottom = (np.full(shape, ohm * np.exp(log_share)) for ohm in wire_ohm)
         before, now = (
             PortCircuit(np.exp(-cell).reshape(shape), top, bottom)
             for cell in (untouched, untouched + lift)
         )
-        at_rest = np.linalg.inv(before.by_cell())
-        by_cell = now.by_cell()
+        at_rest = np.linalg.inv(before.by_cell())  # B0^-1
+        by_cell = now.by_cell()  # B1
         through = by_cell @ at_rest  # B1 B0^-1
-        by_rest_wires = before.by_wires()
-        off_rest = rest_ohm - before.port_ohm
+        by_rest_wires = before.by_wires()  # W0
+        off_rest = rest_ohm - before.port_ohm  # z0
         residual = port_ohm - now.port_ohm - through @ off_rest  # r
         by_segment = now.by_wires() - through @ by_rest_wires  # W
         slopes = by_segment.sum(axis=1)  # w
-        spread = by_cell * variance
+        spread = by_cell * variance  # B1 V
         covariance = spread @ by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
         covariance += (through * rest_std**2) @ through.T + np.diag(port_std**2)
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
-        precision = float(slopes @ weighed[:, 0]) + BEFORE_STD**-2
-        pull = float(slopes @ weighed[:, 1]) - log_share * BEFORE_STD**-2
+        precision = float(slopes @ weighed[:, 0]) + UNLIMITED_STD**-2
+        pull = float(slopes @ weighed[:, 1]) - log_share * UNLIMITED_STD**-2
         step = float(np.clip(pull / precision, -MAX_STEP_LOG, MAX_STEP_LOG))
         log_share += step
         untouched = untouched + at_rest @ (off_rest - step * by_rest_wires.sum(axis=1))
+        # The presses that, with this dy, best explain r. Those of untouched cells are small, and
+        # stay in the covariance.
         lift_step = spread.T @ (weighed[:, 1] - step * weighed[:, 0])
         lift += np.where(free, np.clip(lift_step, -MAX_STEP_LOG, MAX_STEP_LOG), 0.0)
         if abs(step) < CLOSE_STEP:
             break
+    # As many readings are left to contradict the model as cells are not free, less one for y.
     misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
     return log_share, (max(misfit, 1.0) / precision) ** 0.5
