@@ -68,7 +68,7 @@ def doctor(
                 elif into is not None and not (press and wire_ohm):
                     raise ValueError("in mode near, --into needs --press and nominal --wires")
                 evidence = gather(device, report, wire_ohm, press=press)
-            diagnosis = examine(replace(evidence, host_version=ohmskin.__version__))
+            diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201

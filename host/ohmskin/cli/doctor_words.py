@@ -2,6 +2,7 @@
 """The words of ``ohmskin doctor``; those of each kind of finding are in ``doctor_words.toml``."""
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +25,10 @@ _WIDE: Final = "not known: press with something smaller than a cell, further apa
 def words_of(finding: Finding) -> dict[str, str]:
     """What is told of a finding, by the names in `FIELDS`."""
     kind, place, values = finding.kind, finding.place, finding.values
-    words = {"where": named(place), "one_place": place != WHOLE_SKIN, **values, **_words(finding)}
+    line, lines = ("row", place.rows) if place.rows else ("column", place.columns)
+    words: dict[str, Any] = {"where": named(place), "one_place": place != WHOLE_SKIN, "line": line}
+    words |= {"across": "column" if place.rows else "row", "joined": " and ".join(map(str, lines))}
+    words |= {**values, **_words(kind, lines, values)}
     table = _TABLES[words.get("table", kind.id)]
     said = dict(table)
     for case in table.keys() - FIELDS:
@@ -33,28 +37,20 @@ def words_of(finding: Finding) -> dict[str, str]:
     return {field: said[field].format(**words) for field in FIELDS}
 
 
-def _words(finding: Finding) -> dict[str, Any]:
-    """Words and cases of a finding that its values do not have."""
-    values = finding.values
-    line, lines = "row", finding.place.rows
-    if not lines:
-        line, lines = "column", finding.place.columns
-    match finding.kind:
+def _words(kind: Kind, lines: tuple[int, ...], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Words and cases of a kind of finding, about these lines, that its values do not have."""
+    match kind:
         case Kind.SELF_TEST:
-            side, _, fault = values["name"].removeprefix("far_").partition("_")
+            side, _, fault = values["name"].replace("far_", "far ").partition("_")
             doc = ENUMS["finding"].docs.get(values["name"], "a finding of a newer firmware")
-            side = f"far {side}" if values["name"].startswith("far_") else side
             return {"side": side, "fault": fault, "doc": doc}
         case Kind.OPEN_ROW | Kind.OPEN_COLUMN:
             # Lines beyond the skin look open, too.
             beyond = lines == tuple(range(lines[0], values["line_count"]))
             cases = {"one_cell": values["cells_per_line"] == 1, "last_lines": beyond}
-            return {"table": "open", "line": line, "first": lines[0], **cases}
-        case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS | Kind.SHORT_FAR as kind:
-            table = kind.id.removesuffix("_rows").removesuffix("_columns")
-            return {"table": table, "line": line, "joined": " and ".join(map(str, lines))}
-        case Kind.BROKEN_YARN | Kind.BAD_CRIMP | Kind.BAD_SEGMENT:
-            return {"line": line, "across": "column" if line == "row" else "row"}
+            return {"table": "open", "first": lines[0], **cases}
+        case Kind.SHORT_ROWS | Kind.SHORT_COLUMNS:
+            return {"table": "short"}
         case Kind.REFERENCE_RATIO:
             return {"nominal_ratio": values["ref_top_ohm"] / values["ref_bottom_ohm"]}
         case Kind.OPEN_JOINT | Kind.BRIDGE | Kind.WRONG_RESISTOR:
@@ -147,14 +143,10 @@ def line_wire_in_words(line: LineWire) -> str:
 
 def step_in_words(step: Step, detail: Any) -> tuple[str, str]:
     """What is being done, and what a person is asked to do meanwhile, if anything."""
-    if step is Step.PRESSES:
-        return guidance(detail)
-    request = "keep pressing" if step is Step.PRESSED_SETTLING else ""
-    return _TABLES["steps"][step.name].format(detail), request
-
-
-def guidance(presses: CornerScans) -> tuple[str, str]:
-    """What is pressed meanwhile, and where to press next."""
+    if step is not Step.PRESSES:
+        request = "keep pressing" if step is Step.PRESSED_SETTLING else ""
+        return _TABLES["steps"][step.name].format(detail), request
+    presses: CornerScans = detail
     cells = " ".join(map(str, sorted(presses.wanted)))
     request = f"{'now' if presses.read else 'press firmly, at once:'} {cells}"
     if presses.hold:

@@ -2,7 +2,7 @@
 """``ohmskin verify``: a board against a reference plate, known resistors at its crossings."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -60,7 +60,7 @@ def verify(
     exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
     with terminal() as report, ohmskin.open(port, start=False) as device:
         evidence = gather_plate(device, exam.plate.shape, report, seconds)
-    evidence = replace(evidence, host_version=ohmskin.__version__, loss=loss)
+    evidence.loss = loss
     diagnosis = examine(evidence, exam.examine)
     page = as_object(port, diagnosis)
     figures = {

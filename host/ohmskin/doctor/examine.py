@@ -24,6 +24,7 @@ from ohmskin.doctor.wires import CornerScans
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+from ohmskin.version import VERSION
 
 # [ms] The latency timer of a USB bridge cannot be set to less (FTDI, application note AN232B-04).
 LEAST_TIMER_MS: Final = 1
@@ -41,13 +42,13 @@ class Evidence:
     settled: a look with a longer settle time.
     report: the board's self-test.
     wire_ohm: nominal wires of a segment, top and bottom [ohm].
-    presses: what presses of corners show, after all else.
+    presses: scans while somebody pressed corners, after all other looks.
     latency: timer of the USB bridge [ms], and the file that sets it.
-    host_version: version of this package.
     lost: why the board went away meanwhile.
-    clocks: a look by each ADC clock, None for one that shows too few scans.
+    clocks: a look by each ADC clock; None for one that has too few scans.
     loss: this share of missing scans is no fault [1].
-    pressed: such looks at pressed corners, by turns as configured and with a longer settle time.
+    pressed: looks at pressed corners, by turns as configured and with a longer settle time; None
+        for one that has too few scans.
     """
 
     board: Hello
@@ -58,7 +59,6 @@ class Evidence:
     wire_ohm: tuple[float, float] | None = None
     presses: CornerScans | None = None
     latency: tuple[int, str] | None = None
-    host_version: str = ""
     lost: str = ""
     clocks: list[Look | None] = field(default_factory=list)
     loss: float = 0.0
@@ -70,22 +70,24 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
 
     usual: the first look. Wires are at fault only if nominal ones are known.
     """
-    settled = evidence.settled
+    settled, presses, far = evidence.settled, evidence.presses, usual.board.mode == "far"
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
-    moves, scans, far = bool(moved.any()), usual, usual.board.mode == "far"
-    # The means are those with the longer settle time if the usual one is too short. In mode far
-    # they always are: wires change readings by few codes there, so that a part of a code counts.
-    if settled is not None and not moves and (examine_settling(usual, settled, diagnosis) or far):
-        scans = settled
-    # Unless told otherwise, wires are as those of emulated skins.
-    wire_ohm = evidence.wire_ohm or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
-    presses = evidence.presses
+    moves, scans = bool(moved.any()), usual
+    if settled is not None and not moves:
+        is_too_short = examine_settling(usual, settled, diagnosis)
+        # In mode far, wires change readings by few codes. So a part of a code counts, which the
+        # usual settle time leaves even where it is not too short.
+        if is_too_short or far:
+            scans = settled
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
+    # Unless told otherwise, wires are as those of emulated skins.
+    wire_ohm = evidence.wire_ohm or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
     rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
     near = examine_circuit(near_ends(rest) if far else rest, diagnosis)
     if far and not moves and not near.wrong.all():
         examine_far(rest, near, evidence.wire_ohm, diagnosis)
+    # A cell that moves in all may conduct no more on average than one at rest.
     touched = near.touched if near.touched.any() else moved
     if touched.any():
         diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
@@ -95,7 +97,7 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     if presses is not None:
         diagnosis.pressed = presses.measure(rest)
     for share in diagnosis.pressed or ():
-        if share.differs and evidence.wire_ohm is not None:
+        if share.differs and evidence.wire_ohm is not None:  # else nobody says what is nominal
             diagnosis.add(Kind.WIRES, share.place, share=share, nominal_ohm=wire_ohm)
 
 
@@ -152,8 +154,8 @@ def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
     for cause in board.reset_cause:
         if cause in BAD_RESETS:
             add(Kind.RESET_CAUSE, cause=cause)
-    if evidence.host_version and board.version != evidence.host_version:
-        add(Kind.VERSION, firmware=board.version, host=evidence.host_version)
+    if board.version != VERSION:
+        add(Kind.VERSION, firmware=board.version, host=VERSION)
     if evidence.latency is not None and evidence.latency[0] > LEAST_TIMER_MS:
         add(Kind.USB_LATENCY, timer_ms=evidence.latency[0], file=evidence.latency[1])
 
@@ -165,6 +167,7 @@ def _examine_line(evidence: Evidence, diagnosis: Diagnosis) -> None:
     if stats.restarts:
         add(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
     made = stats.scans + stats.missed
+    # Too few scans to look at are a loss, too, unless restarts say why they are few.
     if stats.missed > evidence.loss * made or (len(evidence.scans) < 2 and not stats.restarts):
         add(
             Kind.LOSS,

@@ -107,7 +107,10 @@ class Place:
         return cls(columns=lines) if axis else cls(rows=lines)
 
     def without(self, other: "Place") -> "Place | None":
-        """The lines and cells that `other` has not; None if nothing is left."""
+        """The lines and cells that `other` has not; None if nothing is left.
+
+        The whole skin is not taken apart: only the whole skin leaves nothing of it.
+        """
         if WHOLE_SKIN in (self, other):
             return None if other == WHOLE_SKIN else self
         pairs = zip(astuple(self), astuple(other), strict=True)
@@ -144,12 +147,12 @@ class Finding:
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:
-    """What is told of all that the examiners found, each for itself.
+    """The findings that users are told. Examiners do not know what others have found, so here
 
-    1. What another finding explains is not told: its lines and cells leave the findings of the
-       kinds that `Kind.explains` lists, and a finding of which nothing is left is dropped. Cells
-       beyond a break in a yarn are dead, but the yarn is what must be mended.
-    2. Findings stand in the order of their kinds; of one kind, as they were found.
+    1. each finding loses the lines and cells at which another one explains it, by `Kind.explains`.
+       One that has none left is dropped. Cells beyond a break in a yarn are dead, but it is the
+       yarn that must be mended.
+    2. findings are put in the order of their kinds. Those of one kind stay as they were found.
     """
     kinds, kept = list(Kind), []
     for finding in findings:
@@ -169,8 +172,9 @@ class WireShare:
     place: the row and the column that were measured, or the whole skin.
     share: the resistance over the nominal one.
     std: standard deviation of this share.
-    known: the deviation is small enough to tell the share.
-    differs: the wires are clearly not nominal, and no other share tells it already.
+    known: the deviation is small enough for the share to mean something.
+    differs: the wires are clearly not nominal. Either all wires together differ or single lines
+        do, because one change is one finding.
     """
 
     place: Place
@@ -223,7 +227,7 @@ class Diagnosis:
     @property
     def worse(self) -> list[Finding]:
         """The findings that are more than notes: with any, the skin is not sound."""
-        return [each for each in self.findings if each.kind.severity is not Severity.NOTE]
+        return [one for one in self.findings if one.kind.severity is not Severity.NOTE]
 
     @property
     def wires_hidden(self) -> bool:

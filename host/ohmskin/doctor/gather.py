@@ -76,7 +76,7 @@ def gather(
             evidence.report = device.self_test()
         report(Step.PLATE if clocks else Step.SKIN, seconds)
         _scan(device, evidence.scans, seconds)
-        evidence.board = device.info
+        evidence.board = device.info  # anew: if the board was reset meanwhile, it says why
         settling = second_look(evidence.board)
         with suppress(CommandRefused), put_back(device):
             if settling is not None:
@@ -90,7 +90,11 @@ def gather(
                 evidence.clocks.append(_look(device, NOISE_S, settings))
         if presses is not None:
             evidence.presses = presses
-            _scan_presses(device, presses, report)
+            for scan in scans_for(device, WAIT_S):
+                presses.take(scan)
+                if presses.done:
+                    break
+                report(Step.PRESSES, presses)
             if presses.done and settling is not None:
                 report(Step.PRESSED_SETTLING, None)
                 with suppress(CommandRefused), put_back(device):
@@ -156,12 +160,3 @@ def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
     least_s = (LEAST_SCANS - 1) / device.info.rate_hz
     for scan in scans_for(device, min(max(seconds, least_s), LONGEST * seconds)):
         scans.append(scan)
-
-
-def _scan_presses(device: Device, presses: CornerScans, report: Report) -> None:
-    """Scan until three corners and then three others were pressed, or it has taken too long."""
-    for scan in scans_for(device, WAIT_S):
-        presses.take(scan)
-        if presses.done:
-            return
-        report(Step.PRESSES, presses)

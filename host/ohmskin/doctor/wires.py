@@ -80,8 +80,7 @@ PRESSED_SIEMENS: Final = 2e-5
 # Chosen: three fingers press alike.
 FOURTH_SHARE: Final = 0.5
 # [1] Corners were pressed in passing if they are pressed in less than this share of a look's scans,
-# or of the scans of the corners that were held the longest. Chosen: two of one look cannot both
-# have more.
+# or of as many scans as the corners that were held the longest. Chosen: what is held has far more.
 HELD_SHARE: Final = 0.5
 
 # The fit. Its steps are at most MAX_ITERATIONS and no longer than MAX_STEP_LOG, as in estimators.
