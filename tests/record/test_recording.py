@@ -251,9 +251,12 @@ def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
 
 def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) -> None:
     scans = [scan(n, rows=3 if n < 5 else 2) for n in range(10)]
-    write_recording(path, hello, [*scans[:5], replace(hello, rows=2), *scans[5:]])
+    tare = Tare(np.full((3, 4, 4), 0.25), 1.0)
+    write_recording(path, hello, [tare, *scans[:5], replace(hello, rows=2), *scans[5:]])
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
-        assert_same(list(skin), scans, host_time=False)
+        played = list(skin)
+        assert_same(played, scans, host_time=False)
+        assert [each.rest_ratio is None for each in played] == 5 * [False] + 5 * [True]
         assert skin.info.rows == 2
     with pytest.raises(RecordingError, match="cells or mode change after "):
         export(load_recording(path), tmp_path / "a.npz")

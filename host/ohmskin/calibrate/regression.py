@@ -265,7 +265,7 @@ class _Trial:
 
     rows: what the curve is learned from.
     alike: a number for each row, (n,), of its press or cell. Rows of one number are a group, which
-        is held out as a whole: they are alike, and would tell a curve what it is tested with.
+        is held out as a whole: a curve that is fitted to some of them would know the others, too.
     parts: the groups are split into at most so many parts.
     """
 

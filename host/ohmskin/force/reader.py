@@ -205,8 +205,8 @@ class SkinReader:
 
         :raises TareRefused: something touches the skin.
         """
-        # A new estimator judges them. That of the scans begins each frame from the one before, and
-        # may be in the middle of a touch.
+        # A new estimator judges them: that of the scans begins each frame from the one before,
+        # which may show a touch.
         touched = self._shared.estimator(self._wanted, self.rest).estimate(rest_ratio).touched
         if touched.any() and not force:
             remedy = "take everything off the skin, or force the tare if nothing is on it"

@@ -162,7 +162,8 @@ class ViewedBoard(Closing):
         """What the newest scan shows; None while nobody looks."""
         self._calibrations, self._force = calibrations, force
         self._folder = folder
-        self._status, self._text, self._note = "opening", "", ""
+        self._status, self._text = "opening", ""  # the text says why the board is gone or ended
+        self._note = ""  # why there are no forces, although calibrations were given
         self._skin: Device | None = None
         self._reader: SkinReader | None = None
         self._recording: _Recording | None = None
@@ -235,7 +236,7 @@ class ViewedBoard(Closing):
             if (running := self._running()) is not None:
                 raise OhmskinError(f"{running.recorder.path} is being recorded already")
             recorder = Recorder(self._new_file(reader.board.unit_id), skin.info)
-            if reader.is_tared and reader.rest is not None:
+            if reader.is_tared and reader.rest is not None:  # a replay then begins with it, too
                 recorder.add(Tare(reader.rest.ratio, time.monotonic(), reader.board.mode))
             self._recording = _Recording(skin, recorder, self._changed)
         return "recording: every scan, whatever is shown"
