@@ -135,7 +135,7 @@ class SteppedSkin(Session):
         with self._changed:
             self._wait(lambda: False, seconds)
 
-    def _begin_reading(self) -> None:
+    def _begin_thread(self, work: Callable[[], None], name: str) -> None:
         """Nothing reads by itself."""
 
     def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:

@@ -96,7 +96,7 @@ class Session(Device):
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0  # number of the last command
         self._heard_s = self.now_s  # when a valid frame last came
-        self._begin_reading()
+        self._begin_thread(self._read, f"read {self.name}")
         try:
             self._connect()
             if self.info.scanning:
@@ -109,9 +109,6 @@ class Session(Device):
         except BaseException:
             self.close()
             raise
-
-    def _begin_reading(self) -> None:
-        self._begin_thread(self._read, f"read {self.name}")
 
     def _connect(self) -> None:
         """Wait for hello, by whichever attempt it comes."""
