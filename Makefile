@@ -97,8 +97,9 @@ check-firmware: setup ## cppcheck
 sim: setup ## build the simulator that runs the firmware on an emulated skin
 	$(MAKE) -C firmware/sim
 
-test-host: setup firmware sim ## pytest, a process a core
-	$(ONE_THREAD) $(BIN)/pytest --numprocesses auto --dist loadfile
+# Half of the time that tests take is waiting, so three processes keep two cores busy.
+test-host: setup firmware sim ## pytest, three processes for two cores
+	$(ONE_THREAD) $(BIN)/pytest --numprocesses $$((($$(nproc) * 3 + 1) / 2)) --dist worksteal
 
 FUZZED := build/fuzz/frame_reader
 READER := firmware/src/core/frame_reader

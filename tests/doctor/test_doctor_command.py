@@ -18,16 +18,19 @@ import ohmskin
 from calibrations import calibration
 from command_line import Run, assert_one_line, well
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import readings
+from ohmskin.circuit.skin import Skin, readings
+from ohmskin.cli.doctor_words import measured_in_words
 from ohmskin.doctor import gather as gathering
 from ohmskin.doctor.examine import examine
-from ohmskin.doctor.gather import gather
+from ohmskin.doctor.gather import Step, gather
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link import session
+from ohmskin.link.session import Session
 from ports import Serve
 from recordings import write_recording
 from stepped import stepped, stepped_link
@@ -105,13 +108,26 @@ def test_slow_nodes_are_seen_while_pressed(
         assert np.log(1024 / 0.5) - 2 < needed_us / tau_us < 1.5 * np.log(1024 / 0.5)
 
 
+class PressedWhenAsked(Scene):
+    """Its corners are pressed once somebody is asked to press, however busy the machine was."""
+
+    asked = False
+
+    def skin(self, time_s: float) -> Skin:
+        return super().skin(time_s if self.asked else -1.0)
+
+    def report(self, step: Step, _: object) -> None:
+        self.asked |= step is Step.PRESSES
+
+
 @pytest.mark.simavr
-def test_wires_of_the_simulated_desk_are_measured(run: Run) -> None:
-    """Behind a bootloader, which takes its time before rest can be examined."""
-    url = "simavr://uno?scene=corners&desk=1&seed=1"
-    answer = json.loads(run("doctor", url, "--press", "--wires", "100,200", "--json").out)
-    assert [each["id"] for each in answer["findings"]] == ["settling"]  # 100 pF a line
-    share, _, std = answer["measured"]["wires"].split()[:3]
+def test_wires_of_the_simulated_desk_are_measured() -> None:
+    """Behind a boot loader, in real time."""
+    scene = PressedWhenAsked("corners", 8, 8, seed=1)
+    with Session(SimavrLink("uno", scene, settings={"desk": "1", "seed": "1"})) as skin:
+        diagnosis = examine(gather(skin, scene.report, WireOhm(100.0, 200.0), press=True))
+    assert [each.kind.id for each in diagnosis.findings] == ["settling"]  # 100 pF a line
+    share, _, std = measured_in_words(diagnosis)["wires"].split()[:3]
     assert float(std) <= 0.06
     assert abs(float(share) - 1) < 3 * float(std)
 
