@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""tests/data/far: what is in the files, against their script, ngspice and the node Laplacian."""
+"""tests/data/far: what is in the files, against their script and the circuit."""
 
 import numpy as np
 import pytest
 
 import far_scenes
-from network import laplacian_readings
-from ohmskin.circuit.skin import Skin, all_readings, end_admittance
+from ohmskin.circuit.skin import all_readings, end_admittance
 from ohmskin.record.readings import load_readings
+from studies.trials import reference_trial
 
 FILES = [f"{name}_{number}" for name in far_scenes.KINDS for number in range(2)]
 
@@ -15,10 +15,6 @@ FILES = [f"{name}_{number}" for name in far_scenes.KINDS for number in range(2)]
 def arrays(name: str) -> dict[str, np.ndarray]:
     with np.load(far_scenes.FOLDER / f"{name}.npz", allow_pickle=False) as file:
         return dict(file)
-
-
-def skin_in(file: dict[str, np.ndarray], frame: int) -> Skin:
-    return Skin(1 / file["cell_ohm"][frame], file["top_wire_ohm"], file["bottom_wire_ohm"])
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -34,28 +30,8 @@ def test_the_files_are_what_their_script_draws(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_readings_agree_with_the_circuit(name: str) -> None:
-    file = arrays(name)
-    for frame in range(0, far_scenes.FRAMES, 5):
-        skin = skin_in(file, frame)
-        # Readings are rounded to 1e-9.
-        expected = all_readings(skin, end_admittance(skin))
-        np.testing.assert_allclose(file["ratio"][frame], expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["random_5x9_1", "harsh_8x8_0"])
-def test_readings_agree_with_the_laplacian(name: str) -> None:
-    file = arrays(name)
-    expected = laplacian_readings(skin_in(file, 7), names="abcdefgh")
-    np.testing.assert_allclose(file["ratio"][7], expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.ngspice
-def test_ngspice_still_says_so() -> None:
-    file = arrays("random_5x9_0")
-    wires = file["top_wire_ohm"], file["bottom_wire_ohm"]
-    found = far_scenes.rounded(file["cell_ohm"][7], *wires)
-    np.testing.assert_allclose(found, file["ratio"][7], rtol=0, atol=2e-9)
-    np.testing.assert_allclose(
-        far_scenes.rounded(file["rest_ohm"], *wires), file["rest_ratio"], rtol=0, atol=2e-9
-    )
+def test_readings_at_rest_agree_with_the_circuit(name: str) -> None:
+    """The files are by ngspice; test_circuit.py has their frames, test_ngspice.py asks it again."""
+    trial = reference_trial(f"far/{name}")
+    expected = all_readings(trial.rest, end_admittance(trial.rest))
+    np.testing.assert_allclose(trial.readings.rest_ratio, expected, rtol=0, atol=1e-9)

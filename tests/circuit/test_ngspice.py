@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The forward model, the node Laplacian and the estimators against ngspice, run here and now.
 
-In no skin here does a part float without any
-path to the rest: ngspice may call that singular. The Laplacian does not (tests/test_network.py).
+In no skin here does a part float without any path to the rest: ngspice may call that singular. The
+Laplacian does not: see test_network.py.
 """
 
 import numpy as np

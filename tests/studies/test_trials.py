@@ -1,21 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trials of reference files: the truth beside the readings is the one that gives them."""
+"""Trials of some frames of a reference file; tests/circuit/test_circuit.py has those of all."""
 
 import numpy as np
-import pytest
 
-from ohmskin.circuit.skin import all_readings, end_admittance, readings
+from ohmskin.circuit.skin import all_readings, end_admittance
 from studies.trials import reference_trial
-
-
-@pytest.mark.parametrize("name", ["random_4x6", "bent_8x8", "wire_sweep_3x3", "far/harsh_8x8_0"])
-def test_the_skins_of_a_file_give_its_readings(name: str) -> None:
-    """Of this circuit and of ngspice's: so cells, wires and frames belong together."""
-    trial = reference_trial(name)
-    exact = trial.rounded(None).ratio
-    assert len(exact) == len(trial.frames)
-    for skin, ratio in zip(trial.frames, exact, strict=True):
-        np.testing.assert_allclose(readings(skin), ratio, atol=1e-7)
 
 
 def test_some_frames_of_a_file_in_mode_far() -> None:
