@@ -16,7 +16,7 @@ from ohmskin.circuit.skin import Skin, all_readings, end_admittance
 from ohmskin.link.codes import quantise
 from second_simulator import SecondSim
 
-pytestmark = pytest.mark.second_sim
+pytestmark = [pytest.mark.second_sim, pytest.mark.simavr]  # simavr for the built firmware
 
 saved = settings.saved
 test_boot_hello = commands.test_boot_hello
@@ -33,15 +33,12 @@ test_watchdog = scans.test_watchdog_restarts_a_hung_main_loop
 
 @pytest.fixture(params=BOARDS)
 def rig(request: pytest.FixtureRequest, rng: np.random.Generator) -> Iterator[Rig]:
-    if not elf_of(request.param).with_suffix(".hex").exists():
-        pytest.skip(f"the firmware for {request.param} is not built: make firmware")
     with Rig(request.param, SecondSim(request.param)) as rig:
         rig.run(BOOT_S)
         rig.randomize(rng)
         yield rig
 
 
-@pytest.mark.simavr  # for the built firmware
 def test_a_nano_gets_what_an_uno_gets() -> None:
     uno, nano = (elf_of(each).with_suffix(".hex").read_bytes() for each in ("uno", "nano"))
     assert uno == nano
@@ -69,8 +66,7 @@ def test_codes_times_and_settling(
     check, holds = rig.check(), rig.holds()
     assert check.readings > 2000
     np.testing.assert_array_equal(np.diff(check.start_cycles), hello["scan_cycles"])
-    settled = holds["settle_cycles"][
-        first_holds(holds, mode)[1] : -1
-    ]  # `stop` may come before the last
+    second_scan = first_holds(holds, mode)[1]
+    settled = holds["settle_cycles"][second_scan:-1]  # `stop` may come before the last
     assert settled.min() >= hello["settle_us"] * CYCLES_PER_US
     assert rig.sim.stats()["ignored_triggers"] == 0
