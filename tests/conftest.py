@@ -114,6 +114,20 @@ def attach(monkeypatch: pytest.MonkeyPatch) -> Attach:
     return say
 
 
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium, driven by Playwright."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        # Chromium's sandbox does not start for root.
+        arguments = [] if os.geteuid() else ["--no-sandbox"]
+        chromium = shutil.which("chromium")
+        running = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        yield running
+        running.close()
+
+
 @pytest.fixture
 def command() -> Iterator[Command]:
     """A function that starts ``python -m MODULE ARGUMENTS``, MODULE as a rule ohmskin."""

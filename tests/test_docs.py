@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages say is there: commands and their options, code, files, names, printed numbers."""
 
-import os
 import pkgutil
 import re
 import shlex
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from runpy import run_path
 from types import SimpleNamespace
@@ -17,6 +13,7 @@ import pytest
 from mkdocs.exceptions import PluginError
 
 import ohmskin
+from command_line import python
 from lockstep import Rig
 from ohmskin.cli.main import app
 from places import ROOT
@@ -55,15 +52,11 @@ class Page:
 
 PAGES = [
     Page(path)
-    for path in (
-        *(
-            ROOT / name
-            for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md")
-        ),
-        *sorted(DOCS.glob("*.md")),
-        *sorted(ROOT.glob("examples/*.md")),
-        *sorted(ROOT.glob(".github/ISSUE_TEMPLATE/*.md")),
+    for pattern in (
+        *("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md"),
+        *("docs/*.md", "examples/*.md", ".github/ISSUE_TEMPLATE/*.md"),
     )
+    for path in sorted(ROOT.glob(pattern))
 ]
 every_page = pytest.mark.parametrize("page", PAGES, ids=[page.path.name for page in PAGES])
 COMMANDS: Any = app
@@ -215,37 +208,21 @@ def test_lines_that_describe_fields_are_a_list() -> None:
 
 
 @pytest.mark.browser
-def test_the_site_is_searched_from_the_disk_and_follows_the_scheme(tmp_path: Path) -> None:
-    from playwright.sync_api import sync_playwright
-
-    build = [
-        sys.executable,
-        "-m",
-        "mkdocs",
-        "build",
-        "-q",
-        "-f",
-        ROOT / "mkdocs.yml",
-        "-d",
-        tmp_path,
-    ]
-    quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    subprocess.run(build, env=quiet, check=True, capture_output=True)
+def test_the_site_is_searched_from_the_disk_and_follows_the_scheme(
+    tmp_path: Path, browser: Any
+) -> None:
+    build = ("-m", "mkdocs", "build", "-q", "-f", ROOT / "mkdocs.yml", "-d", tmp_path)
+    assert python(*build, NO_MKDOCS_2_WARNING="1").code == 0
     foreign: list[str] = []
-    with sync_playwright() as playwright:
-        arguments = [] if os.geteuid() else ["--no-sandbox"]
-        chromium = shutil.which("chromium")
-        browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
-        for scheme, name in (("light", "default"), ("dark", "slate")):
-            page = browser.new_context(color_scheme=scheme).new_page()
-            page.on("request", lambda request: foreign.append(request.url))
-            page.goto((tmp_path / "examples/foxglove.html").as_uri())
-            assert page.locator("body").get_attribute("data-md-color-scheme") == name
-        page.locator(".md-search__input").click()
-        page.keyboard.type("brown-out", delay=30)
-        found = page.locator(".md-search-result__item h1", has_text="Troubleshooting")
-        found.wait_for(timeout=20_000)
-        browser.close()
+    for scheme, name in (("light", "default"), ("dark", "slate")):
+        page = browser.new_context(color_scheme=scheme).new_page()
+        page.on("request", lambda request: foreign.append(request.url))
+        page.goto((tmp_path / "examples/foxglove.html").as_uri())
+        assert page.locator("body").get_attribute("data-md-color-scheme") == name
+    page.locator(".md-search__input").click()
+    page.keyboard.type("brown-out", delay=30)
+    found = page.locator(".md-search-result__item h1", has_text="Troubleshooting")
+    found.wait_for(timeout=20_000)
     assert [url for url in foreign if not url.startswith("file:")] == []
 
 

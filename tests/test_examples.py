@@ -63,29 +63,18 @@ def test_every_scan_prints_consecutive_scans() -> None:
     assert numbers == list(range(numbers[0], numbers[0] + 5))
 
 
-def test_estimate_prints_the_moving_finger() -> None:
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import estimate; "
-        "estimate.main('emulator://8x8?scene=moving', seconds=4.5)"
-    )
-    text = output_of("-c", code, str(EXAMPLES))
-    touches = re.findall(r"\((\d), (\d)\): ([\d.]+) \+- ([\d.]+) microsiemens", text)
-    assert touches
-    assert all(float(value) > 0 for *_, value, _ in touches)
-
-
-def test_estimate_knows_the_readings_of_far_ends() -> None:
-    """Against the scene that the board is given, within the noise of its codes."""
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import estimate; "
-        "estimate.main('emulator://8x8?scene=ghost&seed=1&mode=far', seconds=4.5)"
-    )
-    text = output_of("-c", code, str(EXAMPLES))
-    touches = re.findall(r"\((\d), (\d)\): ([\d.]+) \+- ([\d.]+) microsiemens", text)
+@pytest.mark.parametrize(("mode", "error"), [("near", 0.1), ("far", 0.02)])
+def test_estimate_prints_the_touches(
+    mode: str, error: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Against the scene that the board is given: nobody has told the wires, far ends show them."""
+    example("estimate").main(f"emulator://8x8?scene=ghost&seed=1&mode={mode}", seconds=4.5)
+    printed = capsys.readouterr().out
+    touches = re.findall(r"\((\d), (\d)\): ([\d.]+) \+- ([\d.]+) microsiemens", printed)
     assert {(int(row), int(column)) for row, column, *_ in touches} == {(2, 2), (2, 5), (5, 2)}
     truth_us = 1e6 * Scene("ghost", 8, 8, seed=1).skin(BEGIN_S).cell_siemens
     for row, column, us, _ in touches:
-        assert float(us) == pytest.approx(truth_us[int(row), int(column)], rel=0.02)
+        assert float(us) == pytest.approx(truth_us[int(row), int(column)], rel=error)
 
 
 def test_forces_prints_contacts(skin_json: str) -> None:

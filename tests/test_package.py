@@ -30,6 +30,9 @@ assert (ohmskin.cli.board._FIRMWARE / "uno.hex").is_file()
 """
 
 
+BUILD = (sys.executable, "-m", "hatchling", "build", "-d")
+
+
 def run(*command: str | Path, place: Path, **variables: str) -> str:
     # Nothing of this checkout, nor of this environment, may help.
     foreign = ("PYTHON", "OHMSKIN")
@@ -60,18 +63,7 @@ def link_requirements(of: Distribution, place: Path) -> None:
 def metadata_of_wheel(place: Path, source: Path, url: str | None) -> Message:
     """Of a wheel that is built of `source` with OHMSKIN_URL."""
     variables = {} if url is None else {"OHMSKIN_URL": url}
-    run(
-        sys.executable,
-        "-m",
-        "hatchling",
-        "build",
-        "-d",
-        place,
-        "-t",
-        "wheel",
-        place=source,
-        **variables,
-    )
+    run(*BUILD, place, "-t", "wheel", place=source, **variables)
     (wheel,) = place.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
@@ -121,7 +113,7 @@ def test_with_an_address_all_links_are_below_it_and_lead_to_files(tmp_path: Path
 
 
 def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
-    build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path, "-t", "wheel")
+    build = (*BUILD, tmp_path, "-t", "wheel")
     for url in ("example.org/ohmskin", "ftp://example.org", "https://a b"):
         variables = {**os.environ, "OHMSKIN_URL": url}
         done = subprocess.run(build, cwd=ROOT, env=variables, capture_output=True, text=True)
@@ -152,8 +144,7 @@ def test_the_citation_names_the_package_and_the_paper() -> None:
 
 
 def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Path) -> None:
-    build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path)
-    run(*build, "-t", "sdist", place=ROOT)
+    run(*BUILD, tmp_path, "-t", "sdist", place=ROOT)
     (sdist,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -167,7 +158,7 @@ def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Pat
     source = tmp_path / sdist.name.removesuffix(".tar.gz")
     (source / "host/ohmskin/firmware").mkdir()  # as `make wheel` does
     (source / "host/ohmskin/firmware/uno.hex").touch()
-    run(*build, "-t", "wheel", place=source)
+    run(*BUILD, tmp_path, "-t", "wheel", place=source)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         packed = archive.namelist()

@@ -54,7 +54,10 @@ def test_they_need_not_start() -> None:
 def test_every_scan_of_every_board_in_order_of_time() -> None:
     urls = [*units(1, 2), "emulator://4x4?unit=3&rate=200", "emulator://8x8?unit=4&rate=30"]
     with ohmskin.open_all(urls) as skins:
-        taken = list(itertools.islice(skins.scans(), 400))
+        scans = skins.scans()
+        taken = [next(scans)]
+        time.sleep(0.7)  # a slow reader loses nothing
+        taken += itertools.islice(scans, 400)
     assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(taken[100:]))
     for unit in range(1, 5):
         found = [each.scan for each in taken if each.unit_id == unit]
@@ -64,17 +67,6 @@ def test_every_scan_of_every_board_in_order_of_time() -> None:
     rates = Counter(each.unit_id for each in taken[100:])
     assert rates[3] / rates[1] == pytest.approx(200 / 90, rel=0.05)
     assert rates[1] / rates[4] == pytest.approx(90 / 30, rel=0.1)
-
-
-def test_a_slow_reader_loses_nothing() -> None:
-    with ohmskin.open_all(units(1, 2)) as skins:
-        scans = skins.scans()
-        taken = [next(scans)]
-        time.sleep(0.7)
-        taken += itertools.islice(scans, 150)
-    for unit in (1, 2):
-        numbers = [each.scan.number for each in taken if each.unit_id == unit]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 class Past:
