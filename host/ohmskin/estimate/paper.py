@@ -247,8 +247,12 @@ class PaperEstimator(Estimator):
         return self._answer(ratio, x)
 
     def _answer(self, ratio: Float, x: Float, before: Sequence[Optimum] = ()) -> _Answer:
-        """Solve each step, from its own optimum in the frame before, or else from where the step
-        before it ended. x: the states that the first step then starts from.
+        """Solve all steps.
+
+        x: the states (4N, 5N) that the first step starts from. Each of the others starts where the
+        step before it ended.
+        before: the optima of the frame before, one for each step. If there are any, each step
+        starts from its own instead.
         """
         optima: list[Optimum] = []
         for step, previous in zip_longest(self.steps, before):
@@ -305,6 +309,7 @@ def initial_states(
     current = 1.0 / (port_megohm.ravel() + sum(reference_megohm))
     potential = port_difference(impedance, rows) * current[:, None]
     ground = potential[ports, rows + ports % columns]
+    # The column's electrode is above ground by what the bottom reference loses.
     potential += (reference_megohm[1] * current - ground)[:, None]
     potential = potential[ports.reshape(rows, columns).T.ravel()]  # by column-major selected cell
     top, bottom = np.hsplit(potential, [rows])
@@ -379,15 +384,11 @@ class Program:
             start: _make_solver(problem, more | {"max_iter": max_iterations})
             for start, more in _STARTS.items()
         }
-        is_resistance = np.arange(5 * cells) < 3 * cells
+        # Bounds of the variables: resistances have some, potentials none. All laws must be zero.
+        is_resistance = np.tile(np.arange(5 * cells) < 3 * cells, len(states))
         least = np.where(is_resistance, np.log(MIN_MEGOHM), -np.inf)
         most = np.where(is_resistance, np.log(MAX_MEGOHM), np.inf)
-        self._bounds = {
-            "lbx": np.tile(least, len(states)),
-            "ubx": np.tile(most, len(states)),
-            "lbg": 0.0,
-            "ubg": 0.0,
-        }
+        self._bounds = {"lbx": least, "ubx": most, "lbg": 0.0, "ubg": 0.0}
 
     @ctrl_c_kept()
     def solve(
@@ -458,12 +459,14 @@ class _State:
         # The paper's constraints use the inverse of resistance.
         by_top, by_bottom, by_cell = layers(casadi.exp(-logarithms))
         top, bottom = layers(self.potentials)
-        of_top, of_bottom, _ = layers(self.resistances)
+        of_top, of_bottom, _ = layers(self.resistances)  # R^t and R^b
         # Each pair is that of the row and that of the column: the first wire segment, the potential
         # behind it, and the supply.
         first, inner = (of_top[row, 0], of_bottom[0, column]), (top[row, 0], bottom[0, column])
         supply = (1.0, 0.0) if TOP_IS_HIGH[k] else (0.0, 1.0)
         sensed, other = (0, 1) if READING_SENSES_TOP[k] else (1, 0)
+        # Currents from the row's electrode and from the column's into the skin. That of the sensed
+        # electrode follows from the reading, and the same current flows through its reference.
         into: list[Any] = [0.0, 0.0]
         into[sensed] = (y - inner[sensed]) / first[sensed]
         into[other] = (supply[other] - inner[other]) / (first[other] + references[other])

@@ -137,6 +137,7 @@ class NearEnds:
         """What lines that charge add to the currents of least squares, (R, C) [S]."""
         current = near.current
         by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
+        # Noise may make currents negative, and so the share larger than it can be.
         share = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
         charging = near.residual @ self._into_row  # c
         return np.asarray(charging * np.clip(share, -1.0, 1.0))
@@ -182,7 +183,11 @@ class FarEnds:
         self._least_current = knowledge.current_std
 
     def read(self, ratio: Float, near: PortCurrents, variance: Float) -> FarReadings:
-        """variance (R, C): of the difference between readings at two ends [V^2/Vdd^2]."""
+        """What the far ends of checked readings show; near: the currents of the same frame.
+
+        variance (R, C): of the difference between both ends of a line [V^2/Vdd^2]. A side that is
+        not sensed at far ends takes the near end: no wires, as far as they are concerned.
+        """
         current = np.maximum(near.current, self._least_current)
         near_end = 1.0 - self._ref_ohm[0] * current, self._ref_ohm[1] * current  # a, b
         row_end, column_end = (

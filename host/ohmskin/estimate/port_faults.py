@@ -213,15 +213,15 @@ class SkinFaults:
         """What is wrong at rest already: a line that is open, or two that are shorted."""
         if self._rest is None:
             return ""
-        clear = self._rest.current / self._rest.std
+        current_stds = self._rest.current / self._rest.std
         for axis, pairs in enumerate(self._pairs):
-            most = clear.max(axis=1 - axis)
+            clearest = current_stds.max(axis=1 - axis)  # of the ports of each line
             # Where the whole skin hardly conducts, a line without a clear current is like the
             # others. So the median line must be clear by far. Chosen: four times the limit, so that
             # no line counts as open that conducts a quarter of the median line.
-            is_dark = (most < FAULT_STDS) & (float(np.median(most)) > 4 * FAULT_STDS)
-            if is_dark.any():
-                line = f"{_LINES[axis]} {is_dark.argmax()}"
+            is_open = (clearest < FAULT_STDS) & (float(np.median(clearest)) > 4 * FAULT_STDS)
+            if is_open.any():
+                line = f"{_LINES[axis]} {is_open.argmax()}"
                 return f"{line} conducted nothing at rest: is it open?"
             median_line = np.median(self._rest.current, axis=axis, keepdims=True)
             high = np.all(self._rest.current > PAIR_TIMES * median_line, axis=1 - axis)
@@ -270,7 +270,9 @@ class SkinFaults:
 
 
 def far_line_fault(drop: Float, drop_std: Float) -> str:
-    """A line whose far end is not between the near ends, by all its ports together.
+    """A line whose far end is not between the near ends, by all its ports together, or empty.
+
+    The far end of such a line is beyond its near end: its wires seem to lose less than nothing.
 
     drop (2, R, C): what the wires of row and of column lose up to the far ends; drop_std (R, C).
     """

@@ -67,6 +67,7 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.wire_belief import Lesson, WireBelief
 
 Cells = NDArray[np.intp]
+NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
 # `make ablate` tries half, twice and none of each number; docs/estimate.md says what each earns.
 
@@ -216,6 +217,7 @@ class SparseFit:
     least_log_siemens: log conductances from which cells are touched, (RC,).
     log_layers: logs of the layers' segments that the untouched skin was solved with, (2,).
     net: the untouched skin.
+    untouched: the same as a touched skin without touches: each frame starts from it.
     current: its port currents per Vdd, (RC,) [S].
     model_variance: of these, by the drift of cells and by what is not known of wires, (RC,) [S^2].
     path_ohm: wires between each cell and its sensed ends, (RC,).
@@ -234,6 +236,7 @@ class SparseFit:
         self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
         self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), far=belief.far)
+        self.untouched = TouchedNetwork(net, NO_CELLS, np.zeros(0))
         self.current = 1.0 / (net.port_ohm + self.ref_ohm)
         siemens = net.cell_siemens[:, None]
         # By the log of a resistance, the slope of I is I^2 times that of rho, but for the sign. For
@@ -257,7 +260,7 @@ class SparseFit:
             self._solve_rest()
         frame = FewTouches(self, ports)
         # Never from the frame before: cells would stay in the model that no reading asks for.
-        frame.converge(np.zeros(0, dtype=np.intp), np.zeros(0))
+        frame.converge(NO_CELLS, np.zeros(0))
         for _ in range(MAX_ITERATIONS):
             asked, added_siemens = frame.asked_for()
             if not asked.size:
@@ -293,8 +296,10 @@ class FewTouches:
         skin = self._skin
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
-        added = self._siemens - skin.net.cell_siemens[cells]
-        self._touched = TouchedNetwork(skin.net, cells, added)
+        self._touched = skin.untouched
+        if cells.size:
+            added = self._siemens - skin.net.cell_siemens[cells]
+            self._touched = TouchedNetwork(skin.net, cells, added)
         self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
         self._compare()
 
