@@ -186,6 +186,8 @@ def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "-1", ">= 0")
     assert_one_line(run("doctor", "emulator://8x8", "--calibration", "/no/such.json"), "/no/such")
     assert_one_line(run("doctor", "emulator://1x4", "--press"), "1x4", "no rectangle")
+    far = run("doctor", "emulator://8x8?mode=far", "--press")
+    assert_one_line(far, "mode far shows the wires untouched: leave out --press")
     calibration(Scene("rest", 2, 3).rest_ratio).save(tmp_path / "skin.json")
     path = str(tmp_path / "skin.json")
     assert_one_line(run("doctor", "emulator://8x8", "--calibration", path), "2x3", "8x8")
@@ -222,9 +224,10 @@ def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
             return super().__iter__()
 
     bench = Watched(stepped_link("emulator://3x4"))
-    before = bench.configure(rate_hz=77.5, settle_us=120, adc_prescaler="clock_250khz")
+    settings = {"adc_prescaler": "clock_250khz", "mode": "far"}
+    before = bench.configure(rate_hz=77.5, settle_us=120, **settings)
     with nullcontext() if end is None else pytest.raises(end):
-        gather(bench)
+        gather(bench, clocks=True)
     assert looks_us[1] > 3 * looks_us[0]
     assert bench.info == before
 

@@ -94,12 +94,6 @@ def rest_of(skin: Skin) -> Rest:
     return Rest(board, codes, 1, EXACT_LSB, NOMINAL)
 
 
-def test_an_untouched_skin_says_nothing_of_its_wires() -> None:
-    diagnosis = examine(evidence("emulator://8x8?wires=1.5", wire_ohm=NOMINAL))
-    assert diagnosis.findings == []
-    assert diagnosis.wires_hidden
-
-
 @pytest.mark.parametrize("size", ["2x2", "2x5", "3x3", "4x4", "8x8", "12x4", "16x16"])
 def test_wires_that_are_not_nominal_are_found(size: str) -> None:
     for seed, times in enumerate((0.5, 0.67, 1.5, 2.0) if size != "16x16" else (1.5,)):
