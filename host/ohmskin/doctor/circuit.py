@@ -42,7 +42,7 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
 from ohmskin.link.protocol import LARGEST_CODE
 
-# Open lines. A port is dark if what it shows may be no current, but noise, rounding or offset.
+# Open lines. A port is dark if what it shows may be noise, rounding or offset, and no current.
 # [1] Noise shows as a current of this share of its deviation, since no code is below zero: the mean
 # of what is above zero of normal noise is 1 / sqrt(2 pi) of its deviation.
 DARK_NOISE: Final = 0.4

@@ -242,6 +242,7 @@ class _Layer:
     def _floating_cost(self) -> Float:
         """Cost (L,) of the readings, if the far ends float: |(u - k w) / s|^2, of the best k."""
         u, w = self.loss_ohm / self.std_ohm, self.floating_ohm / self.std_ohm
+        # If w is 0, so is k: then no voltage could be kept.
         k = np.sum(w * u, axis=1) / np.maximum(np.sum(w * w, axis=1), 1e-30)
         return np.asarray(np.sum((u - np.clip(k, 0, 1)[:, None] * w) ** 2, axis=1))
 

@@ -53,8 +53,10 @@ FAR_S: Final = 4.0
 # [s] Scans of this time show their noise, and their mean has little of it. Chosen: 90 scans, whose
 # mean has a tenth.
 NOISE_S: Final = 1.0
-# [scans] Noise and hum are not judged by fewer. Chosen: two a block (BLOCKS).
-LEAST_SCANS: Final = 16
+# [blocks] Means of so many parts of the scans show what moves. Chosen: 0.3 s each, as touches last.
+BLOCKS: Final = 8
+# [scans] Noise and hum are not judged by fewer. Chosen: two a block.
+LEAST_SCANS: Final = 2 * BLOCKS
 # [1] The second look has a settle time that is so many times as long. Chosen: four times as many
 # time constants, which no slow node survives.
 LONGER: Final = 4
@@ -98,8 +100,6 @@ SOUND_NOISE_LSB: Final = (DEFAULT_NOISE_LSB**2 + 1 / 12) ** 0.5
 NOISY_SHARE: Final = 1.7
 
 # What moves or has not settled.
-# [blocks] Means of so many parts of the scans show what moves. Chosen: 0.3 s each, as touches last.
-BLOCKS: Final = 8
 # [LSB] A touch changes these means by more. Chosen: the lightest touch changes them by 15.
 MOVED_LSB: Final = 3.0
 # [LSB] A longer settle time changes settled readings by less. Chosen: a code.

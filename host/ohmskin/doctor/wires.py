@@ -219,7 +219,7 @@ class CornerScans:
                 change = np.abs(after - before).max()
                 changes.append((change - FEW_STDS * np.max(variance) ** 0.5, change))
         if not changes or looks[0] is None or looks[1] is None:
-            return
+            return  # corners were not held in enough looks of both kinds
         clear_lsb, change_lsb = map(float, max(changes))
         diagnosis.measured["settling_pressed_lsb"] = round(max(clear_lsb, 0.0), 2)
         if clear_lsb > PRESSED_LSB:
