@@ -318,6 +318,12 @@ def test_there_is_a_limit_of_boards(tmp_path: Path) -> None:
         boards.add("/dev/one-too-many")
 
 
+def test_a_skin_in_stepped_time_is_refused() -> None:
+    """Stopping its recording waited for ever."""
+    with ViewedBoards() as boards, pytest.raises(ValueError, match="leave out speed=0"):
+        boards.add("emulator://4x4?speed=0")
+
+
 @pytest.mark.parametrize(
     ("port", "words"),
     [

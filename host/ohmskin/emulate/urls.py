@@ -89,7 +89,8 @@ def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
 
 def is_stepped(text: str) -> bool:
     """Whether an emulated board has time only while somebody waits for it: ``speed=0``."""
-    return PortUrl.of(text).options.get("speed") == "0"
+    url = PortUrl.of(text)
+    return url.scheme == "emulator" and url.options.get("speed") == "0"
 
 
 def _scene(url: PortUrl, size: str, faults: SkinFaults | None = None) -> Scene:

@@ -21,6 +21,7 @@ import numpy as np
 from ohmskin import opening
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import as_near
+from ohmskin.emulate.urls import is_stepped
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge
@@ -405,11 +406,14 @@ class ViewedBoards(Closing, dict[int, ViewedBoard]):
     def add(self, port: str) -> int:
         """The number of the board at `port`, which is opened if it is new.
 
-        :raises ValueError: there are `MOST_BOARDS` already.
+        :raises ValueError: there are `MOST_BOARDS` already, or time stands still at this port.
         """
         for number, board in self.items():
             if board.port == port:
                 return number
+        if is_stepped(port):
+            # Its scans are on a clock of their own, so a recording would never see its end.
+            raise ValueError("a page has real time: leave out speed=0")
         if len(self) >= MOST_BOARDS:
             raise ValueError(f"there are {MOST_BOARDS} boards: close one first")
         number = next(self._numbers)
