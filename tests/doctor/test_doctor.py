@@ -103,6 +103,7 @@ FOUND = {
     "16x16?dead=15,15": ("dead_cell", "cell (15, 15)"),
     "2x2?dead=0,1": ("dead_cell", "cell (0, 1)"),
     "16x16?saturated=15,15": ("saturated_cell", "cell (15, 15)"),
+    "16x16?saturated=15,15&wires=1.24": ("saturated_cell", "cell (15, 15)"),
     "1x1?saturated=0,0": ("saturated_cell", "cell (0, 0)"),
     "2x2?open_row=1": ("open_row", "row 1"),
     "4x1?open_row=2": ("open_row", "row 2 (or the only cell there is dead)"),
