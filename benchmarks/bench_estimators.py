@@ -15,8 +15,7 @@ units_*                 median time of a frame's estimate over that of the unit 
                         the 16x16 and 32x32 skins the unit has their order and columns. `presses`:
                         one second of four overlapping presses. `random`: every frame touched anew,
                         so that a warm start is worth little. `finger`: soft fingertips that move,
-                        wires not told; `_p99`: the 99th percentile over the median. `paper_2x2`:
-                        `regularized`, both of its steps, in milliseconds.
+                        wires not told; `_p99`: the 99th percentile over the median.
 ms_joint_16x16_finger_p99  99th percentile in milliseconds; a scan takes 26.6 ms.
 error_*, ghost_*        random 8x8, up to 8 touches, cold: error of a pressed cell's conductance,
                         median and 90th percentile; largest conductance above the true one of a cell
@@ -53,7 +52,7 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import Readings, estimate_file
-from studies.information import information_limit
+from studies.information import pressed_limits
 from studies.judge import Judged, answers_of, judge, judge_trial, pooled
 from studies.published import RMSE_MEGOHM
 from studies.trials import (
@@ -146,14 +145,12 @@ def times(part: Part) -> dict[str, float]:
     five = random_scenes(8, 5, frames(30), skins)
     eight = random_scenes(16, 8, frames(20), skins)
     large = random_scenes(32, 10, frames(20), min(2, skins))
-    paper_s, _ = times_of("regularized", random_scenes(2, 3, frames(20), min(3, skins)))
     figures = {
         "units_joint_8x8_random": median_units("joint", random_scenes(8, 8, frames(30), skins)),
         "units_joint_16x16_random": median_units("joint", eight),
         "units_touch_8x8_random": median_units("touch", five),
         "units_touch_16x16_random": median_units("touch", eight),
         "units_touch_32x32_random": median_units("touch", large),
-        "ms_paper_2x2_random": round(1e3 * float(np.median(paper_s)), 1),
     }
     for method in ("matrix", *METHODS):
         figures[f"units_{method}_8x8_presses"] = median_units(method, presses)
@@ -184,13 +181,10 @@ def random_figures(method: str, skins: int) -> tuple[Judged, dict[str, float]]:
     }
 
 
-def limit_percent(trials: list[Trial], **known: float) -> float:
+def limit_percent(trials: list[Trial], layer_std: float | None = None) -> float:
     """Median deviation of a pressed cell in the posterior at the truth, of frames judged."""
-    stds = []
-    for trial in trials:
-        knowledge = trial.rounded(ADC_BITS).knowledge(0)
-        for skin, pressed in zip(trial.frames[LEARNED:], trial.pressed[LEARNED:], strict=True):
-            stds.append(information_limit(skin, knowledge, pressed, **known)[pressed])
+    late = slice(LEARNED, None)
+    stds = [pressed_limits(trial, late, layer_std=layer_std) for trial in trials]
     return 100 * float(np.median(np.concatenate(stds)))
 
 
@@ -283,7 +277,6 @@ BARS = (
     at_most("units_joint_8x8_finger_p99", 4),
     at_most("units_touch_8x8_finger_p99", 4),
     at_most("ms_joint_16x16_finger_p99", 26.6),
-    at_most("ms_paper_2x2_random", 90),
     at_most("error_joint_median_percent", 0.65),
     at_most("error_joint_p90_percent", 5),
     at_most("ghost_joint_p95_us", 0.5),

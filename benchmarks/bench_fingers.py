@@ -34,7 +34,7 @@ import numpy as np
 from bars import Bar, Part, at_least, at_most, run  # beside this file
 from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import estimate_file
-from studies.information import information_limit
+from studies.information import pressed_limits
 from studies.judge import Judged, judge_trial, pooled
 from studies.trials import NOMINAL_WIRE_OHM, Trial, finger_trial
 
@@ -135,13 +135,9 @@ def of_limits(figures: Figures, skins: int) -> None:
             errors = []
             for number in range(skins):
                 trial = fingertips(count, number, NOMINAL_WIRE_OHM)
-                known = trial.rounded(ADC_BITS, wires_told=False).knowledge(0)
-                for frame in range(0, FRAMES, 15):
-                    pressed = trial.pressed[frame]
-                    std = information_limit(
-                        trial.frames[frame], known, pressed, layer_std=layer_std
-                    )[pressed]
-                    errors.append(np.abs(std * random.standard_normal(std.size)))
+                some = slice(0, FRAMES, 15)
+                std = pressed_limits(trial, some, wires_told=False, layer_std=layer_std)
+                errors.append(np.abs(std * random.standard_normal(std.size)))
             p90 = 100 * np.quantile(np.concatenate(errors), 0.9)
             figures.put(f"limit_{name}_{word}_p90_percent", p90)
 

@@ -288,6 +288,7 @@ def measure(board: str, part: Part) -> dict[str, Any]:
     second = _measure_second(board, rng, part) | _measure_late(board, rng) | _measure_nodes(board)
     flash, ram = _sizes(elf_of(board))
     runs = (normal, fastest, large, shortest, far)
+    counted = {"90hz": normal, "max": shortest, "16x16": large, "far": far}
     return {
         "scan_hz": round(normal["made_hz"], 4),
         "jitter_us": round(normal["jitter_us"], 3),
@@ -296,15 +297,9 @@ def measure(board: str, part: Part) -> dict[str, Any]:
         "shortest_scan_hz": round(shortest["delivered_hz"], 3),
         "wrong": normal["wrong"] + fastest["wrong"] + shortest["wrong"],
         "readings": normal["readings"] + fastest["readings"] + shortest["readings"],
-        "wrong_90hz": normal["wrong"],
-        "readings_90hz": normal["readings"],
-        "wrong_max": shortest["wrong"],
-        "readings_max": shortest["readings"],
-        "wrong_16x16": large["wrong"],
-        "readings_16x16": large["readings"],
+        **{f"wrong_{name}": run["wrong"] for name, run in counted.items()},
+        **{f"readings_{name}": run["readings"] for name, run in counted.items()},
         "scan_hz_far": round(far["made_hz"], 4),
-        "wrong_far": far["wrong"],
-        "readings_far": far["readings"],
         **second,
         "settle_us_min": round(min(normal["settle_us_min"], far["settle_us_min"]), 3),
         "settle_us_min_max": round(fastest["settle_us_min"], 3),

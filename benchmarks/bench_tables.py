@@ -36,7 +36,7 @@ from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import estimate_file
 from studies.conditions import converted
 from studies.judge import judge_trial, pooled
-from studies.published import CONDITIONS_MEGOHM, RMSE_MEGOHM, sweep
+from studies.published import CONDITIONS_MEGOHM, RMSE_MEGOHM
 from studies.trials import (
     NOMINAL_WIRE_OHM,
     PAPER_METHODS,
@@ -112,8 +112,10 @@ def print_sweeps(part: Part) -> dict[str, dict[str, list[float]]]:
         figures[name] = {
             method: [round(float(error), 6) for error in row] for method, row in rmse.items()
         }
-    skins = sweep("wire_sweep", PRESSED_OHM)
-    trial = trial_of(skins[0][1], [pressed for pressed, _ in skins])
+    drawn = reference_trial("wire_sweep_3x3")
+    cells = np.where(drawn.pressed, 1 / PRESSED_OHM, drawn.cell_siemens)
+    frames = zip(drawn.frames, cells, strict=True)
+    trial = trial_of(drawn.rest, [replace(skin, cell_siemens=cell) for skin, cell in frames])
     rmse = {method: rmse_megohm(trial, method) for method in theirs}
     swept = f"wires, cells pressed to {PRESSED_OHM / 1e6:g}"
     print_sweep(swept, CONDITIONS_MEGOHM["wire_sweep"], rmse, RMSE_MEGOHM["wire_sweep"])

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from ohmskin.emulate.board import EmulatedBoard
@@ -27,33 +28,31 @@ def serve(boards: Sequence[EmulatedBoard], line: LineFaults | None = None) -> li
     return servers
 
 
+@dataclass
 class Served:
-    """That process. ports: of its boards. said: at the end, the JSON that it printed last."""
+    """That process.
 
-    def __init__(self, script: str, count: int) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, script, "--serve"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self._process.stdout is not None
-        self.ports = [self._process.stdout.readline().strip() for _ in range(count)]
-        self.said: Any = None
+    ports: of its boards.
+    said: at the end, the JSON that it printed last.
+    """
 
-    def end(self) -> None:
-        out, _ = self._process.communicate(timeout=20)
-        self.said = json.loads(out)
+    ports: list[str]
+    said: Any = None
 
 
 @contextmanager
 def served(script: str, count: int = 1) -> Iterator[Served]:
     """A process that runs ``SCRIPT --serve``, until the body ends."""
-    process = Served(script, count)
+    command = [sys.executable, script, "--serve"]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+    assert process.stdout is not None
+    boards = Served([process.stdout.readline().strip() for _ in range(count)])
     try:
-        yield process
+        yield boards
     finally:
-        process.end()
+        out, _ = process.communicate(timeout=20)
+        boards.said = json.loads(out)
 
 
 @contextmanager

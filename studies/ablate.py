@@ -43,7 +43,8 @@ from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.estimate import full_fit, joint, prior, sparse_fit
-from studies.ablate_scenes import SCENES, Plan, Run, Sample, observe
+from studies.ablate_scenes import SCENES, Plan, Sample, observe
+from studies.conditions import Case
 from studies.rows import Progress, as_csv, field_names, in_processes
 
 MODULES: Final = (prior, full_fit, sparse_fit, joint)
@@ -209,11 +210,10 @@ class Row:
 
 
 @lru_cache(maxsize=2)
-def _as_it_is(scene: str, method: str, plan: Plan) -> tuple[list[Run], Sample, dict[str, Float]]:
-    """The frames of a scene, what a method does with them, its figures."""
-    runs = SCENES[scene].build(plan)
-    sample = observe(runs, method)
-    return runs, sample, _figures(sample)
+def _as_it_is(scene: str, method: str, plan: Plan) -> tuple[list[Case], dict[str, Float]]:
+    """The frames of a scene, and the figures of a method."""
+    cases = SCENES[scene].build(plan)
+    return cases, _figures(observe(cases, method))
 
 
 def _figures(sample: Sample) -> dict[str, Float]:
@@ -236,10 +236,10 @@ def compare(task: Task) -> list[Row]:
     scene, method, constant, plan = task
     rows = []
     with threadpool_limits(limits=1):
-        runs, _, figures = _as_it_is(scene, method, plan)
+        cases, figures = _as_it_is(scene, method, plan)
         for variant, value in constant.variants.items():
             with changed(constant, value):
-                sample = observe(runs, method)
+                sample = observe(cases, method)
             for figure, now in _figures(sample).items():
                 base = figures[figure]
                 if np.array_equal(now, base):
@@ -322,11 +322,3 @@ def summary(rows: Sequence[Row], tried: Iterable[Constant]) -> Table:
         words = [_extremes(rows, constant.label, variant) for variant in variants]
         table.add_row(constant.label, f"{constant.value:.4g}", *words)
     return table
-
-
-def moved(rows: Iterable[Row], tried: Iterable[Constant]) -> dict[str, int]:
-    """How many figures each constant changes significantly, over all its variants."""
-    counts = {constant.label: 0 for constant in tried}
-    for row in rows:
-        counts[row.constant] += row.significant
-    return counts

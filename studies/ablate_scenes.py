@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate
-from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import Readings
-from studies.conditions import SWEEPS, Frame, converted
+from studies.conditions import SWEEPS, Case, Frame, converted
 from studies.judge import STATED_STDS, Verdict, answers_of, judge, verdict
 from studies.trials import (
     NOISE_LSB,
@@ -59,30 +58,14 @@ class Plan:
     frames: int = 8
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
-    """Frames of one skin.
-
-    knowledge: what the estimator is told.
-    frames: in the order in which they are read.
-    rest_siemens: the untouched cells, (R, C) [S]; None: only the verdict is of interest.
-    pieces: how many parts the frames have that count as a skin each.
-    """
-
-    knowledge: SkinKnowledge
-    frames: tuple[Frame, ...]
-    rest_siemens: Float | None = None
-    pieces: int = 1
-
-
 def _of_readings(
     readings: Readings, true_siemens: Float, rest_siemens: Float, pieces: int = 1
-) -> Run:
+) -> Case:
     frames = (Frame(*pair) for pair in zip(readings.ratio, true_siemens, strict=True))
-    return Run(readings.knowledge(0), tuple(frames), rest_siemens, pieces)
+    return Case(readings.knowledge(0), tuple(frames), rest_siemens, pieces)
 
 
-def _file(name: str, plan: Plan) -> list[Run]:
+def _file(name: str, plan: Plan) -> list[Case]:
     """All of a file's frames, or as many as all skins of a small plan have, evenly spaced."""
     frames = len(reference_trial(name).frames)
     most = min(plan.skins * plan.frames, frames)
@@ -97,9 +80,9 @@ def _simulated(
     wires_told: bool = True,
     rest_told: bool = True,
     fewer: int = 1,
-) -> list[Run]:
+) -> list[Case]:
     """make: a trial from a number of frames and a seed. fewer: a part of the skins and frames."""
-    runs = []
+    cases = []
     for seed in range(max(2, plan.skins // fewer)):
         trial = make(max(2, plan.frames // fewer), seed)
         random = np.random.default_rng([seed, 1])
@@ -112,18 +95,17 @@ def _simulated(
             rest_ratio=rest_ratio if rest_told else None,
             adc_bits=ADC_BITS,
         )
-        runs.append(_of_readings(readings, trial.cell_siemens, trial.rest.cell_siemens))
-    return runs
+        cases.append(_of_readings(readings, trial.cell_siemens, trial.rest.cell_siemens))
+    return cases
 
 
-def _conditions(conditions: Sequence[tuple[str, float | str]], plan: Plan) -> list[Run]:
-    runs = []
+def _conditions(conditions: Sequence[tuple[str, float | str]], plan: Plan) -> list[Case]:
+    cases = []
     for sweep, x in conditions:
         for skin in range(max(2, plan.skins // 4)):
             random = np.random.default_rng([zlib.crc32(f"{sweep} {x}".encode()), skin])
-            case = SWEEPS[sweep].build(x, (8, 8), max(2, plan.frames // 2), random)
-            runs.append(Run(case.knowledge, case.frames))
-    return runs
+            cases.append(SWEEPS[sweep].build(x, (8, 8), max(2, plan.frames // 2), random))
+    return cases
 
 
 # Conditions under which frames were wrong and not flagged, and neighbours of these.
@@ -141,7 +123,7 @@ FAULTS: Final = (
 class Scene:
     """A set of frames, and the methods that read it."""
 
-    build: Callable[[Plan], list[Run]]
+    build: Callable[[Plan], list[Case]]
     methods: tuple[str, ...] = BOTH
 
 
@@ -178,14 +160,14 @@ class Sample:
     skins: dict[str, NDArray[np.intp]]
 
 
-def observe(runs: Iterable[Run], method: str) -> Sample:
+def observe(cases: Iterable[Case], method: str) -> Sample:
     """Let a method read these frames, each started from the one before."""
     values: defaultdict[str, list[Float]] = defaultdict(list)
     skins: defaultdict[str, list[int]] = defaultdict(list)
     first_skin = 0
-    for run in runs:
-        estimator = make_estimator(method, run.knowledge)
-        for number, frame in enumerate(run.frames):
+    for case in cases:
+        estimator = make_estimator(method, case.knowledge)
+        for number, frame in enumerate(case.frames):
             if frame.afresh:
                 estimator.reset()
             estimate, started_s = None, perf_counter()
@@ -195,12 +177,12 @@ def observe(runs: Iterable[Run], method: str) -> Sample:
             taken_ms = 1e3 * (perf_counter() - started_s)
             if frame.cell_siemens is None:
                 continue
-            skin = first_skin + number * run.pieces // len(run.frames)
-            judged = _judged(estimate, frame.cell_siemens, run.rest_siemens)
+            skin = first_skin + number * case.pieces // len(case.frames)
+            judged = _judged(estimate, frame.cell_siemens, case.rest_siemens)
             for kind, of_frame in {**judged, "ms": np.array([taken_ms])}.items():
                 values[kind].append(of_frame)
                 skins[kind] += [skin] * of_frame.size
-        first_skin += run.pieces
+        first_skin += case.pieces
     return Sample(
         {kind: np.concatenate(parts) for kind, parts in values.items()},
         {kind: np.array(numbers, dtype=np.intp) for kind, numbers in skins.items()},

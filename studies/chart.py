@@ -15,17 +15,16 @@ from statistics import NormalDist
 from typing import Any, Final
 
 import numpy as np
-from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.methods import METHODS
 from ohmskin.record.readings import estimate_file
 from studies import published
-from studies.information import information_limit
+from studies.information import pressed_limits
 from studies.judge import Judged, judge_trial, pooled
-from studies.rows import Progress, Steps, as_csv, field_names, text_table
-from studies.trials import PAPER_METHODS, Trial, random_trial, trial_of
+from studies.rows import Progress, Steps, as_csv, field_names
+from studies.trials import PAPER_METHODS, Trial, random_trial, reference_trial, trial_of
 
 # The paper's methods read skins of so many cells at most: a frame of 9 takes them 0.1 s, one of 16
 # up to 16 s, one of 64 a minute.
@@ -142,11 +141,6 @@ class Row:
     limit_told_percent: float | None = None
 
     @property
-    def resolution(self) -> str:
-        """Of the readings, in words."""
-        return "exact" if self.bits is None else f"{self.bits} bit"
-
-    @property
     def place(self) -> tuple[str, int, int, int | None]:
         """What rows must share to be compared."""
         return self.scene, self.rows, self.columns, self.bits
@@ -251,34 +245,35 @@ def _random_rows(
 
 def _limits(trials: Sequence[Trial], bits: int | None, skip: int) -> dict[str, float]:
     """The columns `limit_...` of a row: what a perfect estimator of one frame could do."""
-    percent: dict[bool, list[float]] = {False: [], True: []}
-    for trial in trials:
-        knowledge = trial.rounded(bits).knowledge(0)
-        for skin, pressed in zip(trial.frames[skip:], trial.pressed[skip:], strict=True):
-            for told, stds in percent.items():
-                known_std = 0.0 if told else None
-                std = information_limit(
-                    skin, knowledge, pressed, rest_std=known_std, layer_std=known_std
-                )
-                stds += (1e2 * std[pressed]).tolist()
-    if not percent[False]:
+    late = slice(skip, None)
+    untold, told = (
+        [
+            1e2 * pressed_limits(trial, late, bits=bits, rest_std=known, layer_std=known)
+            for trial in trials
+        ]
+        for known in (None, 0.0)
+    )
+    stds, stds_told = np.concatenate(untold), np.concatenate(told)
+    if not stds.size:
         return {}
     return {
-        "limit_std_percent": float(np.median(percent[False])),
-        "limit_percent": median_error(percent[False]),
-        "limit_told_percent": median_error(percent[True]),
+        "limit_std_percent": float(np.median(stds)),
+        "limit_percent": median_error(stds),
+        "limit_told_percent": median_error(stds_told),
     }
 
 
-def median_error(stds: Iterable[float]) -> float:
+def median_error(stds: Float) -> float:
     """Median of |e|, with e from normal distributions of these deviations in equal parts."""
-    return float(np.median(np.outer(list(stds), _NORMAL)))
+    return float(np.median(np.outer(stds, _NORMAL)))
 
 
 def _sweep_rows(name: str, plan: Plan, steps: Steps) -> list[Row]:
     """The paper's simulation with exact readings; rest readings and true wires are told."""
     by_method: dict[str, list[Judged]] = defaultdict(list)
-    for pressed, rest in published.sweep(name):
+    drawn = reference_trial(f"{name}_3x3")
+    for pressed in drawn.frames:
+        rest = replace(pressed, cell_siemens=drawn.rest.cell_siemens)
         wire_ohm = (float(rest.top_wire_ohm[0, 0]), float(rest.bottom_wire_ohm[0, 0]))
         trial = trial_of(rest, [pressed] * (plan.repeats + 1), wire_ohm)
         for method in plan.methods:
@@ -346,40 +341,3 @@ def csv_text(rows: Iterable[Row]) -> str:
     """The rows as CSV, columns named after the fields of `Row`; bits may be "exact"."""
     lines = ({**vars(row), "bits": row.bits or "exact"} for row in rows)
     return as_csv(field_names(Row), (line.values() for line in lines))
-
-
-def fronts(rows: Iterable[Row]) -> dict[str, list[str]]:
-    """The methods on each front, fastest first, by scene, size and resolution."""
-    by_place: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        if row.on_front:
-            by_place[f"{row.scene} {row.rows}x{row.columns} {row.resolution}"].append(row)
-    return {
-        place: [row.method for row in sorted(on_front, key=lambda row: or_nan(row.ms))]
-        for place, on_front in by_place.items()
-    }
-
-
-def summary(rows: Iterable[Row]) -> Table:
-    """What was measured, for a terminal."""
-    numbers = ("ms", "error %", "90th", "RMSE MΩ", "conv. %")
-    caption = "*: no method is as fast and as accurate"
-    table = text_table(("skin", "method"), numbers, caption=caption)
-    before: object = None
-    for row in rows:
-        if row.source != MEASURED:
-            continue
-        names = {RANDOM: row.resolution, FAR: f"{row.resolution} far"}
-        size = f"{row.rows}x{row.columns} {names.get(row.scene, row.scene)}"
-        share = row.converged_share
-        table.add_row(
-            size if row.place != before else "",
-            f"{row.method} *" if row.on_front else row.method,
-            *(
-                "" if number is None else f"{number:#.3g}"
-                for number in (row.ms, row.error_percent, row.error_p90_percent, row.rmse_megohm)
-            ),
-            "" if share is None else f"{100 * share:.0f}",
-        )
-        before = row.place
-    return table

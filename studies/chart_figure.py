@@ -5,7 +5,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.estimate.methods import METHODS
@@ -18,10 +23,6 @@ from studies.drawing import (
     prepare,
     write_plain_numbers,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 DEADLINE_MS: Final = 1e3 / DEFAULT_RATE_HZ  # a scan of the board takes so long at its usual rate
 _FAINT: Final = "#777777"
@@ -37,7 +38,8 @@ _PANELS_FOR_NOTES: Final = 3  # widths of panels beside the sweeps
 _NOTES: Final = (
     "Upper rows: the same random skins for all methods, 1 to 100 kΩ where touched, each frame "
     "touched anew and started from the one before. A percentage under a marker: so many frames "
-    "converged; the others count as well. Without it: all did.",
+    "converged; the others count as well. Without it: all did. 'lsq' and 'regularized' read 2x2 "
+    "and 3x3 alone.",
     "Stars: the same frames, read by a board that senses both ends of all lines, by 'joint' and "
     "'touch', which are told nothing of the wires there. Near ends are told the nominal wires.",
     "Limit, of near ends: the median error of the best possible estimator of one frame alone, from "
@@ -53,10 +55,7 @@ _NOTES: Final = (
 
 
 def picture(rows: Sequence[Row], machine: str) -> bytes:
-    """The rows of `chart.measure`, taken on this machine, as a PNG.
-
-    :raises OhmskinError: matplotlib is not installed.
-    """
+    """The rows of `chart.measure`, taken on this machine, as a PNG."""
     random = [row for row in rows if row.scene == RANDOM]
     sizes = list(dict.fromkeys((row.rows, row.columns) for row in random))
     resolutions = list(dict.fromkeys(row.bits for row in random))
@@ -70,8 +69,8 @@ def picture(rows: Sequence[Row], machine: str) -> bytes:
             axes = figure.add_subplot(grid[line, column], sharex=first, sharey=first)
             first = first or axes
             of_panel = [row for row in random if (row.rows, row.columns, row.bits) == (*size, bits)]
+            of_panel += [row for row in rows if row.place == (FAR, *size, bits)]
             _random_panel(axes, of_panel)
-            _far_points(axes, [row for row in rows if row.place == (FAR, *size, bits)])
             _mark_times(axes, [row for row in rows if row.place == (BOARD, *size, bits)])
             axes.tick_params(labelleft=column == 0)
             if line == 0:
@@ -108,27 +107,6 @@ def _random_panel(axes: Axes, rows: Sequence[Row]) -> None:
     if limits[0] is not None and limits[1] is not None:
         axes.axhspan(limits[0], limits[1], color=_BAND, zorder=0.5, linewidth=0)
     _points(axes, [(row, row.error_percent, row.error_p90_percent) for row in rows])
-    absent = [method for method in METHODS if method not in {row.method for row in rows}]
-    if absent:
-        axes.text(
-            0.02,
-            0.02,
-            f"not run: {', '.join(absent)}",
-            transform=axes.transAxes,
-            fontsize=_SMALL_POINTS,
-            color=_FAINT,
-        )
-
-
-def _far_points(axes: Axes, rows: Sequence[Row]) -> None:
-    """What far ends give: stars, and pale lines up to the 90th percentile."""
-    for row in rows:
-        colour = method_style(row.method)["color"]
-        if row.ms is None or row.error_percent is None or row.error_p90_percent is None:
-            continue
-        tail = [row.error_percent, row.error_p90_percent]
-        axes.plot([row.ms, row.ms], tail, color=colour, alpha=0.3, linewidth=4, zorder=1.5)
-        axes.plot([row.ms], [row.error_percent], **_STAR, color=colour, zorder=4)
 
 
 def _sweep_panel(axes: Axes, rows: Sequence[Row]) -> None:
@@ -167,7 +145,8 @@ def _points(axes: Axes, points: Sequence[tuple[Row, float | None, float | None]]
             zorder=1.5,
         )
         face = style["color"] if row.on_front else "white"
-        axes.plot([row.ms], [middle], **style, markerfacecolor=face, zorder=4)
+        marker = _STAR if row.scene == FAR else {"markerfacecolor": face}
+        axes.plot([row.ms], [middle], **style | marker, zorder=4)
         if row.on_front:
             front.append((row.ms, middle))
         if row.converged_share is not None and row.converged_share < 0.995:
@@ -215,9 +194,6 @@ def _mark_times(axes: Axes, rows: Sequence[Row]) -> None:
 
 def _explain(figure: Figure, title: str, methods: set[str]) -> None:
     """Title and legend, above all panels."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
     handles: list[Any] = [
         Line2D([], [], **method_style(method), label=method)
         for method in METHODS

@@ -23,12 +23,10 @@ from studies import chart_figure, force_experiment, force_figure, force_limits
 from studies import far as far_ends
 from studies import stability as verdicts
 from studies.ablate_scenes import Plan
-from studies.drawing import require_matplotlib
 from studies.rows import Progress as ShowProgress
 
-Out = Annotated[
-    Path | None, typer.Option(help="folder to write to: else docs of a checkout, or here")
-]
+DOCS: Final = Path(__file__).parents[1] / "docs"
+Out = Annotated[Path, typer.Option(help="folder to write to", show_default="docs")]
 Jobs = Annotated[int, typer.Option(min=0, help="processes; 0: one a core")]
 QuickExperiment = Annotated[
     bool, typer.Option("--quick", help="fewer skins and frames: rough, in seconds")
@@ -52,12 +50,6 @@ def _machine() -> str:
     return platform.processor() or platform.machine() or "an unknown processor"
 
 
-def default_folder() -> Path:
-    """Where pictures go: docs of a checkout, or here."""
-    root = Path(__file__).parents[1]
-    return root / "docs" if (root / "platformio.ini").is_file() else Path()
-
-
 def save_whole(contents: Mapping[Path, bytes]) -> None:
     """Write all of these files, or none."""
     with ExitStack() as stack:
@@ -74,12 +66,8 @@ class StudyRun:
     least_width: columns of the messages, where stderr is a file.
     """
 
-    def __init__(
-        self, out: Path | None, *, draws: bool = True, is_quiet: bool = False, least_width: int = 0
-    ) -> None:
-        if draws:
-            require_matplotlib()
-        self._folder = default_folder() if out is None else out
+    def __init__(self, out: Path, *, is_quiet: bool = False, least_width: int = 0) -> None:
+        self._folder = out
         self._folder.mkdir(parents=True, exist_ok=True)
         self._started_s = time.monotonic()
         self._written: dict[str, str] = {}
@@ -111,7 +99,7 @@ class StudyRun:
 
 
 def chart(
-    out: Out = None,
+    out: Out = DOCS,
     quick: Annotated[
         bool, typer.Option("--quick", help="fewer frames: rough, in a minute")
     ] = False,
@@ -131,12 +119,11 @@ def chart(
             "speed-accuracy.csv": speed_accuracy.csv_text(rows).encode(),
         }
     )
-    run.messages.print(speed_accuracy.summary(rows))
-    run.answer({"quick": quick}, fronts=speed_accuracy.fronts(rows))
+    run.answer({"quick": quick})
 
 
 def stability(
-    out: Out = None,
+    out: Out = DOCS,
     quick: Annotated[
         bool, typer.Option("--quick", help="fewer frames, smaller skins: rough, in a minute")
     ] = False,
@@ -157,12 +144,11 @@ def stability(
             "stability.csv": verdicts.csv_text(rows).encode(),
         }
     )
-    run.messages.print(verdicts.summary(rows))
     run.answer({"quick": quick}, methods=verdicts.shares(rows))
 
 
 def ablate(
-    out: Out = None,
+    out: Out = DOCS,
     skins: Annotated[int, typer.Option(min=2, help="simulated skins of a kind")] = Plan.skins,
     frames: Annotated[int, typer.Option(min=2, help="frames of each")] = Plan.frames,
     only: Annotated[
@@ -182,18 +168,17 @@ def ablate(
         if unknown:
             raise typer.BadParameter(f"no constant {', '.join(sorted(unknown))}")
         tried = [constant for constant in tried if names & {constant.name, constant.label}]
-    run = StudyRun(out, draws=False)
+    run = StudyRun(out)
     with run.progress("constants on sets of frames") as show:
         plan = Plan(skins, frames)
         rows = constants_tried.measure(tried, plan, jobs=jobs or -1, progress=show)
     run.write({"ablate.csv": constants_tried.csv_text(rows).encode()})
     run.messages.print(constants_tried.summary(rows, tried))
-    asked = {"skins": skins, "frames": frames}
-    run.answer(asked, moved=constants_tried.moved(rows, tried))
+    run.answer({"skins": skins, "frames": frames})
 
 
 def far(
-    out: Out = None,
+    out: Out = DOCS,
     quick: Annotated[bool, typer.Option("--quick", help="fewer frames: rough")] = False,
 ) -> None:
     """Compare lines sensed at both ends with near ends, and with zero potential: a PNG and a CSV.
@@ -218,7 +203,7 @@ def far(
 
 
 @experiment.command()
-def flat(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+def flat(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json = False) -> None:
     """Calibrate with single touches, test with several: a PNG. About two minutes.
 
     Errors of force of all methods on a flat skin. The last line printed is one JSON object.
@@ -227,7 +212,7 @@ def flat(out: Out = None, quick: QuickExperiment = False, only_json: Json = Fals
 
 
 @experiment.command()
-def curved(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+def curved(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json = False) -> None:
     """The same, but the wires of the skin change between calibration and test: a PNG.
 
     About two minutes. The last line printed is one JSON object.
@@ -236,7 +221,7 @@ def curved(out: Out = None, quick: QuickExperiment = False, only_json: Json = Fa
 
 
 @experiment.command()
-def timeseries(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
+def timeseries(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json = False) -> None:
     """Four seconds of one press, and what the other cells show meanwhile: a PNG.
 
     About two minutes. The last line printed is one JSON object.
@@ -250,8 +235,8 @@ def timeseries(out: Out = None, quick: QuickExperiment = False, only_json: Json 
 
 
 @experiment.command()
-def minimum(out: Out = None, quick: QuickExperiment = False, only_json: Json = False) -> None:
-    """The smallest force told from none, alone and beside two touches of 1 N: a PNG.
+def minimum(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json = False) -> None:
+    """The smallest force told from none, alone and beside two touches of 1 N: a table.
 
     About two minutes. The last line printed is one JSON object.
     """
@@ -259,12 +244,11 @@ def minimum(out: Out = None, quick: QuickExperiment = False, only_json: Json = F
     with run.progress("steps") as show:
         plan = QUICK_DETECTION if quick else force_limits.Detection()
         rows = force_limits.smallest_forces(plan, show)
-    run.write({"force-minimum.png": force_figure.smallest_picture(rows)})
     run.messages.print(force_limits.smallest_table(rows))
     run.answer(_asked(quick), smallest_forces=[asdict(row) for row in rows])
 
 
-def _run(out: Path | None, only_json: bool) -> StudyRun:
+def _run(out: Path, only_json: bool) -> StudyRun:
     return StudyRun(out, is_quiet=only_json, least_width=_TABLE_WIDTH)
 
 
@@ -279,5 +263,4 @@ def _surface(run: StudyRun, surface: str, quick: bool) -> None:
     run.write({f"force-{surface}.png": force_figure.surface_picture(rows)})
     for table in force_experiment.surface_tables(rows):
         run.messages.print(table)
-    best = force_experiment.best_of_ours(rows)
-    run.answer(_asked(quick), best=best, rows=[asdict(row) for row in rows])
+    run.answer(_asked(quick), rows=[asdict(row) for row in rows])

@@ -61,10 +61,18 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What an estimator is told of one skin, and its frames in the order they are read."""
+    """One skin.
+
+    knowledge: what the estimator is told.
+    frames: in the order in which they are read.
+    rest_siemens: the untouched cells, (R, C) [S]; None: only verdicts are of interest.
+    pieces: how many parts the frames have that count as a skin each.
+    """
 
     knowledge: SkinKnowledge
     frames: tuple[Frame, ...]
+    rest_siemens: Float | None = None
+    pieces: int = 1
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,10 @@ def _touched_frames(rest: Skin, frames: int, random: Random) -> list[Skin]:
     return [_touched(rest, random) for _ in range(frames)]
 
 
+def _judged(skins: Iterable[Skin]) -> list[Frame]:
+    return [Frame(converted(readings(skin)), skin.cell_siemens) for skin in skins]
+
+
 # ---------------------------------------------------------------------- wires, touches, noise
 
 
@@ -132,12 +144,12 @@ def _wires(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     """x: a wire segment's resistance over a touched cell's, both but for their spread."""
     wire_ohm = (float(x) * PRESSED_OHM, float(x) * PRESSED_OHM)
     rest = skin_at_rest(*shape, random, wire_ohm=wire_ohm)
-    judged = []
+    skins = []
     for skin in _touched_frames(rest, frames, random):
         pressed = np.exp(SPREAD * random.standard_normal(shape)) / PRESSED_OHM
         cell = np.where(skin.cell_siemens > rest.cell_siemens, pressed, rest.cell_siemens)
-        judged.append(Frame(converted(readings(replace(skin, cell_siemens=cell))), cell))
-    return _case(judged, converted(readings(rest)), wire_ohm)
+        skins.append(replace(skin, cell_siemens=cell))
+    return _case(_judged(skins), converted(readings(rest)), wire_ohm)
 
 
 def _touches(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
@@ -145,8 +157,7 @@ def _touches(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     rest = skin_at_rest(*shape, random)
     touches = round(float(x) * rest.cell_siemens.size)
     skins = [touch(rest, touches, random) for _ in range(frames)]
-    judged = (Frame(converted(readings(skin)), skin.cell_siemens) for skin in skins)
-    return _case(judged, converted(readings(rest)))
+    return _case(_judged(skins), converted(readings(rest)))
 
 
 def _noise(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
@@ -162,8 +173,7 @@ def _noise(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
 def _nominal(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     """x: the nominal wires that are told, over the true ones."""
     rest = skin_at_rest(*shape, random)
-    skins = _touched_frames(rest, frames, random)
-    judged = (Frame(converted(readings(skin)), skin.cell_siemens) for skin in skins)
+    judged = _judged(_touched_frames(rest, frames, random))
     top_ohm, bottom_ohm = NOMINAL_WIRE_OHM
     return _case(judged, converted(readings(rest)), (float(x) * top_ohm, float(x) * bottom_ohm))
 

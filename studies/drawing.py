@@ -1,42 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures of all studies have in common. matplotlib is imported when one is drawn."""
+"""What the pictures of all studies have in common."""
 
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any, Final
+import textwrap
+from collections.abc import Iterable
+from typing import Any, Final
 
-from ohmskin.errors import OhmskinError
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
 from ohmskin.estimate.methods import METHODS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 INK: Final = "#333333"
 _COLOURS: Final = ("#666666", "#0072b2", "#e69f00", "#d55e00", "#009e73", "#aa3fb4", "#000000")
 _MARKERS: Final = ("s", "D", "^", "v", "o", "P", "X")
 
 
-def require_matplotlib() -> None:
-    """Nobody should wait for a picture that cannot be drawn.
-
-    :raises OhmskinError: matplotlib is not installed.
-    """
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError as exc:
-        raise OhmskinError("pictures need matplotlib: pip install '.[plot]'") from exc
-
-
 def new_figure(width_inch: float, height_inch: float) -> Figure:
-    """An empty picture whose panels make room for their words.
-
-    :raises OhmskinError: matplotlib is not installed.
-    """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
+    """An empty picture whose panels make room for their words."""
     return Figure(figsize=(width_inch, height_inch), layout="constrained")
 
 
@@ -57,6 +40,12 @@ def method_style(method: str) -> dict[str, Any]:
         "markeredgewidth": 1.5,
         "linestyle": "",
     }
+
+
+def write_notes(figure: Figure, notes: Iterable[str], columns: int) -> None:
+    """What the panels show, below all of them, in lines of so many letters."""
+    text = "\n".join(textwrap.fill(note, columns) for note in notes)
+    figure.supxlabel(text, fontsize=9, color=INK, linespacing=1.4)
 
 
 def prepare(axes: Axes, *, colour: str = "#e4e4e4", **grid: Any) -> None:

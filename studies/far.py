@@ -21,29 +21,27 @@ and of the nominal wires.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from threadpoolctl import threadpool_limits
 
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.record.readings import estimate_file
 from studies import zero_potential
-from studies.drawing import INK, new_figure, png_of, prepare, write_plain_numbers
-from studies.judge import Answers, Judged, judge_trial, pooled
+from studies.drawing import INK, new_figure, png_of, prepare, write_notes, write_plain_numbers
+from studies.judge import Answers, judge_trial, pooled
 from studies.rows import Progress, Steps, as_csv, field_names
 from studies.trials import BEND, Trial, finger_trial, skin_at_rest, stretched, touch, trial_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 NEAR, NEAR_TOLD, FAR = "near", "near, told", "far"
 ZERO, ZERO_BEST = "zero", "zero, best scale"
 ZERO_PATH, ZERO_SOLVED = "zero, less path", "zero, solved"
-READOUTS: Final = (NEAR, NEAR_TOLD, FAR, ZERO, ZERO_BEST, ZERO_PATH, ZERO_SOLVED)
+ESTIMATED: Final = (NEAR, NEAR_TOLD, FAR)  # readouts that state deviations
+READOUTS: Final = (*ESTIMATED, ZERO, ZERO_BEST, ZERO_PATH, ZERO_SOLVED)
 METHOD: Final = "joint"
 SCENES: Final = ("one touch", "eight touches", "fingertip")
 BY_WIRES, BY_BEND = "wires", "bend"  # the sweeps
@@ -127,7 +125,16 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
                     judged = pooled(
                         judge_trial(_read(readout, trial, bits), trial) for trial in trials
                     )
-                    rows.append(_row(judged, sweep, scene, wire_ohm, bend, bits, readout))
+                    states = readout in ESTIMATED
+                    row = Row(
+                        *(sweep, scene, wire_ohm, bend, bits, readout, judged.relative.size),
+                        error_percent=judged.error_percent(),
+                        error_p90_percent=judged.error_percent(0.9),
+                        ghost_us=judged.ghost_us(),
+                        within_4_percent=judged.pressed_within_percent() if states else None,
+                        trusted_percent=judged.converged_percent() if states else None,
+                    )
+                    rows.append(row)
             steps.done()
     return rows
 
@@ -160,7 +167,7 @@ def _trial(scene: str, wire_ohm: float, bend: float, frames: int, seed: int) -> 
 
 
 def _read(readout: str, trial: Trial, bits: int) -> Answers:
-    if readout in (NEAR, NEAR_TOLD, FAR):
+    if readout in ESTIMATED:
         mode = "far" if readout == FAR else "near"
         readings = trial.rounded(bits, mode=mode, wires_told=readout == NEAR_TOLD)
         return estimate_file(readings, METHOD, cold=True)
@@ -176,20 +183,6 @@ def _read(readout: str, trial: Trial, bits: int) -> Answers:
     if readout == ZERO_SOLVED:
         siemens = np.array([zero_potential.solved(frame, wires) for frame in siemens])
     return {"cell_siemens": siemens}
-
-
-def _row(
-    judged: Judged, sweep: str, scene: str, wire_ohm: float, bend: float, bits: int, readout: str
-) -> Row:
-    states = readout in (NEAR, NEAR_TOLD, FAR)
-    return Row(
-        *(sweep, scene, wire_ohm, bend, bits, readout, judged.relative.size),
-        error_percent=judged.error_percent(),
-        error_p90_percent=judged.error_percent(0.9),
-        ghost_us=judged.ghost_us(),
-        within_4_percent=judged.pressed_within_percent() if states else None,
-        trusted_percent=judged.converged_percent() if states else None,
-    )
 
 
 # ---------------------------------------------------------------------------------------- words
@@ -254,10 +247,7 @@ _NOTE: Final = (
 
 
 def picture(rows: Sequence[Row]) -> bytes:
-    """The rows of `far.measure` as a PNG.
-
-    :raises OhmskinError: matplotlib is not installed.
-    """
+    """The rows of `far.measure` as a PNG."""
     figure = new_figure(15.0, 7.6)
     grid = figure.subplots(len(BITS), len(SCENES) + 1, sharey=True, squeeze=False)
     for bits, line in zip(BITS, grid, strict=True):
@@ -278,7 +268,7 @@ def picture(rows: Sequence[Row]) -> bytes:
     )
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
-    figure.supxlabel(textwrap.fill(_NOTE, 190), fontsize=8, color=INK)
+    write_notes(figure, [_NOTE], 170)
     return png_of(figure)
 
 

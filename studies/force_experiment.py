@@ -19,9 +19,9 @@ the cells' memory and their noise leave to the best readout there can be.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from rich.table import Table
@@ -36,7 +36,7 @@ from ohmskin.link.protocol import MODES
 from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 from studies.press import PressModel
 from studies.published import FORCE_RMSE_N
-from studies.rows import Progress, Steps, field_names, text_table
+from studies.rows import Progress, Steps, text_table
 from studies.trials import PAPER_METHODS
 
 TRUTH: Final = "truth"
@@ -329,16 +329,3 @@ def _add_published(table: Table, surface: str) -> None:
             *(f"{error_n:.2f}" for error_n in (*by_cell, np.mean(by_cell))),
             f"{below:.0f} %",
         )
-
-
-def best_of_ours(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """The better of `joint` and `touch` with the regression chosen, against "voltage"."""
-    best: dict[tuple[int, int, str, int], Row] = {}
-    for row in rows:
-        if (row.group, row.regression) == (EVERY_GROUP, CHOICE) and row.method in OURS:
-            place = (row.rows, row.columns, row.cells, row.frames)
-            if place not in best or row.pressed_n < best[place].pressed_n:
-                best[place] = row
-    names = ["rows", "columns", "cells", "frames", "method", "pressed_n", "every_cell_n"]
-    names += [name for name in field_names(Row) if name.endswith("_percent")]
-    return [{name: getattr(row, name) for name in names} for row in best.values()]

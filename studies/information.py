@@ -35,7 +35,6 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, Skin
-from ohmskin.emulate.scenes import REST_OHM
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.prior import (
     LAYER_STD,
@@ -44,20 +43,18 @@ from ohmskin.estimate.prior import (
     UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
 )
-from studies.trials import PRESSED
+from ohmskin.link.protocol import ADC_BITS
+from studies.trials import Trial
 
 # Prior standard deviation of a pressed cell's log conductance: nine decades within one deviation
 # either way is no knowledge.
 PRESSED_STD: Final = 10.0
-# Where nobody says which cells are pressed, those are that conduct so much: half as much again as a
-# usual cell at rest, as `trials` has it.
-PRESSED_SIEMENS: Final = PRESSED / REST_OHM
 
 
 def information_limit(
     skin: Skin,
     knowledge: SkinKnowledge,
-    pressed: NDArray[np.bool_] | None = None,
+    pressed: NDArray[np.bool_],
     *,
     rest_std: float | None = None,
     layer_std: float | None = None,
@@ -65,7 +62,7 @@ def information_limit(
     """Standard deviation of each cell's conductance over its true value, shape (R, C).
 
     skin: the truth. knowledge: what an estimator is told; without rest readings or nominal wires
-    the priors are wider, as in `joint`. pressed: (R, C); if absent, what conducts 1.5 microsiemens.
+    the priors are wider, as in `joint`. pressed: (R, C).
     rest_std, layer_std: how well cells at rest and the mean of each layer's wires are known, of the
     log, instead of the priors of `joint`; 0: exactly.
     Raises ValueError for an open cell, and for shapes that differ.
@@ -74,8 +71,6 @@ def information_limit(
         raise ValueError(f"the skin is {skin.shape}, the knowledge of another size")
     if not np.all(skin.cell_siemens > 0):
         raise ValueError("cells must conduct: an open one has no relative deviation")
-    if pressed is None:
-        pressed = skin.cell_siemens > PRESSED_SIEMENS
     if pressed.shape != skin.shape:
         raise ValueError(f"pressed has shape {pressed.shape}, the skin {skin.shape}")
     free = pressed.ravel()
@@ -105,3 +100,23 @@ def information_limit(
     share = 1.0 - np.sum(learned**2, axis=0) + np.sum(shared**2, axis=0)
     std[~free] = rest_std * np.sqrt(np.maximum(share, 1e-12))  # as far as rounding lets it be known
     return std.reshape(skin.shape)
+
+
+def pressed_limits(
+    trial: Trial,
+    frames: slice,
+    *,
+    bits: int | None = ADC_BITS,
+    wires_told: bool = True,
+    **known: float | None,
+) -> Float:
+    """The limits of the pressed cells in these frames of a trial, one after the other, (n,).
+
+    known: `rest_std` and `layer_std` of `information_limit`.
+    """
+    knowledge = trial.rounded(bits, wires_told=wires_told).knowledge(0)
+    limits = [
+        information_limit(skin, knowledge, pressed, **known)[pressed]
+        for skin, pressed in zip(trial.frames[frames], trial.pressed[frames], strict=True)
+    ]
+    return np.concatenate(limits)

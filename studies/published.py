@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper printed of its speed and accuracy, and the skins of its simulations.
+"""What the paper printed of its speed and accuracy.
 
 [Su2024]: B. Y. Su, Y. Wu, C. Wen, C. Liu, "Optimizing Multi-Touch Textile and Tactile Skin Sensing
 Through Circuit Parameter Estimation": section V.A (errors), "Scalability" in section V (times),
@@ -15,15 +15,11 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
-from ohmskin.circuit.skin import Skin
-from studies.trials import uniform_skin
-
 # [ms] a frame, 2x2, on an AMD 7940HS: 40 for step 3, and 50 more for step 4.
 TIME_2X2_MS: Final = {"lsq": 40.0, "regularized": 90.0}
 
 # RMSE over the nine cells [megohm], one frame per condition, from the source of the two figures.
+# `reference_trial("cell_sweep_3x3")` and "wire_sweep_3x3" have the skins.
 CONDITIONS_MEGOHM: Final = {
     "cell_sweep": (0.01, 0.07, 0.09, 0.5, 0.7),
     "wire_sweep": (0.0001, 0.0005, 0.001, 0.021, 0.041),
@@ -58,22 +54,3 @@ FORCE_RMSE_N: Final = {
         ("solved", "estimation"): (2.208, 1.686, 3.509, 2.380),
     },
 }
-_PRESSED: Final = ([0, 0, 1], [0, 1, 0])  # rows and columns of three corners of a rectangle
-_PRESSED_OHM: Final = 1e3  # of a pressed cell in the wire sweep, by its caption
-_WIRE_OHM: Final = 1e3  # of a segment in the cell sweep, by its caption
-
-
-def sweep(name: str, pressed_in_wires_ohm: float = _PRESSED_OHM) -> list[tuple[Skin, Skin]]:
-    """The pressed skin and the untouched one of each condition of "cell_sweep" or "wire_sweep".
-
-    pressed_in_wires_ohm: a pressed cell of the wire sweep.
-    """
-    pairs = []
-    for condition_ohm in 1e6 * np.array(CONDITIONS_MEGOHM[name]):
-        pressed_ohm = condition_ohm if name == "cell_sweep" else pressed_in_wires_ohm
-        wire_ohm = _WIRE_OHM if name == "cell_sweep" else condition_ohm
-        rest = uniform_skin((3, 3), 1e-6, (wire_ohm, wire_ohm))
-        cell_siemens = rest.cell_siemens.copy()
-        cell_siemens[_PRESSED] = 1 / pressed_ohm
-        pairs.append((Skin(cell_siemens, rest.top_wire_ohm, rest.bottom_wire_ohm), rest))
-    return pairs

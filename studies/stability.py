@@ -9,18 +9,19 @@ results do not depend on how many processes there are.
 
 from __future__ import annotations
 
-import textwrap
 import zlib
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
-from rich.table import Table
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from threadpoolctl import threadpool_limits
 
-from ohmskin.arrays import Float
-from ohmskin.estimate.base import Estimate, Estimator
+from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.methods import METHODS, make_estimator
 from studies.conditions import SWEEPS, Case, Shape, Sweep
 from studies.drawing import (
@@ -29,14 +30,12 @@ from studies.drawing import (
     new_figure,
     png_of,
     prepare,
+    write_notes,
     write_plain_numbers,
 )
 from studies.judge import Verdict, verdict
-from studies.rows import Progress, as_csv, field_names, in_processes, text_table
+from studies.rows import Progress, as_csv, field_names, in_processes
 from studies.trials import PAPER_METHODS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -146,19 +145,14 @@ def _judge_method(task: Task, method: str, case: Case) -> Row:
     for frame in case.frames:
         if frame.afresh:
             estimator.reset()
-        estimate = _answer(estimator, frame.ratio)
+        estimate: Estimate | None = None
+        # An exception of whatever kind misleads nobody, but it is counted.
+        with suppress(Exception):
+            estimate = estimator.estimate(frame.ratio)
         if frame.cell_siemens is not None:
             said = verdict(estimate, frame.cell_siemens)
             row = row.counting(said, raised=estimate is None)
     return row
-
-
-def _answer(estimator: Estimator, ratio: Float) -> Estimate | None:
-    try:
-        return estimator.estimate(ratio)
-    except Exception:
-        # An exception of whatever kind misleads nobody, but it is counted.
-        return None
 
 
 def measure(
@@ -205,22 +199,6 @@ def shares(rows: Iterable[Row]) -> dict[str, dict[str, float]]:
     }
 
 
-def summary(rows: Sequence[Row]) -> Table:
-    """Two of the three shares per sweep and method, for a terminal."""
-    methods = list(totals(rows))
-    table = text_table(["sweep"], methods, title="right / wrong and not flagged [% of frames]")
-    parts = {name: [row for row in rows if row.sweep == name] for name in SWEEPS}
-    for name, part in {**parts, "all": rows}.items():
-        by_method = totals(part)
-        table.add_row(name, *(_percent(by_method[method]) for method in methods))
-    return table
-
-
-def _percent(row: Row) -> str:
-    right, wrong = (100 * count / row.frames for count in (row.right, row.wrong_unflagged))
-    return f"{right:.0f} / {wrong:.{0 if wrong >= 10 else 1}f}"
-
-
 # -------------------------------------------------------------------------------------- picture
 
 # More frames than this that are wrong and not flagged are red. Chosen: one frame in a hundred.
@@ -245,15 +223,11 @@ _NOTES: Final = (
 
 
 def picture(rows: Sequence[Row]) -> bytes:
-    """The rows of `stability.measure` as a PNG.
-
-    :raises OhmskinError: matplotlib is not installed.
-    """
+    """The rows of `stability.measure` as a PNG."""
     measured = {row.sweep for row in rows}
     figure = new_figure(17.0, 12.6)
-    figure.suptitle("Where methods fail, and whether they say so", fontsize=17, color=INK)
     # Labels need more room than numbers: to the right, and below.
-    lines = figure.add_gridspec(3, 1, height_ratios=(5.0, 5.6, 1.3))
+    lines = figure.add_gridspec(2, 1, height_ratios=(5.0, 5.6))
     for line, labelled in enumerate((False, True)):
         sweeps = [s for s in SWEEPS.values() if s.name in measured and s.labelled == labelled]
         if not sweeps:
@@ -265,7 +239,7 @@ def picture(rows: Sequence[Row]) -> bytes:
             lower = figure.add_subplot(places[1, column], sharex=upper)
             _prepare(upper, lower, sweep, leftmost=column == 0)
             _draw(upper, lower, sweep, rows)
-    _explain(figure.add_subplot(lines[2]), rows)
+    _explain(figure, rows)
     return png_of(figure)
 
 
@@ -337,40 +311,20 @@ def _prepare_labels(upper: Axes, lower: Axes, sweep: Sweep) -> None:
             axes.axvline(place - 0.5, color="#d5d5d5", linewidth=0.7, zorder=0.7)
 
 
-def _explain(axes: Axes, rows: Sequence[Row]) -> None:
-    """Legend with totals, and notes."""
-    from matplotlib.lines import Line2D
-
-    axes.set_axis_off()
-    all_frames = totals(rows)
-    handles = [
-        Line2D([], [], label=f"{method}\n{_share(all_frames[method])}", **method_style(method))
-        for method in METHODS
-        if method in all_frames
-    ]
-    axes.legend(
+def _explain(figure: Figure, rows: Sequence[Row]) -> None:
+    """Title, and legend with totals, above all panels; notes below them."""
+    handles = []
+    for method, row in totals(rows).items():
+        share = f"{100 * row.wrong_unflagged / row.frames:.2g} % of {row.frames} frames"
+        label = f"{method}: wrong, not flagged\nin {share}"
+        handles.append(Line2D([], [], label=label, **method_style(method)))
+    figure.legend(
         handles=handles,
-        title="wrong and not flagged, in all panels together",
-        title_fontproperties={"size": 11, "weight": "bold"},
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1.05),
+        title="Where methods fail, and whether they say so",
+        title_fontsize=17,
+        loc="outside upper center",
         ncols=len(handles),
         frameon=False,
         fontsize=11,
-        columnspacing=3.0,
-    ).get_title().set_color(_RED)
-    axes.text(
-        0.5,
-        0.2,
-        "\n".join(textwrap.fill(note, 200) for note in _NOTES),
-        transform=axes.transAxes,
-        va="top",
-        ha="center",
-        fontsize=9,
-        color=INK,
-        linespacing=1.4,
     )
-
-
-def _share(row: Row) -> str:
-    return f"{100 * row.wrong_unflagged / row.frames:.2g} % of {row.frames} frames"
+    write_notes(figure, _NOTES, 200)

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from command_line import Command, finish
-from ohmskin.circuit.skin import readings
 from ohmskin.estimate.methods import METHODS
-from skins import reference
 from studies import chart, chart_figure, published
 from studies.chart import Plan, Row, Size, pareto_front
+from studies.trials import reference_trial
 from waiting import until
 
 TINY = Plan(
@@ -82,7 +81,6 @@ def test_far_ends_read_the_same_frames(rows: list[Row]) -> None:
         assert (far.frames, far.pressed_cells) == (near.frames, near.pressed_cells)
         assert 0 < far.ms <= far.ms_p90
         assert 0 <= far.error_percent < 2  # per cent; measured: 0.3 at 10 bits
-    assert "2x2 10 bit far" in {*chart.summary(rows).columns[0].cells}
 
 
 def test_progress_counts_every_method_on_every_skin() -> None:
@@ -102,7 +100,7 @@ def test_limits_are_ordered(rows: list[Row]) -> None:
 
 
 def test_median_error_of_normal_deviations() -> None:
-    assert chart.median_error([1.0]) == pytest.approx(0.6745, abs=2e-3)
+    assert chart.median_error(np.ones(1)) == pytest.approx(0.6745, abs=2e-3)
     random = np.random.default_rng(2)
     stds = np.exp(random.standard_normal(40))
     drawn = np.abs(stds * random.standard_normal((20_000, 40)))
@@ -115,14 +113,13 @@ def test_the_papers_methods_run_on_small_skins_alone() -> None:
     assert {*METHODS} - {*plan.methods_for(Size(4, 4, 1))} == {"lsq", "regularized"}
 
 
-@pytest.mark.parametrize("name", ["cell_sweep", "wire_sweep"])
-def test_sweeps_are_the_papers(name: str) -> None:
-    """Readings of ngspice, made for the same conditions."""
-    expected, _ = reference(f"{name}_3x3", bits=None)
-    skins = zip(*published.sweep(name), strict=True)
-    pressed, rest = ([readings(skin) for skin in each] for each in skins)
-    np.testing.assert_allclose(pressed, expected.ratio, atol=1e-7)
-    np.testing.assert_allclose(rest, expected.rest_ratio, atol=1e-7)
+def test_sweeps_are_the_papers() -> None:
+    """The files that are read have the conditions that its figures have."""
+    cells, wires = (reference_trial(f"{name}_3x3") for name in ("cell_sweep", "wire_sweep"))
+    megohm = published.CONDITIONS_MEGOHM
+    np.testing.assert_allclose(1e-6 / cells.cell_siemens[:, 0, 0], megohm["cell_sweep"])
+    by_wire = [1e-6 * skin.top_wire_ohm[0, 0] for skin in wires.frames]
+    np.testing.assert_allclose(by_wire, megohm["wire_sweep"])
 
 
 def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
@@ -143,17 +140,6 @@ def test_csv_has_every_row_and_column(rows: list[Row]) -> None:
     assert by_place["board", "regularized"]["error_percent"] == ""
     assert by_place["wire_sweep", "regularized"]["rmse_megohm"] == "0.0829"
     assert by_place["wire_sweep", "regularized"]["ms"] == ""
-
-
-def test_fronts_name_the_fastest_first(rows: list[Row]) -> None:
-    fronts = chart.fronts(rows)
-    assert list(fronts) == [
-        *("random 2x2 exact", "random 2x2 10 bit"),
-        *("cell_sweep 3x3 exact", "wire_sweep 3x3 exact"),
-    ]
-    for place, (fastest, *_) in fronts.items():
-        here = (r for r in rows if f"{r.scene} {r.rows}x{r.columns} {r.resolution}" == place)
-        assert fastest == min((r.ms, r.method) for r in here if r.ms)[1]
 
 
 def test_frames_without_touches_have_a_row_and_a_picture() -> None:

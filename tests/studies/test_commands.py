@@ -3,17 +3,14 @@
 
 import csv
 import json
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
 from command_line import Run
-from places import ROOT
 from studies import ablate, chart, commands, far, force_experiment, stability
 from studies.conditions import SWEEPS
 from studies.force_experiment import Comparison
@@ -70,18 +67,15 @@ def answered(study: Run, tmp_path: Path) -> Any:
 
 
 def test_chart(answered: Any) -> None:
-    answer, table, err = answered("chart --quick")
-    assert answer["fronts"]["random 2x2 10 bit"][0] == "ohm"
+    _, table, _ = answered("chart --quick")
     assert table.startswith("scene,source,rows,columns,bits,method,")
     assert {line["method"] for line in csv.DictReader(table.splitlines())} > set(METHODS)
-    assert "matrix" in err
 
 
 def test_stability(answered: Any) -> None:
-    answer, table, err = answered("stability --quick --jobs 1")
+    answer, table, _ = answered("stability --quick --jobs 1")
     assert answer["methods"]["ohm"]["frames"] == sum(len(each.values) for each in SWEEPS.values())
     assert table.startswith("sweep,x,method,frames,right,flagged,wrong_unflagged\n")
-    assert "wrong and not flagged" in err
 
 
 def test_far(answered: Any) -> None:
@@ -93,8 +87,7 @@ def test_far(answered: Any) -> None:
 
 def test_ablate(answered: Any, study: Run) -> None:
     only = "ablate --only RIVAL_SHARE,prior.SEGMENT_STD"
-    answer, table, err = answered(f"{only} --skins 3 --frames 4 --jobs 1")
-    assert tuple(answer["moved"]) == ABLATED
+    _, table, err = answered(f"{only} --skins 3 --frames 4 --jobs 1")
     assert {line["constant"] for line in csv.DictReader(table.splitlines())} == set(ABLATED)
     assert "worst loss" in err
     assert "no constant NONSENSE" in study("ablate", "--only", "NONSENSE").err
@@ -114,30 +107,9 @@ def test_experiments(answered: Any, name: str, key: str) -> None:
 def test_an_experiment_prints_tables_beside_the_papers_numbers(answered: Any) -> None:
     answer, _, err = answered("experiment flat --quick")
     assert answer["rows"]
-    assert {"rows", "columns", "method", "pressed_below_percent"} < set(answer["best"][0])
     assert "simulated" in err
     assert "3.52" in err  # naive, flat, cell (1, 1)
     assert "…" not in err
-
-
-def test_the_default_folder_is_docs_of_a_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert commands.default_folder() == ROOT / "docs"
-    monkeypatch.setattr(commands, "__file__", "/lib/python/site-packages/studies/x.py")
-    assert commands.default_folder() == Path()
-
-
-@pytest.mark.parametrize(
-    ("command", "module"),
-    [("chart", chart), ("stability", stability), ("experiment flat", force_experiment)],
-)
-def test_without_matplotlib_nothing_is_measured(
-    study: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, module: ModuleType
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    monkeypatch.setattr(module, "measure", lambda *_, **__: pytest.fail("measured in vain"))
-    code, out, err = study(*command.split(), "--quick", "--out", str(tmp_path))
-    assert (code, out) == (2, "")
-    assert err == "studies: pictures need matplotlib: pip install '.[plot]'\n"
 
 
 @pytest.mark.parametrize(
