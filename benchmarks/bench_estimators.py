@@ -146,7 +146,6 @@ def times(part: Part) -> dict[str, float]:
     eight = random_scenes(16, 8, frames(20), skins)
     large = random_scenes(32, 10, frames(20), min(2, skins))
     figures = {
-        "units_joint_8x8_random": median_units("joint", random_scenes(8, 8, frames(30), skins)),
         "units_joint_16x16_random": median_units("joint", eight),
         "units_touch_8x8_random": median_units("touch", five),
         "units_touch_16x16_random": median_units("touch", eight),

@@ -16,8 +16,6 @@ error_*         error of a pressed cell, median and 90th percentile: of the firs
 told_*_worst    the worst total where the wires are told: the nominal 100 and 200 ohm.
 mixed_*         the same fingertips on skins with wires of 20 ohm to 1 kohm a segment, not told:
                 90th percentile of the total's error, pressed cells within 4 stated deviations.
-within_*        all cells of all these scenes: share within 1, 2 and 4 stated deviations.
-stated_*        pressed cells: the median of what is stated over the median error.
 limit_*         90th percentile of the errors that one frame of them allows whoever knows which
                 cells are pressed: wires not told, and wires known exactly (studies/information.py).
 """
@@ -26,7 +24,6 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,9 +43,8 @@ SKINS, FRAMES = 12, 150  # skins of one fingertip, and of two; frames of each
 SIGMA_CELLS, PEAK_SIEMENS = (0.6, 1.0), (3e-5, 1.5e-4)
 WIRE_OHM = (20.0, 1000.0)  # a segment of skins whose wires are mixed: a decade to either side
 # The first frames, in which wires are not learned yet, and the late ones, in which they are.
-FIRST, LATE = slice(0, 50), slice(100, None)
+PARTS = {"every": slice(None), "first": slice(0, 50), "late": slice(100, None)}
 TOUCHED_SIEMENS = 5e-6  # a frame touches if all its cells together rise by so much. Chosen.
-WITHIN_PERCENT = {1: 60, 2: 90, 4: 99}  # bars: cells within so many stated deviations
 
 
 def fingertips(count: int, number: int, wire_ohm: tuple[float, float]) -> Trial:
@@ -68,26 +64,18 @@ class Figures(dict[str, float]):
         self[name] = round(float(value), digits)
 
 
-@dataclass(frozen=True, eq=False)
-class Read:
-    """What a method says of one skin's frames in order: of all, of the first, of the late ones."""
-
-    every: Judged
-    first: Judged
-    late: Judged
-
-
-def read(trial: Trial, method: str, *, wires_told: bool) -> Read:
+def read(trial: Trial, method: str, *, wires_told: bool) -> dict[str, Judged]:
+    """What a method says of one skin's frames in order, by parts of them."""
     answers = estimate_file(trial.rounded(ADC_BITS, wires_told=wires_told), method)
-    return Read(*(judge_trial(answers, trial, part) for part in (slice(None), FIRST, LATE)))
+    return {name: judge_trial(answers, trial, part) for name, part in PARTS.items()}
 
 
 def of_fingers(figures: Figures, method: str, skins: int) -> None:
     """All figures of fingertips, but their limits."""
     random, (low, high) = np.random.default_rng(SEED), np.log(WIRE_OHM)
-    by_name: dict[str, dict[str, list[Read]]] = {}
+    by_name: dict[str, dict[str, list[dict[str, Judged]]]] = {}
     for count, name in enumerate(("one", "two"), start=1):
-        cases: defaultdict[str, list[Read]] = defaultdict(list)
+        cases: defaultdict[str, list[dict[str, Judged]]] = defaultdict(list)
         by_name[name] = cases
         for number in range(skins):
             usual = fingertips(count, number, NOMINAL_WIRE_OHM)
@@ -100,15 +88,10 @@ def of_fingers(figures: Figures, method: str, skins: int) -> None:
     by_name["all"] = {case: one[case] + two[case] for case in one}
     for name, by_case in by_name.items():
         of_case(figures, f"{method}_{name}", by_case)
-    both = pooled(skin.every for case in ("untold", "told") for skin in by_name["all"][case])
-    for stds in WITHIN_PERCENT:
-        figures.put(f"within_{stds}_std_{method}_percent", both.within_percent(stds))
-    stated_over_error = np.median(both.stated) / np.median(both.relative)
-    figures.put(f"stated_over_error_{method}", stated_over_error)
 
 
-def of_case(figures: Figures, key: str, cases: dict[str, list[Read]]) -> None:
-    judged = {case: pooled(skin.every for skin in skins) for case, skins in cases.items()}
+def of_case(figures: Figures, key: str, cases: dict[str, list[dict[str, Judged]]]) -> None:
+    judged = {case: pooled(skin["every"] for skin in skins) for case, skins in cases.items()}
     total = {
         case: every.rise_share[every.rise_siemens > TOUCHED_SIEMENS]
         for case, every in judged.items()
@@ -119,7 +102,7 @@ def of_case(figures: Figures, key: str, cases: dict[str, list[Read]]) -> None:
         worst = np.exp(np.abs(np.log(np.maximum(total[case], 1e-3))).max())
         figures.put(f"{word}_{key}_worst", worst, 3)
     for part in ("first", "late"):
-        of_part = pooled(getattr(skin, part) for skin in cases["untold"])
+        of_part = pooled(skin[part] for skin in cases["untold"])
         figures.put(f"error_{key}_{part}_percent", of_part.error_percent())
         figures.put(f"error_{key}_{part}_p90_percent", of_part.error_percent(0.9))
     figures.put(f"mixed_{key}_p90_percent", 100 * np.quantile(np.abs(total["mixed"] - 1), 0.9))
@@ -143,12 +126,8 @@ def of_limits(figures: Figures, skins: int) -> None:
 
 
 def bars_of(method: str) -> list[Bar]:
-    bars = [
-        at_least(f"within_{n}_std_{method}_percent", share) for n, share in WITHIN_PERCENT.items()
-    ]
-    bars.append(at_most(f"stated_over_error_{method}", 3))
     key = f"{method}_all"
-    bars += [
+    return [
         at_least(f"total_{key}_p10", 0.9),
         at_most(f"total_{key}_p90", 1.08),
         at_most(f"total_{key}_worst", 1.3),
@@ -160,7 +139,6 @@ def bars_of(method: str) -> list[Bar]:
         at_most(f"mixed_{key}_p90_percent", 30),
         at_least(f"mixed_{key}_within_4_std_percent", 95),
     ]
-    return bars
 
 
 def measure(part: Part) -> dict[str, Any]:

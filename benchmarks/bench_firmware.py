@@ -51,7 +51,6 @@ each time to 1024 random codes, a third each at the lower and upper edge of thei
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 import threading
@@ -147,10 +146,7 @@ def _measure_run(
 
 def _sizes(elf: Path) -> tuple[int, int]:
     """Bytes of flash, and of RAM without the stack."""
-    program = shutil.which("avr-size")
-    if program is None:
-        raise FileNotFoundError("avr-size is missing: install binutils-avr")
-    done = subprocess.run([program, elf], capture_output=True, text=True, check=True)
+    done = subprocess.run(["avr-size", elf], capture_output=True, text=True, check=True)
     text, data, bss = map(int, done.stdout.splitlines()[1].split()[:3])
     return text + data, data + bss
 

@@ -9,7 +9,7 @@ simulated, 8x8. What is measured how:
 force_ms_*              median wall time of one scan, from codes to forces and contacts, one core,
                         warm. `presses`: one second of four overlapping presses, readings made with
                         ngspice (tests/data). `finger`: a fingertip with soft edges that covers
-                        some 15 cells. By `touch` unless `joint` is said; p99: 99th percentile.
+                        some 15 cells. By `touch`; p99: 99th percentile.
 live_*                  a process that iterates over the forces of a board, emulated by another
                         process at a pseudo-terminal, which a finger touches: scans in all, scans
                         missed, age of the newest scan at the end [ms], load of the reading process
@@ -84,13 +84,11 @@ def scan_times() -> dict[str, float]:
     finger = np.array([scene.ratio(BEGIN_S + number / 90) for number in range(SCANS)])
     presses = np.tile(pressed.ratio, (-(-SCANS // len(pressed.ratio)), 1, 1, 1))
     figures = {}
-    for name, method, rest, ratios in (
-        ("presses", "touch", pressed_rest, presses),
-        ("presses_joint", "joint", pressed_rest, presses),
-        ("finger", "touch", scene.rest_ratio, finger),
-        ("finger_joint", "joint", scene.rest_ratio, finger),
+    for name, rest, ratios in (
+        ("presses", pressed_rest, presses),
+        ("finger", scene.rest_ratio, finger),
     ):
-        taken_ms = times_ms(SkinReader(board, calibration(board, rest, method)), ratios)
+        taken_ms = times_ms(SkinReader(board, calibration(board, rest, "touch")), ratios)
         figures[f"force_ms_{name}"] = round(float(np.median(taken_ms)), 3)
         figures[f"force_ms_{name}_p99"] = round(float(np.percentile(taken_ms, 99)), 3)
     return figures

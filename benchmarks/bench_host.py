@@ -7,19 +7,14 @@ What is measured how:
 
 decode_scans_per_s     8x8 scans of random codes, bytes in, `scan.ratio` arrays out, on one core;
                        the median of a few runs. The bytes come in chunks of 4096.
-decode_scans_per_s_zeros
-                       the same where all codes are zero: every byte of the tail is a COBS block.
 latency_ms_p50, _p99   from just before another process writes the bytes of a scan, the last one
                        included, to a pseudo-terminal, until `latest()` has returned it in this
                        one. Both read CLOCK_MONOTONIC. 90 scans a second.
 cpu_percent_at_90hz    of one core: user and system time of this process while it iterates over the
                        scans that another process writes to a pseudo-terminal, each at once; the
                        median of three runs of 6 s.
-cpu_percent_at_90hz_simavr
-                       the same while the firmware in the AVR simulator, another process again,
-                       sends byte by byte. null where firmware or simulator are not built.
 record_cpu_percent_at_90hz
-                       the first of the two again, while every scan is recorded besides.
+                       the same while every scan is recorded besides.
 record_bytes_per_s     size of the file by length of the recording, of the emulated scene `moving`
                        with 0.3 LSB of noise, 8x8 at 90 Hz.
 """
@@ -42,7 +37,6 @@ from bars import Part, at_least, at_most, run  # beside this file
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, BoardSettings, EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
-from ohmskin.errors import PortError
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.record.recorder import Recorder
@@ -63,6 +57,7 @@ class NotedLine(LineFaults):
     """A line without faults. passed: when octets began to be written [s], and these."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.passed: list[tuple[float, bytes]] = []
 
     def apply(self, chunk: bytes, now_s: float) -> bytes:
@@ -88,14 +83,14 @@ def serve_noted() -> None:
 # -------------------------------------------------------------------------------- measurements
 
 
-def decode_rate(codes: Callable[[int], NDArray[np.uint16]]) -> float:
-    """Scans a second through `BoardDecoder.feed` and `ratio`."""
+def decode_rate(codes: NDArray[np.uint16]) -> float:
+    """Scans of these codes a second through `BoardDecoder.feed` and `ratio`."""
     kind = protocol.FRAMES["scan"]
     stream = bytearray()
     for number in range(DECODED_SCANS):
         counters = {"scan": number, "time_us": 11_111 * number, "dropped": 0, "rx_errors": 0}
         header = kind.pack(**counters, rows=8, columns=8, mode="near")
-        tail = protocol.pack_codes(codes(number))
+        tail = protocol.pack_codes(codes[number % len(codes)])
         stream += framing.encode(kind.id, number, header + tail)
     chunks = [bytes(stream[i : i + CHUNK_BYTES]) for i in range(0, len(stream), CHUNK_BYTES)]
     rates = []
@@ -177,30 +172,20 @@ def record_bytes_per_s(seconds: float) -> float:
         return 1e6 * path.stat().st_size / (newest.time_us - first.time_us)
 
 
-def measure(part: Part) -> dict[str, float | None]:
+def measure(part: Part) -> dict[str, float]:
     """All figures, as the JSON line has them."""
     random = np.random.default_rng(0)
     blocks = random.integers(0, 1024, (64, 8, 8, 4), dtype=np.uint16)
-    zeros = np.zeros((8, 8, 4), dtype=np.uint16)
-    rate = decode_rate(lambda number: blocks[number % len(blocks)])
-    rate_zeros = decode_rate(lambda _: zeros)
+    rate = decode_rate(blocks)
     latency = latencies_ms(part.of(LATENCY_SCANS))
     load_s, runs = part.share * LOAD_S, range(part.of(LOAD_RUNS))
     cpu = statistics.median(read_cpu_percent(load_s) for _ in runs)
     record_cpu = statistics.median(record_cpu_percent(load_s) for _ in runs)
-    cpu_simavr: float | None = None
-    try:
-        with ohmskin.open("simavr://uno") as skin:
-            cpu_simavr = round(reader_cpu_percent(skin, load_s), 2)
-    except PortError as exc:
-        print(exc, file=sys.stderr)
     return {
         "decode_scans_per_s": round(rate),
-        "decode_scans_per_s_zeros": round(rate_zeros),
         "latency_ms_p50": round(float(np.percentile(latency, 50)), 3),
         "latency_ms_p99": round(float(np.percentile(latency, 99)), 3),
         "cpu_percent_at_90hz": round(cpu, 2),
-        "cpu_percent_at_90hz_simavr": cpu_simavr,
         "record_cpu_percent_at_90hz": round(record_cpu, 2),
         "record_bytes_per_s": round(record_bytes_per_s(part.share * RECORDED_S)),
     }

@@ -4,8 +4,7 @@
     make bench-import
 
 The processor time of a process is divided by that of one that imports what every host program needs
-anyway: numpy, scipy.linalg and serial. The programs take turns, and the median of the ratios' parts
-counts.
+anyway: numpy, scipy.linalg and serial. The programs take turns; the median of each counts.
 
 reference_ms    user and system time of `import numpy, scipy.linalg, serial` [ms]
 import_ratio    `import ohmskin`: names load their modules when they are first asked for

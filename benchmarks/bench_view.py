@@ -14,7 +14,6 @@ latency_ms_p50, _p99   from when the last byte of a scan was read (`Scan.host_ti
                        zeros is taken from the shortest of many questions to the page, as is
                        clock_error_ms, at most half that question's time.
 latency_growth_ms      median of the last tenth less that of the first tenth: what queues up, grows.
-page_says_ms           the median that the page itself shows, by the clock of its websocket.
 frames_per_s           frames that were drawn, each with another scan.
 refreshes_per_s        frames that the browser asked for: in the others there was no newer scan.
 scans_per_s            scans of the board meanwhile, by their numbers.
@@ -102,7 +101,6 @@ def measure(minutes: float) -> dict[str, Any]:
         seconds = time.monotonic() - begin_s
         drawn, refreshes = np.array(page.evaluate("drawn")), page.evaluate("refreshes")
         used_s = cpu_s(server.pid) - before_s
-        says = page.locator(".latency").inner_text()
         missed = page.locator(".missed").inner_text()
     numbers, host_s, drawn_ms = drawn.T
     latency_ms = drawn_ms + offset_ms - 1000 * host_s
@@ -119,7 +117,6 @@ def measure(minutes: float) -> dict[str, Any]:
         "latency_ms_p99": round(float(np.percentile(latency_ms, 99)), 1),
         "latency_growth_ms": round(float(growth_ms), 2),
         "clock_error_ms": round(error_ms, 2),
-        "page_says_ms": float(says.removesuffix(" ms")),
         "frames_per_s": round(len(drawn) / seconds, 1),
         "refreshes_per_s": round(refreshes / seconds, 1),
         "scans_per_s": round((numbers[-1] - numbers[0]) / seconds, 1),

@@ -203,11 +203,6 @@ class Row:
     high: float
     significant: bool
 
-    @property
-    def words(self) -> str:
-        """Change, figure and frames, for a table."""
-        return f"{100 * (self.ratio - 1):+.0f} % {self.figure} {self.scene} {self.method}"
-
 
 @lru_cache(maxsize=2)
 def _as_it_is(scene: str, method: str, plan: Plan) -> tuple[list[Case], dict[str, Float]]:
@@ -309,7 +304,11 @@ def _extremes(rows: Iterable[Row], constant: str, variant: str) -> str:
     mine = [row for row in clear if (row.constant, row.variant) == (constant, variant)]
     mine.sort(key=lambda row: row.ratio)
     losses, gains = [row for row in mine if row.ratio > 1], [row for row in mine if row.ratio < 1]
-    return "\n".join(row.words for row in losses[-1:] + gains[:1]) or "-"
+    words = [
+        f"{100 * (row.ratio - 1):+.0f} % {row.figure} {row.scene} {row.method}"
+        for row in losses[-1:] + gains[:1]
+    ]
+    return "\n".join(words) or "-"
 
 
 def summary(rows: Sequence[Row], tried: Iterable[Constant]) -> Table:

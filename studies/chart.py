@@ -9,7 +9,7 @@ sweeps are added, each frame from a cold start. With one thread, whatever the li
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any, Final
@@ -48,11 +48,6 @@ class Size:
     columns: int
     touches: int
 
-    @property
-    def cells(self) -> int:
-        """How many it has."""
-        return self.rows * self.columns
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -83,7 +78,7 @@ class Plan:
         return [
             method
             for method in self.methods
-            if size.cells <= PAPER_CELLS or method not in PAPER_METHODS
+            if size.rows * size.columns <= PAPER_CELLS or method not in PAPER_METHODS
         ]
 
     @property
@@ -161,12 +156,14 @@ def measure(plan: Plan, progress: Progress | None = None) -> list[Row]:
     """
     steps = Steps(_steps(plan), progress)
     with threadpool_limits(limits=1):
-        rows = [
-            row
-            for size in plan.sizes
-            for bits, trials in _of_each_resolution(size, plan)
-            for row in _random_rows(size, bits, trials, plan, steps)
-        ]
+        rows: list[Row] = []
+        for size in plan.sizes:
+            trials = [
+                random_trial(size.rows, size.columns, size.touches, plan.frames, seed)
+                for seed in range(plan.skins)
+            ]
+            for bits in plan.bits:
+                rows += _random_rows(size, bits, trials, plan, steps)
         for name in published.RMSE_MEGOHM:
             rows += _sweep_rows(name, plan, steps)
     return [*_with_front(rows), *_published_rows()]
@@ -205,15 +202,6 @@ def _middle_and_tail(values: Float) -> tuple[float, float] | tuple[None, None]:
     return float(np.median(values)), float(np.quantile(values, TAIL))
 
 
-def _of_each_resolution(size: Size, plan: Plan) -> Iterator[tuple[int | None, list[Trial]]]:
-    trials = [
-        random_trial(size.rows, size.columns, size.touches, plan.frames, seed)
-        for seed in range(plan.skins)
-    ]
-    for bits in plan.bits:
-        yield bits, trials
-
-
 def _random_rows(
     size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, steps: Steps
 ) -> list[Row]:
@@ -234,13 +222,10 @@ def _random_rows(
             steps.done()
     limits = _limits(trials, bits, plan.warm_up)
     place: dict[str, Any] = {"rows": size.rows, "columns": size.columns, "bits": bits}
-    return [
-        *(
-            _row(parts, scene=RANDOM, method=name, **place, **limits)
-            for name, parts in near.items()
-        ),
-        *(_row(parts, scene=FAR, method=name, **place) for name, parts in far.items()),
+    rows = [
+        _row(parts, scene=RANDOM, method=name, **place, **limits) for name, parts in near.items()
     ]
+    return rows + [_row(parts, scene=FAR, method=name, **place) for name, parts in far.items()]
 
 
 def _limits(trials: Sequence[Trial], bits: int | None, skip: int) -> dict[str, float]:

@@ -170,8 +170,7 @@ def ablate(
         tried = [constant for constant in tried if names & {constant.name, constant.label}]
     run = StudyRun(out)
     with run.progress("constants on sets of frames") as show:
-        plan = Plan(skins, frames)
-        rows = constants_tried.measure(tried, plan, jobs=jobs or -1, progress=show)
+        rows = constants_tried.measure(tried, Plan(skins, frames), jobs=jobs or -1, progress=show)
     run.write({"ablate.csv": constants_tried.csv_text(rows).encode()})
     run.messages.print(constants_tried.summary(rows, tried))
     run.answer({"skins": skins, "frames": frames})

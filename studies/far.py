@@ -174,10 +174,8 @@ def _read(readout: str, trial: Trial, bits: int) -> Answers:
     exact = np.array([zero_potential.currents(skin) for skin in trial.frames])
     scale = zero_potential.USUAL_SIEMENS if readout == ZERO else float(exact.max()) * (1 + 1e-9)
     siemens = zero_potential.converted(exact, scale, bits)
-    top, bottom = trial.readings.nominal_top_wire_ohm, trial.readings.nominal_bottom_wire_ohm
-    assert top is not None
-    assert bottom is not None
-    wires = float(top), float(bottom)
+    wires = trial.readings.knowledge(0).nominal_wire_ohm.both
+    assert wires is not None
     if readout == ZERO_PATH:
         siemens = zero_potential.less_path(siemens, wires)
     if readout == ZERO_SOLVED:
@@ -195,7 +193,9 @@ def csv_text(rows: Iterable[Row]) -> str:
 
 def tables(rows: Iterable[Row]) -> str:
     """Median and 90th percentile of the error [%], as tables in Markdown: those of the page."""
-    rows = list(rows)
+    by_place = {
+        (row.sweep, row.scene, row.wire_ohm, row.bend, row.bits, row.readout): row for row in rows
+    }
     blocks = []
     for bits in BITS:
         places = [
@@ -209,15 +209,10 @@ def tables(rows: Iterable[Row]) -> str:
             f"| {bits} bit: error of a pressed cell [%] | " + " | ".join(READOUTS) + " |",
             "|---" * (len(READOUTS) + 1) + "|",
         ]
-        for name, *place in places:
+        for name, sweep, scene, wire_ohm, bend in places:
             cells = []
             for readout in READOUTS:
-                row = next(
-                    row
-                    for row in rows
-                    if [row.sweep, row.scene, row.wire_ohm, row.bend, row.bits, row.readout]
-                    == [*place, bits, readout]
-                )
+                row = by_place[sweep, scene, wire_ohm, bend, bits, readout]
                 cells.append(f"{row.error_percent:.2g}, {row.error_p90_percent:.2g}")
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         blocks.append("\n".join(lines))

@@ -53,7 +53,6 @@ EVERY_GROUP: Final = "mean"
 SLOW: Final = PAPER_METHODS
 FAST: Final = (VOLTAGE, *(name for name in METHODS if name not in SLOW), TRUTH)
 ALL: Final = (VOLTAGE, *METHODS, TRUTH)
-OURS: Final = ("joint", "touch")
 CELLS: Final = {
     "whole": PressModel(),
     "no memory": PressModel(play_n=0.0, creep=0.0),

@@ -23,6 +23,7 @@ from studies.published import FORCE_RMSE_N
 
 _CELL_COLOURS: Final = ("#0072b2", "#000000", "#d55e00", "#8a8a8a")  # as in the paper's figure
 _CELL_NAMES: Final = groups_of(2, 2)
+_LABELS: Final = {VOLTAGE: "voltage (baseline)", TRUTH: "truth: the true conductances"}
 _PAPER: Final = {"naive": "x", "solved": "+"}
 _PAPER_MARK: Final[dict[str, Any]] = {
     "color": INK,
@@ -91,7 +92,8 @@ def _mark_published(axes: Axes, surface: str) -> None:
 
 
 def _explain(figure: Figure, methods: Iterable[str]) -> None:
-    handles: list[Any] = [Patch(label=_label(method), **_fill(method)) for method in methods]
+    labels = {method: _LABELS.get(method, method) for method in methods}
+    handles: list[Any] = [Patch(label=label, **_fill(method)) for method, label in labels.items()]
     handles.append(Line2D([], [], color=INK, linewidth=1.4, label="in the calibration"))
     handles += [
         Line2D([], [], marker=marker, label=f"paper's {method}, a real skin", **_PAPER_MARK)
@@ -142,9 +144,3 @@ def _fill(method: str) -> dict[str, Any]:
     if method == FAR:
         return {"color": "#7fd4b8"}
     return {"color": "#cc3311" if method == VOLTAGE else "#c8c8c8"}
-
-
-def _label(method: str) -> str:
-    return {VOLTAGE: "voltage (baseline)", TRUTH: "truth: the true conductances"}.get(
-        method, method
-    )

@@ -65,14 +65,10 @@ def information_limit(
     the priors are wider, as in `joint`. pressed: (R, C).
     rest_std, layer_std: how well cells at rest and the mean of each layer's wires are known, of the
     log, instead of the priors of `joint`; 0: exactly.
-    Raises ValueError for an open cell, and for shapes that differ.
+    Raises ValueError for an open cell.
     """
-    if skin.shape != (knowledge.rows, knowledge.columns):
-        raise ValueError(f"the skin is {skin.shape}, the knowledge of another size")
     if not np.all(skin.cell_siemens > 0):
         raise ValueError("cells must conduct: an open one has no relative deviation")
-    if pressed.shape != skin.shape:
-        raise ValueError(f"pressed has shape {pressed.shape}, the skin {skin.shape}")
     free = pressed.ravel()
     if rest_std is None:
         rest_std = UNKNOWN_REST_STD if knowledge.rest_ratio is None else REST_STD

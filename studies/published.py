@@ -37,9 +37,8 @@ RMSE_MEGOHM: Final = {
     },
 }
 # RMSE of force [N] on a real 2x2 skin, from the source of the figures of section V.B: "calibration"
-# is single touch, "estimation" several. In the order of FORCE_CELLS, counted from 1. "solved" is
+# is single touch, "estimation" several. Cells are (1, 1), (1, 2), (2, 1), (2, 2). "solved" is
 # the paper's method: it does not say which of its steps, nor which forces were pressed.
-FORCE_CELLS: Final = ((1, 1), (1, 2), (2, 1), (2, 2))
 FORCE_RMSE_N: Final = {
     "flat": {
         ("naive", "calibration"): (1.648, 1.721, 1.979, 1.204),

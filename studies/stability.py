@@ -10,7 +10,7 @@ results do not depend on how many processes there are.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from typing import Final
@@ -105,12 +105,10 @@ class Task:
     frames: int
 
 
-def tasks_of(plan: Plan, methods: Iterable[str] = METHODS) -> list[Task]:
+def tasks_of(plan: Plan, methods: Collection[str] = METHODS) -> list[Task]:
     """All tasks, the longest first: else the last process would work alone."""
-    papers: list[str] = []
-    others: list[str] = []
-    for method in methods:
-        (papers if method in PAPER_METHODS else others).append(method)
+    papers = [method for method in methods if method in PAPER_METHODS]
+    others = [method for method in methods if method not in PAPER_METHODS]
     conditions = [(sweep.name, x) for sweep in SWEEPS.values() for x in sweep.values]
     # Each of the paper's two is a task of its own, too, because a frame takes it seconds.
     longest = [

@@ -83,9 +83,3 @@ def test_the_tables_say_what_the_rows_say(rows: list[Row]) -> None:
     (line,) = [line for line in far.tables(marked).splitlines() if "| 77, " in line]
     assert line.startswith("| fingertip, 1000/2000 ohm |")
     assert line.split(" | ")[1 + far.READOUTS.index(far.FAR)].startswith("77, ")
-
-
-def test_picture(rows: list[Row]) -> None:
-    octets = far.picture(rows)
-    assert octets.startswith(b"\x89PNG\r\n\x1a\n")
-    assert len(octets) > 30_000

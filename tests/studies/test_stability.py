@@ -191,11 +191,6 @@ def test_csv(rows: list[Row]) -> None:
         assert int(line["frames"]) == sum(int(line[said]) for said in Verdict)
 
 
-def test_picture_of_all_sweeps() -> None:
-    rows = [Row(sweep, x, method, 4, 1, 1, 2) for sweep, x in SKINS for method in METHODS]
-    assert stability.picture(rows).startswith(b"\x89PNG")
-
-
 def test_ctrl_c_leaves_the_old_files_and_no_process(command: Command, tmp_path: Path) -> None:
     (tmp_path / "stability.csv").write_text("old")
     process = command("stability", "--jobs", "2", "--out", str(tmp_path), module="studies")
