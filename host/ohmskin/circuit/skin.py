@@ -434,9 +434,12 @@ def _connected_parts(cell_siemens: Float) -> NDArray[np.intp]:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
 
+@lru_cache(maxsize=8)  # each frame asks for it again
 def reference_ohm(ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
-    """The reference resistor that each configuration senses [ohm], shape (4,)."""
-    return np.where(READING_SENSES_TOP, ref_top_ohm, ref_bottom_ohm)
+    """The reference resistor that each configuration senses [ohm], shape (4,), read-only."""
+    reference = np.where(READING_SENSES_TOP, ref_top_ohm, ref_bottom_ohm)
+    reference.setflags(write=False)
+    return reference
 
 
 def ratio_from_current(
