@@ -261,6 +261,19 @@ def test_told_wires_do_not_mislead_under_two_large_fingertips(seed: int) -> None
     np.testing.assert_allclose(rise / truth, 1, atol=0.08)
 
 
+def test_wires_that_touch_reports_are_those_that_it_has_learned() -> None:
+    """After a lesson, frames reported the wires of before the lesson, until the next one."""
+    readings = bent_trial(8, 8, 8, 6, seed=6).rounded(10)
+    estimator = make_estimator("touch", readings.knowledge(0))
+    few = 0
+    for ratio in np.repeat(readings.ratio, 2, axis=0):
+        top_ohm = estimator.estimate(ratio).top_wire_ohm
+        if top_ohm.std() == 0:  # a few touches explain it; the fit of `joint` has segments
+            assert top_ohm[0, 0] == pytest.approx(estimator.wires().top)
+            few += 1
+    assert few > 3
+
+
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     """Against the textbook's covariance form, two lessons, with what fades after each."""
     random = np.random.default_rng(8)

@@ -125,8 +125,8 @@ class JointEstimator(Estimator):
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
         belief = self._belief
-        wires_of = belief.wires if isinstance(fit, FullFit) else belief.wires_without_fit
-        wires = wires_of(fit.log_wires)
+        full = fit if isinstance(fit, FullFit) else None
+        wires = belief.believed_wires() if full is None else belief.wires(full.log_wires)
         stds = fit.log_cells_std, fit.wires_log_std, belief.layer_std()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)

@@ -197,7 +197,6 @@ class Touched:
     log_cells: log resistances of all cells, (RC,) [log ohm].
     log_cells_std: their deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
-    log_wires: log resistances of the segments, as they were believed, (2RC,) [log ohm].
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     lesson: what the readings say of the wires.
@@ -208,7 +207,6 @@ class Touched:
     log_cells: Float
     log_cells_std: Float
     wires_log_std: Float
-    log_wires: Float
     modelled: Float
     iterations: int
     lesson: Lesson
@@ -252,7 +250,7 @@ class SparseFit:
         per_std = belief.per_std(by_wire * (self.current**2)[:, None])
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
-        self.path_ohm = belief.wires(belief.mean).path_ohm
+        self.path_ohm = belief.believed_wires().path_ohm
         self.wire_std = float(np.hypot(belief.layer_std(), SEGMENT_STD))
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
@@ -453,8 +451,7 @@ class FewTouches:
         std, by_wires = prior.std.copy(), np.zeros(modelled.size)
         std[cells] = np.sqrt(covariance.diagonal())
         by_wires[cells] = wires_log_std
-        wires = self._skin.belief.mean
-        return Touched(cells, self.log_cells, std, by_wires, wires, modelled, self.steps, lesson)
+        return Touched(cells, self.log_cells, std, by_wires, modelled, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """Whether wires matter to a port, (RC,): to those of the touched cells they always do.

@@ -137,7 +137,7 @@ class WireBelief(ABC):
     def _believe(self, log_layers: Float, root: Float) -> None:
         """Take these for m and V^1/2."""
         self.log_layers, self._root = log_layers, root
-        self._without_fit: SkinWires | None = None
+        self._believed: SkinWires | None = None
 
     @abstractmethod
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
@@ -231,17 +231,13 @@ class WireBelief(ABC):
         path = by_top * top.cumsum(axis=1) + by_bottom * bottom.cumsum(axis=0)
         return SkinWires(segments, segments * self.segment_std(), path.ravel())
 
-    def wires_without_fit(self, log_wires: Float) -> SkinWires:
-        """The same of a fit that took the wires as believed, `log_wires` (2RC,).
-
-        Until the belief changes, all such answers have the wires of the first one. That one may be
-        of the frame that taught the belief, so it has the wires from before this lesson.
-        """
-        if self._without_fit is None:
-            self._without_fit = wires = self.wires(log_wires)
+    def believed_wires(self) -> SkinWires:
+        """The wires as believed, for answers whose fit took them so: made once for each belief."""
+        if self._believed is None:
+            self._believed = wires = self.wires(self.mean)
             for array in (wires.segment_ohm, wires.segment_std_ohm):
                 array.setflags(write=False)  # they are in more than one estimate
-        return self._without_fit
+        return self._believed
 
 
 class LearnedWires(WireBelief):
