@@ -37,10 +37,6 @@ def at_least(figure: str, limit: float) -> Bar:
     return Bar(figure, f">= {limit:g}", lambda value: value >= limit)
 
 
-def exactly(figure: str, number: float) -> Bar:
-    return Bar(figure, f"{number:g}", lambda value: value == number)
-
-
 def about(figure: str, middle: float, off: float) -> Bar:
     return Bar(figure, f"{middle:g} ± {off:g}", lambda value: abs(value - middle) <= off)
 

@@ -205,27 +205,22 @@ def _middle_and_tail(values: Float) -> tuple[float, float] | tuple[None, None]:
 def _random_rows(
     size: Size, bits: int | None, trials: Sequence[Trial], plan: Plan, steps: Steps
 ) -> list[Row]:
-    near: dict[str, list[Judged]] = defaultdict(list)
-    far: dict[str, list[Judged]] = defaultdict(list)
+    judged: dict[tuple[str, str], list[Judged]] = defaultdict(list)
     counted = slice(plan.warm_up, None)
     # Method by method within a skin, so that a slow minute of the machine hits all alike.
     for trial in trials:
-        readings = trial.rounded(bits)
-        for method in plan.methods_for(size):
+        near, far = trial.rounded(bits), trial.rounded(bits, mode="far", wires_told=False)
+        of_near = [(RANDOM, near, method) for method in plan.methods_for(size)]
+        for scene, readings, method in of_near + [(FAR, far, name) for name in plan.far_methods]:
             answers = estimate_file(readings, method)
-            near[method].append(judge_trial(answers, trial, counted))
-            steps.done()
-        readings = trial.rounded(bits, mode="far", wires_told=False)
-        for method in plan.far_methods:
-            answers = estimate_file(readings, method)
-            far[method].append(judge_trial(answers, trial, counted))
+            judged[scene, method].append(judge_trial(answers, trial, counted))
             steps.done()
     limits = _limits(trials, bits, plan.warm_up)
     place: dict[str, Any] = {"rows": size.rows, "columns": size.columns, "bits": bits}
-    rows = [
-        _row(parts, scene=RANDOM, method=name, **place, **limits) for name, parts in near.items()
+    return [
+        _row(parts, scene=scene, method=method, **place, **(limits if scene == RANDOM else {}))
+        for (scene, method), parts in judged.items()
     ]
-    return rows + [_row(parts, scene=FAR, method=name, **place) for name, parts in far.items()]
 
 
 def _limits(trials: Sequence[Trial], bits: int | None, skip: int) -> dict[str, float]:

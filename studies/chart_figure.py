@@ -15,14 +15,7 @@ from matplotlib.patches import Patch
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.estimate.methods import METHODS
 from studies.chart import BOARD, FAR, MEASURED, PAPER, RANDOM, Row, or_nan
-from studies.drawing import (
-    INK,
-    method_style,
-    new_figure,
-    png_of,
-    prepare,
-    write_plain_numbers,
-)
+from studies.drawing import INK, method_style, new_figure, png_of, prepare, write_plain_numbers
 
 DEADLINE_MS: Final = 1e3 / DEFAULT_RATE_HZ  # a scan of the board takes so long at its usual rate
 _FAINT: Final = "#777777"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -50,15 +50,6 @@ def _machine() -> str:
     return platform.processor() or platform.machine() or "an unknown processor"
 
 
-def save_whole(contents: Mapping[Path, bytes]) -> None:
-    """Write all of these files, or none."""
-    with ExitStack() as stack:
-        for path, content in contents.items():
-            file = stack.enter_context(whole_file(path))
-            file.write(content)
-            file.flush()
-
-
 class StudyRun:
     """One command: where it writes, what it says on stderr, and its answer.
 
@@ -84,12 +75,17 @@ class StudyRun:
             task = bar.add_task(what, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)
 
-    def write(self, files: Mapping[str, bytes]) -> None:
-        """Write all of these pictures (.png) and tables (.csv), by name, or none."""
-        paths = {self._folder / name: content for name, content in files.items()}
-        save_whole(paths)
-        kinds = {".png": "picture", ".csv": "table"}
-        self._written = {kinds[path.suffix]: str(path) for path in paths}
+    def write(self, name: str, *, picture: bytes = b"", table: str = "") -> None:
+        """Write the picture NAME.png and the table NAME.csv, as far as there are any, or none."""
+        contents = {"picture": (".png", picture), "table": (".csv", table.encode())}
+        with ExitStack() as stack:
+            for kind, (suffix, content) in contents.items():
+                if content:
+                    path = self._folder / f"{name}{suffix}"
+                    file = stack.enter_context(whole_file(path))
+                    file.write(content)
+                    file.flush()
+                    self._written[kind] = str(path)
 
     def answer(self, asked: dict[str, Any], **figures: Any) -> None:
         """Print the answer: what was written, what was asked, and the figures."""
@@ -113,12 +109,8 @@ def chart(
     # Redrawn seldom, because the bar's thread runs beside what is being timed.
     with run.progress("frames", redraws_hz=2) as show:
         rows = speed_accuracy.measure(plan, show)
-    run.write(
-        {
-            "speed-accuracy.png": chart_figure.picture(rows, _machine()),
-            "speed-accuracy.csv": speed_accuracy.csv_text(rows).encode(),
-        }
-    )
+    picture = chart_figure.picture(rows, _machine())
+    run.write("speed-accuracy", picture=picture, table=speed_accuracy.csv_text(rows))
     run.answer({"quick": quick})
 
 
@@ -138,12 +130,7 @@ def stability(
     tasks = verdicts.tasks_of(verdicts.QUICK if quick else verdicts.FULL)
     with run.progress("skins") as show:
         rows = verdicts.measure(tasks, jobs=jobs or -1, progress=show)
-    run.write(
-        {
-            "stability.png": verdicts.picture(rows),
-            "stability.csv": verdicts.csv_text(rows).encode(),
-        }
-    )
+    run.write("stability", picture=verdicts.picture(rows), table=verdicts.csv_text(rows))
     run.answer({"quick": quick}, methods=verdicts.shares(rows))
 
 
@@ -171,7 +158,7 @@ def ablate(
     run = StudyRun(out)
     with run.progress("constants on sets of frames") as show:
         rows = constants_tried.measure(tried, Plan(skins, frames), jobs=jobs or -1, progress=show)
-    run.write({"ablate.csv": constants_tried.csv_text(rows).encode()})
+    run.write("ablate", table=constants_tried.csv_text(rows))
     run.messages.print(constants_tried.summary(rows, tried))
     run.answer({"skins": skins, "frames": frames})
 
@@ -188,12 +175,7 @@ def far(
     run = StudyRun(out)
     with run.progress("conditions") as show:
         rows = far_ends.measure(far_ends.QUICK if quick else far_ends.FULL, show)
-    run.write(
-        {
-            "far-ends.png": far_ends.picture(rows),
-            "far-ends.csv": far_ends.csv_text(rows).encode(),
-        }
-    )
+    run.write("far-ends", picture=far_ends.picture(rows), table=far_ends.csv_text(rows))
     run.messages.print(far_ends.tables(rows), markup=False, highlight=False, soft_wrap=True)
     run.answer({"quick": quick})
 
@@ -228,7 +210,7 @@ def timeseries(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json 
     run = _run(out, only_json)
     with run.progress("steps") as show:
         trial, rows = force_limits.cross_talk(1 if quick else 8, 0 if quick else 2, show)
-    run.write({"force-timeseries.png": force_figure.series_picture(trial)})
+    run.write("force-timeseries", picture=force_figure.series_picture(trial))
     run.messages.print(force_limits.talk_table(rows))
     run.answer(_asked(quick), cross_talk=[asdict(row) for row in rows])
 
@@ -259,7 +241,7 @@ def _surface(run: StudyRun, surface: str, quick: bool) -> None:
     plan = force_experiment.QUICK if quick else force_experiment.FULL
     with run.progress("steps") as show:
         rows = force_experiment.measure(plan, curved=surface == "curved", progress=show)
-    run.write({f"force-{surface}.png": force_figure.surface_picture(rows)})
+    run.write(f"force-{surface}", picture=force_figure.surface_picture(rows))
     for table in force_experiment.surface_tables(rows):
         run.messages.print(table)
     run.answer(_asked(quick), rows=[asdict(row) for row in rows])

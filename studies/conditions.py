@@ -109,12 +109,6 @@ def converted(exact: Float, random: Random | None = None, noise_lsb: float = 0.0
     return ratio_from_codes(quantise(exact, ADC_BITS), ADC_BITS)
 
 
-def shorted_readings(skin: Skin, first: int, second: int) -> Float:
-    """`circuit.readings`, electrodes `first` and `second` (rows first) joined by 0.1 ohm."""
-    ends = np.arange(2 * sum(skin.shape))
-    return joined_readings(skin, [(first, second)], ends)[..., :READINGS_PER_CELL]
-
-
 def _case(
     frames: Iterable[Frame],
     rest_ratio: Float,
@@ -300,7 +294,10 @@ def with_line_fault(skin: Skin, fault: str, place: tuple[int, int]) -> Float:
             first = column % (columns - 1)
             faults = SkinFaults(short_columns=(first, first + 1))
         case "row shorted to column":
-            return shorted_readings(skin, row, rows + column)
+            # Electrodes are numbered rows first, and these two are joined by 0.1 ohm.
+            ends = np.arange(2 * (rows + columns))
+            joined = joined_readings(skin, [(row, rows + column)], ends)
+            return joined[..., :READINGS_PER_CELL]
         case _:
             raise ValueError(f"no fault of lines '{fault}'")
     faults = replace(faults, ref_top=skin.ref_top_ohm, ref_bottom=skin.ref_bottom_ohm)

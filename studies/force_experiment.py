@@ -19,6 +19,7 @@ the cells' memory and their noise leave to the best readout there can be.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -278,17 +279,15 @@ def surface_tables(rows: Sequence[Row]) -> list[Table]:
     "below": less than `voltage` by the same regression; "best": than `voltage` by whichever
     regression suits it best.
     """
+    by_place: dict[tuple[int, int, int, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        by_place[row.rows, row.columns, row.frames, row.regression].append(row)
     tables = []
-    for places in dict.fromkeys(
-        (row.rows, row.columns, row.frames, row.regression) for row in rows
-    ):
-        of_table = [
-            row for row in rows if (row.rows, row.columns, row.frames, row.regression) == places
-        ]
+    for (count, columns, frames, regression), of_table in by_place.items():
         first = of_table[0]
         groups = list(dict.fromkeys(row.group for row in of_table))
-        skin = f"{first.surface} {places[0]}x{places[1]}, {places[3]}, simulated"
-        title = f"{skin}: RMSE [N], {first.skins} skins, {first.frames} frames each"
+        skin = f"{first.surface} {count}x{columns}, {regression}, simulated"
+        title = f"{skin}: RMSE [N], {first.skins} skins, {frames} frames each"
         numbers = ("calibr.", *groups, "below", "best", "every cell", "below", "best")
         table = text_table(("cells", "method"), numbers, title=title, title_justify="left")
         before = ""
@@ -309,7 +308,7 @@ def surface_tables(rows: Sequence[Row]) -> list[Table]:
                 f"{mean.every_cell_below_best_percent:.0f} %",
             )
             before = cells
-        if places[:2] == (2, 2):
+        if (count, columns) == (2, 2):
             _add_published(table, first.surface)
         tables.append(table)
     return tables

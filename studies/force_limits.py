@@ -20,14 +20,7 @@ from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.link import protocol
 from studies.force_experiment import FAST, REGRESSIONS, SLOW, TRUTH, learn, rises
-from studies.force_trial import (
-    REST_FRAMES,
-    Choreography,
-    ForceTrial,
-    OneFrameBoard,
-    Plan,
-    groups_of,
-)
+from studies.force_trial import Choreography, ForceTrial, OneFrameBoard, Plan, groups_of
 from studies.press import PressModel
 from studies.rows import Progress, Steps, text_table
 from studies.trials import knowledge_of, skin_at_rest
@@ -207,15 +200,12 @@ def _levels(plan: Detection, forces_n: Float, seed: int, scene: str, cell: int) 
     model = PressModel(play_n=0.0, creep=0.0, seed=seed)
     rise = model.rise(np.arange(len(target_n), dtype=float), force_n.reshape(-1, *SHAPE))
     board = OneFrameBoard(SHAPE, int(random.integers(1 << 32)))
-    rest_ratio = np.mean(
-        [board.read(frame / DEFAULT_RATE_HZ, skin) for frame in range(REST_FRAMES)], axis=0
-    )
+    known = knowledge_of(board.rest_ratio(skin))
     mixed = random.permutation(len(target_n))
     ratio = np.empty((*rise.shape, protocol.READINGS_PER_CELL))
     for number, frame in enumerate(mixed):
         pressed = replace(skin, cell_siemens=skin.cell_siemens + rise[frame])
         ratio[frame] = board.read(10.0 + number, pressed)
-    known = knowledge_of(rest_ratio)
     levels: dict[str, Float] = {}
     for method in plan.methods:
         if method == VOLTAGE:

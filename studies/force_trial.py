@@ -164,14 +164,12 @@ class Choreography:
         read: dict[str, tuple[Float, Float]] = {}
         for mode in MODES:
             board = OneFrameBoard(self.shape, seed, mode)
-            untouched = [
-                board.read(index / DEFAULT_RATE_HZ, self._skin) for index in range(REST_FRAMES)
-            ]
+            rest_ratio = board.rest_ratio(self._skin)
             ratio = [
                 board.read(float(now_s), self._skin_at(float(now_s), rise))
                 for now_s, rise in zip(time_s, rises[seen], strict=True)
             ]
-            read[mode] = np.array(ratio), np.mean(untouched, axis=0)
+            read[mode] = np.array(ratio), rest_ratio
         return ForceTrial(
             time_s,
             *read["near"],
@@ -240,6 +238,11 @@ class OneFrameBoard:
             lambda _time_s, _mode: self._ratio, settings, noise_lsb=NOISE_LSB, seed=seed
         )
         self._board = SteppedSkin(SteppedLink(board))
+
+    def rest_ratio(self, skin: Skin) -> Float:
+        """Mean of the first readings (R, C, 4), which are those of the untouched skin."""
+        frames = [self.read(index / DEFAULT_RATE_HZ, skin) for index in range(REST_FRAMES)]
+        return np.asarray(np.mean(frames, axis=0))
 
     def read(self, time_s: float, skin: Skin) -> Float:
         """Readings (R, C, 4) of a frame begun at a time, or when the frame before is over."""

@@ -221,15 +221,12 @@ _NOTES: Final = (
 
 
 def picture(rows: Sequence[Row]) -> bytes:
-    """The rows of `stability.measure` as a PNG."""
-    measured = {row.sweep for row in rows}
+    """The rows of `stability.measure`, which are of all conditions, as a PNG."""
     figure = new_figure(17.0, 12.6)
     # Labels need more room than numbers: to the right, and below.
     lines = figure.add_gridspec(2, 1, height_ratios=(5.0, 5.6))
     for line, labelled in enumerate((False, True)):
-        sweeps = [s for s in SWEEPS.values() if s.name in measured and s.labelled == labelled]
-        if not sweeps:
-            continue
+        sweeps = [sweep for sweep in SWEEPS.values() if sweep.labelled == labelled]
         widths = [len(sweep.values) if labelled else 1 for sweep in sweeps]
         places = lines[line].subgridspec(2, len(sweeps), width_ratios=widths, height_ratios=(3, 2))
         for column, sweep in enumerate(sweeps):
@@ -246,19 +243,16 @@ def _draw(upper: Axes, lower: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
     methods = list(totals(rows))
     width = _GROUP_WIDTH / len(methods)
     for number, method in enumerate(methods):
-        found = {row.x: row for row in rows if (row.sweep, row.method) == (sweep.name, method)}
+        shown = [row for row in rows if (row.sweep, row.method) == (sweep.name, method)]
         style = method_style(method)
         for axes, said in ((upper, Verdict.RIGHT), (lower, Verdict.WRONG_UNFLAGGED)):
-            percent = [
-                100 * getattr(found[x], str(said)) / found[x].frames if x in found else np.nan
-                for x in sweep.values
-            ]
+            percent = [100 * getattr(row, str(said)) / row.frames for row in shown]
             if sweep.labelled:
                 shift = (number + 0.5) * width - _GROUP_WIDTH / 2
                 at = shift + np.arange(len(percent))
                 axes.bar(at, percent, width, color=style["color"], zorder=3)
             else:
-                few = max((row.frames for row in found.values()), default=0) < _FEW_FRAMES
+                few = max(row.frames for row in shown) < _FEW_FRAMES
                 style |= {"linestyle": ":" if few else "-", "linewidth": 1.8, "markersize": 5.5}
                 at = np.array(sweep.values, dtype=float)
                 axes.plot(at, percent, clip_on=False, zorder=3 + number / 10, **style)
