@@ -282,6 +282,7 @@ class _Layer:
         ends_ohm: what `FarReadings.ends` gives for this layer.
         dead: dead cells, (R, C).
         """
+        # A broken yarn explains its far end. Such a line is not reported as swapped or open, too.
         for line in lines_of(self.lost):
             self.lost[line] = not self._report_broken(line, dead, diagnosis)
         off = (self.loss_ohm - ends_ohm) / self.std_ohm

@@ -372,8 +372,8 @@ def second_look(board: Hello) -> dict[str, Any] | None:
     """`settle_us` and `rate_hz` of a second look; None if it could show nothing new.
 
     The settle time is longer, so that readings change if they have not settled. The rate is another
-    one, at which no mains is seen at almost 0 Hz: so a hum shows that the first look cannot show.
-    Without either, the second look shows nothing new.
+    one, at which no mains is seen at almost 0 Hz. So it also shows a hum that the first look cannot
+    show. If no longer settle time is possible, and no hum was hidden, it would show nothing new.
     """
     readings = board.rows * board.columns * board.readings_per_cell
     # A longer settle time makes slots longer, and so scans slower: this much is left for it.

@@ -11,10 +11,12 @@ c      (n, n)    current through its segments, per current of these ports       
 q      (n,)      what segments like the layer's mean, as believed, would lose       ohm
 t      (2,)      mean segment of each layer, over what is believed of it            1
 o      scalar    offset of far ends against near ones, over its deviation           1
-h      (n,)      what an offset of one deviation adds to p: I changes by port       ohm
+h      (n,)      what an offset of one deviation adds to p: over I, so it differs    ohm
+                 from port to port
 m      scalar    reference: mean segment of the layer, as first seen                ohm
 z      (n,)      the line's segments, in shares of m; y their mean                  1
-v      scalar    variance of z about y, and of what a line's segments add to t      1
+v      scalar    variance of z about y. Also taken for that of a line's mean about  1
+                 y, as if its segments deviated together: the worst case
 L, l   (n, n)    information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2; l is (n,)
 ====== ========= ================================================================== ==========
 
@@ -84,8 +86,8 @@ class MeasuredWires(WireBelief):
             if self.far[layer]:
                 # By noise, t may come out as 0 or less, which has no log.
                 factor = max(factors[layer], np.exp(-MAX_STEP_LOG))
-                # The frame's variance of log t is cov t / t^2. A scalar Kalman step in logs. It
-                # neglects that both t share the error of o:
+                # A scalar Kalman step in logs, for each layer by itself. The variance of log t is
+                # that of t over t^2. That both t have the same error, of o, is neglected.
                 kept = 1.0 / (1.0 + variance[layer] * factor**2 / covariance[layer, layer])
                 measured = self.log_layers[layer] + np.log(factor)
                 logs[layer] += (1 - kept) * (measured - logs[layer])

@@ -139,7 +139,7 @@ class FullFit:
                 return
             self._evaluate()
             step, moved_stds = self._step()
-            # Old slopes are a little wrong, so by them a step must be half as small to be the last.
+            # Old slopes are a little wrong, so by them the last step must be at most half as large.
             if moved_stds >= 0.5 * CLOSE_STDS:
                 self._linearise()
                 step, moved_stds = self._step()
@@ -201,19 +201,20 @@ class FullFit:
 
         With c the deviation of a cell's prior, that of its posterior is c (1 - l)^1/2. (c is that
         of the normal in use: for a touched cell, its distance from rest.) l is the cell's diagonal
-        element of O^T O, the share of c^2 that the readings have removed. If the truth of a layer
-        is one deviation off, the fit's u of the cell is off by their element of O^T O. The layers
-        are independent, so the part from both is c times the length of these two elements.
+        element of O^T O, the share of c^2 that the readings have removed. The fit is linear: it
+        finds O^T O times the true u. So a layer that is truly one deviation off moves the fitted u
+        of a cell by the element (cell, layer) of O^T O. The layers are independent, so the part
+        from both is c times the length of these two elements.
 
         That holds for cells whose prior can be believed. Those that may be touched unnoticed
         (`_find_unnoticed`) get a wider deviation c' instead of c. The fit stays as it is. S becomes
-        wider by them: with H their columns of O, each times (c'^2 / c^2 - 1)^1/2, it is S' = L (1 +
-        H H^T) L^T. So neighbours, which share readings with them, become less certain too
-        (Woodbury):
+        wider by them: with H the columns of O of these cells, each times (c'^2 / c^2 - 1)^1/2, it
+        is S' = L (1 + H H^T) L^T. So neighbours, which share readings with them, become less
+        certain too (Woodbury):
 
             J^T S'^-1 J = O^T O - O^T H (1 + H^T H)^-1 H^T O .
 
-        The last term is the correction. After it, the columns of J that are theirs grow by c' / c.
+        The last term is the correction. After it, the columns of J of these cells grow by c' / c.
         """
         cell_std = self._cell_std
         whitened = solve_lower(self._factor, self._slopes)

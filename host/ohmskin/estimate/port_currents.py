@@ -143,10 +143,11 @@ class NearEnds:
         return np.asarray(charging * np.clip(share, -1.0, 1.0))
 
     def best_three(self, ratio: Float) -> tuple[float, float]:
-        """What the three readings show that agree best, of the four (4,) of a cell in mode near.
+        """Of the four readings (4,) of a cell in mode near, leave out the one that fits least.
 
-        How far they disagree, as `Spread.rms` of one current in three readings [V/Vdd], and their
-        current [S].
+        There are four ways to leave one out. The best is that whose three others agree best.
+        Returns by how much these three disagree, the root mean square of their residuals [V/Vdd],
+        and the current that they show [S].
         """
         threes = []
         for left_out in range(READINGS_PER_CELL):

@@ -42,9 +42,9 @@ MOST_CELLS_RATIO: Final = 0.016
 # The same for one cell: if it is more, this cell is at fault. Chosen: about twice as much, because
 # one of many cells is the worst even on a sound skin.
 ONE_CELL_RATIO: Final = 0.03
-# In noise, a cell at fault also disagrees by more than so many times the median cell. What
-# disagrees by less is as good as a sound cell: so three readings of a cell may, and agree. Chosen:
-# one more than `FAULT_STDS`, as the median cell is not the noisiest.
+# In noise, a cell at fault also disagrees by more than so many times the median cell. The same
+# limit is used for the three readings that are left when one is taken out: they agree if they
+# disagree by less. Chosen: one more than `FAULT_STDS`, as the median cell is not the noisiest.
 ONE_CELL_TIMES: Final = 6.0
 # Without noise, three readings of a cell agree if they disagree by less than so many standard
 # deviations of rounding. Chosen: 1.2 LSB, more than rounding alone can make of them.
@@ -112,11 +112,12 @@ class LinePairs:
 
     Two shorted lines are one node, so their currents from every other line are the same. `compare`
     compares all pairs of lines in a frame. It counts, for each pair, the frames that were compared
-    since one has shown this pair apart. Frames that are not worth it (`needs_frame`) neither add to
-    a count nor end it, so short touches of the same two lines add up.
+    since one has shown this pair apart, or was too noisy to tell. Frames that are not worth it
+    (`needs_frame`) neither add to a count nor end it, so short touches of the same two lines add
+    up.
 
-    high (lines,): which lines have more current at all of their ports than without a short, as a
-    short adds to all of them. For a frame that is: than the line at rest; at rest: than the median
+    high (lines,): which lines have clearly more current at all of their ports, as a short gives
+    them. In a frame, that is more than the line itself had at rest; at rest, more than the median
     line.
     """
 
@@ -232,7 +233,7 @@ class SkinFaults:
     def find(self, now: PortCurrents) -> str:
         """The first fault that a frame's currents show, in words, or empty.
 
-        Only a frame without a short to a column or a loss is compared for shorted lines, and its
+        A frame is compared for shorted lines only if it has no shorted port and no loss, and its
         columns only if no rows are shorted.
         """
         fault = self._short(now)

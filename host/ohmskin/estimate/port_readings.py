@@ -94,8 +94,8 @@ class PortReader:
         """Currents of checked readings (R, C, m), m for each cell, and what is wrong with them.
 
         in_order: True for live frames: how the residuals have changed since the frame before is
-        noise. False for readings at rest, which may be one scan or the mean of many. `find` counts
-        these for a frame, too: reset after them.
+        noise. False for readings at rest, which may be one scan or the mean of many. Shorted
+        lines are counted there as in a frame, so call `reset` after them.
         """
         near = self._read_near(ratio, in_order=in_order)
         # `find` is not called where another fault is known: such a frame must not count as one that
@@ -105,24 +105,26 @@ class PortReader:
             return PortReadings(ratio, *near.ports, fault)
         variance = self._noise.between_ends(near.variances)
         far = self._far_ends.read(ratio, near.ports, variance)
-        drop_std = np.sqrt(variance)
+        drop_ratio_std = np.sqrt(variance)
         shift_ratio = self._noise.offset_std(near.spread, near.offset_ratio)
         return PortReadings(
             ratio,
             *far.ports,
-            fault or far_line_fault(far.drop, drop_std),
+            fault or far_line_fault(far.drop, drop_ratio_std),
             self.far,
             drop_ohm=far.drop / far.near_current,
-            drop_std=drop_std / far.near_current,
+            drop_std=drop_ratio_std / far.near_current,
             drop_shift=shift_ratio / far.near_current,
         )
 
     def _read_near(self, ratio: Float, *, in_order: bool) -> NearPorts:
         """Currents by the near ends, less what lines that charge add, if readings may show that.
 
-        Where readings disagree so little that nothing can be recognised as staying, no line is seen
-        to charge, and the correction would only add noise. Where they disagree by more, it is made
-        whatever the cause: in a frame that is only noisy, too.
+        Two things make the readings of a cell disagree: noise, which changes from frame to frame,
+        and lines that charge, which do the same in every frame. Where readings hardly disagree by
+        more than rounding, these two cannot be told apart, and the correction would only add noise.
+        Where they disagree by more, it is made whatever the cause: in a frame that is only noisy,
+        too.
         """
         near, noise = self._near_ends.read(ratio), self._noise
         current, v_n = near.current, np.inf  # inf: not known

@@ -167,5 +167,7 @@ def siemens_std(
     lowest_ohm = (cell_ohm - off_up * series_ohm) / (1.0 + off_up)
     highest_ohm = (cell_ohm + off_down * series_ohm) / (1.0 - off_down)
     highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
+    # The hardest touch may be so near that the distance to it is less than the cell's deviation, or
+    # below 0. The deviation to first order is the least that is stated.
     up = np.maximum(siemens * log_std, (highest - siemens) / REACH_STDS)
     return np.asarray(up), np.asarray((siemens - 1.0 / highest_ohm) / REACH_STDS)

@@ -402,9 +402,10 @@ class FewTouches:
         ports, light = np.flatnonzero(heavy), ~heavy
         self._untouched_std, wires = self._sharpened(ports)
         self._compare()
-        covariance = gram(wires, onto=np.eye(ports.size, order="F"))
-        factor = cholesky(covariance)
-        # What the wires have been learned to be since the untouched skin was solved.
+        residual_covariance = gram(wires, onto=np.eye(ports.size, order="F"))  # S
+        factor = cholesky(residual_covariance)
+        # By how much these readings have moved in the model by what was learned of the wires since
+        # the untouched skin was solved: the network still has the old wires.
         offset = self._skin.belief.moved_since(self._skin.log_layers, wires[:, -2:])
         for _ in range(2):  # `converge` has led near, by steps without S
             slopes = self._slopes()
@@ -429,10 +430,11 @@ class FewTouches:
         # The rest is what the wires have of their own, which belongs to the model.
         modelled = self._current.copy()
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
-        covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))
+        covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
+        # By how much a layer that is one deviation off moves x: A^-1 J S^-1 W, of the layers in W.
         by_layers = covariance_of_cells @ whitened.T @ solve_lower(factor, wires[:, -2:])
         # The lesson's S: whatever these touches are, they are noise without limit.
-        unlimited = cholesky(gram(UNLIMITED_STD * heavy_slopes.T, onto=covariance))
+        unlimited = cholesky(gram(UNLIMITED_STD * heavy_slopes.T, onto=residual_covariance))
         lesson = Lesson(wires[:, -2:], residual, unlimited)
         return self._answer(covariance_of_cells, np.hypot(*by_layers.T), modelled, lesson)
 

@@ -279,8 +279,11 @@ class LearnedWires(WireBelief):
         if len(residual) < 2:
             return
         # The lesson is in deviations of the belief that the fit had, but the step may start from an
-        # older one. So what the readings alone say is found first, in logs: `weights` are
-        # L J^T N^-1, and `information` is A. X is `gain @ per_layer_std`.
+        # older one. So what the readings alone say is found first, in logs, from what is given in
+        # deviations: with V = V^1/2 V^T/2, `weights` are
+        #     L J^T N^-1 = V^-T/2 (1 - X)^-1 V^T/2 L J^T S^-1 ,   X = `gain @ per_layer_std` ,
+        # and `information` is A. The step is V = (V^-1 + A)^-1 of the belief before, and m += V
+        # times what the weights make of the residual: the same as the step by S above.
         gain = solve(factor, per_layer_std).T
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(2) - gain @ per_layer_std) @ gain
