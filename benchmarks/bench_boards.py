@@ -64,14 +64,11 @@ class CheapBoard(EmulatedBoard):
         return codes
 
 
-def made_codes() -> NDArray[np.uint16]:
-    ratio = np.tile(reference_trial(PRESSES).readings.ratio, (NOISES, 1, 1, 1))
-    return quantise(converted(ratio, np.random.default_rng(1), NOISE_LSB))
-
-
 def serve_boards() -> None:
     """Serve the boards, and print at the end what was."""
-    codes, load = made_codes(), Load()
+    ratio = np.tile(reference_trial(PRESSES).readings.ratio, (NOISES, 1, 1, 1))
+    codes = quantise(converted(ratio, np.random.default_rng(1), NOISE_LSB))
+    load = Load()
     shifted = (np.roll(codes, 97 * unit_id, axis=0) for unit_id in range(1, BOARDS + 1))
     servers = serve([CheapBoard(made, unit_id) for unit_id, made in enumerate(shifted, start=1)])
     said = {

@@ -266,8 +266,6 @@ def measure(part: Part) -> dict[str, float]:
     return times(part) | accuracy(part)
 
 
-# ---------------------------------------------------------------------------------------- bars
-
 BARS = (
     at_most("units_joint_8x8_presses", 15),
     at_most("units_touch_8x8_presses", 8),

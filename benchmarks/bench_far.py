@@ -211,9 +211,6 @@ def bent(mode: str, method: str, skins: int) -> dict[str, float]:
     }
 
 
-# ------------------------------------------------------------------------------------------ bars
-
-
 def bars_of(method: str) -> list[Bar]:
     bars = []
     for kind, median, tail in (("random", 0.4, 2), ("harsh", 0.5, 3), ("finger", 1.2, 5)):

@@ -56,7 +56,6 @@ import sys
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,13 +65,12 @@ from bars import QUICK, Part, about, at_least, at_most, options, report  # besid
 from desk import near_admittance
 from lockstep import BOARDS, CPU_HZ, Rig, elf_of
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READING_SIGN, all_readings, end_admittance
+from ohmskin.circuit.skin import READING_SIGN, Skin, all_readings, end_admittance
 from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.link import protocol
 from ohmskin.link.session import Session
 from second_simulator import SecondSim
-from studies.trials import uniform_skin
 
 # Readings that are wanted: at 90 Hz, and with the shortest slots; in mode far; in the second
 # simulator, which is slow. Chosen: a fault of one reading in so many would show.
@@ -82,7 +80,7 @@ ADC_CLOCKS = ("clock_500khz", "clock_250khz", "clock_125khz")
 # Three of a rectangle's corners at 5 kOhm, the rest at 1 MOhm, no wires.
 _CELLS = np.full((8, 8), 1e-6)
 _CELLS[[2, 2, 5], [2, 5, 2]] = 1 / 5e3
-THREE_CORNERS = replace(uniform_skin((8, 8), wire_ohm=(0.0, 0.0)), cell_siemens=_CELLS)
+THREE_CORNERS = Skin(_CELLS, *np.zeros((2, 8, 8)))
 # Boards, and boot loaders that they are sold with: the second is an old Nano's.
 _OLD_NANO = (
     "/usr/share/arduino/hardware/arduino/avr/bootloaders/atmega/ATmegaBOOT_168_atmega328.hex"
@@ -230,26 +228,24 @@ def _measure_nodes(board: str) -> dict[str, float]:
     return found
 
 
-def _opens_s(board: str, loader: str, reset_s: float) -> float:
-    """Time to open a board behind its boot loader that is reset so long after its port is [s]."""
-    link = SimavrLink(board, Scene(), settings={"bootloader": loader})
-    reset = threading.Timer(reset_s, link.sim.request, ["X"])
-    started_s = time.monotonic()
-    reset.start()
-    try:
-        Session(link).close()
-    finally:
-        reset.cancel()
-    return time.monotonic() - started_s
-
-
 def measure_opening(part: Part) -> dict[str, float]:
-    """The longest time to open a board [s], in real time: by board, the Nano among the Unos."""
+    """The longest time to open a board [s], in real time: by board, the Nano among the Unos.
+
+    Each is behind its boot loader, and is reset some time after its port was opened.
+    """
     phases = [(board, loader, 0.2 * n) for board, loader in LOADERS for n in range(part.of(10))]
     found: dict[str, float] = {}
     for board, loader, reset_s in phases:
         print(f"{board}: opening, reset after {reset_s:.1f} s", file=sys.stderr, flush=True)
-        taken_s = round(_opens_s(board, loader, reset_s), 2)
+        link = SimavrLink(board, Scene(), settings={"bootloader": loader})
+        reset = threading.Timer(reset_s, link.sim.request, ["X"])
+        started_s = time.monotonic()
+        reset.start()
+        try:
+            Session(link).close()
+        finally:
+            reset.cancel()
+        taken_s = round(time.monotonic() - started_s, 2)
         found[board] = max(found.get(board, 0.0), taken_s)
     return found
 
@@ -298,9 +294,6 @@ def measure(board: str, part: Part) -> dict[str, Any]:
         "flash_bytes": flash,
         "ram_bytes": ram,
     }
-
-
-# ------------------------------------------------------------------------------------- bars
 
 
 BARS = (

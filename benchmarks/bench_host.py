@@ -191,9 +191,6 @@ def measure(part: Part) -> dict[str, float]:
     }
 
 
-# ---------------------------------------------------------------------------------------- bars
-
-
 BARS = (
     at_least("decode_scans_per_s", 10_000),
     at_most("latency_ms_p50", 2),

@@ -314,9 +314,6 @@ def or_nan(value: float | None) -> float:
     return np.nan if value is None else value
 
 
-# --------------------------------------------------------------------------------------- answers
-
-
 def csv_text(rows: Iterable[Row]) -> str:
     """The rows as CSV, columns named after the fields of `Row`; bits may be "exact"."""
     lines = ({**vars(row), "bits": row.bits or "exact"} for row in rows)

@@ -38,7 +38,7 @@ from studies.force_trial import ForceTrial, Plan, groups_of, surface_trial
 from studies.press import PressModel
 from studies.published import FORCE_RMSE_N
 from studies.rows import Progress, Steps, text_table
-from studies.trials import PAPER_METHODS
+from studies.trials import PAPER_METHODS, knowledge_of
 
 TRUTH: Final = "truth"
 UNTOLD: Final = "joint, wires not told"
@@ -169,7 +169,7 @@ def rises(method: str, trial: ForceTrial) -> Float:
         return trial.rise_siemens
     if method == VOLTAGE:
         return voltage_level(trial.ratio) - voltage_level(trial.rest_ratio)
-    knowledge, ratio = trial.knowledge, trial.ratio
+    knowledge, ratio = knowledge_of(trial.rest_ratio), trial.ratio
     if method in (UNTOLD, FAR):
         knowledge = replace(knowledge, nominal_wire_ohm=NO_WIRES)
     if method == FAR:

@@ -18,10 +18,9 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.emulate.board import DEFAULT_RATE_HZ, BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import SteppedLink, SteppedSkin
-from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.press import LEAVE_S, PressModel, robot_presses
-from studies.trials import BEND, NOISE_LSB, SPREAD, knowledge_of, skin_at_rest, stretched
+from studies.trials import BEND, NOISE_LSB, SPREAD, skin_at_rest, stretched
 
 WEIGHT_N: Final = 0.981  # a weight of 100 g, as in the paper's experiment
 FORCES_N: Final = (0.5, 8.0)  # the robot's least and largest. Chosen: the paper does not say.
@@ -71,11 +70,6 @@ class ForceTrial:
     cell: NDArray[np.intp]
     press: NDArray[np.intp]
     group: NDArray[np.intp]
-
-    @property
-    def knowledge(self) -> SkinKnowledge:
-        """What estimators are told of this skin."""
-        return knowledge_of(self.rest_ratio)
 
 
 class Choreography:

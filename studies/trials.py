@@ -120,16 +120,6 @@ def without_wires(given: Readings) -> Readings:
     return replace(given, nominal_top_wire_ohm=None, nominal_bottom_wire_ohm=None)
 
 
-def uniform_skin(
-    shape: tuple[int, int],
-    cell_siemens: float = 1 / REST_OHM,
-    wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
-) -> Skin:
-    """A skin whose cells are all alike, and so are the segments of a layer."""
-    cell, top, bottom = (np.full(shape, each) for each in (cell_siemens, *wire_ohm))
-    return Skin(cell, top, bottom)
-
-
 def skin_at_rest(
     rows: int,
     columns: int,

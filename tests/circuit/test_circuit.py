@@ -16,7 +16,8 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from places import DATA
-from studies.trials import reference_trial, uniform_skin
+from skins import uniform_skin
+from studies.trials import reference_trial
 
 REFERENCE_FILES = sorted(
     str(path.relative_to(DATA).with_suffix("")) for path in DATA.rglob("*_[0-9]x[0-9]*.npz")

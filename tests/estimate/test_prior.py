@@ -6,7 +6,7 @@ import pytest
 
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS, CellPrior, rest_level, siemens_std
-from studies.trials import uniform_skin
+from skins import uniform_skin
 
 REST = np.log([1e6])
 

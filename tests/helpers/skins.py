@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a board would read of a skin, and what is told of the skin, for several test files."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import Readings, load_readings
@@ -16,6 +18,14 @@ from places import DATA
 def ten_bits(ratio: Float) -> Float:
     """Readings as a converter of 10 bits gives them."""
     return ratio_from_codes(quantise(ratio))
+
+
+def uniform_skin(
+    shape: tuple[int, int], cell_siemens: float = 1e-6, wire_ohm: Sequence[float] = (100.0, 200.0)
+) -> Skin:
+    """A skin whose cells are all alike, and so are the segments of a layer."""
+    cell, top, bottom = (np.full(shape, value) for value in (cell_siemens, *wire_ohm))
+    return Skin(cell, top, bottom)
 
 
 def reference(name: str, bits: int | None = 10) -> tuple[Readings, dict[str, Float]]:

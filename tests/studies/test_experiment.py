@@ -94,9 +94,8 @@ def test_true_conductances_of_perfect_cells_give_the_forces() -> None:
 
 
 def test_errors_are_the_root_mean_squares(flat: ForceTrial) -> None:
-    plan = replace(SMALL, seeds=1)
-    rows = measure([Comparison(2, 2, plan, ("voltage", "truth"), ("whole",))], curved=False)
-    trial = surface_trial(2, 2, 0, plan, PressModel(), curved=False)
+    rows = measure([Comparison(2, 2, SMALL, ("voltage", "truth"), ("whole",))], curved=False)
+    trial = surface_trial(2, 2, 0, SMALL, PressModel(), curved=False)
     rise = rises("truth", trial)
     off_n = learn(trial, rise, CHOICE)(rise) - trial.force_n
     row = only(rows, regression=CHOICE, method="truth", group="(2, 1)")

@@ -15,8 +15,8 @@ from ohmskin.estimate.prior import (
     UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
 )
+from skins import uniform_skin
 from studies.information import PRESSED_STD, information_limit
-from studies.trials import uniform_skin
 
 NOMINAL = {"nominal_wire_ohm": WireOhm(100.0, 200.0)}
 

@@ -6,8 +6,9 @@ import pytest
 
 from network import skin_network
 from ohmskin.circuit.skin import Skin
+from skins import uniform_skin
 from spice import resistors, run_ngspice
-from studies.trials import skin_at_rest, touch, uniform_skin
+from studies.trials import skin_at_rest, touch
 from studies.zero_potential import converted, currents, less_path, solved
 
 
@@ -15,12 +16,6 @@ def touched(rows: int, columns: int, touches: int, seed: int, scale: float = 1.0
     random = np.random.default_rng(seed)
     rest = skin_at_rest(rows, columns, random, wire_ohm=(100 * scale, 200 * scale))
     return touch(rest, touches, random)
-
-
-def test_one_cell_by_hand() -> None:
-    # 100 + 10,000 + 200 ohm in series.
-    skin = uniform_skin((1, 1), 1e-4, (100.0, 200.0))
-    np.testing.assert_allclose(currents(skin), [[1 / 10_300]], rtol=1e-12)
 
 
 def test_a_row_of_two_cells_by_hand() -> None:
@@ -45,9 +40,8 @@ def test_a_column_of_two_cells_by_hand() -> None:
     np.testing.assert_allclose(currents(skin), [[first], [second]], rtol=1e-12)
 
 
-@pytest.mark.parametrize("scale", [1.0, 10.0])
-def test_currents_agree_with_the_laplacian(scale: float) -> None:
-    skin = touched(4, 6, 8, seed=1, scale=scale)
+def test_currents_agree_with_the_laplacian() -> None:
+    skin = touched(4, 6, 8, seed=1, scale=10.0)
     rows, columns = skin.shape
     found = currents(skin)
     for driven in range(rows):
