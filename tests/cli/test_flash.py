@@ -193,7 +193,7 @@ def test_a_board_that_stays_silent_is_said(
 def test_a_port_that_does_not_come_back_is_said(
     run: Run, attach: Attach, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flash_command, "REBOOT_S", 0.3)
+    monkeypatch.setattr(flash_command, "SILENCE_TIMEOUT_S", 0.3)
     attach(("/dev/ttyACM77", "uno"))
     assert "no port /dev/ttyACM77" in failed(run)
 

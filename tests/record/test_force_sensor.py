@@ -193,7 +193,7 @@ def test_lines_that_are_no_numbers_are_counted(sketch: PtySensor) -> None:
 
 
 def test_a_sensor_that_falls_silent(sketch: PtySensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.2)
+    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_TIMEOUT_S", 0.2)
     with ForceSensor(sketch.path) as sensor:
         sketch.print(b"\n1\n")
         samples: list[ForceSample] = []
@@ -421,7 +421,7 @@ def test_whatever_ends_a_recording_with_forces_it_is_whole(
 def test_sensors_that_say_nothing(
     run: Run, sketch: PtySensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_S", 0.5)
+    monkeypatch.setattr("ohmskin.record.force_sensor.SILENCE_TIMEOUT_S", 0.5)
 
     def recorded(force_port: str, *options: str) -> Done:
         file = str(tmp_path / "a.mcap")

@@ -46,7 +46,8 @@ COMPRESSION_SHARE: Final = 0.2
 MAX_SPAN_S: Final = 6 * 3600.0
 # Both must have measured together for so long. Chosen: shorter stretches are alike by chance.
 MIN_OVERLAP_S: Final = 15.0
-# And for this share of the shorter one. Chosen for the same reason.
+# They must also have measured together for this share of the shorter one. Chosen: a short part of
+# two long sessions is alike by chance, too.
 MIN_OVERLAP_SHARE: Final = 0.5
 # A smaller r is that of sessions that have nothing in common (tests/calibrate/test_alignment.py).
 MIN_CORRELATION: Final = 0.6
@@ -55,6 +56,7 @@ MIN_CORRELATION: Final = 0.6
 # presses are irregular, and from 0.74 on where they repeat evenly.
 MAX_SECOND_SHARE: Final = 0.7
 # Two sums of products that differ by less than this share are the same but for the FFT's rounding.
+# Chosen: a double has sixteen digits, and a sum of many products loses a few of them.
 _ROUNDING_SHARE: Final = 1e-9
 
 

@@ -44,7 +44,7 @@ VALLEY_LOG: Final = np.log(5.0)
 # What rises by less than this share of the strongest rise is noise, whose logarithm would have
 # valleys without end. Chosen: far below what a light touch shows.
 _NOISE_SHARE: Final = 1e-3
-# Stands for a cell, or a press, where a scan has none.
+# Stands for a cell, or a press, where a scan has none. Chosen: no index is negative.
 _NOTHING: Final = -1
 
 

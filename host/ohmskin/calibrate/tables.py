@@ -36,26 +36,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.rules import require_forces, require_rows
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.files import PathName, naming, read_bounded, save_table
 from ohmskin.force.calibration import MAX_NUMBER
 from ohmskin.record.readings import MAX_CELLS
 
 # A larger file is not read. Chosen: an hour of a sensor at 1 kHz, with columns of other things.
 MAX_TABLE_BYTES: Final = 100_000_000
-# A larger conductance is a number in another unit: a cell of 1 ohm has less than its wires.
-MAX_SIEMENS: Final = 1.0
 # A message shows so many characters of what stands in the file. Chosen: one line of a terminal.
-_SHOWN: Final = 60
+_SHOWN_CHARS: Final = 60
 
 # Fewer samples of a force are no session of presses. Chosen: a fast sensor makes more in a press.
 MIN_SAMPLES: Final = 10
-# A step between two samples is a gap, in which the force is not known, if it is longer than `GAP_S`
-# and than `GAP_STEPS` median steps. Chosen: slow sensors have long steps, fast ones short hiccups.
+# A step between two samples is a gap, in which the force is not known, if it is longer than this
+# and than `GAP_STEPS`. Chosen: a fast sensor's hiccups are shorter, and no gaps.
 GAP_S: Final = 0.5
+# A gap is also longer than so many median steps. Chosen: the steps of slow sensors are long, and
+# are no gaps.
 GAP_STEPS: Final = 10.0
-# A sensor's noise about zero goes below it by `NEGATIVE_N`, or by `NEGATIVE_SHARE` of the largest
-# force. Chosen: a load cell that was zeroed stays within.
+# A force may be negative by this, which is a sensor's noise about zero. Chosen: a load cell that
+# was zeroed stays within.
 NEGATIVE_N: Final = 0.05
+# A force may also be negative by this share of the largest force. Chosen: the zero of a load cell
+# moves with the force that it has borne.
 NEGATIVE_SHARE: Final = 0.02
 
 _CELL: Final = ("row", "column")
@@ -149,7 +152,8 @@ def load_press_table(path: PathName) -> PressTable:
                 must = f"a whole number from 0 to {MAX_CELLS - 1}"
                 require_rows(name, values, whole, must, rows)
             else:
-                of_cell = (values >= 0) & (values <= MAX_SIEMENS)
+                # Estimators state no more: a larger conductance is a number in another unit.
+                of_cell = (values >= 0) & (values <= MAX_CELL_SIEMENS)
                 must = "0 to 1 S: of microsiemens, write 1e-6 times as much"
                 require_rows(name, values, of_cell, must, rows)
             table[name] = values
@@ -215,13 +219,13 @@ def _places(
     ours = [*needed, *(optional or ())]
     for name in needed:
         if name not in names:
-            shown = ",".join(header)[:_SHOWN]
+            shown = ",".join(header)[:_SHOWN_CHARS]
             hint = ": separate columns by commas" if re.search("[;\t]", shown) else ""
             must = f"row 1 must be the header {','.join(needed)}, it is {shown!r}{hint}"
             raise ValueError(f"no column {name}{_UNITS.get(name, '')}: {must}")
     for title, name in zip(header, names, strict=True):
         if name not in ours and optional is not None:
-            named = f"unknown column {title[:_SHOWN]!r}"
+            named = f"unknown column {title[:_SHOWN_CHARS]!r}"
             raise ValueError(f"{named}: leave it out; known are {', '.join(ours)}")
         if name in ours and names.count(name) > 1:
             raise ValueError(f"column {name} stands twice")
@@ -235,5 +239,5 @@ def _number(cell: str, name: str, row: int) -> float:
         number = math.nan
     if not abs(number) <= MAX_NUMBER:
         must = "write a finite number, with a point and no comma, or leave the row out"
-        raise ValueError(f"row {row}: {name} is {cell[:_SHOWN]!r}: {must}")
+        raise ValueError(f"row {row}: {name} is {cell[:_SHOWN_CHARS]!r}: {must}")
     return number

@@ -21,7 +21,7 @@ from typer import Argument, Option
 import ohmskin
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
-from ohmskin.link.device import scans_for
+from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES
 from ohmskin.link.serial_port import SerialPort, serial_ports
@@ -36,10 +36,8 @@ _BOARDS: Final = {
 }
 _ROOT: Final = Path(__file__).parents[3]
 _FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # there is none but in a wheel
-# A flashed board must answer within this time [s]. Chosen: it is in its boot loader for up to 3 s,
-# and its port may be gone meanwhile.
-REBOOT_S: Final = 5.0
-# It is looked for so often meanwhile [s]. Chosen: short beside 3 s.
+# Time between two tries to open a board that was flashed [s]. Chosen: short beside the 3 s that it
+# may be in its boot loader.
 _RETRY_S: Final = 0.2
 
 # Where commands print what people read. No line is broken, so that a pipe gets messages whole.
@@ -241,8 +239,12 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
 
 
 def _answer(port: str) -> Hello:
-    """What the flashed board says of itself."""
-    deadline_s = time.monotonic() + REBOOT_S
+    """What the flashed board says of itself.
+
+    As after every reset, it counts as lost after `SILENCE_TIMEOUT_S`: it is in its boot loader for
+    up to 3 s, and its port may be gone meanwhile.
+    """
+    deadline_s = time.monotonic() + SILENCE_TIMEOUT_S
     while True:
         try:
             with ohmskin.open(port, start=False) as skin:

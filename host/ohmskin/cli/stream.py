@@ -42,7 +42,8 @@ _COLOURS: Final = ("grey50", "cyan", "green", "yellow", "red")
 # Time between two pictures in a terminal [s]. Chosen: an estimate takes time, and nobody reads more
 # numbers. Scans in between are counted, and not estimated.
 DISPLAY_EVERY_S: Final = 0.1
-# The same in a file or pipe [s], where pictures are kept.
+# Time between two pictures in a file or a pipe [s]. Chosen: pictures are kept there, and ten times
+# fewer can still be read.
 _PRINT_EVERY_S: Final = 1.0
 
 

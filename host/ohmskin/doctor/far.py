@@ -29,7 +29,7 @@ wires follow from u and A. So the cells, A and the wires are computed in turn, `
 
 The readings alone do not determine n segments. They are taken to scatter about their mean m:
 
-    cost(r) = |(u - A r) / s|^2 + |(r - m) / (SPREAD m)|^2
+    cost(r) = |(u - A r) / s|^2 + |(r - m) / (SPREAD_SHARE m)|^2
 
 With m free, this gives the segments of a sound line. With the usual m of the layer, and one segment
 that may have any resistance, it finds a bad segment.
@@ -58,7 +58,7 @@ from ohmskin.estimate.prior import SEGMENT_STD
 from ohmskin.link.protocol import ADC_BITS, LARGEST_CODE
 
 # [1] Segments of a line scatter by this share of their mean. Chosen: twice what estimators expect.
-SPREAD: Final = 2 * SEGMENT_STD
+SPREAD_SHARE: Final = 2 * SEGMENT_STD
 # [1] A, and with it A r, is known to this share. Chosen: what is left after ROUNDS.
 MODEL_STD: Final = 0.01
 # [rounds] Each multiplies the error of A by the share of the wires in a port's resistance. Chosen:
@@ -219,11 +219,11 @@ class _Layer:
     def _fit_alike(self) -> Fit:
         """Segments that scatter about the mean of their line. The mean may be anything."""
         # What each segment has if all of a line are equal: one unknown a line, by least squares. It
-        # is near m, and stands for it in SPREAD m: so the cost stays a square.
+        # is near m, and stands for it in SPREAD_SHARE m: so the cost stays a square.
         both_sides = (self._weighed @ self.loss_ohm[..., None]).sum(axis=1)
         precision = (self._weighed @ self.current_share).sum(axis=(1, 2))
         equal_ohm = (both_sides / precision[:, None])[..., None]
-        per_square_ohm = (SPREAD * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
+        per_square_ohm = (SPREAD_SHARE * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
         # This matrix takes the mean out of r, so that only differences from it cost something.
         count = len(self.across)
         return self._fit(equal_ohm, per_square_ohm * (np.eye(count) - 1 / count))
@@ -236,7 +236,7 @@ class _Layer:
         """
         count = len(self.across)
         bound = (1 - np.eye(count + 1, count))[:, None, None]  # 0: this segment is free
-        prior = (SPREAD * usual_ohm) ** -2.0 * np.eye(count) * bound
+        prior = (SPREAD_SHARE * usual_ohm) ** -2.0 * np.eye(count) * bound
         return self._fit(np.full((1, 1, 1), usual_ohm), prior)
 
     def _floating_cost(self) -> Float:

@@ -27,7 +27,7 @@ TURNS: Final = 5
 # [s] Such a look takes this long. Chosen: in longer ones, a hand drifts more.
 TURN_S: Final = 0.3
 # [1] A look at slow scans takes up to this many times as long. Chosen: all looks within 10 s.
-LONGEST: Final = 2.0
+LONGEST_TIMES: Final = 2.0
 
 
 class Step(Enum):
@@ -158,5 +158,5 @@ def _scan(device: Device, scans: list[Scan], seconds: float) -> None:
     A board that scans slowly gets more time, since a few scans do not show noise.
     """
     least_s = (LEAST_SCANS - 1) / device.info.rate_hz
-    for scan in scans_for(device, min(max(seconds, least_s), LONGEST * seconds)):
+    for scan in scans_for(device, min(max(seconds, least_s), LONGEST_TIMES * seconds)):
         scans.append(scan)

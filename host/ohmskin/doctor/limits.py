@@ -5,18 +5,21 @@ from typing import Final
 
 # How many standard deviations a value must be off before it is a finding. The more values are
 # looked at, the further off one of them is by chance. The shares are those of normal errors.
-# [deviations] Of one value, or of some ten such as lines: one of 2,000 is that far off.
+# [deviations] One value, or one of some ten such as lines, is a finding beyond this. Chosen: by
+# chance, one of 2,000 is that far off.
 FEW_STDS: Final = 3.5
-# [deviations] Of hundreds of values, such as cells or segments: one of 1.7 million is.
+# [deviations] One of hundreds of values, such as cells or segments, is a finding beyond this.
+# Chosen: by chance, one of 1.7 million is that far off.
 MANY_STDS: Final = 5.0
-# [deviations] Of all 1,024 readings of the largest scan: one of 500 million is.
+# [deviations] One of all 1,024 readings of the largest scan is a finding beyond this. Chosen: by
+# chance, one of 500 million is that far off.
 ALL_STDS: Final = 6.0
 
 # [LSB] Offset of a sound converter, and as much gain error at full scale (ATmega328P data sheet,
 # ADC characteristics: 2 LSB each).
 ADC_ERROR_LSB: Final = 2.0
-# [LSB] Rounding to a code is off by up to half of one. Hum of a smaller amplitude is not reported,
-# and scatter is taken to be at least this, since rounding may hide it.
+# [LSB] Rounding to a code is off by up to half of one, by definition. Hum of a smaller amplitude is
+# not reported, and scatter is taken to be at least this, since rounding may hide it.
 ROUNDING_LSB: Final = 0.5
 # [LSB] A board with more noise in its usual cell is noisy, and so is a single line or cell with
 # more. Chosen: nearly twice that of a sound one.

@@ -42,7 +42,8 @@ from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import ADC_BITS
 
-FULL: Final = 1 << ADC_BITS  # [LSB] Vdd, as a code: the board's converter says so.
+# [LSB] A voltage of Vdd, in codes (adc_bits of frames.toml).
+FULL_LSB: Final = 1 << ADC_BITS
 
 # [S] Where the plate has no resistor, a bridge conducts more than this, and than TOUCH_STDS
 # deviations. Chosen: 1 MOhm, far above what a plate's resistors are.
@@ -123,12 +124,12 @@ class PlateExam:
             if examine_settling(usual, settled, diagnosis, self.tolerance.settling_lsb):
                 scans = settled
         knowledge = SkinKnowledge.of(scans.board, nominal_wire_ohm=self.wire_ohm)
-        shown = circuit.READING_SIGN * (scans.mean + 0.5 - FULL * circuit.READING_OFFSET)
+        shown = circuit.READING_SIGN * (scans.mean + 0.5 - FULL_LSB * circuit.READING_OFFSET)
         self.shown_lsb = self._in_order(shown, knowledge, diagnosis)
         knowledge = self._with_references(knowledge, diagnosis)
         as_is = self._examine_cells(_estimate(self.shown_lsb, knowledge), diagnosis)
         ratio = circuit.readings(self._skin(as_is, knowledge))
-        self.predicted_lsb = FULL * circuit.READING_SIGN * (ratio - circuit.READING_OFFSET)
+        self.predicted_lsb = FULL_LSB * circuit.READING_SIGN * (ratio - circuit.READING_OFFSET)
         self._examine_lines(diagnosis)
 
     def _examine_signal(self, evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
@@ -137,7 +138,7 @@ class PlateExam:
         for look in (usual, *evidence.clocks):
             if look is not None:
                 # An offset may clip readings that are as near to Vdd or ground.
-                lit = np.abs(look.mean - FULL / 2) < FULL / 2 - self.tolerance.offset_lsb
+                lit = np.abs(look.mean - FULL_LSB / 2) < FULL_LSB / 2 - self.tolerance.offset_lsb
                 variance = noise_variance(look.codes)[lit]
                 noise_lsb = float(np.mean(variance)) ** 0.5 if lit.any() else 0.0
                 self.noise_lsb.setdefault(look.board.adc_prescaler, noise_lsb)
@@ -169,7 +170,7 @@ class PlateExam:
         bad = np.logical_or(*self._open_and_bridged(estimate))
         siemens = np.where(bad, estimate.cell_siemens, self.plate)
         port_ohm = circuit.port_resistance_ohm(self._skin(siemens, board))
-        share = self.shown_lsb / FULL
+        share = self.shown_lsb / FULL_LSB
         top = share[..., circuit.READING_SENSES_TOP].mean(axis=2)
         bottom = share[..., ~circuit.READING_SENSES_TOP].mean(axis=2)
         of_plate = 1 - top - bottom
@@ -254,7 +255,7 @@ class PlateExam:
 
 def _estimate(shown_lsb: Float, knowledge: SkinKnowledge) -> Estimate:
     """What `joint` estimates from s."""
-    ratio = np.clip(circuit.READING_OFFSET + circuit.READING_SIGN * shown_lsb / FULL, 0.0, 1.0)
+    ratio = np.clip(circuit.READING_OFFSET + circuit.READING_SIGN * shown_lsb / FULL_LSB, 0.0, 1.0)
     return make_estimator("joint", knowledge).estimate(ratio)
 
 

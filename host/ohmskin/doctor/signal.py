@@ -74,7 +74,8 @@ LEAST_LOOK_HZ: Final = 4.0
 # Hum.
 # [Hz] The world has these mains (IEC 60038).
 MAINS_HZ: Final = (50.0, 60.0)
-# [Hz] They are looked for so far off: a board's ceramic resonator is off by up to 0.5 %.
+# [Hz] They are looked for so far off: a board's ceramic resonator is off by up to 0.5 %, as
+# `messages.MAX_RATE_ERROR` says. Chosen: steps so fine that no tone falls between two.
 MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)
 # [deviations] P of hum is above that of noise by this many, if all readings were independent. The
 # four readings of a cell round alike, so that it is half as many. Chosen: 5 of these.
@@ -83,7 +84,7 @@ HUM_OVER_NOISE: Final = 10.0
 # are not. Chosen: in noise, the largest of some is about twice the usual one.
 HUM_OVER_BESIDE: Final = 3.0
 # [1 / duration] Frequencies beside a tone. A Hann window's main lobe ends at 2 (Harris 1978).
-BESIDE: Final = (-7, -6, -5, -4, 4, 5, 6, 7)
+BESIDE_BINS: Final = (-7, -6, -5, -4, 4, 5, 6, 7)
 # [1] From this |m|^2 on, a sine and its mirror image cannot be separated. Chosen: what separates
 # them divides noise by 1 - |m|^2, too.
 OVERLAP: Final = 0.5
@@ -309,7 +310,7 @@ def _hum_at(mains_hz: float, scans: Look) -> Hum | None:
         of_power = float(np.mean(np.abs(sine) ** 2)) / power  # |a|^2 over |c|^2
     of_noise = 4 * float(np.mean((scans.codes - scans.mean) ** 2) * np.sum(scans.window**2))
     lsb = max(of_power * (power - of_noise), 0.0) ** 0.5
-    beside_hz = hz + np.array(BESIDE) / np.ptp(scans.time_s)
+    beside_hz = hz + np.array(BESIDE_BINS) / np.ptp(scans.time_s)
     beside = np.median([scans.power(at_hz) for at_hz in beside_hz])
     over_noise = power > of_noise * (1 + HUM_OVER_NOISE / c.size**0.5)
     if lsb > ROUNDING_LSB and over_noise and power > HUM_OVER_BESIDE * beside:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from io import DEFAULT_BUFFER_SIZE
 
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
@@ -21,9 +21,6 @@ from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
 from ohmskin.link.serial_port import READ_TIMEOUT_S
 from ohmskin.link.session import Session
-
-# So many bytes of commands are taken from a pseudo-terminal at once: Linux keeps no more for us.
-_READ_BYTES: Final = 4096
 
 
 class _Running:
@@ -184,7 +181,8 @@ class PtyServer(_Running, Closing):
                 wake_s = min(now_s + READ_TIMEOUT_S, end_s, self.board.next_scan_s or end_s)
                 if select.select([self._master], [], [], max(0.0, wake_s - self.now_s()))[0]:
                     self._write(self.board.heard(self._faults, self.now_s()))
-                    self.board.receive(os.read(self._master, _READ_BYTES))
+                    # More than a pseudo-terminal keeps: Linux has 4096 bytes for us.
+                    self.board.receive(os.read(self._master, DEFAULT_BUFFER_SIZE))
 
     def _write(self, octets: bytes) -> None:
         taken = 0

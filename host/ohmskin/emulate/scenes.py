@@ -17,27 +17,31 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SkinFaults
 
-# Medians of an untouched cell, and of the wire segments of rows and of columns [ohm]. Chosen: in
-# the range of a knitted skin.
+# Median of the untouched cells [ohm]. Chosen: in the range of a knitted skin.
 REST_OHM: Final = 1.0e6
+# Median of the wire segments of rows [ohm]. Chosen: in the range of a knitted skin.
 TOP_WIRE_OHM: Final = 100.0
+# Median of the wire segments of columns [ohm]. Chosen: other than that of rows, so that layers that
+# are confused show.
 BOTTOM_WIRE_OHM: Final = 200.0
 # Cells and segments scatter about their medians by this share: it is the standard deviation of
-# their logarithm. Chosen.
+# their logarithm. Chosen: no two are alike, and a cell at rest is far from a touched one.
 _SPREAD_SHARE: Final = 0.1
 # Touches begin at this time [s]. Chosen: who tares before, tares the untouched skin.
 BEGIN_S: Final = 3.0
 # Those of the scene "corners" begin at this time [s]. Chosen: the doctor has examined the untouched
 # skin by then, behind a boot loader too, and waits for presses of corners.
 _CORNERS_BEGIN_S: Final = 8.0
-# In the scene "corners", each rectangle is pressed for this time [s]. Chosen.
+# In the scene "corners", each rectangle is pressed for this time [s]. Chosen: long enough for
+# several of the doctor's looks of 0.3 s.
 _CORNERS_HELD_S: Final = 1.5
 # Its three touches: resistance [ohm], and how often in a second it trembles, as a finger does [Hz].
 # Chosen so that no two tremble together.
 _CORNERS_OHM_HZ: Final = ((5e3, 3.1), (8e3, 4.7), (6e3, 6.1))
-# Conductances of these touches tremble by this share to either side. Chosen.
+# Conductances of these touches tremble by this share to either side. Chosen: enough to tell the
+# three apart, and no touch ends by it.
 _TREMBLE_SHARE: Final = 0.05
-# In the scene "moving", a finger goes round in this time [s]. Chosen.
+# In the scene "moving", a finger goes round in this time [s]. Chosen: an eye can follow it.
 _MOVING_PERIOD_S: Final = 4.0
 # Its pressure falls off from its middle as a normal density of this standard deviation [cells].
 # Chosen: it then covers some 15 cells.

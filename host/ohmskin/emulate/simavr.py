@@ -31,10 +31,11 @@ PROGRAM: Final = _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
 # Requests and replies begin with an operation (u8) and the length of what follows (u32):
 # firmware/sim/README.md.
 _HEADER: Final = struct.Struct("<BI")
-# Added to the number of rows in the request "C", this says that far ends are in its matrix, too.
+# Added to the number of rows in the request "C", this says that far ends are in its matrix, too
+# (HAS_FAR of firmware/sim/control.c).
 _FAR_ENDS: Final = 0x80
 # A simulator whose pipes are closed ends at once. One that has not after this time [s] hangs, and
-# is killed. Chosen.
+# is killed. Chosen: long even for a machine that is busy.
 _EXIT_TIMEOUT_S: Final = 2.0
 # While touches move, the simulator is told a new skin every so often [s]. Chosen: a scan at 90 Hz
 # takes 11 ms, and solving a skin of 16x16 some milliseconds.

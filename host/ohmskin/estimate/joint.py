@@ -45,7 +45,8 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 from ohmskin.estimate.wire_belief import LearnedWires, WireBelief
 
-# `make ablate` tries half, twice and none of both numbers; docs/estimate.md says what each earns.
+# Both numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
+# table "What each number earns" of docs/estimate.md says what came of it.
 
 # Fits of the rest readings, each about the median of the one before.
 REST_FITS: Final = 3

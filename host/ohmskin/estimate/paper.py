@@ -57,12 +57,12 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.ctrl_c import ctrl_c_kept
 from ohmskin.estimate.base import Estimator, Solution
-from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.matrix import CellFit, solve_ports
 from ohmskin.estimate.port_faults import FAULT_STDS, cell_of
 from ohmskin.estimate.port_readings import PortReadings
 
-# The costs of the paper are in megohm (docs/paper.md says why).
+# Ohms in a megohm, by definition: the costs of the paper are in megohm (docs/paper.md says why).
 OHM_PER_MEGOHM: Final = 1e6
 # In which configurations the top pin is high. Where no current flows, a reading is 1 if its node is
 # at the pin that is high. So the top pin is high if the top node reads 1, or the bottom node 0.
@@ -71,9 +71,8 @@ TOP_IS_HIGH: Final = (READING_OFFSET > 0) == READING_SENSES_TOP
 # Most cells. Chosen: there are 20 N^2 variables, and 64 cells take 1.9 GB and 25 s a step
 # (docs/paper.md).
 MAX_CELLS: Final = 64
-# Least and highest of any resistance. Chosen: an ohm, as `knowledge.MAX_CELL_SIEMENS`, and twenty
-# cells at rest in series.
-MIN_MEGOHM: Final = 1e-6
+# Highest of any resistance; the least is that of `MAX_CELL_SIEMENS`, an ohm. Chosen: twenty cells
+# at rest in series.
 MAX_MEGOHM: Final = 20.0
 # Most iterations of Ipopt in a step. Chosen: the frames of docs/paper.md that converge take fewer.
 MAX_ITERATIONS: Final = 300
@@ -386,7 +385,7 @@ class Program:
         }
         # Bounds of the variables: resistances have some, potentials none. All laws must be zero.
         is_resistance = np.tile(np.arange(5 * cells) < 3 * cells, len(states))
-        least = np.where(is_resistance, np.log(MIN_MEGOHM), -np.inf)
+        least = np.where(is_resistance, -np.log(OHM_PER_MEGOHM * MAX_CELL_SIEMENS), -np.inf)
         most = np.where(is_resistance, np.log(MAX_MEGOHM), np.inf)
         self._bounds = {"lbx": least, "ubx": most, "lbg": 0.0, "ubg": 0.0}
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 
-# `make ablate` tries half, twice and none of each number; docs/estimate.md says what each earns.
+# All numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
+# table "What each number earns" of docs/estimate.md says what came of it.
 # _STD and _LOG: a deviation and a difference of the log of a resistance, where 0.1 is about 10 %.
 # _STDS: a number of standard deviations.
 

@@ -69,7 +69,8 @@ from ohmskin.estimate.wire_belief import Lesson, WireBelief
 Cells = NDArray[np.intp]
 NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
-# `make ablate` tries half, twice and none of each number; docs/estimate.md says what each earns.
+# All numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
+# table "What each number earns" of docs/estimate.md says what came of it.
 
 # Touches for each line, on average, that are still few; a fingertip covers more.
 MAX_TOUCHES_PER_LINE: Final = 0.5

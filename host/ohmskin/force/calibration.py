@@ -50,8 +50,10 @@ from ohmskin.link.protocol import FRAMES, MODES
 from ohmskin.record.readings import MAX_CELLS
 
 FORMAT: Final = "ohmskin calibration"
+# Version of the file's layout, which is described above; a file of another one is refused. Chosen:
+# the first layout counts as 1.
 SCHEMA: Final = 1
-# A larger file is not read: `MAX_CELLS` cells of 13 fields take about 1 MB.
+# A larger file is not read. Chosen: `MAX_CELLS` cells of 13 fields take about 1 MB.
 MAX_FILE_BYTES: Final = 4_000_000
 # No number of a file is larger. Chosen: far beyond any force, time or conductance in any unit, and
 # the slope of any power law in siemens; and sums of its square do not overflow.

@@ -9,8 +9,8 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 
-# A contact moves by at most so many cells between two scans: at 30 Hz, a finger at 0.5 m/s passes
-# over 1.7 cells of 1 cm. What is farther away is another contact.
+# A contact moves by at most so many cells between two scans. Chosen: at 30 Hz, a finger at 0.5 m/s
+# passes over 1.7 cells of 1 cm. What is farther away is another contact.
 FARTHEST_CELLS: Final = 2.0
 # A contact that is gone for less time [us] stays the same. Chosen: a light touch flickers about its
 # threshold for some scans, and no finger comes back to a place within a tenth of a second.

@@ -36,9 +36,11 @@ from ohmskin.arrays import Bool, Float
 
 LINEAR: Final = "linear"
 POWER: Final = "power"
-# The smallest and largest exponents that a fit may give. Chosen: presses of known skins lie well
-# inside, and a fit that runs into one of them has found no curve.
+# The smallest exponent that a fit may give. Chosen: presses of known skins lie well above, and a
+# fit that runs into it has found no curve.
 MIN_EXPONENT: Final = 0.2
+# The largest exponent that a fit may give: the reciprocal of the smallest, because a curve and its
+# inverse are limited alike.
 MAX_EXPONENT: Final = 1 / MIN_EXPONENT
 
 

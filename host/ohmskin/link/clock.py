@@ -54,7 +54,8 @@ FIT_WINDOW_S: Final = 30.0
 # by as much, and a host that slept for a shorter time can be followed by the slow way.
 CLOCK_STEP_S: Final = 0.05
 # Of each block of so much board time only the point that came earliest is kept: the others do not
-# change the line, and 120 points are fitted in no time. Chosen.
+# change the line, and 120 points are fitted in no time. Chosen: a block has scans enough for one
+# that came early.
 _BLOCK_S: Final = 0.25
 # The difference between the old line and a better one fades within this time. Chosen: its largest
 # value, `CLOCK_STEP_S`, is then 5 % of the time that passes, so times go on rising.

@@ -23,8 +23,10 @@ from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 # What a program may want in its log: restarts and boards that go are warnings, missed scans infos.
 LOG = logging.getLogger("ohmskin")
 LOG.addHandler(logging.NullHandler())
-# A device that should scan and is silent for so long, and two scans, counts as lost [s]. Chosen: a
-# board that was reset is in its boot loader for 2 s, and then has to be started again.
+# A board or a force sensor that is silent for so long counts as lost [s]; a board that should scan
+# has the time of two scans more. Chosen: an Arduino that was reset, as by opening its port, is in
+# its boot loader for 2 to 3 s. Then a board has to be started, and a sensor's sketch zeroes the
+# sensor.
 SILENCE_TIMEOUT_S: Final = 5.0
 # So many scans are kept for an iterator that is slower than the board. Chosen: 11 s at 90 Hz, which
 # is longer than a program's pause for a file or a picture.

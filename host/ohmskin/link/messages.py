@@ -26,11 +26,11 @@ _DROPPED_SPAN = _SCAN.span("dropped")
 # up to 0.5 % off (data sheet of Murata's CSTCE16M0V53, which an Arduino Uno has), a crystal 0.01 %;
 # a fifth more is left for delays.
 MAX_RATE_ERROR = 0.006
-# No sound board says that a scan takes longer: the largest skin at the longest settle time takes
-# 3.2 s. Chosen, not a number of the protocol, as is the next one.
+# No sound board says that a scan takes longer. Chosen: three times the 3.2 s of the largest skin at
+# the longest settle time; the protocol has no such number.
 _MAX_SCAN_S = 10
-# No sound board says that it has a larger reference resistor: through one, the leakage of the
-# converter's input, 1 uA at most by the ATmega328P's data sheet, would be all that is read.
+# No sound board says that it has a larger reference resistor. Chosen: through one, the leakage of
+# the converter's input, 1 uA at most by the ATmega328P's data sheet, would be all that is read.
 _MAX_REF_OHM = 10_000_000
 
 

@@ -197,7 +197,8 @@ READINGS_PER_CELL = CONSTANTS["readings_per_cell"]
 # A scan passes over all cells so often, and takes `readings_per_pass` of each cell every time.
 _PASSES = READINGS_PER_CELL // CONSTANTS["readings_per_pass"]
 ADC_BITS = CONSTANTS["adc_bits"]
-LARGEST_CODE = (1 << ADC_BITS) - 1  # of the converter, for a voltage of Vdd
+# The converter's largest code, for a voltage of Vdd (adc_bits of frames.toml).
+LARGEST_CODE = (1 << ADC_BITS) - 1
 # What each bit of a code counts, the least significant one first.
 _BIT_VALUES = 1 << np.arange(ADC_BITS, dtype=np.uint16)
 

@@ -26,7 +26,7 @@ _WRITE_TIMEOUT_S: Final = 2.0
 USB_SERIAL: Final = Path("/sys/bus/usb-serial/devices")
 # Boards by the USB ids of Arduino's product, under both of its vendor ids (boards.txt of its AVR
 # core). Other makers' boards have ids of USB bridges, which do not tell what is behind them.
-_ARDUINO: Final = (0x2341, 0x2A03)
+_ARDUINO_VENDORS: Final = (0x2341, 0x2A03)
 _BOARDS: Final = {0x0001: "uno", 0x0043: "uno", 0x0010: "megaatmega2560", 0x0042: "megaatmega2560"}
 
 
@@ -136,7 +136,7 @@ def serial_ports() -> list[SerialPort]:
         SerialPort(
             port.device,
             "" if port.description in (None, "n/a") else port.description,
-            _BOARDS.get(port.pid or 0, "") if port.vid in _ARDUINO else "",
+            _BOARDS.get(port.pid or 0, "") if port.vid in _ARDUINO_VENDORS else "",
         )
         for port in sorted(list_ports.comports(), key=lambda port: port.device)
     ]

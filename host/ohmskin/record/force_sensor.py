@@ -14,14 +14,12 @@ from typing import Final
 
 from ohmskin.errors import DeviceLost
 from ohmskin.files import Closing
+from ohmskin.link.device import SILENCE_TIMEOUT_S
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.record.recording import ForceSample
 
 # Speed of the sensor's line, unless the user says another. Chosen: that of most sketches.
 DEFAULT_BAUD: Final = 115_200
-# A sensor without a number for so long counts as lost. Chosen: opening the port resets an Arduino,
-# which is in its boot loader for 2 s, and then the sketch zeroes the sensor.
-SILENCE_S: Final = 5.0
 # Samples that are kept for a slow reader. Chosen: 25 s of an HX711, which makes 80 a second at most
 # (its data sheet).
 QUEUE_SAMPLES: Final = 2000
@@ -109,7 +107,7 @@ class ForceSensor(Closing):
         """The samples since the last call, `QUEUE_SAMPLES` at most, times rising. Never waits.
 
         :raises DeviceLost: there are none, and the sensor has gone, or has printed no number for
-            `SILENCE_S`.
+            `SILENCE_TIMEOUT_S`.
         """
         with self._changed:
             taken = list(self._waiting)
@@ -129,9 +127,11 @@ class ForceSensor(Closing):
         """Raise DeviceLost if no sample is to be expected any more."""
         if self._is_gone:
             raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
-        if time.monotonic() - self._last_s <= SILENCE_S:
+        if time.monotonic() - self._last_s <= SILENCE_TIMEOUT_S:
             return
-        trouble = f"no number from {self.path} for {SILENCE_S:g} s ({self.damaged} damaged lines)"
+        trouble = (
+            f"no number from {self.path} for {SILENCE_TIMEOUT_S:g} s ({self.damaged} damaged lines)"
+        )
         remedy = f"the force sensor must print one number a line, and that at {self._baud} baud"
         raise DeviceLost(trouble, remedy)
 

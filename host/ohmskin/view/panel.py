@@ -23,9 +23,9 @@ from ohmskin.view.boards import Shown, ViewedBoard
 
 # The close code of a websocket whose board was closed, by this page or another. Chosen from 4000 to
 # 4999, which RFC 6455 leaves to programs; page/wire.js knows it.
-_GONE: Final = 4001
-# No page's clock shows more [ms]. A page counts from its begin, and 1e15 ms are 30,000 years; a
-# number that JavaScript reads as infinite must not be sent back.
+_GONE_CODE: Final = 4001
+# No page's clock shows more [ms]. Chosen: a page counts from its begin, and 1e15 ms are 30,000
+# years; a number that JavaScript reads as infinite must not be sent back.
 _MOST_MS: Final = 1e15
 _Command = Callable[[], str]
 
@@ -66,8 +66,8 @@ class Panel:
             await self._news.wait()
             self._news.clear()
             if self._board.closing.is_set():
-                await self._socket.close(_GONE)
-                raise WebSocketDisconnect(_GONE)
+                await self._socket.close(_GONE_CODE)
+                raise WebSocketDisconnect(_GONE_CODE)
             state, shown = self._board.state(), self._board.shown
             if state != said:
                 said = state

@@ -36,7 +36,8 @@ from ohmskin.view.boards import LONGEST_TEXT_CHARS, ViewedBoards
 from ohmskin.view.panel import Panel
 
 _PAGE: Final = Path(__file__).parent / "page"
-# A page's message has at most so many bytes: those of a text of `LONGEST_TEXT_CHARS`, and of names.
+# A page's message has at most so many bytes. Chosen: a text of `LONGEST_TEXT_CHARS` has at most
+# 4000 in UTF-8, and names are added.
 _LONGEST_MESSAGE_BYTES: Final = 8192
 # Connections that are open when the server ends have so long to close [s]. Chosen: a page on this
 # machine takes milliseconds, and nobody likes to wait after Ctrl-C.
