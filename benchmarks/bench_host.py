@@ -26,7 +26,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -118,42 +118,31 @@ def latencies_ms(scans: int) -> Float:
     return np.array([1e3 * (at_s - board.said[str(n)]) for n, at_s in returned_s.items()])
 
 
-def reader_cpu_percent(
-    skin: ohmskin.Device, seconds: float, take: Callable[[Scan], object] = lambda scan: None
-) -> float:
-    """CPU time of this process per wall time while it reads every scan, and `take`s it."""
-    scans = iter(skin)
-    for _ in range(RATE_HZ):  # what is done once is not load
-        next(scans)
-    load = Load()
-    count = missed = 0
-    for scan in scans:
-        count += 1
-        missed += scan.missed
-        take(scan)
-        if load.seconds() >= seconds:
-            break
-    rate_hz, percent = count / load.seconds(), load.percent()
+def reader_cpu_percent(seconds: float, *, is_recorded: bool) -> float:
+    """CPU time of this process per wall time while it reads every scan, and perhaps records it."""
+    with ExitStack() as stack:
+        place = stack.enter_context(tempfile.TemporaryDirectory())
+        board = stack.enter_context(served(__file__))
+        skin = stack.enter_context(ohmskin.open(board.ports[0]))
+        recorder = Recorder(Path(place) / "bench.mcap", skin.info) if is_recorded else None
+        if recorder:
+            stack.enter_context(recorder)
+        scans = iter(skin)
+        for _ in range(RATE_HZ):  # what is done once is not load
+            next(scans)
+        load = Load()
+        count = missed = 0
+        for scan in scans:
+            count += 1
+            missed += scan.missed
+            if recorder:
+                recorder.add(scan)
+            if load.seconds() >= seconds:
+                break
+        rate_hz, percent = count / load.seconds(), load.percent()
     if missed or abs(rate_hz - RATE_HZ) > 1:
         print(f"{skin.name}: {rate_hz:.2f} scans a second, {missed} missed", file=sys.stderr)
     return percent
-
-
-def read_cpu_percent(seconds: float) -> float:
-    """`reader_cpu_percent` of a served board."""
-    with served(__file__) as board, ohmskin.open(board.ports[0]) as skin:
-        return reader_cpu_percent(skin, seconds)
-
-
-def record_cpu_percent(seconds: float) -> float:
-    """As `reader_cpu_percent`, of a process that records."""
-    with (
-        tempfile.TemporaryDirectory() as place,
-        served(__file__) as board,
-        ohmskin.open(board.ports[0]) as skin,
-        Recorder(Path(place) / "bench.mcap", skin.info) as recorder,
-    ):
-        return reader_cpu_percent(skin, seconds, recorder.add)
 
 
 def record_bytes_per_s(seconds: float) -> float:
@@ -179,8 +168,10 @@ def measure(part: Part) -> dict[str, float]:
     rate = decode_rate(blocks)
     latency = latencies_ms(part.of(LATENCY_SCANS))
     load_s, runs = part.share * LOAD_S, range(part.of(LOAD_RUNS))
-    cpu = statistics.median(read_cpu_percent(load_s) for _ in runs)
-    record_cpu = statistics.median(record_cpu_percent(load_s) for _ in runs)
+    cpu, record_cpu = (
+        statistics.median(reader_cpu_percent(load_s, is_recorded=is_recorded) for _ in runs)
+        for is_recorded in (False, True)
+    )
     return {
         "decode_scans_per_s": round(rate),
         "latency_ms_p50": round(float(np.percentile(latency, 50)), 3),
