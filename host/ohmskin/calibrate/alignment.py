@@ -34,7 +34,8 @@ from numpy.typing import ArrayLike
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.tables import ForceLog, between_gaps
 
-# Both are compared on a grid of this step. Chosen: as fine as the scans of most boards.
+# The recording and the force log are compared on a grid of this step. Chosen: as fine as the scans
+# of most boards.
 GRID_STEP_S: Final = 0.01
 # Standard deviation of the Gaussian that differentiates. Chosen: longer than a scan takes, shorter
 # than a press begins.
@@ -44,7 +45,8 @@ SMOOTHING_S: Final = 0.05
 COMPRESSION_SHARE: Final = 0.2
 # A longer recording or log is refused. Chosen: it would take memory that no session needs.
 MAX_SPAN_S: Final = 6 * 3600.0
-# Both must have measured together for so long. Chosen: shorter stretches are alike by chance.
+# The recording and the force log must have measured together for so long. Chosen: shorter stretches
+# are alike by chance.
 MIN_OVERLAP_S: Final = 15.0
 # They must also have measured together for this share of the shorter one. Chosen: a short part of
 # two long sessions is alike by chance, too.

@@ -24,7 +24,7 @@ Cells = tuple[tuple[int, int], ...]
 CERTAIN_S: Final = 0.3
 # A press is read over a window of so long. Chosen: noise averages out, and nobody loses patience.
 READING_S: Final = 1.0
-# And over so many scans at least. Chosen: fewer do not tell a change from noise.
+# A press is read over so many scans at least. Chosen: fewer do not tell a change from noise.
 MIN_READING_SCANS: Final = 8
 # Largest change from one half of the window to the other, as a share of the mean. Chosen: a
 # conductance that creeps by 30 % a decade of time changes by less from 2 s after the touch on.

@@ -24,7 +24,7 @@ WAIT_S: Final = 30.0
 # [looks] While corners are pressed, each settle time gets this many looks. Chosen: their scatter
 # shows how much the hand drifts.
 TURNS: Final = 5
-# [s] Such a look takes this long. Chosen: in longer ones, a hand drifts more.
+# [s] While corners are pressed, a look takes this long. Chosen: in longer ones, a hand drifts more.
 TURN_S: Final = 0.3
 # [1] A look at slow scans takes up to this many times as long. Chosen: all looks within 10 s.
 LONGEST_TIMES: Final = 2.0

@@ -60,10 +60,10 @@ LEAST_SCANS: Final = 2 * BLOCKS
 # [1] The second look has a settle time that is so many times as long. Chosen: four times as many
 # time constants, which no slow node survives.
 LONGER: Final = 4
-# [us] It is at least this long. Chosen: ten time constants of 10 us.
+# [us] The longer settle time is at least this. Chosen: ten time constants of 10 us.
 LEAST_LONGER_US: Final = 100
-# [us] In mode far it is at least this long: wires show as a few codes, so that a tenth counts.
-# Chosen: with less, far nodes keep a part of a code (docs/troubleshooting.md).
+# [us] In mode far, the longer settle time is at least this: wires show as a few codes, so that a
+# tenth counts. Chosen: with less, far nodes keep a part of a code (docs/troubleshooting.md).
 LONGER_FAR_US: Final = 300
 # [1] A settle time that is longer by less than this factor shows nothing new. Chosen: it changes
 # what a slow node lacks by less than that lack itself.

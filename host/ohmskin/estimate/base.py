@@ -22,8 +22,8 @@ from ohmskin.estimate.port_readings import PortReader, PortReadings
 # The conductance of a touched cell has risen by more than this. Chosen: half of what a cell of one
 # megohm conducts at rest, so that a drift by some percent is no touch.
 TOUCH_SIEMENS: Final = 0.5e-6
-# It has also risen by more than so many of its standard deviations. Chosen: by chance, one normal
-# error of 32,000 is larger.
+# The conductance of a touched cell has also risen by more than so many standard deviations. Chosen:
+# by chance, one normal error of 32,000 is larger.
 TOUCH_STDS: Final = 4.0
 
 

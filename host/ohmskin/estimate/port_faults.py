@@ -39,8 +39,8 @@ FAULT_STDS: Final = 5.0
 # Root of the mean square by which the readings of a cell disagree, over Vdd. If it is more for the
 # median cell, most cells are at fault. Chosen: the simulated desk (`make bench-desk`) stays below.
 MOST_CELLS_RATIO: Final = 0.016
-# The same for one cell: if it is more, this cell is at fault. Chosen: about twice as much, because
-# one of many cells is the worst even on a sound skin.
+# A cell is at fault if its readings disagree by more than this root mean square, over Vdd. Chosen:
+# about twice `MOST_CELLS_RATIO`, because one of many cells is the worst even on a sound skin.
 ONE_CELL_RATIO: Final = 0.03
 # In noise, a cell at fault also disagrees by more than so many times the median cell. The same
 # limit is used for the three readings that are left when one is taken out: they agree if they

@@ -22,14 +22,15 @@ from ohmskin.arrays import Float
 UNTOUCHED_STD: Final = 1.0
 # Deviation of a cell from the level of all cells, where nobody has rest readings.
 UNKNOWN_REST_STD: Final = 0.3
-# Drift of a cell since its rest readings.
+# Deviation of a cell from its rest readings, because it drifts.
 REST_STD: Final = 0.05
-# The hardest touch: a cell that conducts more is a short.
+# The hardest touch, of 300 ohm: a cell that conducts more is a short.
 HIGHEST_TOUCH_SIEMENS: Final = 1 / 300.0
 
 # A cell further from rest than so many deviations of its prior is touched.
 TOUCHED_STDS: Final = 2.0
-# What nobody knows of a touched cell's force before it is read: a factor of twenty, either way.
+# Deviation of a touched cell before it is read, because nobody knows how hard the touch is: a
+# factor of twenty, either way.
 UNLIMITED_STD: Final = 3.0
 # A rise that must not go unnoticed, and how well `touch` has to know a cell.
 HIDDEN_LOG: Final = 0.3
@@ -40,11 +41,12 @@ SOFT_CORRELATION: Final = 0.5
 
 # A wire segment of a layer whose nominal value nobody has told.
 UNKNOWN_WIRE_OHM: Final = 150.0
-# What all segments of such a layer share: a factor of two.
+# Deviation that all segments share, of a layer whose nominal value nobody has told: a factor of
+# two.
 UNKNOWN_LAYER_STD: Final = 0.7
-# What all segments of a layer share if its nominal value is told: stretch, temperature.
+# Deviation that all segments share, of a layer whose nominal value is told: stretch, temperature.
 LAYER_STD: Final = 0.3
-# What each segment has of its own.
+# Deviation of each segment from what its layer shares.
 SEGMENT_STD: Final = 0.1
 # Share of what is known of the layers that fades after each lesson, because skins bend.
 FADE_SHARE: Final = 0.1

@@ -68,7 +68,8 @@ COMMAND_TIMEOUT_S = 1.0
 # A scanning board that sends no valid frame for so long is asked who it is. Chosen: a board that is
 # reset and left alone says hello within 2 s, and only what stays silent has to be asked.
 _SPEED_LOST_S = 2.5
-# It is asked again after so long: a boot loader that took the question for an upload is done then.
+# A silent board is asked again after so long. Chosen: the Mega's boot loader, if it took the
+# question for an upload, waits for 5 s (see `ATTEMPTS_AFTER_RESET`), and then the firmware starts.
 _ASK_AGAIN_S = 6.5
 _BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
 
