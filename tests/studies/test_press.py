@@ -2,15 +2,11 @@
 """The press model, against analytic answers and its own claims; a skin that follows it."""
 
 from dataclasses import replace
-from itertools import islice
 
 import numpy as np
 import pytest
 
-from ohmskin.emulate.board import BoardSettings, EmulatedBoard
-from ohmskin.link.codes import quantise
 from press_scene import PressScene
-from stepped import stepped
 from studies.press import PressModel
 
 QUIET = PressModel(noise=0.0, drift=0.0, gain_spread=0.0, exponent_spread=0.0)
@@ -116,23 +112,3 @@ def test_a_robot_presses_one_cell_after_another() -> None:
         assert 0.4 < peaks[0] < 0.6
         assert 6 < peaks[-1] < 8.1
     assert not force_n[-1].any()
-
-
-def test_the_scene_answers_the_same_whenever_asked() -> None:
-    asked = [30.0, 4.0, 30.0, 3.0, 3.6]
-    scene, other = (PressScene(2, 2, seed=1) for _ in range(2))
-    first = [scene.ratio(t) for t in asked]
-    np.testing.assert_array_equal(first, [other.ratio(t) for t in asked])
-    np.testing.assert_array_equal(first[0], first[2])
-    assert (PressScene(2, 2, seed=2).ratio(3.6) != first[4]).any()
-
-
-def test_the_board_reads_the_forces() -> None:
-    """What is pressed conducts, and the scan says when it was."""
-    scene = PressScene(2, 2, seed=1)
-    scans = list(islice(stepped(EmulatedBoard(scene.ratio, BoardSettings(2, 2))), 1800))
-    for scan in scans[::97]:
-        np.testing.assert_allclose(scan.codes, quantise(scene.ratio(scan.time_us * 1e-6)), atol=1)
-    conducts = np.array([scan.ratio[0, 0, 1] for scan in scans])
-    force_n = np.array([scene.force_n(scan.time_us * 1e-6)[0, 0] for scan in scans])
-    assert conducts[force_n > 6].min() > 5 * np.median(conducts[force_n < 0.1])
