@@ -203,9 +203,10 @@ class _Layer:
         mean_ohm: mean of the segments, (..., 1, 1) [ohm].
         prior: inverse of their covariance before the readings, (..., n, n) [1 / ohm^2].
 
-        A right model costs about n - 1: n readings and n segments' prior, less n segments and one
-        mean, or one bad segment, that are free. A higher cost shows that the model is wrong by more
-        than s says. The covariance is widened by as much.
+        A right model costs about n - 1. There are 2 n terms, n of readings and n of the prior, and
+        n + 1 free numbers: the segments, and their mean. (With one bad segment, its term of the
+        prior is missing instead.) A higher cost shows that the model is wrong by more than s says.
+        The covariance is widened by as much.
         """
         covariance = np.linalg.inv(self._weighed @ self.current_share + prior)
         expected = prior.sum(axis=-1, keepdims=True) * mean_ohm

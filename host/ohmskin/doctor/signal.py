@@ -389,7 +389,7 @@ def second_look(board: Hello) -> dict[str, Any] | None:
     # Some rate between these shows every mains far from 0 Hz. A much slower one gives fewer scans.
     rates_hz = np.linspace(0.7, 1.0, 31) * fastest_hz
     best_hz = max(rates_hz, key=lambda rate_hz: min(_seen_hz(hz, rate_hz) for hz in MAINS_HZ))
-    rate_hz = max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)
+    rate_hz = max(round(float(best_hz), 3), CONSTANTS["rate_mhz_min"] / 1000)  # of mHz
     return {"settle_us": longer_us, "rate_hz": rate_hz}
 
 
@@ -423,7 +423,8 @@ def settling_values(usual: Look, settled: Look, change_lsb: float) -> dict[str, 
 
     change_lsb: the largest change.
 
-    From slot to slot, a node swings by S. In a slot of t seconds, what it lacks to its final
+    From slot to slot, a node swings by S: at most by the range of a cell's readings, which follow
+    each other. In a slot of t seconds, what it lacks to its final
     voltage falls by the factor exp(-t / tau). So at the slot's end the change e = S exp(-t / tau)
     is still to come, from which tau = t / ln(S / e). The time required leaves half of
     UNSETTLED_LSB: tau ln(2 S / UNSETTLED_LSB).
@@ -431,8 +432,8 @@ def settling_values(usual: Look, settled: Look, change_lsb: float) -> dict[str, 
     swing = float(np.ptp(settled.mean, axis=2).max())
     # Noise and a hand may change readings by more than a swing leaves: the log must stay above 0.
     remnant = min(change_lsb, 0.9 * swing)
-    slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
-    needed_us = usual.board.settle_us + 1e6 * slot_s(usual.board) * (slots - 1)
+    needed_slots = np.log(2 * swing / UNSETTLED_LSB) / np.log(swing / remnant)
+    needed_us = usual.board.settle_us + 1e6 * slot_s(usual.board) * (needed_slots - 1)
     return {
         "change_lsb": change_lsb,
         "settle_us": usual.board.settle_us,

@@ -15,8 +15,8 @@ h      (n,)      what an offset of one deviation adds to p: over I, so it differ
                  from port to port
 m      scalar    reference: mean segment of the layer, as first seen                ohm
 z      (n,)      the line's segments, in shares of m; y their mean                  1
-v      scalar    variance of z about y. Also taken for that of a line's mean about  1
-                 y, as if its segments deviated together: the worst case
+v      scalar    variance of a segment's own deviation, in shares of the mean. In   1
+                 the fit of t, a line as a whole gets the same: the worst case
 L, l   (n, n)    information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2; l is (n,)
 ====== ========= ================================================================== ==========
 

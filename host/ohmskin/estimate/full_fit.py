@@ -223,7 +223,7 @@ class FullFit:
         self._unnoticed, unnoticed_std = self._find_unnoticed(learned)
         if self._unnoticed.any():
             wider = np.where(self._unnoticed, unnoticed_std / cell_std, 1.0)
-            added = np.sqrt(wider[self._unnoticed] ** 2 - 1.0)
+            added = np.sqrt(wider[self._unnoticed] ** 2 - 1.0)  # (c'^2 / c^2 - 1)^1/2
             coupling = (whitened[:, :-2][:, self._unnoticed] * added).T @ whitened  # H^T O
             system = np.eye(len(added)) + coupling[:, :-2][:, self._unnoticed] * added
             correction = solve_lower(cholesky(system), coupling)
@@ -245,7 +245,7 @@ class FullFit:
         learned: l, the share of the prior's variance that the readings have removed, (RC,).
         """
         prior = self._prior
-        fitted_log = prior.expected - self.log_cells  # by how much the fit has it above rest
+        fitted_log = prior.expected - self.log_cells  # rise of the log conductance in the fit
         at_rest = np.abs(fitted_log) < prior.std
         # What the readings alone say. The fit is the product of two normals, the prior and theirs.
         # So it has moved the cell by l times the rise that they show, of variance c^2 (1 - l) / l.
@@ -257,7 +257,8 @@ class FullFit:
             # rest is then the prior's opinion alone, and it may have any force.
             unnoticed, rise_log = at_rest, np.maximum(rise_log, UNLIMITED_STD)
         else:
-            # Within two deviations, the rise may be one that matters; and it is more than noise.
+            # A touch may be unnoticed if the rise, two deviations up, would be one that matters,
+            # and if it is itself larger than one deviation.
             unnoticed = at_rest & (rise_log + 2 * rise_std > HIDDEN_LOG) & (rise_log > rise_std)
         # A normal about rest, of a deviation that reaches as far as the rise that the readings show
         # and one deviation of it further. Where they show next to nothing, it is very wide.

@@ -112,9 +112,9 @@ class LinePairs:
 
     Two shorted lines are one node, so their currents from every other line are the same. `compare`
     compares all pairs of lines in a frame. It counts, for each pair, the frames that were compared
-    since one has shown this pair apart, or was too noisy to tell. Frames that are not worth it
-    (`needs_frame`) neither add to a count nor end it, so short touches of the same two lines add
-    up.
+    since one has shown this pair apart, or was too noisy to tell. Other frames (`needs_frame` says
+    which) neither add to a count nor end it. This has a price: many short, even touches of the same
+    two lines may in the end look like a short. It saves comparing all pairs in most frames.
 
     high (lines,): which lines have clearly more current at all of their ports, as a short gives
     them. In a frame, that is more than the line itself had at rest; at rest, more than the median
@@ -155,8 +155,8 @@ class LinePairs:
         some pair is full: the frame may show this pair apart. Lines with fewer than three ports may
         be alike by chance.
         """
-        no_count_is_full = self._alike_frames.max() < ALIKE_FRAMES
-        return self._ports >= 3 and not (no_count_is_full and np.count_nonzero(high) < 2)
+        some_count_is_full = self._alike_frames.max() >= ALIKE_FRAMES
+        return self._ports >= 3 and bool(some_count_is_full or np.count_nonzero(high) >= 2)
 
     def compare(self, now: PortCurrents) -> None:
         """Count in a frame for all pairs of lines."""

@@ -164,7 +164,7 @@ def siemens_std(
     wider = np.expm1(REACH_STDS * layer_std) / (REACH_STDS * layer_std)
     up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * wires_log_std**2)
     # d log u = - r / (r + series) d log r. So at the limits the current is (1 +- off) u, and the
-    # whole resistance is (r + series) / (1 +- off). Without series, that is the cell's.
+    # whole resistance is (r + series) / (1 +- off). Less `series_ohm`, that is the cell's.
     off_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)
     off_up, off_down = up_std * off_per_std, np.minimum(log_std * off_per_std, 1.0 - 1e-6)
     lowest_ohm = (cell_ohm - off_up * series_ohm) / (1.0 + off_up)

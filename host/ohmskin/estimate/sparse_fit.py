@@ -393,8 +393,8 @@ class FewTouches:
 
         None if the readings reject these touches. They do so at ports where wires matter (heavy) by
         their chi-square. Elsewhere (light) they do so if a port draws less current than the model,
-        because no further touch makes it draw less. Light ports that draw more have had their say
-        in `find`: there, the strongest of them would have added its cell.
+        because no further touch makes it draw less. `find` has already judged light ports that draw
+        more: the strongest of them would have added its cell.
         """
         if not self.cells.size:
             return self._nothing_touched()
@@ -405,8 +405,8 @@ class FewTouches:
         self._compare()
         residual_covariance = gram(wires, onto=np.eye(ports.size, order="F"))  # S
         factor = cholesky(residual_covariance)
-        # By how much these readings have moved in the model by what was learned of the wires since
-        # the untouched skin was solved: the network still has the old wires.
+        # The network was solved with wires as they were believed then. `offset` is what newer ones
+        # change in these residuals, to first order.
         offset = self._skin.belief.moved_since(self._skin.log_layers, wires[:, -2:])
         for _ in range(2):  # `converge` has led near, by steps without S
             slopes = self._slopes()
@@ -428,7 +428,8 @@ class FewTouches:
         if self._residual[light].min(initial=0.0) < -DEMAND_STDS:
             return None
         # Of a residual of covariance S, S^-1 times it is the noise of readings, of covariance 1.
-        # The rest is what the wires have of their own, which belongs to the model.
+        # The rest comes from wires that differ from what is believed, and belongs to the model. So
+        # does `offset`, which `_current` does not have.
         modelled = self._current.copy()
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1

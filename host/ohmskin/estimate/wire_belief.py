@@ -35,7 +35,9 @@ The first frame of a touch is noisy, as it changes. A calmer one of the same tou
 its step starts from m and V as they were before the touch. What its readings alone say of m is the
 information A, the inverse of a covariance:
 
-    A = L J^T N^-1 J L^T = V^-1/2 (1 - X)^-1 X V^-1/2 ,     X = V^1/2 L J^T S^-1 J L^T V^1/2 .
+    A = L J^T N^-1 J L^T = V^-T/2 (1 - X)^-1 X V^-1/2 ,     X = V^T/2 L J^T S^-1 J L^T V^1/2 ,
+
+V^1/2 the Cholesky factor of V, and V^T/2 its transpose.
 
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
 cells as noise without limit. After a lesson V grows back towards V0: a skin bends. What single
@@ -270,7 +272,8 @@ class LearnedWires(WireBelief):
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
         """One Kalman step.
 
-        replace_last: undo the last lesson first, by a step from where that lesson started.
+        replace_last: undo the last lesson first, by a step from where that lesson started. A lesson
+            that says nothing undoes nothing.
         """
         if not replace_last:
             self._before_lesson = self.log_layers, self._root
@@ -278,12 +281,11 @@ class LearnedWires(WireBelief):
         # One reading shows its own touch, of unknown resistance, and so nothing of the wires.
         if len(residual) < 2:
             return
-        # The lesson is in deviations of the belief that the fit had, but the step may start from an
-        # older one. So what the readings alone say is found first, in logs, from what is given in
-        # deviations: with V = V^1/2 V^T/2, `weights` are
-        #     L J^T N^-1 = V^-T/2 (1 - X)^-1 V^T/2 L J^T S^-1 ,   X = `gain @ per_layer_std` ,
-        # and `information` is A. The step is V = (V^-1 + A)^-1 of the belief before, and m += V
-        # times what the weights make of the residual: the same as the step by S above.
+        # The lesson counts in deviations of the belief that the fit had, but the step may start
+        # from an older belief. So the lesson is first changed to logs, and freed of that belief:
+        #     L J^T N^-1 = V^-T/2 (1 - X)^-1 V^T/2 L J^T S^-1     are the `weights`,
+        # X is `gain @ per_layer_std`, and A is `information`. The step from V and m of the older
+        # belief is V' = (V^-1 + A)^-1, m' = m + V' L J^T N^-1 z: the same as that by S above.
         gain = solve(factor, per_layer_std).T
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(2) - gain @ per_layer_std) @ gain
