@@ -17,8 +17,7 @@ from ohmskin.circuit.skin import (
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_faults import ALIKE_FRAMES
 from ohmskin.estimate.port_readings import PortReader
-from skins import ten_bits, told
-from studies.conditions import shorted_readings
+from skins import shorted_readings, ten_bits, told
 from studies.trials import random_trial, skin_at_rest, touch
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin
+from ohmskin.circuit.skin import READINGS_PER_CELL, Skin
+from ohmskin.emulate.faults import joined_readings
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import Readings, load_readings
@@ -61,3 +62,9 @@ def placed(in_order: list[int], rows: int, columns: int) -> NDArray[np.uint16]:
     for place, code in zip(scan_order(rows, columns), in_order, strict=True):
         codes[place] = code
     return codes
+
+
+def shorted_readings(skin: Skin, first: int, second: int) -> Float:
+    """`circuit.readings`, electrodes `first` and `second` (rows first) joined by 0.1 ohm."""
+    ends = np.arange(2 * sum(skin.shape))
+    return joined_readings(skin, [(first, second)], ends)[..., :READINGS_PER_CELL]
