@@ -12,10 +12,15 @@ from calibrations import of_scene
 from ohmskin import files
 from ohmskin.calibrate.tables import PRESS, save_press_table
 from ohmskin.record.readings import save_arrays
-from studies.commands import save_whole
+
+
+def save_bytes(path: Path) -> None:
+    with files.whole_file(path) as file:
+        file.write(b"new")
+
 
 SAVERS: dict[str, Callable[[Path], object]] = {
-    "bytes": lambda path: save_whole({path: b"new", path.with_name("second"): b"new"}),
+    "bytes": save_bytes,
     "calibration": lambda path: of_scene("rest").save(path),
     "presses": lambda path: save_press_table(path, np.zeros(3, PRESS)),
     "readings": lambda path: save_arrays(path, {"chi2": np.zeros(3)}),
@@ -62,7 +67,7 @@ def test_nothing_that_is_no_file_is_replaced(tmp_path: Path) -> None:
     """As root, a device could be."""
     os.mkfifo(pipe := tmp_path / "pipe")
     with pytest.raises(ValueError, match="pipe: cannot be written: it is no file"):
-        save_whole({pipe: b"new"})
+        save_bytes(pipe)
     assert pipe.is_fifo()
 
 
@@ -72,7 +77,7 @@ def test_a_link_in_place_of_the_file_beside_is_not_followed(
     monkeypatch.setattr(files, "token_hex", lambda _: "0")
     (tmp_path / ".file.0.part").symlink_to(tmp_path / "other")
     with pytest.raises(ValueError, match="file: cannot be written: File exists"):
-        save_whole({tmp_path / "file": b"new"})
+        save_bytes(tmp_path / "file")
     assert not (tmp_path / "other").exists()
 
 
@@ -80,7 +85,7 @@ def test_what_a_killed_program_left_hinders_no_other(tmp_path: Path) -> None:
     """In a container, programs have the same number again and again."""
     left = tmp_path / f".file.{os.getpid()}.part"
     left.write_bytes(b"begun")
-    save_whole({tmp_path / "file": b"new"})
+    save_bytes(tmp_path / "file")
     assert (tmp_path / "file").read_bytes() == b"new"
     assert left.read_bytes() == b"begun"
 
