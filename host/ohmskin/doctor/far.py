@@ -188,8 +188,9 @@ class _Layer:
         if len(alone) > 2:  # of two lines, nobody can say which is usual
             one_bad = self._fit_one_bad(self._median_ohm(alone))
             least_cost = np.minimum(least_cost, one_bad.cost.min(axis=0))
-        # A connected end costs less than MANY_STDS^2 a reading; and it costs less than a floating
-        # one would, or hardly more: both costs are small where wires lose little.
+        # A connected end has a cost below two limits: MANY_STDS^2 for each reading, and the cost of
+        # a floating end. MANY_STDS^2 is added to the second: where wires lose little, both costs
+        # are small and cannot be told apart.
         most_of_any = MANY_STDS**2 * max(len(self.across) - 1, 1)
         most_cost = np.minimum(most_of_any, MANY_STDS**2 + self._floating_cost())
         too_much = np.abs(self.fit.ohm.sum(axis=1)) > MOST_LINE_OHM
@@ -220,7 +221,7 @@ class _Layer:
     def _fit_alike(self) -> Fit:
         """Segments that scatter about the mean of their line. The mean may be anything."""
         # What each segment has if all of a line are equal: one unknown a line, by least squares. It
-        # is near m, and stands for it in SPREAD_SHARE m: so the cost stays a square.
+        # is near m, and stands for it in SPREAD_SHARE m: so the cost stays quadratic in r.
         both_sides = (self._weighed @ self.loss_ohm[..., None]).sum(axis=1)
         precision = (self._weighed @ self.current_share).sum(axis=(1, 2))
         equal_ohm = (both_sides / precision[:, None])[..., None]

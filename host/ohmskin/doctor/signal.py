@@ -65,8 +65,8 @@ LEAST_LONGER_US: Final = 100
 # [us] In mode far, the longer settle time is at least this: wires show as a few codes, so that a
 # tenth counts. Chosen: with less, far nodes keep a part of a code (docs/troubleshooting.md).
 LONGER_FAR_US: Final = 300
-# [1] A settle time that is longer by less than this factor shows nothing new. Chosen: it changes
-# what a slow node lacks by less than that lack itself.
+# [1] A settle time that is longer by less than this factor shows nothing new. Chosen: a
+# fifth more is the least that clearly changes what a slow node lacks, by 60 % at 5 time constants.
 NOT_LONGER: Final = 1.2
 # [Hz] The second look is not slower, unless the board is. Chosen: some six scans in SETTLED_S.
 LEAST_LOOK_HZ: Final = 4.0
@@ -424,10 +424,10 @@ def settling_values(usual: Look, settled: Look, change_lsb: float) -> dict[str, 
     change_lsb: the largest change.
 
     From slot to slot, a node swings by S: at most by the range of a cell's readings, which follow
-    each other. In a slot of t seconds, what it lacks to its final
-    voltage falls by the factor exp(-t / tau). So at the slot's end the change e = S exp(-t / tau)
-    is still to come, from which tau = t / ln(S / e). The time required leaves half of
-    UNSETTLED_LSB: tau ln(2 S / UNSETTLED_LSB).
+    each other. In a slot of t seconds, what it lacks to its final voltage falls by the factor
+    exp(-t / tau). So at the slot's end the change e = S exp(-t / tau) is still to come, from which
+    tau = t / ln(S / e). The time required leaves half of UNSETTLED_LSB:
+    tau ln(2 S / UNSETTLED_LSB).
     """
     swing = float(np.ptp(settled.mean, axis=2).max())
     # Noise and a hand may change readings by more than a swing leaves: the log must stay above 0.

@@ -238,9 +238,9 @@ class FullFit:
     def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:
         """Cells that the prior holds at rest and that may be touched; their deviation c' (RC,).
 
-        A cell stays at rest if the prior pulls it towards rest more than the readings pull it away.
-        It may be touched all the same: a touch that is small for the readings, because much else
-        conducts there, need not be small for the cell.
+        A cell counts as at rest if the fit leaves it within one deviation of rest: there the prior
+        is the narrow normal, and not its tail. It may be touched all the same: a touch that is
+        small for the readings, because much else conducts there, need not be small for the cell.
 
         learned: l, the share of the prior's variance that the readings have removed, (RC,).
         """

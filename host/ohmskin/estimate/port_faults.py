@@ -113,8 +113,9 @@ class LinePairs:
     Two shorted lines are one node, so their currents from every other line are the same. `compare`
     compares all pairs of lines in a frame. It counts, for each pair, the frames that were compared
     since one has shown this pair apart, or was too noisy to tell. Other frames (`needs_frame` says
-    which) neither add to a count nor end it. This has a price: many short, even touches of the same
-    two lines may in the end look like a short. It saves comparing all pairs in most frames.
+    which) neither add to a count nor end it. This has a price: many brief touches that press the
+    same two lines equally may in the end look like shorted lines. It saves comparing all pairs in
+    most frames.
 
     high (lines,): which lines have clearly more current at all of their ports, as a short gives
     them. In a frame, that is more than the line itself had at rest; at rest, more than the median

@@ -94,8 +94,8 @@ class PortReader:
         """Currents of checked readings (R, C, m), m for each cell, and what is wrong with them.
 
         in_order: True for live frames: how the residuals have changed since the frame before is
-        noise. False for readings at rest, which may be one scan or the mean of many. Shorted
-        lines are counted there as in a frame, so call `reset` after them.
+        noise. False for readings at rest, which may be one scan or the mean of many. They, too,
+        count as one frame in the search for shorted lines, so call `reset` after them.
         """
         near = self._read_near(ratio, in_order=in_order)
         # `find` is not called where another fault is known: such a frame must not count as one that

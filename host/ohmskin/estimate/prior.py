@@ -157,10 +157,10 @@ def siemens_std(
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
-    # The cell conducts most if its wires resist most. Wires are normal in their log: at this limit
-    # they are exp(reach layer_std) - 1 above their mean, not reach layer_std, and the part that
-    # comes from them grows by that ratio. At the other limit they are off by less than reach
-    # layer_std, so there the first order is enough.
+    # The cell conducts most if its wires resist most. Wires are normal in their log. So at this
+    # limit, with k = `REACH_STDS`, they are exp(k layer_std) - 1 above their mean, where the first
+    # order has k layer_std. The part that comes from them grows by that ratio. At the other limit
+    # they are off by less than k layer_std, so there the first order is enough.
     wider = np.expm1(REACH_STDS * layer_std) / (REACH_STDS * layer_std)
     up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * wires_log_std**2)
     # d log u = - r / (r + series) d log r. So at the limits the current is (1 +- off) u, and the

@@ -317,6 +317,7 @@ class FewTouches:
     def converge(self, cells: Cells, log_siemens: Float) -> None:
         """Steps from here until none matters; cells that fall back to rest leave.
 
+        It starts from what counts as touched at the least: what a touch adds must be above 0.
         If steps still matter after `MAX_ITERATIONS`, it ends all the same: `asked_for` and
         `explain` judge what there is.
         """
@@ -427,9 +428,9 @@ class FewTouches:
             return None
         if self._residual[light].min(initial=0.0) < -DEMAND_STDS:
             return None
-        # Of a residual of covariance S, S^-1 times it is the noise of readings, of covariance 1.
-        # The rest comes from wires that differ from what is believed, and belongs to the model. So
-        # does `offset`, which `_current` does not have.
+        # The residual has the covariance S, and the noise of the readings in it 1. So S^-1 times
+        # the residual is the most probable noise. The rest comes from wires that differ from what
+        # is believed, and belongs to the model. So does `offset`, which `_current` does not have.
         modelled = self._current.copy()
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
