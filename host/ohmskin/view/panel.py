@@ -10,7 +10,7 @@ From the page come texts, whose ``do`` is a command of `Panel._asked`, "ack" wit
 import asyncio
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Any, Final
 
@@ -74,10 +74,23 @@ class Panel:
                 await self._say("state", **state)
             if shown is not None and shown is not self._sent and self._awaited is None:
                 self._sent, self._awaited = shown, shown.number
-                await self._socket.send_bytes(shown.message)
+                await self._deliver(self._socket.send_bytes(shown.message))
 
     async def _say(self, kind: str, **content: Any) -> None:
-        await self._socket.send_text(json.dumps({"kind": kind, **content}))
+        await self._deliver(self._socket.send_text(json.dumps({"kind": kind, **content})))
+
+    async def _deliver(self, sending: Awaitable[None]) -> None:
+        """Send. A connection that the server has closed is gone, as one that the page has closed.
+
+        The server closes it by itself after a message that is too long, and says so in `receive`.
+        A scan that is sent just before that meets an error that only its text tells from a fault.
+        """
+        try:
+            await sending
+        except RuntimeError as exc:
+            if "after sending 'websocket.close'" in str(exc):
+                raise WebSocketDisconnect(_GONE_CODE) from exc
+            raise
 
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
