@@ -80,12 +80,6 @@ def scan_s(board: Hello) -> float:
     return board.rows * board.columns * board.readings_per_cell * slot_s(board)
 
 
-def reading_offsets_s(board: Hello) -> Float:
-    """Time of each reading since the first of its scan [s], shape (rows, columns, readings)."""
-    slots = np.arange(board.rows * board.columns * board.readings_per_cell)
-    return slot_s(board) * protocol.from_scan_order(slots, board.rows, board.columns)
-
-
 def line_delay_s(scan: Scan, board: Hello) -> float:
     """Time from a scan's end to its last byte at the end of a serial line [s], without USB.
 
