@@ -58,7 +58,9 @@ def measured(seed: int) -> WireOhm:
     """What `ohmskin doctor --press --into` keeps of the wires."""
     whole = (examined(seed, NOMINAL_WIRE_OHM).pressed or [])[0]
     top_ohm, bottom_ohm = NOMINAL_WIRE_OHM
-    return WireOhm(whole.share * top_ohm, whole.share * bottom_ohm, whole.std / whole.share)
+    log_std = whole.std / whole.share
+    segments = whole.share * top_ohm, whole.share * bottom_ohm
+    return WireOhm(*segments, top_log_std=log_std, bottom_log_std=log_std)
 
 
 def judged(
@@ -99,7 +101,7 @@ def measure(part: Part) -> dict[str, float]:
     by_doctor = [measured(seed) for seed in range(count)]
     nominal, unknown = [WireOhm(*NOMINAL_WIRE_OHM)] * count, [NO_WIRES] * count
     shares = [wires.top / NOMINAL_WIRE_OHM[0] for wires in by_doctor if wires.top]
-    stds = [wires.log_std for wires in by_doctor if wires.log_std is not None]
+    stds = [wires.top_log_std for wires in by_doctor if wires.top_log_std is not None]
     figures = {
         "doctor_share": round(float(np.median(shares)), 3),
         "doctor_std": round(float(np.median(stds)), 3),

@@ -207,8 +207,9 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
         assert [each["id"] for each in json.loads(done.out)["findings"]] == names
         assert done.code == len(names)
     assert run("doctor", url, "--wires", "100,200", "--press", "--into", str(path)).code == 1
-    top, bottom, log_std = load_calibration(path).nominal_wire_ohm
-    assert [top, bottom, 0.05] == pytest.approx([150, 300, log_std], rel=0.1, abs=0.045)
+    kept = load_calibration(path).nominal_wire_ohm
+    assert kept.both == pytest.approx((150, 300), rel=0.1)
+    assert (kept.top_log_std, kept.bottom_log_std) == pytest.approx((0.05, 0.05), abs=0.045)
     assert_one_line(run("doctor", url, "--into", str(path)), "--press")
 
 

@@ -128,10 +128,11 @@ def test_wires_that_a_session_has_taught_are_kept(tmp_path: Path) -> None:
         board.calibration.save(tmp_path / "skin.json")
     kept = load_calibration(tmp_path / "skin.json").nominal_wire_ohm
     assert kept.both is not None
-    assert kept.log_std is not None
-    assert kept.log_std < 0.5 * UNKNOWN_LAYER_STD
-    off = np.mean(np.log(kept.both)) - np.mean(np.log([TOP_WIRE_OHM, BOTTOM_WIRE_OHM]))
-    assert abs(off) < 3 * kept.log_std
+    stds = kept.top_log_std, kept.bottom_log_std
+    for ohm, true_ohm, std in zip(kept.both, (TOP_WIRE_OHM, BOTTOM_WIRE_OHM), stds, strict=True):
+        assert std is not None
+        assert std < UNKNOWN_LAYER_STD
+        assert abs(np.log(ohm / true_ohm)) < 3 * std
 
 
 def test_tare_follows_a_drift(tmp_path: Path) -> None:

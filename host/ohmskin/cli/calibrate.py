@@ -267,12 +267,13 @@ def _finish(
         TERMINAL.print(
             message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else "")
         )
-    top, bottom, log_std = calibration.nominal_wire_ohm
-    if log_std is not None:
+    wires = calibration.nominal_wire_ohm
+    if wires.top_log_std is not None:
         TERMINAL.print(
-            f"wires, as presses tell: {top:.0f}, {bottom:.0f} Ohm, +- {100 * log_std:.0f} %"
+            f"wires, as presses tell: {wires.top:.0f}, {wires.bottom:.0f} Ohm, "
+            f"+- {100 * wires.top_log_std:.0f} %"
         )
-    elif top is None or bottom is None:
+    elif wires.both is None:
         TERMINAL.print("wires are not told (--wires): forces' standard deviations are wide")
     TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 

@@ -139,7 +139,8 @@ def measured_wires(diagnosis: Diagnosis) -> WireOhm | None:
     if diagnosis.nominal_ohm and diagnosis.pressed and diagnosis.pressed[0].known:
         whole = diagnosis.pressed[0]
         top, bottom = (whole.share * ohm for ohm in diagnosis.nominal_ohm)
-        return WireOhm(top, bottom, whole.std / whole.share)
+        log_std = whole.std / whole.share
+        return WireOhm(top, bottom, top_log_std=log_std, bottom_log_std=log_std)
     return segments_of(diagnosis.lines)
 
 

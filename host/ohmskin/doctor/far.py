@@ -393,8 +393,7 @@ def near_ends(rest: Rest) -> Rest:
 def segments_of(lines: Sequence[LineWire]) -> WireOhm | None:
     """Segment of each layer [ohm]: the median of its lines, so that one bad line does not count.
 
-    None if it is not known of both layers. The deviation is the mean of both layers', and not less
-    as of two measurements, because what is wrong with the model is wrong in both.
+    None if it is not known of both layers.
     """
     segment_ohm, log_stds = [], []
     for name in ("rows", "columns"):
@@ -405,8 +404,10 @@ def segments_of(lines: Sequence[LineWire]) -> WireOhm | None:
         segment_ohm.append(ohm / len(layer[0].segment_ohm))
         # The variance of a median is pi / 2 times that of a mean.
         log_stds.append(std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5)
-    top, bottom = segment_ohm
-    return WireOhm(top, bottom, sum(log_stds) / 2) if max(log_stds) <= KNOWN_STD else None
+    if max(log_stds) > KNOWN_STD:
+        return None
+    (top, bottom), (top_log_std, bottom_log_std) = segment_ohm, log_stds
+    return WireOhm(top, bottom, top_log_std=top_log_std, bottom_log_std=bottom_log_std)
 
 
 def examine_far(

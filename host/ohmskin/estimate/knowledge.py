@@ -28,17 +28,22 @@ class WireOhm(NamedTuple):
 
     top: nominal resistance of one segment of the top layer [ohm].
     bottom: the same of the bottom layer [ohm].
-    log_std: standard deviation of the log of both together, where they were measured.
+    lead: what lies between a multiplexer's common pin and the first crossing of a line, nominal
+        for all lines alike [ohm]; 0: nothing.
+    top_log_std, bottom_log_std, lead_log_std: standard deviations of the logs of these, where they
+        were measured.
     """
 
     top: float | None = None
     bottom: float | None = None
-    log_std: float | None = None
+    lead: float | None = None
+    top_log_std: float | None = None
+    bottom_log_std: float | None = None
+    lead_log_std: float | None = None
 
     def check(self) -> Self:
         """Itself. Raises ValueError, naming the field, for what is not finite or below 0."""
-        names = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
-        for name, number in zip(names, self, strict=True):
+        for name, number in zip(WIRE_FIELDS, self, strict=True):
             if number is not None and not (np.isfinite(number) and number >= 0):
                 raise ValueError(f"{name} is {number}, it must be finite and >= 0")
         return self
@@ -50,6 +55,15 @@ class WireOhm(NamedTuple):
 
 
 NO_WIRES: Final = WireOhm()
+# What the fields of `WireOhm` are called in files and errors, in their order.
+WIRE_FIELDS: Final = (
+    "nominal_top_wire_ohm",
+    "nominal_bottom_wire_ohm",
+    "nominal_lead_ohm",
+    "top_wire_log_std",
+    "bottom_wire_log_std",
+    "lead_log_std",
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,9 @@ UNKNOWN_LAYER_STD: Final = 0.7
 LAYER_STD: Final = 0.3
 # Deviation of each segment from what its layer shares.
 SEGMENT_STD: Final = 0.1
+# A lead that nobody has told: the switch of a CD74HC4067 at 5 V (data sheet: 70 typically, 160 at
+# most), and a crimp.
+UNKNOWN_LEAD_OHM: Final = 100.0
 # Share of what is known of the layers that fades after each lesson, because skins bend.
 FADE_SHARE: Final = 0.1
 

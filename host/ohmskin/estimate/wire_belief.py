@@ -117,15 +117,11 @@ class WireBelief(ABC):
     ) -> None:
         """wires: what is known of them before any frame."""
         self.shape, self.far = shape, far
-        *ohms, log_std = wires
+        ohms = wires.top, wires.bottom
         layer_std = UNKNOWN_LAYER_STD if None in ohms else LAYER_STD
-        # V0 in two parts that are independent: the mean of both logs, and half of their difference.
-        # Whoever has measured wires (`log_std`) has measured both in series, so their difference
-        # stays as open as before. No measurement is believed to be better than 1 %.
-        half_apart = 0.5 * layer_std**2
-        both = half_apart if log_std is None else float(np.clip(log_std, 0.01, 1.0)) ** 2
-        apart = np.array([[1.0, -1.0], [-1.0, 1.0]])
-        self._prior_covariance = both + max(half_apart, both) * apart
+        # However well wires were measured: since then, the skin may have been stretched.
+        measured_std = [std or 0.0 for std in (wires.top_log_std, wires.bottom_log_std)]
+        self._prior_covariance = np.diag(np.hypot(layer_std, measured_std) ** 2)
         nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in ohms]
         self._nominal: Float = np.log(nominal)
         self.reset()
@@ -166,15 +162,12 @@ class WireBelief(ABC):
         return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
 
     def learned(self) -> WireOhm | None:
-        """Mean segments of the layers, and the deviation of the log of both together.
-
-        None before any lesson.
-        """
+        """Mean segments of the layers, and the deviations of their logs. None before any lesson."""
         if self._lesson_cells is None:
             return None
-        top, bottom = np.exp(self.log_layers)
-        log_std = float(np.linalg.norm(self._root.sum(axis=0)) / 2)
-        return WireOhm(float(top), float(bottom), log_std)
+        top, bottom = np.exp(self.log_layers).tolist()
+        top_log_std, bottom_log_std = np.linalg.norm(self._root, axis=1).tolist()
+        return WireOhm(top, bottom, top_log_std=top_log_std, bottom_log_std=bottom_log_std)
 
     def circuit(self, log_cells: Float, log_layers: Float) -> PortCircuit:
         """The skin with these logs of its cells (RC,), and of its layers' segments (2,)."""

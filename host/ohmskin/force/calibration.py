@@ -13,8 +13,11 @@ rows, columns                              R, C
 mode                                       which readings its scans hold, "near" if absent
 nominal_top_wire_ohm                       one wire segment of each layer [ohm]; null: not known
 nominal_bottom_wire_ohm
-wire_log_std                               standard deviation of the logarithm of both; null: not
-                                           measured
+nominal_lead_ohm                           from a multiplexer's common pin to the first crossing of
+                                           a line [ohm]; null: not known
+top_wire_log_std                           standard deviations of the logarithms of these three;
+bottom_wire_log_std                        null: not measured
+lead_log_std
 indenter_area_m2                           what the skin was pressed with [m^2]
 rest.date                                  ISO 8601
 rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
@@ -41,7 +44,13 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
-from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm, check_ratio
+from ohmskin.estimate.knowledge import (
+    NO_WIRES,
+    WIRE_FIELDS,
+    SkinKnowledge,
+    WireOhm,
+    check_ratio,
+)
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
@@ -64,7 +73,6 @@ UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
 # types; in its rests; in its `WireOhm`; in its model, of which some may be null.
 _OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str, "indenter_area_m2": float}
 _RESTS: Final = ("rest", "tare")
-_WIRES: Final = ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm", "wire_log_std")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
 _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 
@@ -178,7 +186,7 @@ class Calibration:
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
         for name in (*_OWN, "rows", "columns"):
             content[name] = getattr(self, name)
-        content |= dict(zip(_WIRES, self.nominal_wire_ohm, strict=True))
+        content |= dict(zip(WIRE_FIELDS, self.nominal_wire_ohm, strict=True))
         for name in _RESTS:
             rest = getattr(self, name)
             content[name] = None if rest is None else vars(rest)
@@ -217,13 +225,17 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
     if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
-    content = {"wire_log_std": None, "mode": "near", **content}  # older files do not have them
-    names = {"format", "schema", "rows", "columns", *_OWN, *_WIRES, *_RESTS, *_MODEL_FIELDS}
+    # Older files have no mode, no leads, and one deviation for both layers.
+    of_both = content.pop("wire_log_std", None)
+    absent = dict.fromkeys(WIRE_FIELDS[2:]) | dict.fromkeys(WIRE_FIELDS[3:5], of_both)
+    content = {"mode": "near", **absent, **content}
+    names = {"format", "schema", "rows", "columns", *_OWN, *WIRE_FIELDS, *_RESTS, *_MODEL_FIELDS}
     _require_fields(content, names)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
     wires = (
-        None if content[name] is None else _value(name, content[name], float) for name in _WIRES
+        None if content[name] is None else _value(name, content[name], float)
+        for name in WIRE_FIELDS
     )
     return Calibration(
         **{name: _value(name, content[name], wanted) for name, wanted in _OWN.items()},
