@@ -69,6 +69,22 @@ def test_far_ends_show_the_crossing_that_carries_the_current() -> None:
     np.testing.assert_allclose(found, [a, b, 1 - b, 1 - a, e, f, 1 - f, 1 - e], rtol=1e-9)
 
 
+def test_leads_are_in_series_with_the_port_and_lose_nothing_up_to_far_ends() -> None:
+    cell = np.zeros((3, 4))
+    cell[1, 2] = 1 / 40e3
+    leads = np.array([7, 5, 7, 9, 9, 2, 9]) * 1e3  # three rows, four columns
+    skin = Skin(cell, np.full((3, 4), 1e3), np.full((3, 4), 2.5e3), lead_ohm=leads)
+    # 30 kOhm, lead of 5, three segments of 1, the cell, two of 2.5, lead of 2, 30 kOhm: 115 kOhm.
+    a, b, e, f = (np.array([115 - 30, 30, 115 - 38, 37]) / 115).tolist()
+    found = all_readings(skin, end_admittance(skin))[1, 2]
+    np.testing.assert_allclose(found, [a, b, 1 - b, 1 - a, e, f, 1 - f, 1 - e], rtol=1e-9)
+    np.testing.assert_allclose(readings(skin)[1, 2], [a, b, 1 - b, 1 - a], rtol=1e-12)
+    assert port_resistance_ohm(skin)[1, 2] == pytest.approx(48e3)  # of the skin alone
+    alike = replace(skin, lead_ohm=np.array(80.0))
+    np.testing.assert_array_equal(alike.lead_ohm, [80.0] * 7)
+    assert not Skin(cell, skin.top_wire_ohm, skin.bottom_wire_ohm).lead_ohm.any()
+
+
 def test_open_cells_give_inf_ports_and_readings_at_the_rails() -> None:
     skin = uniform_skin((3, 2), 0.0)
     assert np.all(np.isinf(port_resistance_ohm(skin)))
@@ -102,6 +118,8 @@ def test_current_is_the_combination_of_least_variance() -> None:
         ({"cell_siemens": np.full((2, 2), np.nan)}, "cell_siemens must be finite"),
         ({"ref_top_ohm": 0.0}, "ref_top_ohm must be positive"),
         ({"ref_bottom_ohm": np.inf}, "ref_bottom_ohm must be positive"),
+        ({"lead_ohm": np.ones(3)}, "lead_ohm has shape"),
+        ({"lead_ohm": np.array(-1.0)}, "lead_ohm must be finite"),
     ],
 )
 def test_impossible_skins_are_refused(change: dict[str, object], message: str) -> None:

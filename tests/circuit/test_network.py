@@ -60,21 +60,24 @@ def test_voltages_and_currents_agree_with_qucs(name: str) -> None:
     columns=st.integers(1, 5),
     zero_wires=st.sampled_from([0.0, 0.3, 1.0]),
     open_cells=st.sampled_from([0.0, 0.3, 0.8, 1.0]),
+    zero_leads=st.sampled_from([0.0, 0.3, 1.0]),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_the_forward_model_agrees_with_the_laplacian(
-    rows: int, columns: int, zero_wires: float, open_cells: float, seed: int
+    rows: int, columns: int, zero_wires: float, open_cells: float, zero_leads: float, seed: int
 ) -> None:
     random = np.random.default_rng(seed)
     shape = (rows, columns)
     cell_siemens = 1 / np.exp(random.uniform(np.log(1e3), np.log(2e6), shape))
     top, bottom = random.uniform(1, 1000, (2, *shape))
+    leads = random.uniform(1, 5000, rows + columns)
     skin = Skin(
         np.where(random.random(shape) < open_cells, 0, cell_siemens),
         np.where(random.random(shape) < zero_wires, 0, top),
         np.where(random.random(shape) < zero_wires, 0, bottom),
         ref_top_ohm=27e3,
         ref_bottom_ohm=33e3,
+        lead_ohm=np.where(random.random(leads.size) < zero_leads, 0, leads),
     )
     # Measured: 2e-12, all of it the Laplacian's own rounding.
     expected = laplacian_readings(skin, names="abcdefgh")

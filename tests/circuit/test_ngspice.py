@@ -5,6 +5,8 @@ In no skin here does a part float without any path to the rest: ngspice may call
 Laplacian does not: see test_network.py.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,11 @@ def touched(rows: int, columns: int, seed: int) -> Skin:
     )
 
 
+def with_leads(low_ohm: float, high_ohm: float) -> Skin:
+    lead_ohm = np.exp(np.random.default_rng(7).uniform(np.log(low_ohm), np.log(high_ohm), 9))
+    return replace(touched(4, 5, seed=8), lead_ohm=lead_ohm)
+
+
 def with_open_cells(*cells: tuple[int, int]) -> Skin:
     skin = touched(4, 3, seed=4)
     cell_siemens = skin.cell_siemens.copy()
@@ -55,6 +62,7 @@ SKINS = {
     "one open cell": with_open_cells((1, 2)),
     "a row with one cell left": with_open_cells((2, 0), (2, 1)),
     "wires of 1 ohm to 10 kOhm": with_wires(1, 10e3),
+    "leads of 80 ohm to 5 kOhm": with_leads(80, 5e3),
 }
 
 
@@ -64,7 +72,8 @@ def test_all_readings_agree_with_ngspice(name: str) -> None:
     with np.errstate(divide="ignore"):
         cell_ohm = 1 / skin.cell_siemens
     refs = skin.ref_top_ohm, skin.ref_bottom_ohm
-    expected = solved(cell_ohm, skin.top_wire_ohm, skin.bottom_wire_ohm, refs)
+    leads = skin.lead_ohm if skin.lead_ohm.any() else None
+    expected = solved(cell_ohm, skin.top_wire_ohm, skin.bottom_wire_ohm, refs, leads)
     # Measured: 6e-13; where wires begin at 1 ohm 3e-12, by the Laplacian 6e-12: it and ngspice add
     # conductances up in a diagonal, which costs the small ones digits.
     np.testing.assert_allclose(readings(skin), expected[..., :4], rtol=0, atol=2e-11)

@@ -103,25 +103,27 @@ def laplacian_readings(
     """Sense-node voltages / Vdd of the readings named, (R, C, n).
 
     Each cell is two circuits: Vdd - ref_top - row electrode i, column electrode j - ref_bottom -
-    ground gives A, B, E and F; with Vdd and ground exchanged D, C, H and G. A far end is behind 1
-    ohm. joints: pairs of ends that 0.1 ohm joins: near ends, rows first, then far ends.
+    ground gives A, B, E and F; with Vdd and ground exchanged D, C, H and G. Each electrode is
+    behind its line's lead, where its near end is; a far end is behind 1 ohm. joints: pairs of ends
+    that 0.1 ohm joins: near ends, rows first, then far ends.
     """
     rows, columns = skin.shape
     alone, lines = skin_network(skin), rows + columns
     top, bottom = np.arange(lines, alone.nodes).reshape(2, rows, columns)
-    at_far_end = np.concatenate([top[:, -1], bottom[-1]])
-    ends = np.concatenate([np.arange(lines), alone.nodes + np.arange(lines)])
-    top_end, bottom_end = alone.nodes + lines, alone.nodes + lines + 1
+    line_ends = np.concatenate([np.arange(lines), top[:, -1], bottom[-1]])
+    ends = alone.nodes + np.arange(2 * lines)
+    top_end, bottom_end = alone.nodes + 2 * lines, alone.nodes + 2 * lines + 1
     one, other = ends[np.array(joints, dtype=np.intp).reshape(-1, 2).T]
     references = [skin.ref_top_ohm, skin.ref_bottom_ohm]
-    ohm = np.concatenate([alone.branch_ohm, [1.0] * lines, [0.1] * len(joints), references])
+    to_ends = np.concatenate([skin.lead_ohm, [1.0] * lines])
+    ohm = np.concatenate([alone.branch_ohm, to_ends, [0.1] * len(joints), references])
     ratio = np.empty((rows, columns, len(names)))
     for i in range(rows):
         for j in range(columns):
             network = Network(
-                alone.nodes + lines + 2,
-                np.concatenate([alone.tail, at_far_end, one, [top_end, bottom_end]]),
-                np.concatenate([alone.head, ends[lines:], other, [i, rows + j]]),
+                alone.nodes + 2 * lines + 2,
+                np.concatenate([alone.tail, line_ends, one, [top_end, bottom_end]]),
+                np.concatenate([alone.head, ends, other, ends[[i, rows + j]]]),
                 ohm,
             )
             sense = ends[[i, rows + j, lines + i, lines + rows + j]]

@@ -37,9 +37,16 @@ def resistors(cell_ohm: Array, top_ohm: Array, bottom_ohm: Array, end: str = "")
 
 
 def solved(
-    cell_ohm: Array, top_ohm: Array, bottom_ohm: Array, ref_ohm: Sequence[float] = (30e3, 30e3)
+    cell_ohm: Array,
+    top_ohm: Array,
+    bottom_ohm: Array,
+    ref_ohm: Sequence[float] = (30e3, 30e3),
+    lead_ohm: Array | None = None,
 ) -> Array:
-    """Readings a to h of every cell, (R, C, 8), with these references at rows and columns."""
+    """Readings a to h of every cell, (R, C, 8), with these references at rows and columns.
+
+    lead_ohm: in front of each line, rows first (R+C,), all > 0; None: nothing is there.
+    """
     rows, columns = cell_ohm.shape
     near = [f"row{i}" for i in range(rows)] + [f"column{j}" for j in range(columns)]
     far = [f"t{i}_{columns - 1}" for i in range(rows)]
@@ -49,6 +56,11 @@ def solved(
         for direction, top_end, bottom_end in (("ab", "vdd", "0"), ("cd", "0", "vdd")):
             port = f"{direction}{i}_{j}"
             ends = [f"{name}{port}" for name in near + far]
+            if lead_ohm is not None:
+                for line in (i, rows + j):
+                    behind = f"behind_{ends[line]}"
+                    ports.append(f"rl{ends[line]} {ends[line]} {behind} {lead_ohm[line]:.17g}")
+                    ends[line] = behind
             ports += [
                 f"rt{port} {top_end} row{i}{port} {ref_ohm[0]:.17g}",
                 f"rb{port} {bottom_end} column{j}{port} {ref_ohm[1]:.17g}",

@@ -10,6 +10,7 @@ R, C                number of rows (stripes of the top layer) and of columns (bo
 g      (R, C)       cell conductance, joins top node T[i,j] and bottom node B[i,j]       S
 Rt     (R, C)       top wire segment that ends at T[i,j], from T[i,j-1] or the electrode  ohm
 Rb     (R, C)       bottom segment that ends at B[i,j], from B[i-1,j] or the electrode    ohm
+Rl     (R+C,)       lead of a line: between the multiplexer's common pin and electrode    ohm
 K      (RC, RC)     voltage lost in the wires to cell e per current of cell f            ohm
 E      (R+C, RC)    incidence: +1 at a cell's row electrode, -1 at its column electrode
 Y      (R+C, R+C)   admittance of the skin seen from its electrodes                      S
@@ -24,7 +25,10 @@ Q      (R+C, R+C)   E (diag(1/g) + K)^-1 F: currents of electrodes that F drives
 Equations. With x the cell currents and V the electrode potentials,
 
     (diag(1/g) + K) x = E^T V ,     Y = E (diag(1/g) + K)^-1 E^T ,
-    rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] ,     I = 1 / (rho + R_top + R_bottom) .
+    rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] ,     I = 1 / (rho + Rl[i] + Rl[j] + R_top + R_bottom) .
+
+A lead (switch of the multiplexer, crimp, margin of yarn) carries the whole current of a port, and
+none while another line is selected. So it adds to the port's resistance, as a reference does.
 
 This is Kirchhoff's law on the network of 2RC nodes, with the nodes of wires eliminated: along a
 line, cells j and k share the wire up to the nearer of them, so K is a sum of segments. What is
@@ -33,7 +37,7 @@ for wires of zero ohm.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Final
 
@@ -73,6 +77,7 @@ class Skin:
     bottom_wire_ohm: segments of the bottom layer (R, C) [ohm]; [i, j] ends at B[i, j], and [0, j]
         comes from the electrode of column j.
     ref_top_ohm, ref_bottom_ohm: reference resistors [ohm].
+    lead_ohm: leads of the rows, then of the columns (R+C,) [ohm]; given as (), all are alike.
 
     Raises ValueError for other shapes, values that are negative or not finite, references not > 0.
     """
@@ -82,16 +87,23 @@ class Skin:
     bottom_wire_ohm: Float
     ref_top_ohm: float = DEFAULT_REF_OHM
     ref_bottom_ohm: float = DEFAULT_REF_OHM
+    lead_ohm: Float = field(default_factory=lambda: np.array(0.0))
 
     def __post_init__(self) -> None:
         check_references(self.ref_top_ohm, self.ref_bottom_ohm)
         shape = np.shape(self.cell_siemens)
         if len(shape) != 2 or 0 in shape:
             raise ValueError(f"cell_siemens must be (rows, columns), at least 1x1, not {shape}")
-        for name in ("cell_siemens", "top_wire_ohm", "bottom_wire_ohm"):
+        expected = dict.fromkeys(("cell_siemens", "top_wire_ohm", "bottom_wire_ohm"), shape)
+        for name, expected_shape in (expected | {"lead_ohm": (sum(shape),)}).items():
             resistances = np.array(getattr(self, name), dtype=np.float64)
-            if resistances.shape != shape:
-                raise ValueError(f"{name} has shape {resistances.shape}, cell_siemens {shape}")
+            if name == "lead_ohm" and not resistances.ndim:
+                resistances = np.full(expected_shape, resistances)
+            if resistances.shape != expected_shape:
+                raise ValueError(
+                    f"{name} has shape {resistances.shape}, not {expected_shape}, as cell_siemens "
+                    f"has {shape}"
+                )
             if not np.all(np.isfinite(resistances) & (resistances >= 0)):
                 raise ValueError(f"{name} must be finite and not negative")
             resistances.setflags(write=False)
@@ -231,14 +243,18 @@ def _unit_path(rows: int, columns: int) -> Float:
 def end_admittance(skin: Skin) -> Float:
     """Y [S] of both ends of all lines, (2(R+C), 2(R+C)): near ends, rows first, then far ends.
 
-    A far end is behind 1 ohm, for its multiplexer, at T[i, C-1] or B[R-1, j]. So it is computed as
-    one more cell of its line, at the end of the line's wire, to an electrode of its own.
+    A near end is in front of the line's lead, which therefore adds to the first segment. A far end
+    is behind 1 ohm, for its multiplexer, at T[i, C-1] or B[R-1, j]. So it is computed as one more
+    cell of its line, at the end of the line's wire, to an electrode of its own.
     """
     rows, columns = skin.shape
     cells, lines = rows * columns, rows + columns
-    shared = _path_of_lines(skin.top_wire_ohm, skin.bottom_wire_ohm, skin.shape)
+    top_ohm, bottom_ohm = skin.top_wire_ohm.copy(), skin.bottom_wire_ohm.copy()
+    top_ohm[:, 0] += skin.lead_ohm[:rows]
+    bottom_ohm[0] += skin.lead_ohm[rows:]
+    shared = _path_of_lines(top_ohm, bottom_ohm, skin.shape)
     whole = np.diag(shared.max(axis=0))
-    coupling = wire_coupling_ohm(skin.top_wire_ohm, skin.bottom_wire_ohm, skin.shape)
+    coupling = wire_coupling_ohm(top_ohm, bottom_ohm, skin.shape)
     sign = np.diag(np.repeat([1.0, -1.0], (rows, columns)))
     ends = np.block([[_incidence(rows, columns), np.zeros((cells, lines))], [sign, -sign]])
     root = np.sqrt(np.concatenate([skin.cell_siemens.ravel(), np.ones(lines)]))[:, None]
@@ -496,8 +512,10 @@ def current_std(ratio_std: float, ref_top_ohm: float, ref_bottom_ohm: float) -> 
 
 
 def readings(skin: Skin) -> Float:
-    """Sense-node voltages / Vdd, shape (R, C, 4): y = offset + sign R_ref / (rho + Rt + Rb)."""
-    current = 1.0 / (port_resistance_ohm(skin) + skin.ref_top_ohm + skin.ref_bottom_ohm)
+    """Sense-node voltages / Vdd, shape (R, C, 4): y = offset + sign R_ref I."""
+    rows, leads = skin.shape[0], skin.lead_ohm
+    port_ohm = port_resistance_ohm(skin) + leads[:rows, None] + leads[rows:]
+    current = 1.0 / (port_ohm + skin.ref_top_ohm + skin.ref_bottom_ohm)
     return ratio_from_current(current, skin.ref_top_ohm, skin.ref_bottom_ohm)
 
 
