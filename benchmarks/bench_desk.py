@@ -34,7 +34,7 @@ import numpy as np
 from bars import Part, at_least, at_most, run  # beside this file
 from desk import DeskSkin, desk_skin, examined  # tests/helpers
 from ohmskin.circuit.skin import readings
-from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS, MODES
@@ -60,7 +60,7 @@ def measured(seed: int) -> WireOhm:
     top_ohm, bottom_ohm = NOMINAL_WIRE_OHM
     log_std = whole.std / whole.share
     segments = whole.share * top_ohm, whole.share * bottom_ohm
-    return WireOhm(*segments, top_log_std=log_std, bottom_log_std=log_std)
+    return WireOhm(*segments, lead=0.0, top_log_std=log_std, bottom_log_std=log_std)
 
 
 def judged(
@@ -99,7 +99,10 @@ def measure(part: Part) -> dict[str, float]:
     desk = [desk_skin(seed, frames) for seed in range(count)]
     far = [desk_skin(seed, frames, mode="far") for seed in range(count)]
     by_doctor = [measured(seed) for seed in range(count)]
-    nominal, unknown = [WireOhm(*NOMINAL_WIRE_OHM)] * count, [NO_WIRES] * count
+    # The simulator's multiplexers have 1 ohm: there are no leads, and that is told.
+    nominal, unknown = (
+        [WireOhm(top, bottom, lead=0.0)] * count for top, bottom in (NOMINAL_WIRE_OHM, (None, None))
+    )
     shares = [wires.top / NOMINAL_WIRE_OHM[0] for wires in by_doctor if wires.top]
     stds = [wires.top_log_std for wires in by_doctor if wires.top_log_std is not None]
     figures = {

@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.regression import ForceRegression, fit_power
-from ohmskin.estimate.knowledge import NO_WIRES
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import METHODS, VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.link.protocol import MODES
@@ -171,7 +171,7 @@ def rises(method: str, trial: ForceTrial) -> Float:
         return voltage_level(trial.ratio) - voltage_level(trial.rest_ratio)
     knowledge, ratio = knowledge_of(trial.rest_ratio), trial.ratio
     if method in (UNTOLD, FAR):
-        knowledge = replace(knowledge, nominal_wire_ohm=NO_WIRES)
+        knowledge = replace(knowledge, nominal_wire_ohm=WireOhm(lead=0.0))
     if method == FAR:
         names, ratio = MODES["far"], trial.far_ratio
         knowledge = replace(knowledge, rest_ratio=trial.far_rest_ratio, reading_names=names)

@@ -3,7 +3,8 @@
 
 A trial is one skin and frames of it. Most are simulated, drawn from a seed: cells of about 1 MOhm
 at rest, touches of 1 to 100 kOhm (log-uniform) at random places, wires that vary by 10 % around 100
-and 200 Ohm. `reference_trial` gives the skins of tests/data, which ngspice has solved.
+and 200 Ohm. `reference_trial` gives the skins of tests/data, which ngspice has solved. No skin has
+leads, and estimators are told so.
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ def rounded(exact: Readings, bits: int = ADC_BITS) -> Readings:
 
 
 def without_wires(given: Readings) -> Readings:
-    """These readings, where nobody knows the nominal wires."""
+    """These readings, where nobody knows the nominal wires; that there are no leads is told."""
     return replace(given, nominal_top_wire_ohm=None, nominal_bottom_wire_ohm=None)
 
 
@@ -157,14 +158,14 @@ def stretched(skin: Skin, factor: float) -> Skin:
 def knowledge_of(
     rest_ratio: Float, nominal_wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM
 ) -> SkinKnowledge:
-    """What estimators of 10-bit readings are told: rest (R, C, 4), nominal wires, no more."""
+    """What estimators of 10-bit readings are told: rest (R, C, 4), nominal wires, no leads."""
     rows, columns, _ = rest_ratio.shape
     return SkinKnowledge(
         rows,
         columns,
         adc_bits=ADC_BITS,
         rest_ratio=rest_ratio,
-        nominal_wire_ohm=WireOhm(*nominal_wire_ohm),
+        nominal_wire_ohm=WireOhm(*nominal_wire_ohm, lead=0.0),
     )
 
 
@@ -173,7 +174,7 @@ def trial_of(
     frames: list[Skin],
     nominal_wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM,
 ) -> Trial:
-    """A trial whose estimators are told the rest readings and the nominal wires."""
+    """A trial whose estimators are told the rest readings, the nominal wires, and no leads."""
     told = Readings(
         ratio=np.array([readings(skin) for skin in frames]),
         rest_ratio=readings(rest),
@@ -181,6 +182,7 @@ def trial_of(
         ref_bottom_ohm=rest.ref_bottom_ohm,
         nominal_top_wire_ohm=np.array(nominal_wire_ohm[0]),
         nominal_bottom_wire_ohm=np.array(nominal_wire_ohm[1]),
+        nominal_lead_ohm=np.array(0.0),
     )
     return Trial(told, tuple(frames), rest)
 
@@ -193,7 +195,7 @@ def reference_trial(name: str, frames: slice | NDArray[np.intp] = slice(None)) -
     """
     path = DATA / f"{name}.npz"
     given = load_readings(path)
-    given = replace(given, ratio=given.ratio[frames])
+    given = replace(given, ratio=given.ratio[frames], nominal_lead_ohm=np.array(0.0))
     with np.load(path, allow_pickle=False) as file:
         cell_ohm, rest_siemens = file["cell_ohm"], 1 / file["rest_ohm"]
         cell_siemens, top, bottom = (

@@ -21,7 +21,11 @@ def test_errors_are_small_and_stated(skins: list[DeskSkin], method: str) -> None
     error, stated = [], []
     for skin in skins:
         known = SkinKnowledge(
-            8, 8, adc_bits=10, rest_ratio=skin.rest_ratio, nominal_wire_ohm=WireOhm(100.0, 200.0)
+            8,
+            8,
+            adc_bits=10,
+            rest_ratio=skin.rest_ratio,
+            nominal_wire_ohm=WireOhm(100.0, 200.0, lead=0.0),
         )
         estimator = make_estimator(method, known)
         for truth, ratios in zip(skin.frames, skin.ratios, strict=True):
@@ -47,7 +51,12 @@ def test_far_ends_need_no_wires(far_skins: list[DeskSkin], method: str) -> None:
     error, stated = [], []
     for skin in far_skins:
         known = SkinKnowledge(
-            8, 8, adc_bits=10, rest_ratio=skin.rest_ratio, reading_names=MODES["far"]
+            8,
+            8,
+            adc_bits=10,
+            rest_ratio=skin.rest_ratio,
+            nominal_wire_ohm=WireOhm(lead=0.0),
+            reading_names=MODES["far"],
         )
         estimator = make_estimator(method, known)
         for truth, ratios in zip(skin.frames, skin.ratios, strict=True):

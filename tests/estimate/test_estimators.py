@@ -133,7 +133,7 @@ def test_standard_deviation_covers_noise_above_what_was_said(method: str) -> Non
     cell_ohm = np.full((3, 3), 1e5)
     alone = ratio_from_current(1 / (cell_ohm + 60e3), 30e3, 30e3)
     exact = alone if method == "ohm" else wire_free_readings(cell_ohm)
-    known = SkinKnowledge(3, 3, adc_bits=16, nominal_wire_ohm=WireOhm(0.0, 0.0))
+    known = SkinKnowledge(3, 3, adc_bits=16, nominal_wire_ohm=WireOhm(0.0, 0.0, 0.0))
     estimator = make_estimator(method, known)
     z = []
     for _ in range(200):
@@ -327,6 +327,7 @@ def test_an_unknown_method_is_answered_with_the_known_ones() -> None:
         ({"rest_ratio": np.full((2, 2, 4), 2.0)}, r"rest_ratio of cell \(0, 0\)"),
         ({"nominal_wire_ohm": WireOhm(-1.0)}, "nominal_top_wire_ohm"),
         ({"nominal_wire_ohm": WireOhm(bottom=np.nan)}, "nominal_bottom_wire_ohm"),
+        ({"nominal_wire_ohm": WireOhm(lead=np.inf)}, "nominal_lead_ohm"),
     ],
 )
 def test_impossible_knowledge_is_refused(wrong: dict[str, object], message: str) -> None:

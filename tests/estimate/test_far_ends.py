@@ -30,7 +30,11 @@ def seen(skin: Skin, names: str = "aebf") -> Float:
 
 def knowledge(rest: Float, names: str = "aebf", bits: int | None = 10) -> SkinKnowledge:
     return SkinKnowledge(
-        *rest.shape[:2], adc_bits=bits, rest_ratio=rest, reading_names=tuple(names)
+        *rest.shape[:2],
+        adc_bits=bits,
+        rest_ratio=rest,
+        nominal_wire_ohm=WireOhm(lead=0.0),
+        reading_names=tuple(names),
     )
 
 
@@ -241,7 +245,9 @@ def test_a_far_end_that_floats_is_named() -> None:
 @pytest.mark.parametrize("method", ["joint", "touch"])
 def test_exact_nonsense_is_answered(method: str) -> None:
     """Without noise to weigh it, wires that are measured from nonsense cannot be solved for."""
-    known = SkinKnowledge(1, 1, nominal_wire_ohm=WireOhm(1e9, 1e9), reading_names=tuple("aebf"))
+    known = SkinKnowledge(
+        1, 1, nominal_wire_ohm=WireOhm(1e9, 1e9, 0.0), reading_names=tuple("aebf")
+    )
     found = make_estimator(method, known).estimate(np.full((1, 1, 4), 0.5))
     assert np.isfinite([found.cell_siemens, found.cell_siemens_std]).all()
     assert found.message.endswith("the circuit that these readings lead to cannot be solved")

@@ -10,7 +10,7 @@ from network import Network, skin_network  # tests/helpers
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit, Skin, port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
-from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import FADE_SHARE, LAYER_STD, SEGMENT_STD
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
@@ -242,7 +242,7 @@ def test_two_fingertips_over_much_of_a_skin_whose_wires_nobody_knows(
     """With rest more likely than a touch, long wires and few hard touches gave up to 1.5."""
     trial = finger_trial(8, 8, 20, 2000 + seed)
     assert trial.pressed.mean() > 0.3
-    knowledge = replace(trial.rounded(10).knowledge(0), nominal_wire_ohm=NO_WIRES)
+    knowledge = replace(trial.rounded(10).knowledge(0), nominal_wire_ohm=WireOhm(lead=0.0))
     estimator, rest = make_estimator(method, knowledge), trial.rest.cell_siemens
     for ratio, truth in zip(trial.rounded(10).ratio, trial.cell_siemens, strict=True):
         found = estimator.estimate(ratio).cell_siemens

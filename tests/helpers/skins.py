@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL, Skin
 from ohmskin.emulate.faults import joined_readings
-from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import Readings, load_readings
 from places import DATA
@@ -30,8 +30,11 @@ def uniform_skin(
 
 
 def reference(name: str, bits: int | None = 10) -> tuple[Readings, dict[str, Float]]:
-    """Readings of a file of tests/data, exact (None) or in 10 bits, and all that the file has."""
-    exact = load_readings(DATA / f"{name}.npz")
+    """Readings of a file of tests/data, exact (None) or in 10 bits, and all that the file has.
+
+    It has no leads, which is told.
+    """
+    exact = replace(load_readings(DATA / f"{name}.npz"), nominal_lead_ohm=np.array(0.0))
     with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
         arrays = dict(file)
     if bits is None:
@@ -41,12 +44,12 @@ def reference(name: str, bits: int | None = 10) -> tuple[Readings, dict[str, Flo
 
 
 def told(rest_ratio: Float, *, wires: bool = True) -> SkinKnowledge:
-    """Knowledge of a board of 10 bits: exact readings of the untouched skin, perhaps its wires."""
+    """Knowledge of a board of 10 bits: exact rest readings, no leads, perhaps wires."""
     return SkinKnowledge(
         *rest_ratio.shape[:2],
         adc_bits=10,
         rest_ratio=ten_bits(rest_ratio),
-        nominal_wire_ohm=WireOhm(100.0, 200.0) if wires else NO_WIRES,
+        nominal_wire_ohm=WireOhm(*(100.0, 200.0) * wires, lead=0.0),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import METHODS
 from ohmskin.record import readings as readings_module
 from ohmskin.record.readings import Readings, estimate_file, load_readings, save_arrays
@@ -60,6 +61,7 @@ def test_a_sweep_has_rest_and_wires_of_its_own_per_frame() -> None:
     assert readings.one_skin_per_frame
     first, last = readings.knowledge(0), readings.knowledge(4)
     assert (first.nominal_wire_ohm.top, last.nominal_wire_ohm.top) == (100, 41_000)
+    assert first.nominal_wire_ohm.lead is None
     assert not np.array_equal(first.rest_ratio, last.rest_ratio)  # type: ignore[arg-type]
 
 
@@ -70,6 +72,12 @@ def test_ratio_alone_is_enough(tmp_path: Path) -> None:
     assert knowledge.ref_top_ohm == 30e3
     assert knowledge.rest_ratio is None
     assert knowledge.nominal_wire_ohm.top is None
+    assert knowledge.nominal_wire_ohm.lead is None
+    path = write(tmp_path / "leads.npz", ratio=GOOD, nominal_lead_ohm=80.0)
+    assert load_readings(path).knowledge(0).nominal_wire_ohm == WireOhm(lead=80.0)
+    each = Readings(GOOD, nominal_lead_ohm=np.array([0.0, 300.0]))
+    assert each.one_skin_per_frame
+    assert [each.knowledge(frame).nominal_wire_ohm.lead for frame in (0, 1)] == [0.0, 300.0]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -145,6 +153,8 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),
         ({"ratio": GOOD, "nominal_top_wire_ohm": np.ones(3)}, "nominal_top_wire_ohm has shape"),
         ({"ratio": GOOD, "nominal_bottom_wire_ohm": [1, -1]}, "nominal_bottom_wire_ohm is -1"),
+        ({"ratio": GOOD, "nominal_lead_ohm": -1.0}, "nominal_lead_ohm is -1"),
+        ({"ratio": GOOD, "nominal_lead_ohm": np.ones((2, 1))}, "nominal_lead_ohm has shape"),
     ],
 )
 def test_a_wrong_file_is_refused_by_name_in_one_line(

@@ -18,7 +18,7 @@ from ohmskin.estimate.prior import (
 from skins import uniform_skin
 from studies.information import PRESSED_STD, information_limit
 
-NOMINAL = {"nominal_wire_ohm": WireOhm(100.0, 200.0)}
+NOMINAL = {"nominal_wire_ohm": WireOhm(100.0, 200.0, 0.0)}
 
 
 def skin_of(rows: int, columns: int, pressed: int, seed: int) -> tuple[Skin, NDArray[np.bool_]]:

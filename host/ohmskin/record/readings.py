@@ -12,6 +12,7 @@ ref_top_ohm             scalar                       reference resistors, 30 kOh
 ref_bottom_ohm          scalar
 nominal_top_wire_ohm    scalar or F                  one wire segment, per layer (optional)
 nominal_bottom_wire_ohm scalar or F
+nominal_lead_ohm        scalar or F                  from multiplexer to first crossing; 0: nothing
 adc_bits                scalar                       absent: the readings are exact
 reading_names           4, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
@@ -43,7 +44,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR
 from ohmskin.estimate.base import Estimate
-from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
+from ohmskin.estimate.knowledge import WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import PathName, naming, whole_file
 from ohmskin.link.protocol import ENUMS
@@ -55,7 +56,8 @@ MAX_ARRAY_BYTES: Final = 200_000_000
 MAX_CELLS: Final = 4096
 _NAMES: Final = tuple(ENUMS["reading"].values)
 # What may be given for each frame, and how many dimensions it has where it is given once.
-_ONCE_NDIM: Final = {"rest_ratio": 3, "nominal_top_wire_ohm": 0, "nominal_bottom_wire_ohm": 0}
+_WIRES: Final = WIRE_FIELDS[:3]
+_ONCE_NDIM: Final = {"rest_ratio": 3} | dict.fromkeys(_WIRES, 0)
 # The arrays that go out, in this order.
 _OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
 _OF_WIRES: Final = ("top_wire_ohm", "bottom_wire_ohm", "top_wire_ohm_std", "bottom_wire_ohm_std")
@@ -72,6 +74,7 @@ class Readings:
     ref_bottom_ohm: float = DEFAULT_REF_OHM
     nominal_top_wire_ohm: Float | None = None
     nominal_bottom_wire_ohm: Float | None = None
+    nominal_lead_ohm: Float | None = None
     adc_bits: int | None = None
     reading_names: tuple[str, ...] = NEAR
 
@@ -92,7 +95,7 @@ class Readings:
         rest = self.rest_ratio
         if rest is not None and rest.ndim == 4 and len(rest) != frames:
             raise ValueError(f"rest_ratio has {len(rest)} frames, ratio {frames}")
-        for name in ("nominal_top_wire_ohm", "nominal_bottom_wire_ohm"):
+        for name in _WIRES:
             wire_ohm = getattr(self, name)
             if wire_ohm is not None and wire_ohm.shape not in ((), (frames,)):
                 raise ValueError(f"{name} has shape {wire_ohm.shape}, not () or ({frames},)")
@@ -106,7 +109,7 @@ class Readings:
 
     def knowledge(self, frame: int) -> SkinKnowledge:
         """What an estimator is told before it reads `frame`."""
-        rest_ratio, top_ohm, bottom_ohm = (self._of_frame(name, frame) for name in _ONCE_NDIM)
+        rest_ratio, *wires = (self._of_frame(name, frame) for name in _ONCE_NDIM)
         return SkinKnowledge(
             rows=self.ratio.shape[1],
             columns=self.ratio.shape[2],
@@ -114,7 +117,7 @@ class Readings:
             ref_bottom_ohm=self.ref_bottom_ohm,
             adc_bits=self.adc_bits,
             rest_ratio=rest_ratio,
-            nominal_wire_ohm=WireOhm(top_ohm, bottom_ohm),
+            nominal_wire_ohm=WireOhm(*wires),
             reading_names=self.reading_names,
         )
 
