@@ -97,10 +97,11 @@ def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> N
     done = weigh(script, *OPTIONS, interrupt_s=begin_s + 4 + 1.2 * PUT_S)
     assert (done.code, done.err) == (130, "")
     lines = done.out.splitlines()
-    assert lines[0] == "take everything off the skin: its rest is measured, 1 s"
-    assert re.fullmatch(r"rest: \d\.\d\d to \d\.\d\d microsiemens", lines[1])
-    assert lines[2] == "put 50 g (0.490 N) on cell (0, 0), row 0, column 0"
-    assert re.fullmatch(r"1 of 6: .*microsiemens above rest: take it off", lines[3])
+    asked = "take everything off the skin: its rest is measured in"
+    assert lines[:3] == [f"{asked} {left_s} s" for left_s in (3, 2, 1)]
+    assert re.fullmatch(r"rest: \d\.\d\d to \d\.\d\d microsiemens", lines[3])
+    assert lines[4] == "put 50 g (0.490 N) on cell (0, 0), row 0, column 0"
+    assert re.fullmatch(r"1 of 6: .*microsiemens above rest: take it off", lines[5])
     wrong = lines.index("cell (0, 0) is pressed: put the weight on (0, 1) alone")
     assert lines[wrong - 1] == "put 50 g (0.490 N) on cell (0, 1), row 0, column 1"
     assert "cells (0, 0), (0, 1) are pressed: put the weight on (0, 1) alone" in lines[wrong:]
@@ -109,7 +110,7 @@ def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> N
     assert not out.exists()
 
     done = well(weigh(putting(ASKED[4:]), *OPTIONS))
-    assert done.out.splitlines()[2] == "put 200 g (1.961 N) on cell (0, 1), row 0, column 1"
+    assert done.out.splitlines()[4] == "put 200 g (1.961 N) on cell (0, 1), row 0, column 1"
     assert "held-out error" in done.out
     assert f"{out}: calibration of unit 7" in done.out
     assert pairs_of(table) == ASKED

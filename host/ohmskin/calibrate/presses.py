@@ -19,11 +19,13 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.regression import ForceRegression
 from ohmskin.calibrate.rules import check_cell, check_cells_differ
 from ohmskin.calibrate.tables import ForceLog, PressTable
+from ohmskin.errors import TareRefused
+from ohmskin.estimate.base import TOUCH_SIEMENS, TOUCH_STDS
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.reader import now
+from ohmskin.force.reader import DEFAULT_METHOD, now, touched_cells
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
 
@@ -44,6 +46,15 @@ VALLEY_LOG: Final = np.log(5.0)
 # What rises by less than this share of the strongest rise is noise, whose logarithm would have
 # valleys without end. Chosen: far below what a light touch shows.
 _NOISE_SHARE: Final = 1e-3
+# At least this share of the cells is taken to be untouched at rest. Chosen: so three touched cells
+# of four are found.
+UNTOUCHED_SHARE: Final = 0.25
+# A cell that conducts more than untouched ones by this factor at rest is touched. Chosen: untouched
+# cells scatter by tens of percent, and a touch of 100 kOhm is a factor of eleven.
+TOUCHED_TIMES: Final = 8.0
+# A cell that has lost more than this share of its rest in the later scans was touched at rest.
+# Chosen: no rest drifts by as much in a session.
+LOST_SHARE: Final = 0.5
 # Stands for a cell, or a press, where a scan has none. Chosen: no index is negative.
 _NOTHING: Final = -1
 
@@ -202,11 +213,18 @@ class Calibrator:
     method: the one by which forces will be read.
     indenter_area_m2: area that the skin is pressed with [m^2].
     nominal_wire_ohm: what is known of its wires.
+    force: calibrate even if cells seem touched at rest.
 
     Made from these:
 
     estimator: of this method, for this skin.
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
+
+    No earlier rest says how the untouched skin reads. So a cell counts as touched if it conducts
+    far more than most others do, g > `TOUCHED_TIMES` max(quantile of g, 0.5e-6 S), whatever wires
+    and scatter of cells make of g; and by later scans, if its level falls by `LOST_SHARE` of rest.
+
+    :raises TareRefused: something touched the skin while its rest was measured.
     """
 
     board: Hello
@@ -214,24 +232,41 @@ class Calibrator:
     method: str
     indenter_area_m2: float
     nominal_wire_ohm: WireOhm = NO_WIRES
+    force: bool = False
 
     def __post_init__(self) -> None:
         self._knowledge = SkinKnowledge.of(self.board, self.rest_ratio, self.nominal_wire_ohm)
+        at_rest = make_estimator(DEFAULT_METHOD, self._knowledge).rest()
+        assert at_rest is not None  # the readings are known
+        siemens = at_rest.cell_siemens
+        untouched = float(np.quantile(siemens, UNTOUCHED_SHARE, method="lower"))
+        self._refuse(siemens > TOUCHED_TIMES * max(untouched, TOUCH_SIEMENS))
         self.estimator = make_estimator(self.method, self._knowledge)
         self.rest_level = self.estimator.rest_level()
+
+    def _refuse(self, touched: Bool) -> None:
+        """Raise TareRefused if a cell (R, C) was touched at rest."""
+        if touched.any() and not self.force:
+            remedy = "measure rest with nothing on the skin, or say --force if nothing was on it"
+            raise TareRefused(f"{touched_cells(touched)} at rest", remedy)
 
     def measure(
         self, scans: list[Scan], progress: Callable[[Iterable[Scan]], Iterable[Scan]] = iter
     ) -> LevelHistory:
         """What all scans show above rest. progress: passes them on, one after another.
 
-        Raises ValueError for scans of another size than the untouched skin.
+        Raises ValueError for scans of another size than the untouched skin, and TareRefused where
+        it was touched.
         """
         levels = []
         for scan in progress(scans):
             answer = self.estimator.estimate(scan.ratio)
             levels.append((answer.level - self.rest_level, answer.level_std, answer.touched))
-        return LevelHistory(scan_times_s(scans), *map(np.array, zip(*levels, strict=True)))
+        history = LevelHistory(scan_times_s(scans), *map(np.array, zip(*levels, strict=True)))
+        # Single cells are pressed: each is untouched in most scans.
+        rise, std = np.median(history.rise, axis=0), np.median(history.rise_std, axis=0)
+        self._refuse(-rise > np.fmax(LOST_SHARE * self.rest_level, TOUCH_STDS * std))
+        return history
 
     def presses_in_table(self, table: PressTable) -> Presses:
         """The presses of a table, each of its rows one.

@@ -2,6 +2,7 @@
 """``ohmskin calibrate``: with weights, from a recording, from a table of presses; ``tare``."""
 
 import math
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Final
@@ -32,18 +33,21 @@ from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
-from ohmskin.link.device import Device, mean_ratio
+from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello
 from ohmskin.record.recording import Recording, load_recording
 
 # Standard gravity [m/s^2], by its definition (CGPM, 1901).
 GRAVITY_M_PER_S2: Final = 9.80665
+# Rest is measured so long [s] after somebody is asked to let go. Chosen: long enough to let go.
+COUNT_DOWN_S: Final = 3
 
 Out = Annotated[Path, Argument(help="calibration file to write (.json)")]
 Method = Annotated[str, Option(help=" | ".join(LEVEL_METHODS))]
 Indenter = Annotated[
     float, Option("--indenter-mm2", help="area that the skin is pressed with, in mm2")
 ]
+Force = Annotated[bool, Option("--force", help="even if cells seem to be touched at rest")]
 calibrate = typer.Typer(
     no_args_is_help=True,
     help="Learn forces from presses of single cells: a calibration file (.json).",
@@ -64,6 +68,7 @@ def weights(
     redo: Annotated[list[str] | None, Option(help="row,column: drop its presses first")] = None,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
+    force: Force = False,
 ) -> None:
     """With weights: says which to put on which cell of the skin at PORT, and when it has read it.
 
@@ -87,8 +92,10 @@ def weights(
             every = [*read, *missing]
             check_enough(len(every), [press.force_n for press in every])
             check_cells_differ({press.cell for press in every}, shape)
-        TERMINAL.print(f"take everything off the skin: its rest is measured, {TARE_S:g} s")
-        calibrator = calibrator_of(skin.info, skin.mean_ratio(TARE_S))
+        for left_s in range(COUNT_DOWN_S, 0, -1):
+            TERMINAL.print(f"take everything off the skin: its rest is measured in {left_s} s")
+            deque(scans_for(skin, 1.0), maxlen=0)  # so time passes by the board's clock
+        calibrator = calibrator_of(skin.info, skin.mean_ratio(TARE_S), force)
         with naming(kept.path):
             calibrator.presses_in_table(kept.table)  # raises ValueError for another skin's
         if again:
@@ -118,6 +125,7 @@ def recording(
     ] = 0.0,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
+    force: Force = False,
 ) -> None:
     """From a recording of presses, with the forces in it or a force sensor's log of the same time.
 
@@ -136,7 +144,7 @@ def recording(
         if log is None:  # the scans have the same clock
             samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
             log = ForceLog(*samples.T)
-        calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s))
+        calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s), force)
         history = calibrator.measure(given.scans, progress("scans"))
         alignment = align(history.time_s, history.of_skin, log)
         presses = find_presses(history, log, alignment.offset_s)
@@ -161,12 +169,13 @@ def table(
     ] = TARE_S,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
+    force: Force = False,
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
     calibrator_of = _options(out, method, indenter_mm2, wires, table, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
-        calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s))
+        calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s), force)
     _from_table(calibrator, rows, table, out)
 
 
@@ -206,11 +215,12 @@ def _options(
     wires: str,
     *inputs: Path | None,
     table: bool = False,
-) -> Callable[[Hello, Float], Calibrator]:
+) -> Callable[[Hello, Float, bool], Calibrator]:
     """Check the options that all commands have, before anybody presses cells for an hour.
 
     table: whether presses are in a table. Returns a function that makes the calibrator from what
-    the board says of itself and the readings (R, C, 4) of its untouched skin.
+    the board says of itself, the readings (R, C, 4) of its untouched skin, and whether they count
+    even if cells seem touched.
     """
     nominal = wires_of(wires)
     if method not in LEVEL_METHODS:
@@ -220,7 +230,8 @@ def _options(
     if not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     check_place(out, *inputs)
-    return lambda board, rest: Calibrator(board, rest, method, 1e-6 * indenter_mm2, nominal)
+    area_m2 = 1e-6 * indenter_mm2
+    return lambda board, rest, force: Calibrator(board, rest, method, area_m2, nominal, force)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
