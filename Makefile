@@ -27,8 +27,8 @@ BIOME = $(firstword $(shell ls tools/page_lint/node_modules/@biomejs/cli-*/biome
 PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
-BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers far orders desk force view \
-                boards quick)
+BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons far orders desk force \
+                view boards quick)
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
@@ -148,6 +148,9 @@ bench-tables: setup-host ## measure the paper's sweeps, and methods that are tol
 
 bench-fingers: setup-host ## measure fingertips where nobody knows the wires, and the paper's method
 	$(BENCH)/bench_fingers.py
+
+bench-newtons: setup-host ## measure forces under many touches where nobody has told the wires
+	$(BENCH)/bench_newtons.py
 
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
 	$(BENCH)/bench_far.py

@@ -2,13 +2,14 @@
 """The node Laplacian against Qucs and hand arithmetic; the forward model against the Laplacian."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from network import Network, laplacian_readings, skin_network
+from network import Network, SkinCircuit, laplacian_readings, skin_network
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from places import DATA
 
@@ -84,6 +85,22 @@ def test_the_forward_model_agrees_with_the_laplacian(
     np.testing.assert_allclose(readings(skin), expected[..., :4], rtol=0, atol=5e-11)
     found = all_readings(skin, end_admittance(skin))
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-11)
+
+
+@pytest.mark.parametrize("wire_ohm", [1.0, 100.0, 1e4])
+def test_many_frames_of_one_skin_agree_with_the_laplacian(wire_ohm: float) -> None:
+    random, shape = np.random.default_rng(1), (3, 4)
+    cell = 1e-6 * random.uniform(0.5, 2, shape)
+    wires = wire_ohm * random.uniform(0.5, 2, (2, *shape))
+    rest = Skin(cell, *wires, 27e3, 33e3, lead_ohm=random.uniform(0, 3000, 7))
+    circuit = SkinCircuit(rest)
+    for pressed in (0, 1, 5, 12):
+        more = np.zeros(cell.size)
+        more[random.choice(cell.size, pressed, replace=False)] = 1e-3 * random.random(pressed)
+        skin = replace(rest, cell_siemens=cell + more.reshape(shape))
+        expected = laplacian_readings(skin, names="abcdefgh")
+        found = circuit.readings(skin.cell_siemens)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=5e-11)
 
 
 def test_a_cube_of_resistors_has_five_sixths_from_corner_to_corner() -> None:
