@@ -335,6 +335,8 @@ def _guided(
         for scan in until_ctrl_c(iter(skin.latest, None)):
             frame = calibrator.estimator.estimate(scan.ratio)
             step = guide.feed(1e-6 * scan.time_us, frame.level - rest, frame.touched)
+            if skin.put is not None:  # a simulated skin: nobody else puts a weight on it
+                skin.put(None if step.state is State.TAKE_OFF else step.wanted)
             if step.wanted is not None and step.rise is not None:
                 kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
                 done += 1

@@ -29,17 +29,20 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import check_place
 from ohmskin.force.reader import DEFAULT_METHOD
+from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
 from ohmskin.record.readings import estimate_file, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import FORMATS, Mark, load_recording
+from ohmskin.record.recording import FORMATS, ForceSample, Mark, load_recording
 from ohmskin.record.recording import export as export_recording
 
 # With a force sensor the first scans are a tare of so many seconds [s], unless told. Chosen: a
 # person who starts the command still takes a hand away in the first second.
 FORCE_TARE_S: Final = 2.0
+# In place of a force sensor's port: the forces that a simulated skin knows.
+TRUTH: Final = "truth"
 
 _T = TypeVar("_T")
 
@@ -53,7 +56,10 @@ def record(
         float | None, Option("--tare", min=0, help="touch nothing for so long at first, in s")
     ] = None,
     mark: Annotated[list[str] | None, Option(help="a mark at the beginning")] = None,
-    force_port: Annotated[str, Option(help="a force sensor's serial port: a number a line")] = "",
+    force_port: Annotated[
+        str,
+        Option(help="a force sensor's serial port: a number a line; of a simulated skin: truth"),
+    ] = "",
     force_baud: Annotated[int, Option(help="speed of that port")] = DEFAULT_BAUD,
     force_scale: Annotated[float, Option(help="newtons a unit; of grams: 0.00980665")] = 1.0,
 ) -> None:
@@ -66,14 +72,16 @@ def record(
         tare_s = FORCE_TARE_S if force_port else 0.0
     with ExitStack() as stack:
         skin, sensor = stack.enter_context(ohmskin.open(port, start=False)), None
-        if force_port:
+        if force_port and force_port != TRUTH:
             sensor = stack.enter_context(ForceSensor(force_port, force_baud, force_scale))
             sensor.wait()
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
             recorder.add(Mark(text, recorder.now_s()))
         look = None
-        if sensor is not None:
+        if force_port == TRUTH:
+            look = _truth(skin, recorder)
+        elif sensor is not None:
             TERMINAL.print(
                 f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it"
             )
@@ -91,10 +99,23 @@ def record(
         except DeviceLost as exc:
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
     done = f"{recorder.scans} scans, missed {recorder.missed}, {recorder.size} bytes"
-    if sensor is not None:
+    if force_port:
         done += f", {recorder.forces} forces"
-        done += f", {sensor.damaged} lines that are no numbers" if sensor.damaged else ""
+    if sensor is not None and sensor.damaged:
+        done += f", {sensor.damaged} lines that are no numbers"
     TERMINAL.print(f"{file}: {done}", markup=False)
+
+
+def _truth(skin: Device, recorder: Recorder) -> Callable[[Scan], None]:
+    """Records the true force on a simulated skin, as a force sensor under it would show it."""
+    true_force_n = skin.true_force_n
+    if true_force_n is None:
+        raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
+
+    def look(scan: Scan) -> None:
+        recorder.add(ForceSample(float(true_force_n(scan).sum()), scan.host_time_s, source=TRUTH))
+
+    return look
 
 
 def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:

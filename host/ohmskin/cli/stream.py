@@ -24,6 +24,7 @@ from ohmskin.cli.board import Port, Scans, Seconds, asked_for
 from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
+from ohmskin.force.contacts import ContactTracker
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -79,7 +80,7 @@ def stream(
         with ends_by_ctrl_c():
             given = asked_for(skin, scans, seconds)
             if as_json:
-                _print_scans(reader, given)
+                _print_scans(skin, reader, given)
             else:
                 _show_scans(skin, reader, given)
     lost = skin.stats
@@ -89,7 +90,7 @@ def stream(
         print(text, file=sys.stderr)  # noqa: T201
 
 
-def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
+def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
     for scan in scans:
         line: dict[str, Any] = {
             "scan": scan.number,
@@ -114,6 +115,8 @@ def _print_scans(reader: SkinReader | None, scans: Iterator[Scan]) -> None:
                     {name: numbers(getattr(contact, name)) for name in of_contact}
                     for contact in shown.contacts
                 ]
+                if skin.true_force_n is not None:
+                    line["true_force_n"] = numbers(skin.true_force_n(scan))
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
         except BrokenPipeError:
@@ -127,7 +130,7 @@ def numbers(values: ArrayLike) -> Any:
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
-    drawn_s = 0.0
+    drawn_s = float("-inf")  # a skin in stepped time begins at 0
     live = Live(console=_out, auto_refresh=False) if _out.is_terminal else None
     with live or nullcontext():
         for scan in scans:
@@ -163,7 +166,13 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
             f"contact {one.identity}: {one.force_text} at ({one.row:.1f}, {one.column:.1f})"
             for one in shown.contacts
         )
-        caption = f"{'   '.join(contacts) or 'no contact'}\n{caption}"
+        lines = ["   ".join(contacts) or "no contact"]
+        if skin.true_force_n is not None:
+            true_n = skin.true_force_n(scan)
+            truth = ContactTracker().update(0, true_n > KNOWN_N, true_n, np.zeros_like(true_n))
+            of_each = (f"{one.force_n:.2f} N at ({one.row:.1f}, {one.column:.1f})" for one in truth)
+            lines.append(f"truth: {'   '.join(of_each) or 'no contact'}")
+        caption = "\n".join([*lines, caption])
     else:
         title = f"{skin.name}: cell conductance by '{reader.method}' [microsiemens]"
         table = coloured(1e6 * shown.estimate.cell_siemens, FULL_SCALE_USIEMENS)

@@ -127,7 +127,7 @@ class EmulatedBoard:
         self.settings = dict(self._stored or self._defaults)
         self._settings_source = "stored" if self._stored else "defaults_blank"
         self._reset_cause = cause
-        self._boot_s = self.now_s
+        self.boot_s = self.now_s
         self._plan = _scan_plan(self.settings)
         self._baud = _CONSTANTS["baud_default"]
         self._sequence = 0
@@ -243,7 +243,7 @@ class EmulatedBoard:
             "scan",
             protocol.pack_codes(codes),
             scan=self._scan % _SCAN.span("scan"),
-            time_us=round((start_s - self._boot_s) * 1e6) % _SCAN.span("time_us"),
+            time_us=round((start_s - self.boot_s) * 1e6) % _SCAN.span("time_us"),
             dropped=0,
             rx_errors=self._decoder.stats.damaged % _SCAN.span("rx_errors"),
             rows=codes.shape[0],

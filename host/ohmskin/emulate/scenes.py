@@ -3,7 +3,12 @@
 
 A scene is a skin, whose wires and cells at rest are drawn from a seed, and touches that depend on
 time alone. So a scene always gives the same answer for the same time. It begins untouched, so that
-who tares first tares the skin at rest.
+who tares first tares the skin at rest. In "weights" alone, touches depend on what `Scene.put` is
+told.
+
+Every scene knows the forces on its cells, by the simplest law that a calibration can learn: the
+conductance that a force F adds to a cell is k F^b, with a k of each cell. It has no creep, no
+hysteresis, no drift and no noise of the contact, as textiles have (docs/force.md).
 """
 
 from dataclasses import replace
@@ -49,6 +54,34 @@ _FINGER_STD_CELLS: Final = 0.7
 # A cell in its middle gains this conductance [S]. Chosen: 5 kOhm is a firm touch.
 _FINGER_SIEMENS: Final = 2e-4
 
+# A force of 1 N adds this conductance to a usual cell [S]. Chosen: as in the studies' model of
+# textile contact (studies/press.py).
+_SIEMENS_AT_1N: Final = 30e-6
+# The conductance grows with this power of the force. Chosen: as in that model.
+_EXPONENT: Final = 1.7
+# Cells scatter by this in what they conduct at 1 N: it is the standard deviation of its logarithm.
+# Chosen: as in that model.
+_GAIN_SPREAD: Final = 0.2
+# The robot of the scene "presses" begins at this time [s]. Chosen: boot loader and tare are over.
+_ROBOT_BEGIN_S: Final = 6.0
+# It presses each cell so often. Chosen: so many give a cell a curve of its own.
+ROBOT_PRESSES: Final = 5
+# Least and largest peak of its presses [N]. Chosen: from a touch to a firm push of a finger.
+_ROBOT_PEAK_N: Final = (0.4, 8.0)
+# A press begins at the first of these times, holds from the second to the third, and is gone at
+# the fourth [s]. Chosen: a scan is short against them.
+_ROBOT_PRESS_S: Final = (0.0, 0.2, 0.4, 0.6)
+# Least and longest pause before a press [s]. Chosen: presses at even times could not be aligned.
+_ROBOT_PAUSE_S: Final = (0.15, 0.45)
+
+# When touches begin, where it is not at `BEGIN_S` [s].
+_BEGIN_S: Final = {
+    "rest": float("inf"),
+    "corners": _CORNERS_BEGIN_S,
+    "presses": _ROBOT_BEGIN_S,
+    "weights": 0.0,
+}
+
 SCENES: Final = {
     "rest": "nothing touches the skin",
     "single": f"after {BEGIN_S:g} s (begin=0: at once, as in every scene), one touch in the middle",
@@ -58,13 +91,16 @@ SCENES: Final = {
     f"{_CORNERS_HELD_S:g} s one of them moves across",
     "moving": f"after {BEGIN_S:g} s, one fingertip on a closed curve over the whole skin, once in "
     f"{_MOVING_PERIOD_S:g} s",
+    "presses": f"after {_ROBOT_BEGIN_S:g} s, a robot presses cell after cell {ROBOT_PRESSES} times "
+    f"with {_ROBOT_PEAK_N[0]:g} to {_ROBOT_PEAK_N[1]:g} N, which takes some 4.5 s a cell",
+    "weights": "the weights that 'ohmskin calibrate weights' asks for",
 }
 
 
 class Scene:
     """A scene by name (see `SCENES`) on a rows x columns skin.
 
-    Conductance of a cell: g(t) = 1 / r_rest + touch(t) [S], both (rows, columns).
+    Conductance of a cell: g(t) = 1 / r_rest + touch(t), touch = k F(t)^b [S], all (rows, columns).
 
     seed: of the wires and cells at rest, and of the touches of "multi".
     faults: what is wrong with the skin; a fault that differs from reading to reading, such as hum,
@@ -94,9 +130,8 @@ class Scene:
         self.name = name
         self.rows = rows
         self.columns = columns
-        self.moves = name in ("corners", "moving")
-        usual_s = {"rest": float("inf"), "corners": _CORNERS_BEGIN_S}.get(name, BEGIN_S)
-        self.begin_s = usual_s if begin_s is None else begin_s
+        self.moves = name in ("corners", "moving", "presses", "weights")
+        self.begin_s = _BEGIN_S.get(name, BEGIN_S) if begin_s is None else begin_s
         if not self.begin_s >= 0:
             raise ValueError(f"begin must be 0 s or later, not {begin_s}")
         self.faults = faults or SkinFaults()
@@ -108,6 +143,10 @@ class Scene:
 
         self.rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
         self._touches = self._place(random)
+        # Of other generators, so that a scene has the same skin and touches whatever else is drawn.
+        log_gain = _GAIN_SPREAD * np.random.default_rng([seed, 1]).standard_normal((rows, columns))
+        self._siemens_at_1n = _SIEMENS_AT_1N * np.exp(log_gain)
+        self._robot_peaks_n, self._robot_starts_s = _robot_presses(rows * columns, seed)
         self._still_ratio = lru_cache(
             lambda at_s, mode: self.faults.readings(self.skin(at_s), mode)
         )
@@ -119,14 +158,19 @@ class Scene:
 
     def skin(self, time_s: float) -> Skin:
         """Every resistance of the skin at a time."""
-        if time_s < self.begin_s:
-            touch = np.zeros_like(self._touches)
-        elif self.name == "corners":
-            touch = self._corners(time_s)
-        else:
-            touch = self._finger(time_s) if self.moves else self._touches
-        touched = replace(self.rest, cell_siemens=self.rest.cell_siemens + touch)
+        touched = replace(self.rest, cell_siemens=self.rest.cell_siemens + self._touch(time_s))
         return self.faults.damaged(touched)
+
+    def force_n(self, time_s: float) -> Float:
+        """The true force on each cell at a time, (rows, columns) [N]: (touch / k)^(1 / b)."""
+        return np.asarray((self._touch(time_s) / self._siemens_at_1n) ** (1 / _EXPONENT))
+
+    def put(self, weight: tuple[tuple[int, int], float] | None) -> None:
+        """Press a cell by a force [N], and no other; None: none. For the scene "weights"."""
+        force_n = np.zeros((self.rows, self.columns))
+        if weight is not None:
+            force_n[weight[0]] = weight[1]
+        self._touches = self._siemens_at_1n * force_n**_EXPONENT
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
         """Cells, (rows, columns), to which a touch adds as much as a cell has at rest, 1 uS."""
@@ -138,6 +182,19 @@ class Scene:
         if self.moves and time_s >= self.begin_s:
             return self.faults.readings(self.skin(time_s), mode)
         return self._still_ratio(self.begin_s if time_s >= self.begin_s else -1.0, mode)
+
+    def _touch(self, time_s: float) -> Float:
+        """What touches add to each cell at a time, (rows, columns) [S]."""
+        if time_s < self.begin_s:
+            return np.zeros_like(self._touches)
+        match self.name:
+            case "corners":
+                return self._corners(time_s)
+            case "moving":
+                return self._finger(time_s)
+            case "presses":
+                return self._robot(time_s)
+        return self._touches
 
     def _place(self, random: np.random.Generator) -> Float:
         touches = np.zeros((self.rows, self.columns))
@@ -166,12 +223,31 @@ class Scene:
             touches[cell] = (1 + _TREMBLE_SHARE * np.sin(2 * np.pi * hz * time_s)) / ohm
         return touches
 
+    def _robot(self, time_s: float) -> Float:
+        force_n = np.zeros((self.rows, self.columns))
+        robot_s = time_s - self.begin_s
+        press = int(np.searchsorted(self._robot_starts_s, robot_s, side="right")) - 1
+        if press >= 0:
+            peak_n, into_s = self._robot_peaks_n[press], robot_s - self._robot_starts_s[press]
+            shape_n = (0.0, peak_n, peak_n, 0.0)
+            force_n.flat[press // ROBOT_PRESSES] = np.interp(into_s, _ROBOT_PRESS_S, shape_n)
+        return np.asarray(self._siemens_at_1n * force_n**_EXPONENT)
+
     def _finger(self, time_s: float) -> Float:
         angle = 2 * np.pi * (time_s - self.begin_s) / _MOVING_PERIOD_S
         row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
         away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
         return np.asarray(_FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_STD_CELLS**2)))
+
+
+def _robot_presses(cells: int, seed: int) -> tuple[Float, Float]:
+    """Peaks [N], and when each press begins after the robot has [s]; each (n,), cell after cell."""
+    random, count = np.random.default_rng([seed, 2]), ROBOT_PRESSES * cells
+    least_n, most_n = _ROBOT_PEAK_N
+    peaks_n = least_n * (most_n / least_n) ** random.uniform(size=count)
+    before_s = random.uniform(*_ROBOT_PAUSE_S, count)
+    return peaks_n, np.cumsum(before_s + _ROBOT_PRESS_S[-1]) - _ROBOT_PRESS_S[-1]
 
 
 def _two_of(count: int) -> tuple[int, int]:

@@ -175,13 +175,13 @@ class SimavrLink(SerialLink):
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
             opened.pop_all()
-        self._begin_s = time.monotonic()
+        self.begin_s = time.monotonic()
         self._table_due_s = scene.begin_s
         self.name = name or f"simavr://{board}"
 
     def read(self) -> bytes:
         """See `Link.read`; also moves what touches the skin."""
-        elapsed_s = time.monotonic() - self._begin_s
+        elapsed_s = time.monotonic() - self.begin_s
         if elapsed_s >= self._table_due_s:
             self._table_due_s = elapsed_s + _TABLE_EVERY_S if self._scene.moves else float("inf")
             try:

@@ -6,6 +6,7 @@ here, and those of faults, which `faults` defines.
 """
 
 import re
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFau
 from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
+from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
 from ohmskin.link.session import Session
 from ohmskin.link.url import PortUrl
@@ -35,10 +37,12 @@ def open_emulator(text: str) -> Session:
 
     :raises PortError: the URL is wrong.
     """
-    board, _, faults = emulated(text)
+    board, scene, faults = emulated(text)
     if is_stepped(text):
-        return SteppedSkin(SteppedLink(board, text, faults))
-    return Session(EmulatorLink(board, text, faults))
+        skin: Session = SteppedSkin(SteppedLink(board, text, faults))
+    else:
+        skin = Session(EmulatorLink(board, text, faults))
+    return _in_scene(skin, scene, lambda scan: board.boot_s + 1e-6 * scan.time_us)
 
 
 def open_simavr(text: str) -> Session:
@@ -52,7 +56,17 @@ def open_simavr(text: str) -> Session:
         scene = _scene(url, f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}")
         for name in (*_OF_SCENE, "baud"):
             settings.pop(name, None)
-        return Session(SimavrLink(url.place, scene, text, settings), baud)
+        link = SimavrLink(url.place, scene, text, settings)
+        # Its board has a clock of its own, and begins after its boot loader.
+        return _in_scene(Session(link, baud), scene, lambda scan: scan.host_time_s - link.begin_s)
+
+
+def _in_scene(skin: Session, scene: Scene, time_s: Callable[[Scan], float]) -> Session:
+    """The skin, which knows the forces of its scene. time_s: the scene's time at a scan [s]."""
+    skin.true_force_n = lambda scan: scene.force_n(time_s(scan))
+    if scene.name == "weights":
+        skin.put = scene.put
+    return skin
 
 
 def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:

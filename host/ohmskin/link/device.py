@@ -50,6 +50,10 @@ class Device(Closing):
     def __init__(self, name: str, stats: BoardStats) -> None:
         self.name = name
         """The port's name."""
+        self.true_force_n: Callable[[Scan], Float] | None = None
+        """Gives the force on each cell (R, C) [N] at a scan, where a simulation knows it."""
+        self.put: Callable[[tuple[tuple[int, int], float] | None], None] | None = None
+        """Presses a cell by a force [N], or none, where a simulated skin lets a program do so."""
         self._stats = stats
         self._changed = threading.Condition()
         self._hello: Hello | None = None

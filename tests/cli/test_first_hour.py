@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an emulated skin to newtons by commands alone, and how near they come to the truth."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command_line import Done, Run, assert_one_line, well
+from ohmskin.arrays import Float
+from ohmskin.record.recording import load_recording
+
+INDENTER = ("--indenter-mm2", "80")
+
+
+def by_robot(run: Run, skin: str, folder: Path) -> Path:
+    """A calibration from what the scene "presses" does to the skin."""
+    recording, out = folder / "presses.mcap", folder / "skin.json"
+    url = f"emulator://{skin}?scene=presses&rate=45&speed=0"
+    seconds = ("--seconds", str(8 + 4.6 * np.prod([int(n) for n in skin.split("x")])))
+    done = well(run("record", url, str(recording), "--force-port", "truth", *seconds))
+    given = load_recording(recording)
+    assert f"{len(given.scans)} scans, missed 0" in done.out
+    assert f", {len(given.forces)} forces\n" in done.out
+    assert {sample.source for sample in given.forces} == {"truth"}
+    well(run("calibrate", "recording", str(recording), str(out), *INDENTER))
+    return out
+
+
+def by_weights(run: Run, skin: str, folder: Path) -> Path:
+    """A calibration from weights, which the scene "weights" puts where it is asked to."""
+    out = folder / "skin.json"
+    url = f"emulator://{skin}?scene=weights&rate=20&speed=0"
+    grams = ("--grams", "50,200,400", "--repeats", "2")
+    done = well(run("calibrate", "weights", url, str(out), *grams, *INDENTER))
+    asked = [line for line in done.out.splitlines() if line.startswith("put ")]
+    assert len(asked) == len(set(asked)) * 2 == 6 * np.prod([int(n) for n in skin.split("x")])
+    assert "wrong" not in done.out
+    return out
+
+
+def streamed(run: Run, url: str, calibration: Path) -> tuple[Float, Float]:
+    """Forces and true forces of the cells in one scan [N]."""
+    done: Done = well(
+        run("stream", url, "--calibration", str(calibration), "--scans", "3", "--json")
+    )
+    line = json.loads(done.out.splitlines()[-1])
+    return np.array(line["force_n"], dtype=float), np.array(line["true_force_n"])
+
+
+@pytest.mark.parametrize("calibrated", [by_robot, by_weights])
+def test_forces_of_many_touches_are_those_of_the_scene(
+    run: Run, tmp_path: Path, calibrated: Callable[[Run, str, Path], Path]
+) -> None:
+    out = calibrated(run, "3x3", tmp_path)
+    for scene in ("ghost", "single"):
+        url = f"emulator://3x3?scene={scene}&begin=0&speed=0"
+        force_n, true_n = streamed(run, url, out)
+        pressed = true_n > 0
+        assert pressed.sum() == {"ghost": 3, "single": 1}[scene]
+        np.testing.assert_allclose(force_n[pressed], true_n[pressed], rtol=0.1)
+        assert force_n[~pressed].max() < 0.1
+    done = well(run("stream", url, "--calibration", str(out), "--scans", "1"))
+    assert f"truth: {true_n.max():.2f} N at (1.0, 1.0)\n" in done.out
+
+
+def test_only_a_simulated_skin_has_a_truth(run: Run, tmp_path: Path) -> None:
+    recording = tmp_path / "a.mcap"
+    well(run("record", "emulator://2x2?speed=0", str(recording), "--scans", "5"))
+    again = ("record", f"replay://{recording}?speed=0", str(tmp_path / "b.mcap"))
+    assert_one_line(run(*again, "--force-port", "truth"), "only emulator:// and simavr:// know it")

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forces of scenes: what presses a cell, and what that adds to its conductance."""
+
+import numpy as np
+import pytest
+
+from ohmskin.calibrate.rules import MIN_PRESSES
+from ohmskin.emulate.scenes import ROBOT_PRESSES, SCENES, Scene
+
+
+def rise(scene: Scene, time_s: float) -> np.ndarray:
+    """What touches add to the cells [S]."""
+    return scene.skin(time_s).cell_siemens - scene.rest.cell_siemens
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_cells_follow_one_power_law_each_in_every_scene(name: str) -> None:
+    """Scenes of one seed are of one skin: its cells have the same law, whatever presses them."""
+    scene, scale = Scene(name, 3, 4, seed=5), Scene("weights", 3, 4, seed=5)
+    scene.put(((1, 1), 2.0) if name == "weights" else None)
+    for time_s in np.arange(0.0, 20.0, 0.37):
+        force_n = scene.force_n(time_s)
+        assert ((force_n > 0) == (rise(scene, time_s) > 0)).all()
+        for cell in np.argwhere(force_n):
+            place = int(cell[0]), int(cell[1])
+            scale.put((place, float(force_n[place])))
+            np.testing.assert_allclose(rise(scale, 0.0)[place], rise(scene, time_s)[place])
+    one_n, two_n = (scale.put(((2, 3), each)) or rise(scale, 0.0)[2, 3] for each in (1.0, 2.0))
+    assert two_n / one_n == pytest.approx(2**1.7)
+    assert one_n == pytest.approx(30e-6, rel=1.0)
+
+
+def test_a_weight_lies_on_one_cell_until_it_is_taken_off() -> None:
+    scene = Scene("weights", 2, 2)
+    untouched = scene.ratio(1.0)
+    for weight in (((0, 1), 1.5), ((1, 0), 0.5), None):
+        scene.put(weight)
+        force_n = np.zeros((2, 2))
+        if weight is not None:
+            force_n[weight[0]] = weight[1]
+        np.testing.assert_allclose(scene.force_n(1.0), force_n)
+        assert (scene.ratio(1.0) == untouched).all() == (weight is None)
+
+
+def test_the_robot_presses_each_cell_as_often_as_a_curve_needs() -> None:
+    assert ROBOT_PRESSES == MIN_PRESSES
+    scene = Scene("presses", 2, 3, seed=4)
+    times_s = np.arange(0.0, 6 + 6 * 5 + 2, 0.005)
+    force_n = np.array([scene.force_n(time_s).ravel() for time_s in times_s])
+    assert not force_n[times_s < 6].any()
+    assert (np.count_nonzero(force_n, axis=1) <= 1).all()
+    begins = np.flatnonzero((force_n[1:].sum(axis=1) > 0) & (force_n[:-1].sum(axis=1) == 0)) + 1
+    cells = force_n[begins + 1].argmax(axis=1)
+    assert cells.tolist() == [cell for cell in range(6) for _ in range(5)]
+    peaks_n = np.array([force_n[begin : begin + 120].max() for begin in begins])
+    assert peaks_n.min() >= 0.4
+    assert peaks_n.max() <= 8.0
+    assert np.unique(np.round(np.diff(times_s[begins]), 2)).size > 10  # at irregular times
+    assert not force_n[-1].any()
