@@ -114,7 +114,7 @@ def test_wires_as_large_as_cells_at_rest_are_said(
 ) -> None:
     wires = np.full((8, 8), ohm)
     rest = readings(Skin(rest_of((8, 8)).cell_siemens, wires, wires))
-    knowledge = replace(told(rest), nominal_wire_ohm=WireOhm(ohm, ohm, 0.0))
+    knowledge = replace(told(rest), nominal_wire_ohm=WireOhm(ohm, ohm, lead=0.0))
     found = make_estimator(method, knowledge).estimate(rest)
     assert ("wires resist too much" in found.message) == is_too_much
 

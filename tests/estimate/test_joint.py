@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
@@ -18,7 +19,14 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import LAYER_STD, REST_STD, SEGMENT_STD, CellPrior
+from ohmskin.estimate.prior import (
+    LAYER_STD,
+    LEAD_STD,
+    OWN_LEAD_STD,
+    REST_STD,
+    SEGMENT_STD,
+    CellPrior,
+)
 from ohmskin.estimate.wire_belief import LearnedWires
 from skins import reference, ten_bits, told
 from studies.trials import skin_at_rest, touch
@@ -141,31 +149,37 @@ def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
 
 
 def test_the_answer_is_where_the_posterior_is_highest() -> None:
-    """Against the posterior written out with dense matrices, along each of all 3RC resistances."""
+    """Against the posterior written out with dense matrices, along each of all resistances."""
     random = np.random.default_rng(8)
     rest = skin_at_rest(3, 4, random)
     known, measured = told(readings(rest)), ten_bits(readings(touch(rest, 3, random)))
-    prior = CellPrior(-np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD))
-    layer = np.kron(np.eye(2), np.ones((12, 12)))
-    inverse = np.linalg.inv(LAYER_STD**2 * layer + SEGMENT_STD**2 * np.eye(24))
-    nominal = np.log(np.repeat([100.0, 200.0], 12))
+    wires = WireOhm(100.0, 200.0, lead=500.0)
+    belief = LearnedWires((3, 4), wires)
+    prior = CellPrior(
+        -np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD), np.zeros((12, 3)), belief.means
+    )
+    shared = scipy.linalg.block_diag(*(np.ones((n, n)) for n in (12, 12, 7)))
+    stds = np.repeat([LAYER_STD, LAYER_STD, LEAD_STD * 500.0], (12, 12, 7))
+    own = np.repeat([SEGMENT_STD, SEGMENT_STD, OWN_LEAD_STD * 500.0], (12, 12, 7))
+    inverse = np.linalg.inv(shared * stds * stds[:, None] + np.diag(own**2))
+    nominal = np.repeat([np.log(100.0), np.log(200.0), 500.0], (12, 12, 7))
     ports = PortReader(known).read(measured)
 
-    def cost(log_ohm: Float) -> float:
-        cell, top, bottom = log_ohm.reshape(3, 3, 4)
+    def cost(state: Float) -> float:
+        (cell, top, bottom), leads = state[:36].reshape(3, 3, 4), state[36:]
         rho = port_resistance_ohm(Skin(np.exp(-cell), np.exp(top), np.exp(bottom)))
+        rho = rho + leads[:3, None] + leads[3:]
         residual = (ports.current.ravel() - 1 / (rho.ravel() + 6e4)) / ports.current_std.ravel()
-        off, square = log_ohm[12:] - nominal, prior.rise_stds(log_ohm[:12]) ** 2
+        off, square = state[12:] - nominal, prior.rise_stds(state[:12]) ** 2
         of_cells = np.where(square < 1, square, 1 + np.log(square))
         return float(np.sum(residual**2) + of_cells.sum() + off @ inverse @ off)
 
-    belief = LearnedWires((3, 4), WireOhm(100.0, 200.0))
     found = FullFit(prior, belief, 6e4, ports, prior.expected)
     assert not found.message
-    best = np.concatenate([found.log_cells, found.log_wires])
+    best = np.concatenate([found.log_cells, found.wires])
     lowest = cost(best)
-    for resistor in range(36):
+    for resistor in range(43):
         for step in (-0.03, -0.003, 0.003, 0.03):
             moved = best.copy()
-            moved[resistor] += step
+            moved[resistor] += step * (500.0 if resistor >= 36 else 1.0)
             assert cost(moved) > lowest - 0.05

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from network import Network, skin_network  # tests/helpers
 from ohmskin.arrays import Float
@@ -12,7 +13,7 @@ from ohmskin.circuit.skin import PortCircuit, Skin, port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.prior import FADE_SHARE, LAYER_STD, SEGMENT_STD
+from ohmskin.estimate.prior import FADE_SHARE, LAYER_STD, OWN_LEAD_STD, SEGMENT_STD
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
 from ohmskin.estimate.wire_belief import LearnedWires, Lesson
 from ohmskin.record.readings import estimate_file
@@ -277,70 +278,77 @@ def test_wires_that_touch_reports_are_those_that_it_has_learned() -> None:
 def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     """Against the textbook's covariance form, two lessons, with what fades after each."""
     random = np.random.default_rng(8)
-    belief = LearnedWires((2, 3), WireOhm(100.0, 200.0))
-    layers, own = np.kron(np.eye(2), np.ones((6, 1))), SEGMENT_STD**2 * np.eye(12)
-    mean, covariance = np.log([100.0, 200.0]), LAYER_STD**2 * np.eye(2)
+    belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0, lead_std_ohm=20.0))
+    layers = scipy.linalg.block_diag(*(np.ones((n, 1)) for n in (6, 6, 5)))
+    mean = np.array([np.log(100.0), np.log(200.0), 50.0])
+    prior = np.diag([LAYER_STD, LAYER_STD, 20.0]) ** 2
+    covariance, scale = prior.copy(), np.repeat([1.0, 1.0, 0.01], (6, 6, 5))
     for _ in range(2):
-        slopes, residual = random.normal(size=(4, 12)), random.normal(size=4)
+        slopes, residual = scale * random.normal(size=(4, 17)), random.normal(size=4)
+        own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, OWN_LEAD_STD * mean[2]], (6, 6, 5))) ** 2
         noise = np.diag(random.uniform(1, 2, 4))
         whole = layers @ covariance @ layers.T + own
         gain = covariance @ layers.T @ slopes.T @ np.linalg.inv(slopes @ whole @ slopes.T + noise)
         mean = mean + gain @ residual
         covariance = covariance - gain @ slopes @ layers @ covariance
-        covariance += FADE_SHARE * (LAYER_STD**2 * np.eye(2) - covariance)
+        faded = prior.copy()
+        faded[2, 2] = covariance[2, 2]
+        covariance += FADE_SHARE * (faded - covariance)
         factor = np.linalg.cholesky(slopes @ (whole @ slopes.T) + noise)
-        belief.take(Lesson(belief.per_layer_std(slopes @ layers), residual, factor))
+        belief.take(Lesson(belief.per_mean_std(slopes @ layers), residual, factor))
+    own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, OWN_LEAD_STD * mean[2]], (6, 6, 5))) ** 2
     whole = layers @ covariance @ layers.T + own
     np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
-    root = belief.per_std(np.eye(12))
-    np.testing.assert_allclose(root @ root.T, whole, atol=1e-12)
-    np.testing.assert_allclose(root[:, -2:], belief.per_layer_std(layers), atol=1e-12)
-    assert belief.layer_std() == pytest.approx(np.sqrt(covariance.diagonal().max()))
-    away = random.normal(size=14)
-    wires = belief.log_wires_off(away[-2:], away[:-2])
-    np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=1e-9)
-    some = random.normal(size=(3, 12))
-    before = np.log([100.0, 200.0])
-    moved = belief.moved_since(before, belief.per_layer_std(some @ layers))
+    root = belief.per_std(np.eye(17), np.zeros((17, 3)))
+    np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(root[:, -3:], belief.per_mean_std(layers), atol=1e-9)
+    np.testing.assert_allclose(belief.mean_std(), np.sqrt(covariance.diagonal()))
+    away = 0.1 * random.normal(size=20)
+    wires = belief.wires_off(away[-3:], away[:-3])
+    np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=0.01)
+    some = random.normal(size=(3, 17))
+    before = np.array([np.log(100.0), np.log(200.0), 50.0])
+    moved = belief.moved_since(before, belief.per_mean_std(some @ layers))
     np.testing.assert_allclose(moved, some @ (belief.mean - layers @ before), rtol=1e-9)
 
 
 def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
     """The belief is that of a skin that the first frame of the touch never taught."""
     random = np.random.default_rng(9)
-    slopes = random.normal(size=(3, 5, 2))  # of three frames, by the logs of the layers
+    slopes = random.normal(size=(3, 5, 3)) * (1.0, 1.0, 0.01)  # of three frames, by the means
     residual, noise = random.normal(size=(3, 5)), np.diag(random.uniform(1, 2, 5))
-    nominal = np.log([100.0, 200.0])
+    nominal = np.array([np.log(100.0), np.log(200.0), 50.0])
 
     def teach(belief: LearnedWires, frame: int, *, replace_last: bool = False) -> None:
-        at_mean = residual[frame] - slopes[frame] @ (belief.log_layers - nominal)
-        per_std = belief.per_layer_std(slopes[frame])
+        at_mean = residual[frame] - slopes[frame] @ (belief.means - nominal)
+        per_std = belief.per_mean_std(slopes[frame])
         factor = np.linalg.cholesky(per_std @ per_std.T + noise)
         belief.take(Lesson(per_std, at_mean, factor), replace_last=replace_last)
 
-    taught, never = (LearnedWires((2, 3), WireOhm(100.0, 200.0)) for _ in range(2))
+    taught, never = (LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0)) for _ in range(2))
     teach(taught, 0)
     teach(taught, 1)
     teach(taught, 2, replace_last=True)
     teach(never, 0)
     teach(never, 2)
-    np.testing.assert_allclose(taught.log_layers, never.log_layers, rtol=1e-9)
+    np.testing.assert_allclose(taught.means, never.means, rtol=1e-9)
     np.testing.assert_allclose(
-        taught.per_layer_std(np.eye(2)), never.per_layer_std(np.eye(2)), atol=1e-9
+        taught.per_mean_std(np.eye(3)), never.per_mean_std(np.eye(3)), atol=1e-9
     )
 
 
 def test_a_touch_alone_does_not_take_the_lesson_before_it_away() -> None:
-    belief = LearnedWires((2, 3), WireOhm(100.0, 200.0))
-    lesson = Lesson(belief.per_layer_std(np.ones((2, 2))), np.ones(2), 3.0 * np.eye(2))
+    belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0))
+    slopes = np.array([[1.0, 1.0, 0.01]] * 2)
+    lesson = Lesson(belief.per_mean_std(slopes), np.ones(2), 3.0 * np.eye(2))
     belief.take(lesson)
-    taught = belief.log_layers
-    nothing = Lesson(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0)))
+    taught = belief.means
+    nothing = Lesson(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 0)))
     belief.take(nothing)
     belief.take(nothing, replace_last=True)
-    assert belief.log_layers is taught
+    np.testing.assert_array_equal(belief.means, taught)
     belief.take(lesson, replace_last=True)
-    assert np.all(np.abs(belief.log_layers) > np.abs(taught))
+    assert np.all(np.abs(belief.means) > np.abs(taught))
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])

@@ -9,35 +9,50 @@ symbol shape     meaning                                                        
 p, s   (n,)      what the line lost per current of its ports, and its deviation     ohm
 c      (n, n)    current through its segments, per current of these ports           1
 q      (n,)      what segments like the layer's mean, as believed, would lose       ohm
-t      (2,)      mean segment of each layer, over what is believed of it            1
+t      (4,)      mean segment of each layer over what is believed of it; o; and
+                 the mean lead [ohm]
 o      scalar    offset of far ends against near ones, over its deviation           1
 h      (n,)      what an offset of one deviation adds to p: over I, so it differs    ohm
                  from port to port
 m      scalar    reference: mean segment of the layer, as first seen                ohm
-z      (n,)      the line's segments, in shares of m; y their mean                  1
-v      scalar    variance of a segment's own deviation, in shares of the mean. In   1
-                 the fit of t, a line as a whole gets the same: the worst case
-L, l   (n, n)    information of all frames: sums of m^2 c^T c / s^2, m c^T p / s^2; l is (n,)
+z      (1+n,)    the line's lead [ohm] and its segments, in shares of m; y their
+                 mean
+V      (1+n,)    variances of what each of them has of its own. In the fit of t, a
+                 line as a whole gets the same share: the worst case
+L      (1+n,     information of all frames: sums of g^T g / s^2, with g = [1, m c] the
+       1+n)      slopes of p by z
+l      (1+n,)    sums of g^T p / s^2
 ====== ========= ================================================================== ==========
 
-The circuit gives c and q, which depend little on the wires. So p = m c z is linear in the segments.
+The circuit gives c and q, which depend little on the wires. So p = g z is linear in the wires.
 
-A frame alone shows the layers. An offset of the far ends would make rows seem to lose too much and
-columns too little, so it is found with the layers. Minimised is, over t and o,
+A lead loses its resistance for each current of a port, the same for all ports of the line. So of
+what a line loses, q grows from port to port, and the lead is what stays.
 
-    sum_lines (p - t q -+ o h)^T (s^2 + v q q^T)^-1 (p - t q -+ o h) + o^2     (- rows, + columns).
+A frame alone shows the layers and the mean lead. An offset of the far ends would make rows seem to
+lose too much and columns too little, so it is found with them. Minimised is, over t and o,
 
-v q q^T is there because the ports of a line share its segments: what these have of their own moves
-all ports of the line together, so they are not as many independent looks at the layer. The result
-is weighed against what frames before have shown. That fades, because a skin bends.
+    sum_lines (p - X t)^T (s^2 + A A^T)^-1 (p - X t) + o^2 + (lead - k)^2 / d^2 ,
+
+where X has the columns q of the line's layer, -+ h of the offset (- rows, + columns) and ones for
+the lead, t is what each is multiplied with, and A has the columns q and ones, each times the
+deviation that a wire has of its own. A is there because the ports of a line share its wires: what
+these have of their own moves all ports of the line together, so they are not as many independent
+looks at the means. k and d are the mean lead that frames before have shown, and its deviation. For
+the layers, the result is weighed against what frames before have shown. That fades, because a skin
+bends.
 
 What single segments have of their own takes many frames. It does not fade, because it is kept in
 shares of a reference m, and a bend stretches all segments alike. m stays until the layer differs
-from it by more than a segment does. With the normal prior of z, the mean y and the variance v,
+from it by more than a segment does. With z the lead of a line [ohm] and its segments [m], u of them
+what is expected, and V its variances, as a diagonal,
 
-    z = y + v (1 + v L)^-1 (l - L y) , y = sum_lines 1^T (1 + v L)^-1 l / sum 1^T (1 + v L)^-1 L 1 ,
+    z = u + V (1 + L V)^-1 (l - L u) ,
 
-of covariance v (1 + v L)^-1; y is where the readings of all lines are most probable.
+of covariance V (1 + L V)^-1. The expected lead is the mean lead. Expected segments are all y, where
+the readings of all lines are most probable: with e the ones of segments,
+
+    y = sum_lines e^T (1 + L V)^-1 (l - L u_lead) / sum_lines e^T (1 + L V)^-1 L e .
 
 No calmer frame takes a lesson's place here, as it does where touches teach the wires. There, a
 touch is a lesson once, and its error would stay. Here, each frame measures the layers anew, and in
@@ -49,7 +64,13 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import FADE_SHARE, LAYER_STD, MAX_STEP_LOG, SEGMENT_STD
+from ohmskin.estimate.prior import (
+    FADE_SHARE,
+    LAYER_STD,
+    MAX_STEP_LOG,
+    OWN_LEAD_STD,
+    SEGMENT_STD,
+)
 from ohmskin.estimate.wire_belief import Fit, WireBelief
 
 
@@ -59,28 +80,28 @@ class MeasuredWires(WireBelief):
     def reset(self) -> None:
         """Back to the wires at rest, or the nominal ones."""
         super().reset()
-        # Mean and variance of the layers' logs before this frame: each frame starts from here.
-        self._layers_before = self._nominal, np.diagonal(self._prior_covariance)
-        self._log_reference = self._nominal  # log m of both layers
+        # The means and their variances before this frame: each frame starts from here.
+        self._means_before = self._nominal, np.diagonal(self._prior_covariance)
+        self._log_reference = self._nominal[:2]  # log m of both layers
         self._segment_ohm: Float | None = None  # (2, R, C) as learned, None before any lesson
         self._own_std = np.full((2, *self.shape), SEGMENT_STD)  # of z, (2, R, C)
         # L and l of the lines of each layer, which all lessons add to.
         self._information = [
-            (np.zeros((lines, n, n)), np.zeros((lines, n)))
+            (np.zeros((lines, 1 + n, 1 + n)), np.zeros((lines, 1 + n)))
             for lines, n in (self.shape, self.shape[::-1])
         ]
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
-        """Take the layers from this frame, weighed against the frames before.
+        """Take the means from this frame, weighed against the frames before.
 
         log_cells: those that the fit starts from will do: c and q need no more than a model of the
         frame that is nearly right.
         """
-        self._measure(self.circuit(log_cells, self.log_layers), ports)
+        self._measure(self.circuit(log_cells, self.means), ports)
 
     def _measure(self, circuit: PortCircuit, ports: PortReadings) -> tuple[float, float]:
-        """The layers of one frame, from an approximate circuit of it; o and the variance of o."""
-        logs, variance = (before.copy() for before in self._layers_before)
+        """The means of one frame, from an approximate circuit of it; o and the variance of o."""
+        means, variance = (before.copy() for before in self._means_before)
         factors, covariance = self._factors(circuit, ports)
         for layer in (0, 1):
             if self.far[layer]:
@@ -89,64 +110,73 @@ class MeasuredWires(WireBelief):
                 # A scalar Kalman step in logs, for each layer by itself. The variance of log t is
                 # that of t over t^2. That both t have the same error, of o, is neglected.
                 kept = 1.0 / (1.0 + variance[layer] * factor**2 / covariance[layer, layer])
-                measured = self.log_layers[layer] + np.log(factor)
-                logs[layer] += (1 - kept) * (measured - logs[layer])
+                measured = self.means[layer] + np.log(factor)
+                means[layer] += (1 - kept) * (measured - means[layer])
                 variance[layer] *= kept
-        self._believe(logs, np.diag(np.sqrt(variance)))
+        # What was known of the lead is in the fit already.
+        means[2], variance[2] = factors[3], covariance[3, 3]
+        self._believe(means, np.diag(variance))
         return factors[2], covariance[2, 2]
 
     def _factors(self, circuit: PortCircuit, ports: PortReadings) -> tuple[Float, Float]:
-        """t of both layers and o, (3,), and their covariance: the normal equations of the cost.
+        """t, (4,), and its covariance (4, 4): the normal equations of the cost.
 
-        With ab for a^T b / s^2, a sum over the ports of a line, Sherman and Morrison's formula is
+        With ab for a^T b / s^2, a sum over the ports of a line, Woodbury's formula is
 
-            a^T (s^2 + v q q^T)^-1 b = ab - gain qa qb ,   gain = 1 / (1 / v + qq) .
+            a^T (s^2 + A A^T)^-1 b = ab - aA (1 + AA)^-1 Ab .
 
         Raises LinAlgError for readings so exact that nothing is left of these differences.
         """
         weight = ports.drop_std**-2.0
+        lead_ohm, lead_variance = (before[2] for before in self._means_before)
         # The 1 of o is o^2 in the cost. The 1 of t stays only for a layer that is not sensed, whose
         # t nobody uses: without it, there were no inverse.
-        normal, right = np.eye(3), np.zeros(3)
+        normal, right = np.eye(4), np.zeros(4)
+        normal[3, 3], right[3] = 1.0 / lead_variance, lead_ohm / lead_variance
+        own = np.array([SEGMENT_STD, OWN_LEAD_STD * abs(self.means[2])])
         for layer, sign in ((0, 1.0), (1, -1.0)):
             if not self.far[layer]:
                 continue
             q = circuit.drop_ohm[layer].reshape(self.shape)
-            p, h = ports.drop_ohm[layer], sign * ports.drop_shift
-            qq, qh, qp, hh, hp = (
-                (weight * one * other).sum(axis=1 - layer)
-                for one, other in ((q, q), (q, h), (q, p), (h, h), (h, p))
-            )
-            gain = 1.0 / (1.0 / SEGMENT_STD**2 + qq)
-            normal[layer, layer] = (qq - gain * qq * qq).sum()
-            normal[layer, 2] = normal[2, layer] = (qh - gain * qq * qh).sum()
-            normal[2, 2] += (hh - gain * qh * qh).sum()
-            right[layer] = (qp - gain * qq * qp).sum()
-            right[2] += (hp - gain * qh * qp).sum()
+            columns = q, sign * ports.drop_shift, np.ones_like(q), ports.drop_ohm[layer]
+            lines = np.moveaxis(np.array([*columns, weight]), 1 + layer, 1)
+            x, of_ports = lines[:-1], lines[-1]
+            products = np.einsum("alp,blp,lp->lab", x, x, of_ports)
+            shared = products[:, [0, 2]] * own[:, None]
+            system = np.eye(2) + shared[:, :, [0, 2]] * own
+            products -= shared.transpose(0, 2, 1) @ np.linalg.solve(system, shared)
+            summed = products.sum(axis=0)
+            normal[layer, layer] = 0.0
+            at = [layer, 2, 3]
+            normal[np.ix_(at, at)] += summed[:3, :3]
+            right[at] += summed[:3, 3]
         covariance = np.asarray(np.linalg.inv(normal), np.float64)
         return covariance @ right, covariance
 
     def fix_rest_wires(self) -> None:
         """Later frames are expected about the wires at rest, but for a bend."""
-        variance = np.where(self.far, LAYER_STD**2, np.diagonal(self._prior_covariance))
-        self._nominal, self._prior_covariance = self.log_layers, np.diag(variance)
-        self._layers_before = self._nominal, variance
+        prior = np.diagonal(self._prior_covariance)
+        bend = np.array([*np.where(self.far, LAYER_STD**2, prior[:2]), self._root[2, 2] ** 2])
+        self._nominal, self._prior_covariance = self.means, np.diag(bend)
+        self._means_before = self._nominal, bend
 
-    def after_fit(self, fit: Fit, ports: PortReadings) -> None:
-        """Learn from a frame that is news: layers as before the fit, and single segments."""
+    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
+        """Learn from a frame that is news: means as before the fit, and single segments."""
         if not self._is_news(fit.log_cells):
-            return
+            return False
         self._lesson_cells = fit.log_cells
-        circuit = self.circuit(fit.log_cells, self.log_layers)
+        circuit = self.circuit(fit.log_cells, self.means)
         offset = self._measure(circuit, ports)
         variance = np.diagonal(self._root) ** 2
         most = np.diagonal(self._prior_covariance)
-        self._layers_before = self.log_layers, variance + FADE_SHARE * (most - variance)
+        fades = np.array([FADE_SHARE, FADE_SHARE, 0.0])  # a bend does not change leads
+        self._means_before = self.means, variance + fades * (most - variance)
         segments = self.segment_ohm(self.mean)
         for layer in (0, 1):
             if self.far[layer]:
                 segments[layer] = self._segments_of(layer, circuit, ports, offset)
         self._segment_ohm = segments
+        return False
 
     def _segments_of(
         self, layer: int, circuit: PortCircuit, ports: PortReadings, offset: tuple[float, float]
@@ -156,29 +186,32 @@ class MeasuredWires(WireBelief):
         It adds the frame to the L and l of the layer's lines, and sets the layer's `_own_std`.
         offset: o and its variance, in this frame.
         """
-        if abs(self.log_layers[layer] - self._log_reference[layer]) > SEGMENT_STD:
+        if abs(self.means[layer] - self._log_reference[layer]) > SEGMENT_STD:
             self._log_reference = self._log_reference.copy()
-            self._log_reference[layer] = self.log_layers[layer]
+            self._log_reference[layer] = self.means[layer]
         shift = (1 - 2 * layer) * ports.drop_shift
         drop = ports.drop_ohm[layer] - offset[0] * shift
         weight = 1.0 / (ports.drop_std**2 + offset[1] * shift**2)
         if layer == 1:  # a line first, then its ports
             drop, weight = drop.T, weight.T
-        reference_ohm = np.exp(self._log_reference[layer])
-        slopes = reference_ohm * circuit.line_current(layer)  # m c, (lines, ports, segments)
+        reference_ohm, lead_ohm = np.exp(self._log_reference[layer]), self.means[2]
+        currents = circuit.line_current(layer)  # c, (lines, ports, segments)
+        slopes = np.concatenate([np.ones((*drop.shape, 1)), reference_ohm * currents], axis=2)  # g
         heavy = slopes * weight[..., None]
         information, pull = self._information[layer]  # L and l, which are written into
         information += np.matmul(heavy.transpose(0, 2, 1), slopes)
         pull += np.einsum("lpk,lp->lk", heavy, drop)
-        variance = SEGMENT_STD**2
-        inverse = np.linalg.inv(np.eye(len(information[0])) + variance * information)
-        # (1 + v L)^-1 l, and (1 + v L)^-1 L 1, of each line.
+        variance = np.full(slopes.shape[2], SEGMENT_STD**2)
+        variance[0] = max((OWN_LEAD_STD * lead_ohm) ** 2, 1e-6)
+        inverse = np.linalg.inv(np.eye(len(variance)) + information * variance)
+        # (1 + L V)^-1 (l - L u_lead), and (1 + L V)^-1 L e, of each line.
+        beyond_lead = pull - information[..., 0] * lead_ohm
         of_pull, of_ones = np.matmul(
-            inverse, np.stack([pull, information.sum(axis=2)], axis=2)
+            inverse, np.stack([beyond_lead, information[..., 1:].sum(axis=2)], axis=2)
         ).transpose(2, 0, 1)
-        mean = of_pull.sum() / of_ones.sum()
-        share = mean + variance * (of_pull - mean * of_ones)
-        own_std = np.sqrt(variance * np.einsum("lkk->lk", inverse))
+        mean = of_pull[:, 1:].sum() / of_ones[:, 1:].sum()
+        share = (mean + variance * (of_pull - mean * of_ones))[:, 1:]
+        own_std = np.sqrt(variance * np.einsum("lkk->lk", inverse))[:, 1:]
         self._own_std[layer] = own_std if layer == 0 else own_std.T
         return np.asarray(reference_ohm * (share if layer == 0 else share.T))
 
@@ -190,4 +223,4 @@ class MeasuredWires(WireBelief):
 
     def segment_std(self) -> Float:
         """As of layers that are known, and what readings leave of each segment's own."""
-        return np.asarray(np.hypot(np.diagonal(self._root)[:, None, None], self._own_std))
+        return np.asarray(np.hypot(np.diagonal(self._root)[:2, None, None], self._own_std))

@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One frame's fit of all 3RC resistances: what `joint` minimises, and what it says of the answer.
+"""One frame's fit of all resistances: what `joint` minimises, and what it says of the answer.
 
 Symbols
 
 ====== ============ ============================================================= ==========
 symbol shape        meaning                                                       unit
 ====== ============ ============================================================= ==========
-x      (RC + 2,)    log resistances: cells, mean segments of both layers          log ohm
-m      (RC + 2,)    what the prior expects of x                                   log ohm
-P      (RC+2, RC+2) covariance of the prior
-u      (RC + 2,)    deviations from the prior: x = m + P^1/2 u                    1
+x      (RC + 3,)    log resistances of cells and mean segments of both layers,    log ohm,
+                    and the mean lead                                             ohm
+m      (RC + 3,)    what the prior expects of x                                   as x
+P      (RC+3, RC+3) covariance of the prior
+u      (RC + 3,)    deviations from the prior: x = m + P^1/2 u                    1
 y, h   (RC,)        measured and modelled port currents per Vdd, over noise       1
-J      (RC, RC + 2) dh / du                                                       1
-W      (RC, 2RC)    dh / dw s, w the log segments, s what each has of its own     1
+J      (RC, RC + 3) dh / du                                                       1
+W      (RC, w)      dh / dw s, w the log segments and the leads, s the deviation  1
+                    that each has of its own
 N      (RC, RC)     covariance of y: of its noise and of what is not in x         1
 S      (RC, RC)     covariance of y, N + J J^T: of all that is not certain        1
-O      (RC, RC + 2) J whitened: L^-1 J, with L L^T = S                            1
+O      (RC, RC + 3) J whitened: L^-1 J, with L L^T = S                            1
 ====== ============ ============================================================= ==========
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2, P of the cells re-weighted for the tails of their prior
-at every step. What segments have of their own is small: it is noise, N = 1 + W W^T, and afterwards
+at every step. What wires have of their own is small: it is noise, N = 1 + W W^T, and afterwards
 W^T S^-1 (y - h(u) + J u) says what it has been. The steps are Gauss-Newton's in the space of the
 readings (Tarantola 2005, eq. 3.51),
 
@@ -60,6 +62,7 @@ class FullFit:
     log_cells: log resistances of the cells, (RC,) [log ohm].
     log_cells_std: their posterior deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
+    leads_log_std: the part of it that comes from the mean lead, (RC,).
     iterations: steps taken.
     message: why it did not converge, or empty.
     """
@@ -77,7 +80,7 @@ class FullFit:
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
         self.log_cells: Float = start
-        self._layer_stds = np.zeros(2)  # u of the layers
+        self._mean_stds = np.zeros(3)  # u of the layers and the lead
         self._moved_log = np.inf  # the most that a log resistance can have moved since N was made
         self._evaluate()
         self._minimise()
@@ -85,18 +88,21 @@ class FullFit:
 
     def _evaluate(self) -> None:
         """The circuit at the present state."""
-        log_layers = self._belief.log_layers_off(self._layer_stds)
-        self._circuit = self._belief.circuit(self.log_cells, log_layers)
-        self._modelled = 1.0 / (self._circuit.port_ohm + self._ref_ohm)
+        self._means = self._belief.means_off(self._mean_stds)
+        self._circuit = self._belief.circuit(self.log_cells, self._means)
+        series_ohm = self._ref_ohm + self._belief.leads_of_port * self._means[2]
+        # No reading has less in series than the references: a step may make leads negative.
+        self._modelled = 1.0 / (self._circuit.port_ohm + max(series_ohm, 0.5 * self._ref_ohm))
         self._residual = (self._current - self._modelled) * self._weight
+        self._prior = self._prior.about(self._means)
         self._centre, self._variance = self._prior.normal(self.log_cells)
 
-    def _weighted(self, slopes: Float, scale: float = 1.0) -> Float:
+    def _weighted(self, slopes: Float) -> Float:
         """Slopes of h from those of rho, (RC, ...), which are overwritten.
 
         h = weight / (rho + ref), so dh / d rho is -weight times the modelled current squared.
         """
-        slopes *= (-scale * self._weight * self._modelled**2)[:, None]
+        slopes *= (-self._weight * self._modelled**2)[:, None]
         return slopes
 
     def _linearise(self) -> None:
@@ -108,27 +114,33 @@ class FullFit:
         """
         if self._moved_log > SEGMENT_STD:
             self._moved_log = 0.0
-            self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
-            self._noise = gram(self._by_segment)
+            by_wire = self._weighted(self._belief.with_leads(self._circuit.by_wires()))
+            self._by_wire = by_wire * self._belief.own_std(self._means)
+            self._noise = gram(self._by_wire)
             np.einsum("ii->i", self._noise)[:] += 1.0
         self._by_cell = self._weighted(self._circuit.by_cell())
-        by_layer = self._weighted(self._circuit.by_layers())
-        self._per_layer_std = self._belief.per_layer_std(by_layer)
+        by_lead = np.full((self._modelled.size, 1), float(self._belief.leads_of_port))
+        by_mean = self._weighted(np.hstack([self._circuit.by_layers(), by_lead]))
+        self._by_mean = by_mean + self._by_cell @ self._prior.by_means
+        self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
         self._slopes, self._factor = self._factorised(self._cell_std)
 
-    def _factorised(self, cell_std: Float) -> tuple[Float, Float]:
-        """J for cells of these deviations (RC,), and L."""
-        slopes = np.empty((len(cell_std), len(cell_std) + 2))
-        np.multiply(self._by_cell, cell_std, out=slopes[:, :-2])
-        slopes[:, -2:] = self._per_layer_std
-        return slopes, cholesky(gram(slopes, onto=self._noise.copy(order="F")))
+    def _factorised(self, cell_std: Float, more: Float | None = None) -> tuple[Float, Float]:
+        """J for cells of these deviations (RC,), and L. more: a root of more noise, (RC, n)."""
+        noise = self._noise.copy(order="F")
+        slopes = np.empty((len(cell_std), len(cell_std) + 3))
+        np.multiply(self._by_cell, cell_std, out=slopes[:, :-3])
+        slopes[:, -3:] = self._per_mean_std
+        return slopes, cholesky(
+            gram(slopes, onto=noise if more is None else gram(more, onto=noise))
+        )
 
     def _minimise(self) -> None:
         """Steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
 
         Each is first tried with the slopes of the one before. The circuit is not evaluated after
-        the last move: `modelled`, `misfit` and `log_wires` are what the last step has forecast.
+        the last move: `modelled`, `misfit` and `wires` are what the last step has forecast.
         """
         self._linearise()
         step, moved_stds = self._step()
@@ -153,38 +165,37 @@ class FullFit:
         centre) / present variance. So u of a cell is this slope times the older deviation.
         """
         cell_stds = (self.log_cells - self._centre) * self._cell_std / self._variance
-        present = np.concatenate([cell_stds, self._layer_stds])
+        present = np.concatenate([cell_stds, self._mean_stds])
         self._weighted_residual = solve(self._factor, self._residual + self._slopes @ present)
         step = self._weighted_residual @ self._slopes - present
         readings_step = self._slopes @ step
-        return step, float(max(np.abs(readings_step).max(), np.abs(step[:-2]).max()))
+        return step, float(max(np.abs(readings_step).max(), np.abs(step[:-3]).max()))
 
     def _move(self, step: Float) -> None:
         """Take a step, or so much of it that no log resistance moves by more than MAX_STEP_LOG."""
+        means_step = self._belief.means_off(step[-3:]) - self._belief.means
         # A cell that would leave its limits goes to the limit, and does not shorten the whole step.
-        log_cells = self.log_cells + self._cell_std * step[:-2]
+        log_cells = self.log_cells + self._cell_std * step[:-3] + self._prior.by_means @ means_step
         cells_step = np.minimum(np.maximum(log_cells, _LEAST_LOG_OHM), _MOST_LOG_OHM)
         cells_step -= self.log_cells
-        layers_step = self._belief.log_layers_off(step[-2:]) - self._belief.log_layers
-        most = max(np.abs(cells_step).max(), np.abs(layers_step).max(), 1e-9)
+        most = max(np.abs(cells_step).max(), np.abs(means_step[:2]).max(), 1e-9)
         share = min(1.0, MAX_STEP_LOG / most)
         self._moved_log += share * most
         self.log_cells = self.log_cells + share * cells_step
-        self._layer_stds = self._layer_stds + share * step[-2:]
+        self._mean_stds = self._mean_stds + share * step[-3:]
 
     @cached_property
-    def log_wires(self) -> Float:
-        """Log resistances of the segments, (2RC,): their layer's, and what they have of their own.
+    def wires(self) -> Float:
+        """Logs of the segments, and leads, (w,): their mean's, and what each has of its own.
 
         The latter was noise of covariance W W^T. Of a residual whose whole covariance is S, its
         most probable share is W^T S^-1 times the residual.
         """
-        segment_stds = self._weighted_residual @ self._by_segment
-        return self._belief.log_wires_off(self._layer_stds, segment_stds)
+        return self._belief.wires_off(self._mean_stds, self._weighted_residual @ self._by_wire)
 
     @property
     def modelled(self) -> Float:
-        """Port currents of the model, (RC,) [S], with what segments have of their own.
+        """Port currents of the model, (RC,) [S], with what wires have of their own.
 
         By the same rule, the share of the readings' noise, whose covariance is 1, is S^-1 times the
         residual; the rest of the measured current is the model's.
@@ -202,9 +213,9 @@ class FullFit:
         With c the deviation of a cell's prior, that of its posterior is c (1 - l)^1/2. (c is that
         of the normal in use: for a touched cell, its distance from rest.) l is the cell's diagonal
         element of O^T O, the share of c^2 that the readings have removed. The fit is linear: it
-        finds O^T O times the true u. So a layer that is truly one deviation off moves the fitted u
-        of a cell by the element (cell, layer) of O^T O. The layers are independent, so the part
-        from both is c times the length of these two elements.
+        finds O^T O times the true u. So a mean that is truly one deviation off moves the fitted u
+        of a cell by the element (cell, mean) of O^T O: its part of the cell's deviation is c times
+        that. The layers are independent, and their parts are added as variances.
 
         That holds for cells whose prior can be believed. Those that may be touched unnoticed
         (`_find_unnoticed`) get a wider deviation c' instead of c. The fit stays as it is. S becomes
@@ -218,21 +229,22 @@ class FullFit:
         """
         cell_std = self._cell_std
         whitened = solve_lower(self._factor, self._slopes)
-        learned = np.einsum("ij,ij->j", whitened, whitened)[:-2]
-        with_layers = whitened[:, :-2].T @ whitened[:, -2:]  # O^T O of cells and layers
+        learned = np.einsum("ij,ij->j", whitened, whitened)[:-3]
+        with_means = whitened[:, :-3].T @ whitened[:, -3:]  # O^T O of cells and means
         self._unnoticed, unnoticed_std = self._find_unnoticed(learned)
         if self._unnoticed.any():
             wider = np.where(self._unnoticed, unnoticed_std / cell_std, 1.0)
             added = np.sqrt(wider[self._unnoticed] ** 2 - 1.0)  # (c'^2 / c^2 - 1)^1/2
-            coupling = (whitened[:, :-2][:, self._unnoticed] * added).T @ whitened  # H^T O
-            system = np.eye(len(added)) + coupling[:, :-2][:, self._unnoticed] * added
+            coupling = (whitened[:, :-3][:, self._unnoticed] * added).T @ whitened  # H^T O
+            system = np.eye(len(added)) + coupling[:, :-3][:, self._unnoticed] * added
             correction = solve_lower(cholesky(system), coupling)
-            learned = learned - np.einsum("ij,ij->j", correction, correction)[:-2]
-            with_layers -= correction[:, :-2].T @ correction[:, -2:]
+            learned = learned - np.einsum("ij,ij->j", correction, correction)[:-3]
+            with_means -= correction[:, :-3].T @ correction[:, -3:]
             learned = wider**2 * learned
-            with_layers *= wider[:, None]
+            with_means *= wider[:, None]
             cell_std = wider * cell_std
-        self.wires_log_std: Float = cell_std * np.linalg.norm(with_layers, axis=1)
+        self.wires_log_std: Float = cell_std * np.linalg.norm(with_means[:, :2], axis=1)
+        self.leads_log_std: Float = cell_std * np.abs(with_means[:, 2])
         self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:
@@ -266,13 +278,23 @@ class FullFit:
         # No deviation becomes narrower.
         return unnoticed & (unnoticed_std > self._cell_std), unnoticed_std
 
+    def cells_by_means(self) -> Float:
+        """How the fitted cells follow the means, (RC, 3): d log r / d m, the readings being kept.
+
+        A fit about other means would have other residuals, by -`_by_mean` dm. Its answer is that of
+        cells alone: P J^T (N + J P J^T)^-1 times that, P their prior's variance.
+        """
+        by_cell = self._by_cell * self._cell_std
+        factor = cholesky(gram(by_cell, onto=self._noise.copy(order="F")))
+        return -self._cell_std[:, None] * (by_cell.T @ solve(factor, self._by_mean))
+
     @property
     def lesson(self) -> Lesson:
-        """What the readings say of the layers, whatever the touched cells are."""
-        # The belief wants the residual at its own mean, not at the layers that the fit has found.
-        residual = self._residual + self._per_layer_std @ self._layer_stds
+        """What the readings say of the means, whatever the touched cells are."""
+        # The belief wants the residual at its own means, not at those that the fit has found.
+        residual = self._residual + self._per_mean_std @ self._mean_stds
         # A touched cell is noise without limit; one at rest is known to its drift.
         touched = np.abs(self._prior.rise_stds(self.log_cells)) > TOUCHED_STDS
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
-        _, factor = self._factorised(cell_std)
-        return Lesson(self._per_layer_std, residual, factor)
+        _, factor = self._factorised(cell_std, self._weighted(self._belief.odd_leads()))
+        return Lesson(self._per_mean_std, residual, factor)

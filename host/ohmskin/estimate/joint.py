@@ -34,8 +34,10 @@ from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     HIDDEN_LOG,
     HIGHEST_TOUCH_SIEMENS,
+    LAYER_STD,
     MAX_CHI2,
     REST_STD,
+    SEGMENT_STD,
     UNKNOWN_REST_STD,
     UNTOUCHED_STD,
     CellPrior,
@@ -43,7 +45,7 @@ from ohmskin.estimate.prior import (
     siemens_std,
 )
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
-from ohmskin.estimate.wire_belief import LearnedWires, WireBelief
+from ohmskin.estimate.wire_belief import MOST_FITS, LearnedWires, WireBelief
 
 # Both numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
 # table "What each number earns" of docs/estimate.md says what came of it.
@@ -52,6 +54,9 @@ from ohmskin.estimate.wire_belief import LearnedWires, WireBelief
 REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
+# The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
+# by less than their rounding.
+LEAST_LEAD_OHM: Final = 20.0
 
 
 class JointEstimator(Estimator):
@@ -100,35 +105,50 @@ class JointEstimator(Estimator):
             )
 
     def _answer(self, ports: PortReadings) -> Solution:
-        """The answer for one frame: a few touches for `touch`, else the fit of all resistances."""
+        """The answer for one frame: its last fit, if what it teaches of the wires wants several."""
+        again = False
+        for _ in range(MOST_FITS):
+            solution, again = self._fitted(ports, again=again)
+            if not again:
+                break
+        return solution
+
+    def _fitted(self, ports: PortReadings, *, again: bool) -> tuple[Solution, bool]:
+        """A few touches for `touch`, else the fit of all resistances; and `after_fit` of it."""
         prior = self._prior_of(ports)
         touches = None
         # Trying takes time, and under a finger that stays, few touches explain no frame. So they
         # are not tried after a fit with many.
         if self._finder is not None and self._touches <= self._finder.most:
             touches = self._finder.find(ports)
-        if touches is not None and (touched := self._explained_by(touches, ports)):
-            return self._solution(ports, touched)
+        if touches is not None and (touched := self._explained_by(touches)):
+            again = not ports.fault and self._belief.after_fit(touched, ports, again=again)
+            return self._solution(ports, touched), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
         expected = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
+        self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
         # A crowded frame teaches nothing: other forces explain it as well as other wires do.
-        if not (ports.fault or message or prior.is_crowded(fit.log_cells)):
-            self._belief.after_fit(fit, ports)
-        return self._solution(ports, fit, message)
+        if ports.fault or message or prior.is_crowded(fit.log_cells):
+            again = False
+        else:
+            again = self._belief.after_fit(fit, ports, again=again)
+        solution = self._solution(ports, fit, message)
+        self._belief.expect_usual_leads(True)
+        return solution, again
 
-    def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
+    def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer, if these few touches are all that the frame shows: never, for `joint`."""
         return None
 
     def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
         belief = self._belief
         full = fit if isinstance(fit, FullFit) else None
-        wires = belief.believed_wires() if full is None else belief.wires(full.log_wires)
-        stds = fit.log_cells_std, fit.wires_log_std, belief.layer_std()
+        wires = belief.believed_wires() if full is None else belief.wires(full.wires)
+        stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
         # A model that misses the readings by more than their noise is wrong by as much more.
@@ -185,14 +205,30 @@ class JointEstimator(Estimator):
         before, rest_ratio = self._prior, self.knowledge.rest_ratio
         if rest_ratio is None:
             prior = self._prior_by_level(ports)
+        elif before is None:
+            prior = self._prior_by_rest(self._reader.read(rest_ratio))
         else:
-            prior = before or self._prior_by_rest(self._reader.read(rest_ratio))
+            prior = self._prior_followed(before)
         if prior is not before:
             self._prior = prior
             # Where wires hide even cells at rest, no few touches are sure. Then there is no finder,
             # and all frames start from `matrix`.
             if self._rest_wires_log_std <= REST_STD:
                 self._finder = SparseFit(prior, self._belief, self.knowledge.ref_ohm)
+        return prior
+
+    def _prior_followed(self, prior: CellPrior) -> CellPrior:
+        """This prior, or one about the means of the wires as they are believed now.
+
+        Few touches are found in a network that is solved for these means. Small changes of what is
+        believed are corrected in each frame, to first order, and larger ones need a new solution.
+        Readings of two far ends have no wires of their own lines in them, so there a change has to
+        be larger before it matters.
+        """
+        means = self._belief.means
+        least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
+        if (np.abs(means - prior.means) > [least_log, least_log, LEAST_LEAD_OHM]).any():
+            return prior.about(means)
         return prior
 
     def _prior_by_level(self, ports: PortReadings) -> CellPrior:
@@ -206,7 +242,12 @@ class JointEstimator(Estimator):
         if before is not None and log_ohm <= before.expected[0]:
             return before
         cells = ports.current.size
-        return CellPrior(np.full(cells, log_ohm), np.full(cells, UNKNOWN_REST_STD))
+        return self._alike(cells, log_ohm, UNKNOWN_REST_STD)
+
+    def _alike(self, cells: int, log_ohm: float, std: float) -> CellPrior:
+        """A prior of so many cells, all alike."""
+        logs, stds = np.full(cells, log_ohm), np.full(cells, std)
+        return CellPrior(logs, stds, np.zeros((cells, 3)), self._belief.means)
 
     def _prior_by_rest(self, ports: PortReadings) -> CellPrior:
         """Log resistances of the untouched cells, and how well they are known: by the same fit.
@@ -218,14 +259,17 @@ class JointEstimator(Estimator):
         log_cells: Float = np.full(ports.current.size, -np.log(level))
         for _ in range(REST_FITS):
             self._belief.before_fit(log_cells, ports)
-            std = np.full(log_cells.size, UNTOUCHED_STD)
-            alike = CellPrior(np.full(log_cells.size, np.median(log_cells)), std)
+            alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
             fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)
             log_cells = fit.log_cells
+        means = self._belief.means
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
+        # Where wires hide even cells at rest, these follow them too far for slopes to say how.
+        hidden = self._rest_wires_log_std > REST_STD
+        by_means = alike.by_means if hidden else fit.cells_by_means()
         std = np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
-        return CellPrior(log_cells, std)
+        return CellPrior(log_cells, std, by_means, means)
 
 
 class TouchEstimator(JointEstimator):
@@ -233,13 +277,11 @@ class TouchEstimator(JointEstimator):
 
     name: ClassVar[str] = "touch"
 
-    def _explained_by(self, touches: FewTouches, ports: PortReadings) -> Touched | None:
+    def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer of these few touches; None if they leave something open, or one uncertain."""
         touched = None if self.knowledge.rest_ratio is None else touches.explain()
         if touched is None:
             return None
         if touched.log_cells_std[touched.cells].max(initial=0.0) > HIDDEN_LOG:
             return None
-        if not ports.fault:
-            self._belief.after_fit(touched, ports)
         return touched

@@ -30,8 +30,8 @@ class WireOhm(NamedTuple):
     bottom: the same of the bottom layer [ohm].
     lead: what lies between a multiplexer's common pin and the first crossing of a line, nominal
         for all lines alike [ohm]; 0: nothing.
-    top_log_std, bottom_log_std, lead_log_std: standard deviations of the logs of these, where they
-        were measured.
+    top_log_std, bottom_log_std: standard deviations of the logs of these, where they were measured.
+    lead_std_ohm: the same of the lead [ohm]. A lead may be next to nothing, which has no log.
     """
 
     top: float | None = None
@@ -39,7 +39,7 @@ class WireOhm(NamedTuple):
     lead: float | None = None
     top_log_std: float | None = None
     bottom_log_std: float | None = None
-    lead_log_std: float | None = None
+    lead_std_ohm: float | None = None
 
     def check(self) -> Self:
         """Itself. Raises ValueError, naming the field, for what is not finite or below 0."""
@@ -62,7 +62,7 @@ WIRE_FIELDS: Final = (
     "nominal_lead_ohm",
     "top_wire_log_std",
     "bottom_wire_log_std",
-    "lead_log_std",
+    "lead_std_ohm",
 )
 
 

@@ -5,8 +5,8 @@ RC readings do not determine 3RC resistances; these numbers decide the rest. Wha
 wires corrects what is believed of them (`wire_belief`).
 """
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,14 @@ SEGMENT_STD: Final = 0.1
 # A lead that nobody has told: the switch of a CD74HC4067 at 5 V (data sheet: 70 typically, 160 at
 # most), and a crimp.
 UNKNOWN_LEAD_OHM: Final = 100.0
+# Deviation that all leads share, if nobody has told them: a margin of yarn makes kilohms.
+UNKNOWN_LEAD_STD_OHM: Final = 1500.0
+# The same of usual leads: a switch and a crimp.
+USUAL_LEAD_STD_OHM: Final = 150.0
+# Deviation that all leads share, if they are told, as a share of them.
+LEAD_STD: Final = 0.1
+# Deviation of each lead from the mean lead, as a share of that: crimps differ more than segments.
+OWN_LEAD_STD: Final = 0.2
 # Share of what is known of the layers that fades after each lesson, because skins bend.
 FADE_SHARE: Final = 0.1
 
@@ -76,12 +84,24 @@ class CellPrior:
     touch. Cells at rest are a quadratic problem, which costs no iterations; being touched is
     unlikely, but how hard, once a cell is, costs little.
 
+    The rest readings show a cell and its wires together. So what is expected of cells is right for
+    one value of the means of the wires (`wire_belief`); for others, it follows these.
+
     expected: log resistances at rest, (RC,) [log ohm].
     std: deviation of a cell that is not touched, (RC,).
+    by_means: how `expected` follows the means, (RC, 3).
+    means: those for which `expected` is right, (3,).
     """
 
     expected: Float
     std: Float
+    by_means: Float
+    means: Float
+
+    def about(self, means: Float) -> "CellPrior":
+        """The same for other means of the wires, (3,)."""
+        expected = self.expected + self.by_means @ (means - self.means)
+        return CellPrior(expected, self.std, self.by_means, means)
 
     def rise_stds(self, log_ohm: Float) -> Float:
         """How far a cell conducts more than at rest, in deviations."""
@@ -114,7 +134,7 @@ class CellPrior:
         hard touches behind long wires seem more likely than many soft ones, because fewer cells
         have to leave rest.
         """
-        return CellPrior(self.expected, np.maximum(self.std, UNTOUCHED_STD))
+        return replace(self, std=np.maximum(self.std, UNTOUCHED_STD))
 
     def normal(
         self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
@@ -143,15 +163,32 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
     return float(min(level, HIGHEST_TOUCH_SIEMENS))
 
 
+class WireStds(NamedTuple):
+    """How well the means of a skin's wires are known.
+
+    layer_std: standard deviation of the log of the layer that is known less.
+    lead_reach: standard deviation of the mean lead, over that which fits take it to have.
+    """
+
+    layer_std: float
+    lead_reach: float
+
+
 def siemens_std(
-    log_siemens: Float, log_std: Float, wires_log_std: Float, layer_std: float, series_ohm: Float
+    log_siemens: Float,
+    log_std: Float,
+    wires_log_std: Float,
+    leads_log_std: Float,
+    wires: "WireStds",
+    series_ohm: Float,
 ) -> tuple[Float, Float]:
     """Standard deviations of conductances, upwards and downwards [S], all (RC,).
 
     log_std: deviation of the log conductance, to first order.
     wires_log_std: the part of it that comes from the mean wires of the layers.
-    layer_std: deviation of the log of these wires, a scalar.
-    series_ohm: wires to the cell, and references.
+    leads_log_std: the part of it that comes from the mean lead.
+    wires: how well the means are known.
+    series_ohm: leads and wires to the cell, and references.
 
     What is normal is the error of the port current u = 1 / (r + series), not that of g = 1 / r. So
     the limits of `REACH_STDS` deviations are found for u, and carried over to g: each deviation
@@ -164,8 +201,10 @@ def siemens_std(
     # limit, with k = `REACH_STDS`, they are exp(k layer_std) - 1 above their mean, where the first
     # order has k layer_std. The part that comes from them grows by that ratio. At the other limit
     # they are off by less than k layer_std, so there the first order is enough.
-    wider = np.expm1(REACH_STDS * layer_std) / (REACH_STDS * layer_std)
-    up_std = np.sqrt(log_std**2 + (wider**2 - 1.0) * wires_log_std**2)
+    # A lead may be larger than a fit takes it for; less than nothing it cannot be.
+    wider = np.expm1(REACH_STDS * wires.layer_std) / (REACH_STDS * wires.layer_std)
+    more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_reach**2 - 1.0) * leads_log_std**2
+    up_std = np.sqrt(log_std**2 + more)
     # d log u = - r / (r + series) d log r. So at the limits the current is (1 +- off) u, and the
     # whole resistance is (r + series) / (1 +- off). Less `series_ohm`, that is the cell's.
     off_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)

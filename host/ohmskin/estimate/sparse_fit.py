@@ -19,8 +19,8 @@ s      (RC,)    their noise: of the readings, of cells at rest and wires        
 r      (RC,)    residual (I_read - I) / s, I_read the measured currents            1
 J      (k, RC)  dI / dx / s                                                        1
 A      (k, k)   J J^T and the precision of the prior of x                          1
-W      (m, n)   dI / dw / s P^1/2, w the log wire resistances, P their covariance, 1
-                at the m ports they matter to; n = 2RC + 2
+W      (m, n)   dI / dw / s P^1/2, w the logs of segments and leads, P their       1
+                covariance, at the m ports they matter to; n = 2RC + R+C + 3
 S      (m, m)   covariance of r at these ports with wires in it, 1 + W W^T         1
 ====== ======== ================================================================== ==========
 
@@ -55,7 +55,6 @@ from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLOSE_STDS,
     HIGHEST_TOUCH_SIEMENS,
-    LAYER_STD,
     MAX_CHI2,
     MAX_ITERATIONS,
     MAX_STEP_LOG,
@@ -198,6 +197,7 @@ class Touched:
     log_cells: log resistances of all cells, (RC,) [log ohm].
     log_cells_std: their deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
+    leads_log_std: the part of it that comes from the mean lead, (RC,).
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     lesson: what the readings say of the wires.
@@ -208,6 +208,7 @@ class Touched:
     log_cells: Float
     log_cells_std: Float
     wires_log_std: Float
+    leads_log_std: Float
     modelled: Float
     iterations: int
     lesson: Lesson
@@ -219,49 +220,41 @@ class SparseFit:
 
     most: touches that are still few; with more, a frame is not for it.
     least_log_siemens: log conductances from which cells are touched, (RC,).
-    log_layers: logs of the layers' segments that the untouched skin was solved with, (2,).
+    series_ohm: references, and leads of a port: all that is in series with the skin [ohm].
     net: the untouched skin.
     untouched: the same as a touched skin without touches: each frame starts from it.
     current: its port currents per Vdd, (RC,) [S].
     model_variance: of these, by the drift of cells and by what is not known of wires, (RC,) [S^2].
-    path_ohm: wires between each cell and its sensed ends, (RC,).
-    wire_std: deviation of the log of a wire segment.
+    path_ohm: wires and leads between each cell and its sensed ends, (RC,).
+    path_std_ohm: how far that may be off, (RC,).
     """
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
-        self.prior, self.belief, self.ref_ohm = prior, belief, ref_ohm
+        self.prior, self.belief = prior, belief
+        self.series_ohm = ref_ohm + belief.leads_of_port * prior.means[2]
         self.most = MAX_TOUCHES_PER_LINE * sum(belief.shape)
         self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
-        self._solve_rest()
-
-    def _solve_rest(self) -> None:
-        """The untouched skin, with wires as they are believed now."""
-        prior, belief = self.prior, self.belief
-        self.log_layers = belief.log_layers
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(rest_siemens, *np.exp(belief.log_layers), far=belief.far)
+        self.net = net = RestNetwork(rest_siemens, *np.exp(prior.means[:2]), far=belief.far)
         self.untouched = TouchedNetwork(net, NO_CELLS, np.zeros(0))
-        self.current = 1.0 / (net.port_ohm + self.ref_ohm)
+        self.current = 1.0 / (net.port_ohm + self.series_ohm)
         siemens = net.cell_siemens[:, None]
         # By the log of a resistance, the slope of I is I^2 times that of rho, but for the sign. For
         # a cell that of rho is v v' g, for wires likewise (Tellegen).
         by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
         currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
         by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
-        per_std = belief.per_std(by_wire * (self.current**2)[:, None])
+        by_wire = belief.with_leads(by_wire) * (self.current**2)[:, None]
+        per_std = belief.per_std(by_wire, by_cell.T @ prior.by_means)
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
         self.path_ohm = belief.believed_wires().path_ohm
-        self.wire_std = float(np.hypot(belief.layer_std(), SEGMENT_STD))
+        *layer_std, lead_std_ohm = belief.mean_std().tolist()
+        wires_std = np.hypot(max(layer_std), SEGMENT_STD) * self.path_ohm
+        self.path_std_ohm = wires_std + belief.leads_of_port * lead_std_ohm
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""
-        # Small changes of what is believed of the wires are corrected in each frame (`explain`), to
-        # first order. Larger ones need a new solution. Readings of two far ends have no wires of
-        # their own lines in them, so there a change has to be larger before it matters.
-        least_log = 0.5 * (LAYER_STD if all(self.belief.far) else SEGMENT_STD)
-        if np.abs(self.belief.log_layers - self.log_layers).max() > least_log:
-            self._solve_rest()
         frame = FewTouches(self, ports)
         # Never from the frame before: cells would stay in the model that no reading asks for.
         frame.converge(NO_CELLS, np.zeros(0))
@@ -292,7 +285,7 @@ class FewTouches:
         # s of ports whose own cell is at rest. At first it is approximate: cells at rest and wires
         # move the currents as in an untouched skin. `explain` makes it anew for these touches.
         self._untouched_std = np.sqrt(self._reading_std**2 + skin.model_variance)
-        self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.ref_ohm
+        self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.series_ohm
         self.steps = 0
 
     def _place(self, cells: Cells, log_siemens: Float) -> None:
@@ -304,7 +297,7 @@ class FewTouches:
         if cells.size:
             added = self._siemens - skin.net.cell_siemens[cells]
             self._touched = TouchedNetwork(skin.net, cells, added)
-            self._current = 1.0 / (self._touched.port_ohm + skin.ref_ohm)
+            self._current = 1.0 / (self._touched.port_ohm + skin.series_ohm)
         self._compare()
 
     def _compare(self) -> None:
@@ -408,7 +401,7 @@ class FewTouches:
         factor = cholesky(residual_covariance)
         # The network was solved with wires as they were believed then. `offset` is what newer ones
         # change in these residuals, to first order.
-        offset = self._skin.belief.moved_since(self._skin.log_layers, wires[:, -2:])
+        offset = self._skin.belief.moved_since(self._skin.prior.means, wires[:, -3:])
         for _ in range(2):  # `converge` has led near, by steps without S
             slopes = self._slopes()
             residual = self._residual[ports] - offset
@@ -434,29 +427,36 @@ class FewTouches:
         modelled = self._current.copy()
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
-        # By how much a layer that is one deviation off moves x: A^-1 J S^-1 W, of the layers in W.
-        by_layers = covariance_of_cells @ whitened.T @ solve_lower(factor, wires[:, -2:])
+        # By how much a mean that is one deviation off moves x: A^-1 J S^-1 W, of the means in W.
+        by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, wires[:, -3:])
         # The lesson's S: whatever these touches are, they are noise without limit.
-        unlimited = cholesky(gram(UNLIMITED_STD * heavy_slopes.T, onto=residual_covariance))
-        lesson = Lesson(wires[:, -2:], residual, unlimited)
-        return self._answer(covariance_of_cells, np.hypot(*by_layers.T), modelled, lesson)
+        by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
+        odd_leads = by_ohm * self._skin.belief.odd_leads(ports)
+        noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
+        unlimited = cholesky(gram(noise, onto=residual_covariance))
+        lesson = Lesson(wires[:, -3:], residual, unlimited)
+        return self._answer(covariance_of_cells, np.abs(by_means), modelled, lesson)
 
     def _nothing_touched(self) -> Touched | None:
         """The answer if no cell is touched; None if a current is below an untouched skin's."""
         if self._residual.min() < -DEMAND_STDS:
             return None
-        lesson = Lesson(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 0)))
-        return self._answer(np.zeros((0, 0)), np.zeros(0), self._current, lesson)
+        lesson = Lesson(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 0)))
+        return self._answer(np.zeros((0, 0)), np.zeros((0, 3)), self._current, lesson)
 
     def _answer(
-        self, covariance: Float, wires_log_std: Float, modelled: Float, lesson: Lesson
+        self, covariance: Float, by_means: Float, modelled: Float, lesson: Lesson
     ) -> Touched:
-        """covariance, wires_log_std: of the touched cells. Others have their prior's deviation."""
+        """covariance, and what a deviation of each mean moves: (k, k) and (k, 3), of touched cells.
+
+        Others have their prior's deviation.
+        """
         prior, cells = self._skin.prior, self.cells
-        std, by_wires = prior.std.copy(), np.zeros(modelled.size)
+        std, of_means = prior.std.copy(), np.zeros((modelled.size, 3))
         std[cells] = np.sqrt(covariance.diagonal())
-        by_wires[cells] = wires_log_std
-        return Touched(cells, self.log_cells, std, by_wires, modelled, self.steps, lesson)
+        of_means[cells] = by_means
+        parts = np.hypot(*of_means[:, :2].T), of_means[:, 2]
+        return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """Whether wires matter to a port, (RC,): to those of the touched cells they always do.
@@ -464,7 +464,7 @@ class FewTouches:
         Touches let more current through the port's own wires: I^2 path is what these take of it.
         """
         skin = self._skin
-        move = (self._current**2 - skin.current**2) * skin.path_ohm * skin.wire_std
+        move = (self._current**2 - skin.current**2) * skin.path_std_ohm
         heavy: NDArray[np.bool_] = move > HEAVY_SHARE * self._std
         heavy[self.cells] = True
         return heavy
@@ -479,11 +479,12 @@ class FewTouches:
         square = self._current[ports] ** 2
         by_cell = currents * sensed / net.cell_siemens
         by_cell[:, self.cells] = 0.0
+        by_mean = by_cell @ skin.prior.by_means
         by_cell *= skin.prior.std
         model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
         std = self._std.copy()
         std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
         std[self.cells] = self._reading_std[self.cells]
-        by_wire = net.by_wires_of(ports, currents, sensed)
-        by_wire *= -(square / std[ports])[:, None]
-        return std, skin.belief.per_std(by_wire)
+        by_wire = skin.belief.with_leads(net.by_wires_of(ports, currents, sensed), ports)
+        by_rho = -(square / std[ports])[:, None]
+        return std, skin.belief.per_std(by_rho * by_wire, by_rho * by_mean)

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is believed of a skin's wires: before any frame, and after what frames have shown.
+"""What is believed of a skin's wires and leads: before any frame, and after what frames have shown.
+
+A lead is what lies between the multiplexer's common pin and the first crossing of a line. It
+carries the whole current of a port and no other. So the leads of a port's lines add to its
+resistance as the references do, if its lines are sensed at near ends. At a far end, no current
+flows, and leads are not in the readings.
 
 Symbols
 
@@ -7,20 +12,24 @@ Symbols
 symbol shape      meaning                                                         unit
 ====== ========== =============================================================== ==========
 R, C              number of rows and of columns
-m      (2,)       log of the mean segment of each layer: top, bottom              log ohm
-V      (2, 2)     its covariance; V0 before any frame
-s      scalar     deviation of a segment from its layer's mean, each by itself    log ohm
-L      (2, 2RC)   ones: which segments are of which layer
-P      (2RC, 2RC) covariance of the log segments, L^T V L + s^2
-J      (n, 2RC)   slope of n readings by the log segments, over their noise       1
-N      (n, n)     covariance of these readings, were the layers known: of their   1
-                  noise, of cells, and of what segments have of their own
+W                 number of wires: 2RC segments and R+C leads
+w      (W,)       the wires: logs of the segments, then leads                     log ohm, ohm
+m      (3,)       log of the mean segment of each layer, top and bottom, and the  log ohm, ohm
+                  mean lead
+V      (3, 3)     its covariance; V0 before any frame
+s      (W,)       deviation of a wire from its mean, each by itself               log ohm, ohm
+L      (3, W)     ones: which wires are of which mean
+P      (W, W)     covariance of w, L^T V L + s^2
+J      (n, W)     slope of n readings by w, over their noise
+N      (n, n)     covariance of these readings, were the means known: of their    1
+                  noise, of cells, and of what wires have of their own
 S      (n, n)     covariance of these readings, N + J L^T V L J^T                 1
 z      (n,)       residual of these readings at the mean                          1
 ====== ========== =============================================================== ==========
 
-P^1/2 has a column for each segment's own deviation, and two for what the segments of the layers
-share: s and L^T V^1/2.
+Leads are no logs, because a lead may be next to nothing, and because readings are nearly linear in
+them. P^1/2 has a column for each wire's own deviation, and three for what wires share:
+s and L^T V^1/2.
 
 There are two beliefs, and `joint` asks both the same: `before_fit`, what this frame and those
 before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`, below, knows near ends
@@ -40,15 +49,16 @@ information A, the inverse of a covariance:
 V^1/2 the Cholesky factor of V, and V^T/2 its transpose.
 
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
-cells as noise without limit. After a lesson V grows back towards V0: a skin bends. What single
-segments have of their own is not learned: frames of near ends say too little of it.
+cells as noise without limit. After a lesson V grows back towards V0, but for the lead: a skin
+bends. What single wires have of their own is not learned: frames of near ends say too little of it.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
@@ -58,22 +68,34 @@ from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     FADE_SHARE,
     LAYER_STD,
+    LEAD_STD,
     MAX_STEP_LOG,
+    OWN_LEAD_STD,
     SEGMENT_STD,
     UNKNOWN_LAYER_STD,
+    UNKNOWN_LEAD_OHM,
+    UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
+    USUAL_LEAD_STD_OHM,
+    WireStds,
 )
+
+# A frame is fitted again if it moves the log of a mean by more. Chosen: 30 %, up to which slopes
+# are nearly right.
+FAR_LOG: Final = 0.3
+# So often at most.
+MOST_FITS: Final = 4
 
 
 class Lesson(NamedTuple):
     """What n readings of one frame say of the wires.
 
-    per_layer_std: J L^T V^1/2, (n, 2).
+    per_mean_std: J L^T V^1/2, (n, 3).
     residual: z, (n,).
     factor: Cholesky factor of S, (n, n).
     """
 
-    per_layer_std: Float
+    per_mean_std: Float
     residual: Float
     factor: Float
 
@@ -96,7 +118,7 @@ class SkinWires:
 
     segment_ohm: segments of top and bottom layer, (2, R, C) [ohm].
     segment_std_ohm: their standard deviations, (2, R, C) [ohm].
-    path_ohm: wires between each cell and the sensed ends of its lines, (RC,) [ohm].
+    path_ohm: wires and leads between each cell and the sensed ends of its lines, (RC,) [ohm].
     """
 
     segment_ohm: Float
@@ -109,7 +131,7 @@ class WireBelief(ABC):
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
-    log_layers: m, (2,). It is replaced when the belief changes, and never written into.
+    means: m, (3,). It is replaced when the belief changes, and never written into.
     """
 
     def __init__(
@@ -117,24 +139,56 @@ class WireBelief(ABC):
     ) -> None:
         """wires: what is known of them before any frame."""
         self.shape, self.far = shape, far
-        ohms = wires.top, wires.bottom
-        layer_std = UNKNOWN_LAYER_STD if None in ohms else LAYER_STD
+        rows, columns = shape
+        self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
+        # Which leads are in the readings of each port: those of its lines that are sensed at near
+        # ends, (RC, R+C).
+        by_row = np.kron(np.eye(rows), np.ones((columns, 1))) * (not far[0])
+        by_column = np.tile(np.eye(columns), (rows, 1)) * (not far[1])
+        self._leads_of_ports = np.hstack([by_row, by_column])
+        layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         # However well wires were measured: since then, the skin may have been stretched.
-        measured_std = [std or 0.0 for std in (wires.top_log_std, wires.bottom_log_std)]
-        self._prior_covariance = np.diag(np.hypot(layer_std, measured_std) ** 2)
-        nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in ohms]
-        self._nominal: Float = np.log(nominal)
+        layer_stds = np.hypot(layer_std, [wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
+        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM
+        self._usual_lead_std_ohm = USUAL_LEAD_STD_OHM
+        if wires.lead is not None:
+            lead_ohm, lead_std_ohm = wires.lead, wires.lead_std_ohm or LEAD_STD * wires.lead
+            self._usual_lead_std_ohm = lead_std_ohm = max(lead_std_ohm, 1e-3)
+        self._prior_covariance = np.diag([*layer_stds, lead_std_ohm]) ** 2
+        nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
+        self._nominal: Float = np.array([*np.log(nominal), lead_ohm])
         self.reset()
 
     def reset(self) -> None:
         """Forget what frames have shown."""
         self._lesson_cells: Float | None = None  # log resistances of the last lesson's frame
-        root = np.asarray(np.linalg.cholesky(self._prior_covariance), np.float64)
-        self._believe(self._nominal, root)
+        self._believe(self._nominal, self._prior_covariance)
 
-    def _believe(self, log_layers: Float, root: Float) -> None:
-        """Take these for m and V^1/2."""
-        self.log_layers, self._root = log_layers, root
+    def _believe(self, means: Float, covariance: Float) -> None:
+        """Take these for what is known, (3,) and (3, 3): m and V are these, but for the lead.
+
+        A lead that nobody told may be anything up to kilohms, and that is how frames teach it. But
+        most skins have a usual lead, and frames that tell nothing of it, as under fingertips, are
+        answered better if fits expect that, in so far as what is known agrees: as a cell's, this
+        prior has a heavy tail (`prior.CellPrior`). Deviations of answers always have what is known.
+        """
+        self._known = means, covariance
+        self.expect_usual_leads(True)
+
+    def expect_usual_leads(self, wanted: bool) -> None:
+        """Whether m and V are what fits take under fingertips, or what is known."""
+        means, covariance = self._known
+        away_ohm = abs(float(means[2] - self._nominal[2]))
+        usual = max(self._usual_lead_std_ohm, away_ohm) ** -2.0 - 1.0 / self._prior_covariance[2, 2]
+        if usual > 0.0 and wanted:
+            information = np.linalg.inv(covariance)
+            right = information @ means
+            information[2, 2] += usual
+            right[2] += usual * self._nominal[2]
+            covariance = np.linalg.inv(information)
+            means = covariance @ right
+        self.means = means
+        self._root = np.asarray(np.linalg.cholesky(covariance), np.float64)
         self._believed: SkinWires | None = None
 
     @abstractmethod
@@ -145,8 +199,13 @@ class WireBelief(ABC):
         """
 
     @abstractmethod
-    def after_fit(self, fit: Fit, ports: PortReadings) -> None:
-        """Learn from a frame whose fit is to be trusted."""
+    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
+        """Learn from a frame whose fit is to be trusted.
+
+        again: it is another fit of the same frame, in place of what the last one has taught.
+        Returns whether this has moved what is believed so far that the frame wants another fit:
+        slopes hold for small moves only.
+        """
 
     @abstractmethod
     def fix_rest_wires(self) -> None:
@@ -162,69 +221,107 @@ class WireBelief(ABC):
         return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
 
     def learned(self) -> WireOhm | None:
-        """Mean segments of the layers, and the deviations of their logs. None before any lesson."""
+        """The means, and their deviations. None before any lesson."""
         if self._lesson_cells is None:
             return None
-        top, bottom = np.exp(self.log_layers).tolist()
-        top_log_std, bottom_log_std = np.linalg.norm(self._root, axis=1).tolist()
-        return WireOhm(top, bottom, top_log_std=top_log_std, bottom_log_std=bottom_log_std)
+        means, covariance = self._known
+        top, bottom = np.exp(means[:2]).tolist()
+        lead = max(float(means[2]), 0.0)
+        return WireOhm(top, bottom, lead, *np.sqrt(covariance.diagonal()).tolist())
 
-    def circuit(self, log_cells: Float, log_layers: Float) -> PortCircuit:
-        """The skin with these logs of its cells (RC,), and of its layers' segments (2,)."""
+    def circuit(self, log_cells: Float, means: Float) -> PortCircuit:
+        """The skin with these logs of its cells (RC,), and these means (3,), without its leads."""
         cell_siemens = np.exp(-log_cells).reshape(self.shape)
-        return PortCircuit(cell_siemens, *np.exp(log_layers), far=self.far)
+        return PortCircuit(cell_siemens, *np.exp(means[:2]), far=self.far)
+
+    @property
+    def leads_of_port(self) -> int:
+        """How many leads are in a reading of the near ends: 2, and 0 of far ends."""
+        return 2 - sum(self.far)
+
+    def with_leads(self, by_segment: Float, ports: NDArray[np.intp] | slice = slice(None)) -> Float:
+        """Slopes of the resistance of n ports by w, (n, W), of those by log segments, (n, 2RC)."""
+        return np.hstack([by_segment, self._leads_of_ports[ports]])
 
     @property
     def mean(self) -> Float:
-        """Expected log resistances of the segments, (2RC,)."""
-        return np.repeat(self.log_layers, self.shape[0] * self.shape[1])
+        """Expected wires w, (W,)."""
+        return np.repeat(self.means, self._counts)
 
-    def layer_std(self) -> float:
-        """Standard deviation of the log of the layer that is known less."""
-        return float(np.hypot(*self._root.T).max())
+    def own_std(self, means: Float) -> Float:
+        """s, (W,), where the means are these."""
+        own = SEGMENT_STD, SEGMENT_STD, OWN_LEAD_STD * abs(means[2])
+        return np.repeat(own, self._counts)
 
-    def per_layer_std(self, slopes: Float) -> Float:
-        """J L^T V^1/2, (n, 2), from slopes by the layers' logs, J L^T (n, 2)."""
+    def mean_std(self) -> Float:
+        """Standard deviations of the means, (3,)."""
+        return np.asarray(np.linalg.norm(self._root, axis=1))
+
+    def stds(self) -> WireStds:
+        """How well the means are known."""
+        *layers, lead_std_ohm = self.mean_std().tolist()
+        return WireStds(max(layers), self._known_lead_std_ohm / lead_std_ohm)
+
+    @property
+    def _known_lead_std_ohm(self) -> float:
+        return float(self._known[1][2, 2] ** 0.5)
+
+    def odd_leads(self, ports: NDArray[np.intp] | slice = slice(None)) -> Float:
+        """What leads may have of their own beyond `own_std`, as the mean is not known: (n, R+C).
+
+        It is noise for a lesson: where leads are large, they also differ by more.
+        """
+        return np.asarray(OWN_LEAD_STD * self._known_lead_std_ohm * self._leads_of_ports[ports])
+
+    def per_mean_std(self, slopes: Float) -> Float:
+        """J L^T V^1/2, (n, 3), from slopes by the means, J L^T (n, 3)."""
         return slopes @ self._root
 
-    def per_std(self, slopes: Float) -> Float:
-        """J P^1/2, (n, 2RC + 2), from J (n, 2RC): by what segments have, by what layers share."""
-        root = np.empty((len(slopes), slopes.shape[1] + 2))
-        np.multiply(slopes, SEGMENT_STD, out=root[:, :-2])
-        root[:, -2:] = self.per_layer_std(slopes.reshape(len(slopes), 2, -1).sum(axis=2))
+    def per_std(self, slopes: Float, of_cells: Float) -> Float:
+        """J P^1/2, (n, W + 3), from J (n, W): by what wires have, by what they share.
+
+        of_cells: what the means change in readings by the cells at rest that follow them, (n, 3).
+        """
+        root = np.empty((len(slopes), slopes.shape[1] + 3))
+        np.multiply(slopes, self.own_std(self.means), out=root[:, :-3])
+        starts = 0, self._counts[0], 2 * self._counts[0]
+        root[:, -3:] = self.per_mean_std(np.add.reduceat(slopes, starts, axis=1) + of_cells)
         return root
 
-    def log_layers_off(self, layer_stds: Float) -> Float:
-        """Logs of the layers (2,) that are so many deviations off: m + V^1/2 `layer_stds` (2,)."""
-        return self.log_layers + self._root @ layer_stds
+    def means_off(self, mean_stds: Float) -> Float:
+        """The means (3,) that are so many deviations off: m + V^1/2 `mean_stds` (3,)."""
+        return self.means + self._root @ mean_stds
 
-    def log_wires_off(self, layer_stds: Float, segment_stds: Float) -> Float:
-        """Log resistances (2RC,) of layers that are so far off (2,), and segments (2RC,)."""
-        common = np.repeat(self.log_layers_off(layer_stds), self.shape[0] * self.shape[1])
+    def wires_off(self, mean_stds: Float, own_stds: Float) -> Float:
+        """w (W,) of means that are so far off (3,), and wires (W,)."""
+        means = self.means_off(mean_stds)
+        off_mean = self.own_std(means) * own_stds
         # What comes from slopes holds as far as readings are linear in the logs.
-        off_layer = np.minimum(np.maximum(SEGMENT_STD * segment_stds, -MAX_STEP_LOG), MAX_STEP_LOG)
-        return common + off_layer
+        logs = off_mean[: 2 * self._counts[0]]
+        np.clip(logs, -MAX_STEP_LOG, MAX_STEP_LOG, out=logs)
+        return np.repeat(means, self._counts) + off_mean
 
-    def moved_since(self, log_layers: Float, per_layer_std: Float) -> Float:
-        """What readings have moved since m was `log_layers` (2,): J L^T (m - log_layers), (n,)."""
-        return np.asarray(per_layer_std @ solve_lower(self._root, self.log_layers - log_layers))
+    def moved_since(self, means: Float, per_mean_std: Float) -> Float:
+        """What readings have moved since m was `means` (3,): J L^T (m - means), (n,)."""
+        return np.asarray(per_mean_std @ solve_lower(self._root, self.means - means))
 
-    def segment_ohm(self, log_wires: Float) -> Float:
-        """Top and bottom segments (2, R, C) [ohm] of a fit that found these logs (2RC,)."""
-        return np.asarray(np.exp(log_wires).reshape(2, *self.shape))
+    def segment_ohm(self, wires: Float) -> Float:
+        """Top and bottom segments (2, R, C) [ohm] of a fit that found these wires w (W,)."""
+        return np.asarray(np.exp(wires[: 2 * self._counts[0]]).reshape(2, *self.shape))
 
     def segment_std(self) -> Float:
         """Standard deviation of the log of each segment, for (2, R, C)."""
-        return np.asarray(np.hypot(np.hypot(*self._root.T), SEGMENT_STD)[:, None, None])
+        return np.asarray(np.hypot(self.mean_std()[:2], SEGMENT_STD)[:, None, None])
 
-    def wires(self, log_wires: Float) -> SkinWires:
-        """The wires of an answer whose fit found these logs, (2RC,)."""
-        top, bottom = segments = self.segment_ohm(log_wires)
+    def wires(self, wires: Float) -> SkinWires:
+        """The wires of an answer whose fit found these, w (W,)."""
+        top, bottom = segments = self.segment_ohm(wires)
         # A sensed far end has the potential of the cell, as no current flows from one to the other:
         # the wires of such a line do not count.
         by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
         path = by_top * top.cumsum(axis=1) + by_bottom * bottom.cumsum(axis=0)
-        return SkinWires(segments, segments * self.segment_std(), path.ravel())
+        leads = self._leads_of_ports @ np.maximum(wires[2 * self._counts[0] :], 0.0)
+        return SkinWires(segments, segments * self.segment_std(), path.ravel() + leads)
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
@@ -242,7 +339,7 @@ class LearnedWires(WireBelief):
         """Back to the nominal wires."""
         super().reset()
         self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
-        self._before_lesson = self.log_layers, self._root
+        self._before_lesson = self._known
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Nothing: before its touches are known, a frame of near ends shows no wires."""
@@ -250,7 +347,7 @@ class LearnedWires(WireBelief):
     def fix_rest_wires(self) -> None:
         """Nothing: an untouched skin shows no wires, as its cells resist far more than they do."""
 
-    def after_fit(self, fit: Fit, ports: PortReadings) -> None:
+    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
         """Learn from a touch that is new, or again from a calmer frame of the last one.
 
         The calmer frame must not count as one more, since both have the touch's errors. So it
@@ -258,9 +355,12 @@ class LearnedWires(WireBelief):
         """
         noise = float(ports.current_std.mean())
         is_news = self._is_news(fit.log_cells)
-        if is_news or noise < self._lesson_noise:
-            self._lesson_cells, self._lesson_noise = fit.log_cells, noise
-            self.take(fit.lesson, replace_last=not is_news)
+        if not (again or is_news or noise < self._lesson_noise):
+            return False
+        self._lesson_cells, self._lesson_noise = fit.log_cells, noise
+        before = self.means
+        self.take(fit.lesson, replace_last=again or not is_news)
+        return bool((np.abs(self.means - before) > [FAR_LOG, FAR_LOG, USUAL_LEAD_STD_OHM]).any())
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
         """One Kalman step.
@@ -269,25 +369,27 @@ class LearnedWires(WireBelief):
             that says nothing undoes nothing.
         """
         if not replace_last:
-            self._before_lesson = self.log_layers, self._root
-        per_layer_std, residual, factor = lesson
+            self._before_lesson = self._known
+        per_mean_std, residual, factor = lesson
         # One reading shows its own touch, of unknown resistance, and so nothing of the wires.
         if len(residual) < 2:
             return
         # The lesson counts in deviations of the belief that the fit had, but the step may start
         # from an older belief. So the lesson is first changed to logs, and freed of that belief:
         #     L J^T N^-1 = V^-T/2 (1 - X)^-1 V^T/2 L J^T S^-1     are the `weights`,
-        # X is `gain @ per_layer_std`, and A is `information`. The step from V and m of the older
+        # X is `gain @ per_mean_std`, and A is `information`. The step from V and m of the older
         # belief is V' = (V^-1 + A)^-1, m' = m + V' L J^T N^-1 z: the same as that by S above.
-        gain = solve(factor, per_layer_std).T
+        gain = solve(factor, per_mean_std).T
         per_log = np.linalg.inv(self._root)
-        weights = per_log.T @ np.linalg.inv(np.eye(2) - gain @ per_layer_std) @ gain
-        information = weights @ per_layer_std @ per_log
-        before, root = self._before_lesson
-        # z is the residual at the mean that the fit had, which is `self.log_layers`. At the mean
+        weights = per_log.T @ np.linalg.inv(np.eye(3) - gain @ per_mean_std) @ gain
+        information = weights @ per_mean_std @ per_log
+        before, covariance = self._before_lesson
+        # z is the residual at the mean that the fit had, which is `self.means`. At the mean
         # that the step starts from, the residual differs by what the mean has moved since.
-        pull = weights @ residual + information @ (self.log_layers - before)
-        covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + information)
-        log_layers = before + covariance @ pull
-        covariance += FADE_SHARE * (self._prior_covariance - covariance)
-        self._believe(log_layers, np.asarray(np.linalg.cholesky(covariance), np.float64))
+        pull = weights @ residual + information @ (self.means - before)
+        covariance = np.linalg.inv(np.linalg.inv(covariance) + information)
+        means = before + covariance @ pull
+        faded = self._prior_covariance.copy()
+        faded[2, 2] = covariance[2, 2]  # a bend does not change leads
+        covariance += FADE_SHARE * (faded - covariance)
+        self._believe(means, covariance)

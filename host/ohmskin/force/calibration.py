@@ -15,9 +15,9 @@ nominal_top_wire_ohm                       one wire segment of each layer [ohm];
 nominal_bottom_wire_ohm
 nominal_lead_ohm                           from a multiplexer's common pin to the first crossing of
                                            a line [ohm]; null: not known
-top_wire_log_std                           standard deviations of the logarithms of these three;
+top_wire_log_std                           standard deviations of the logarithms of both segments;
 bottom_wire_log_std                        null: not measured
-lead_log_std
+lead_std_ohm                               standard deviation of the lead [ohm]; null: not measured
 indenter_area_m2                           what the skin was pressed with [m^2]
 rest.date                                  ISO 8601
 rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]

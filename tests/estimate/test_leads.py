@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Leads between the multiplexers and the skin, told or not: readings by a circuit that has them.
+
+That circuit is compared with ngspice in tests/circuit.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.methods import make_estimator
+from studies.trials import Trial, finger_trial, random_trial, trial_of
+
+METHODS = ("joint", "touch")
+
+
+def with_leads(trial: Trial, ohm: float) -> Trial:
+    """The same skin behind leads of about so many ohm, each 10 % off by itself."""
+    random = np.random.default_rng(1)
+    lead_ohm = ohm * np.exp(0.1 * random.standard_normal(sum(trial.rest.shape)))
+
+    def led(skin: Skin) -> Skin:
+        return replace(skin, lead_ohm=lead_ohm)
+
+    return trial_of(led(trial.rest), [led(skin) for skin in trial.frames])
+
+
+def estimates(
+    trial: Trial, method: str, lead_ohm: float | None, mode: str = "near"
+) -> tuple[list[Estimate], float]:
+    """Answers to all frames, by who was told this lead; and the lead that came of them [ohm]."""
+    given = trial.rounded(10, mode=mode, wires_told=False)
+    nominal = given.knowledge(0).nominal_wire_ohm._replace(lead=lead_ohm)
+    estimator = make_estimator(method, replace(given.knowledge(0), nominal_wire_ohm=nominal))
+    answers = [estimator.estimate(ratio) for ratio in given.ratio]
+    return answers, estimator.wires().lead or 0.0
+
+
+def errors(trial: Trial, answers: list[Estimate]) -> tuple[Float, Float]:
+    """Of the pressed cells: error over the truth, and over the deviation that is stated."""
+    found, std = (
+        np.array([getattr(answer, name) for answer in answers])[trial.pressed]
+        for name in ("cell_siemens", "cell_siemens_std")
+    )
+    off = np.abs(found - trial.cell_siemens[trial.pressed])
+    return off / trial.cell_siemens[trial.pressed], off / std
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_leads_that_are_told_cost_little(method: str) -> None:
+    without = random_trial(8, 8, 6, 20, seed=4)
+    behind = with_leads(without, 600.0)
+    usual = np.median(errors(without, estimates(without, method, 0.0)[0])[0])
+    assert np.median(errors(behind, estimates(behind, method, 600.0)[0])[0]) < 1.5 * usual
+    silent = np.median(errors(behind, estimates(behind, method, 0.0)[0])[0])
+    assert silent > 3 * usual  # they matter
+
+
+@pytest.mark.parametrize("ohm", [0.0, 300.0, 1000.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_leads_that_nobody_told_are_in_the_deviations(method: str, ohm: float) -> None:
+    for trial in (random_trial(8, 8, 6, 20, seed=4), finger_trial(8, 8, 10, seed=4)):
+        behind = with_leads(trial, ohm)
+        _, stds_off = errors(behind, estimates(behind, method, None)[0])
+        assert np.mean(stds_off < 4) > 0.95
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_several_touches_teach_the_lead(method: str) -> None:
+    behind = with_leads(random_trial(8, 8, 6, 25, seed=5), 600.0)
+    assert estimates(behind, method, None)[1] == pytest.approx(600, rel=0.2)
+
+
+@pytest.mark.parametrize("ohm", [100.0, 1000.0])
+def test_far_ends_measure_leads_and_are_not_misled(ohm: float) -> None:
+    without = random_trial(8, 8, 6, 20, seed=6)
+    behind = with_leads(without, ohm)
+    usual, _ = errors(without, estimates(without, "joint", 0.0, "far")[0])
+    answers, lead_ohm = estimates(behind, "joint", None, "far")
+    off, stds_off = errors(behind, answers)
+    assert lead_ohm == pytest.approx(behind.rest.lead_ohm.mean(), rel=0.1)
+    assert np.median(off) < 1.5 * np.median(usual)
+    assert np.mean(stds_off < 4) > 0.97
