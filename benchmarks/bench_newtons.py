@@ -3,37 +3,39 @@
 
     make bench-newtons
 
-Everything is simulated: `pressed` says how. A skin is calibrated by a recording of presses, and
-then 100 frames of 2 to 6 touches of 0.4 to 7 N are read. The figure is the root mean square of the
-error of touched cells, RMSE [N]. Seven pairs of wires, twice each: presses by two laws. `told` has
-the true middle of both layers, else nobody has told anything. --only takes some of these:
+Everything is simulated: tests/helpers/pressed_skin.py says how. A skin is calibrated by a recording
+of presses, and 100 frames of 2 to 6 touches of 0.4 to 7 N are read after that. RMSE [N]: root mean
+square of the error of touched cells. Seven pairs of wires, each with presses by two laws. `told`:
+the true middle of both layers; else nobody has told anything. --only takes some of these groups:
 
 force     METHOD_over_told: RMSE over that of `joint` told, of the first five pairs, of 2000/4000
-          and of 10000/10000. METHOD_over_ohm: over that of `ohm`. told_over_before: `joint` and
-          `touch` told, over the same before calibrations learned wires. METHOD_bent: wires 0.75
-          and 1.35 of those at the calibration, over `joint` told on the same frames. within_4,
-          wrong: touched cells within 4 stated deviations; cells that are off by half, by 0.5 N and
-          by 4 deviations in a frame that converged, for 100 touched ones.
-wrong     METHOD_wrong: told wires wrongly, twice or half of them, over `joint` told rightly;
-          wrong_said: how often ``calibrate`` says that they disagree [%]. The first five pairs.
-wires     20 skins, wires of 20 ohm to 2 kohm: how often the wires of a layer that ``calibrate``
-          has found are within 30 ohm or 12 %, and within 2 of their deviations [%].
-small     2x2 and 3x3, the first five pairs: METHOD_over_told.
-few       presses of 12 cells alone, of 8x8, the first five pairs.
+          and of 10000/10000. METHOD_over_ohm: over that of `ohm`. METHOD_told_over_before: told,
+          over the same before calibrations learned wires. METHOD_bent: wires 0.75 and 1.35 of those
+          at the calibration, over `joint` told on the same frames. within_4, wrong: touched cells
+          within 4 stated deviations; cells off by half, by 0.5 N and by 4 deviations in frames that
+          converged, for 100 touched ones.
+wrong     METHOD_wrong: told twice the wires, or half of them, over `joint` told rightly. Five
+          pairs. wrong_said: how often ``calibrate`` says that presses and told wires disagree [%].
+wires     20 skins, wires of 20 ohm to 2 kohm: how often those of a layer that ``calibrate`` has
+          found are within 30 ohm or 12 %, and within 2 of their deviations [%].
+small     2x2 and 3x3, five pairs: over `joint` told.
+few       presses of 12 cells alone, of 8x8, five pairs: over `joint` told, over `ohm`.
 newtons   leads of 600 ohm at every line, 100/200 ohm a segment: over `ohm`.
-leads     conductances, no forces: 100/200 ohm a segment, leads of so many ohm at every line. Random
-          touches, and fingertips. within_4 of pressed cells; wrong: frames with a cell that is off
-          by half, by 10 uS and by 4 deviations, though they converged. told, far: median or 90th
-          percentile of the error, the larger share, over that without leads.
+leads     conductances, no forces: 100/200 ohm a segment, leads of so many ohm at every line; random
+          touches, and fingertips. within_4: of pressed cells. wrong: frames with a cell off by
+          half, by 10 uS and by 4 deviations, though they converged. told, far: the median of the
+          error or its 90th percentile, whichever is worse, over that without leads.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from itertools import product
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,65 +44,51 @@ from threadpoolctl import threadpool_limits
 
 from bars import ALL, Bar, Part, at_least, at_most, finish, options  # beside this file
 from network import SkinCircuit  # tests/helpers
-from ohmskin.arrays import Float
-from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.codes import ratio_from_codes
-from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES
-from pressed import LAWS, PressedSkin, calibrate, noisy_codes, with_leads  # beside this file
+from ohmskin.link.protocol import ADC_BITS, MODES
+from pressed_skin import LAWS, Plan, PressedSkin, calibrate, codes_of, with_leads  # tests/helpers
 from studies.judge import Judged, Verdict, answers_of, judge_trial, pooled, verdict
-from studies.rows import in_processes
+from studies.rows import Progress, in_processes
 from studies.trials import NOMINAL_WIRE_OHM, finger_trial, random_trial
 
-PAIRS: tuple[tuple[float, float], ...] = (
-    *((20, 40), (50, 100), (200, 400), (500, 1000), (50, 600)),
-    *((2000, 4000), (10000, 10000)),
-)
-FIRST = 5  # of these pairs; the other two have bars of their own
+FIVE = ((20.0, 40.0), (50.0, 100.0), (200.0, 400.0), (500.0, 1000.0), (50.0, 600.0))
+LONG, LONGEST = (2000.0, 4000.0), (10000.0, 10000.0)  # these have bars of their own
+PAIRS = (*FIVE, LONG, LONGEST)
 METHODS = ("joint", "touch")
 SEED = 9000  # of the first skin
 BENDS = (0.75, 1.35)  # wires over those at the calibration
+LEADS = "leads"  # the group of conductances
+KINDS, LEADS_OHM = ("random", "fingers"), (300, 1000, 3000)
 REST_FRAMES = 90  # of the untouched skin, where conductances are measured
-LEADS_OHM = (300, 1000, 3000)
-# RMSE of `joint` and `touch` told [N] before calibrations learned wires, by pair and law: commit
-# 0710d63, with this file, on the same recordings.
-BEFORE_N: dict[tuple[float, float, str], tuple[float, float]] = {}
+# RMSE of `joint` and of `touch` told [N], by pair and law, before calibrations learned wires: by
+# commit 0710d63, on the recordings that this file makes.
+BEFORE_N: dict[tuple[tuple[float, float], str], tuple[float, float]] = {}
 
 
-class Told(NamedTuple):
-    """A method, and what is told: the wires over the true ones, or nothing."""
+# ----------------------------------------------------------------------------- pressed skins
+
+
+class Way(NamedTuple):
+    """A method, and what ``calibrate`` is told: the wires over the true ones; None: nothing."""
 
     method: str
     factor: float | None = None
 
 
-OHM, TOLD = Told("ohm"), Told("joint", 1.0)
-UNTOLD = {method: Told(method) for method in METHODS}
-COMPARED = (OHM, TOLD, *UNTOLD.values())
-
-
-@dataclass(frozen=True)
-class Skin:
-    """A skin that is calibrated, of which group of figures it is, and in which ways it is read."""
-
-    group: str
-    wire_ohm: tuple[float, float]
-    law: str
-    seed: int
-    ways: tuple[Told, ...] = COMPARED
-    shape: tuple[int, int] = (8, 8)
-    lead_ohm: float = 0.0
-    presses_of: int | None = None
-    touches: int = 100
-    bends: tuple[float, ...] = ()
+OHM, TOLD = Way("ohm"), Way("joint", 1.0)
+COMPARED = (OHM, TOLD, *map(Way, METHODS))
+# Told wrongly: twice the wires, or half of them.
+WRONG = dict(zip(LAWS, (2.0, 0.5), strict=True))
 
 
 class Read(NamedTuple):
     """What one way shows of a skin.
 
-    rmse_n: as calibrated, then bent. within, wrong: [%]. said: by ``calibrate``. found: wires that
-    it keeps. true_ohm: the mean segments of both layers.
+    rmse_n: as calibrated, then bent. within, wrong: [%]. said: by ``calibrate``. found: the wires
+    that it keeps.
     """
 
     rmse_n: tuple[float, ...]
@@ -108,205 +96,206 @@ class Read(NamedTuple):
     wrong: float
     said: str
     found: WireOhm
+
+
+class Task(NamedTuple):
+    """A skin, the group of figures it is of, the ways in which it is read, how it bends."""
+
+    group: str
+    plan: Plan
+    ways: tuple[Way, ...] = COMPARED
+    bends: tuple[float, ...] = ()
+
+
+class Shown(NamedTuple):
+    """What all ways show of a skin. true_ohm: its mean segments, top and bottom."""
+
+    task: Task
+    by: dict[Way, Read]
     true_ohm: tuple[float, float]
 
 
-def read(skin: Skin) -> tuple[Skin, dict[Told, Read]]:
-    """Press, calibrate and touch a skin. A way whose calibration is refused shows nothing."""
-    pressed = PressedSkin(
-        *(skin.wire_ohm, skin.law, skin.seed),
-        shape=skin.shape,
-        lead_ohm=skin.lead_ohm,
-        presses_of=skin.presses_of,
-        touches=skin.touches,
-    )
-    true_ohm = float(pressed.rest.top_wire_ohm.mean()), float(pressed.rest.bottom_wire_ohm.mean())
-    shown: dict[Told, Read] = {}
+def show(task: Task) -> Shown:
+    """Press, calibrate and touch a skin. A way whose calibration is refused is infinitely off."""
+    plan, pressed, by = task.plan, PressedSkin(task.plan), {}
     with tempfile.TemporaryDirectory() as place, threadpool_limits(limits=1):
         recording, file = Path(place, "presses.mcap"), Path(place, "skin.json")
         pressed.record(recording)
-        for way in skin.ways:
-            told = WireOhm()
+        for way in task.ways:
+            told = NO_WIRES
             if way.factor is not None:
-                top, bottom = skin.wire_ohm
-                told = WireOhm(way.factor * top, way.factor * bottom, skin.lead_ohm)
+                top, bottom = plan.wire_ohm
+                told = WireOhm(way.factor * top, way.factor * bottom, plan.lead_ohm)
             try:
                 said = calibrate(recording, file, way.method, told)
             except ValueError as refusal:
-                nan = float("nan")
-                refused = (nan,) * (1 + len(skin.bends)), nan, nan, str(refusal)
-                shown[way] = Read(*refused, WireOhm(), true_ohm)
+                never = (np.inf,) * (1 + len(task.bends))
+                by[way] = Read(never, 0.0, 100.0, str(refusal), NO_WIRES)
                 continue
-            flat, *bent = (pressed.read(file, factor) for factor in (1.0, *skin.bends))
-            shown[way] = Read(
-                tuple(forces.rmse_n() for forces in (flat, *bent)),
-                flat.within_percent(),
-                flat.wrong_percent(),
-                said,
-                load_calibration(file).nominal_wire_ohm,
-                true_ohm,
-            )
-    return skin, shown
+            flat, *bent = (pressed.read(file, factor) for factor in (1.0, *task.bends))
+            rmse_n = tuple(forces.rmse_n() for forces in (flat, *bent))
+            found = load_calibration(file).nominal_wire_ohm
+            by[way] = Read(rmse_n, flat.within_percent(), flat.wrong_percent(), said, found)
+    rest = pressed.rest
+    return Shown(task, by, (float(rest.top_wire_ohm.mean()), float(rest.bottom_wire_ohm.mean())))
 
 
-def skins(group: str, part: Part, seed: int) -> list[Skin]:
+def tasks_of(group: str, part: Part, seed: int) -> list[Task]:
     """All skins of a group of figures."""
-    of_laws = [
-        Skin(group, pair, law, seed, touches=part.of(100))
-        for pair, law in product(PAIRS[: part.of(len(PAIRS))], LAWS)
-    ][: part.of(2 * len(PAIRS))]
-    first = [skin for skin in of_laws if skin.wire_ohm in PAIRS[:FIRST]]
-    if part is not ALL:
-        of_laws = first = [replace(skin, shape=(2, 2)) for skin in first]
+    size = (8, 8) if part is ALL else (2, 2)
+    pairs = PAIRS if group == "force" else FIVE
+    plans = [
+        Plan(pair, law, seed, shape=size, touches=part.of(100))
+        for pair, law in product(pairs[: part.of(len(pairs))], LAWS)
+    ]
     match group:
         case "force":
-            return [
-                replace(skin, ways=(*COMPARED, Told("touch", 1.0)), bends=BENDS) for skin in of_laws
-            ]
+            return [Task(group, plan, (*COMPARED, Way("touch", 1.0)), BENDS) for plan in plans]
         case "wrong":
-            factors = dict(zip(LAWS, (2.0, 0.5), strict=True))
-            ways = {law: tuple(Told(m, factors[law]) for m in METHODS) for law in LAWS}
-            return [replace(skin, ways=(TOLD, *ways[skin.law])) for skin in first]
+            ways = {law: tuple(Way(method, WRONG[law]) for method in METHODS) for law in LAWS}
+            return [Task(group, plan, (TOLD, *ways[plan.law])) for plan in plans]
         case "wires":
             random = np.random.default_rng(seed)
-            ohm = np.exp(random.uniform(np.log(20), np.log(2000), (part.of(20), 2)))
-            laws = list(LAWS) * len(ohm)
+            ohm = np.exp(random.uniform(np.log(20), np.log(2000), (part.of(20), 2))).tolist()
             return [
-                replace(
-                    first[0],
-                    wire_ohm=(float(top), float(bottom)),
-                    law=law,
-                    seed=seed + number,
-                    ways=(UNTOLD["joint"],),
-                    touches=1,
+                Task(
+                    group,
+                    Plan((top, bottom), list(LAWS)[number % 2], seed + number, size, touches=1),
+                    (Way("joint"),),
                 )
-                for number, ((top, bottom), law) in enumerate(zip(ohm, laws, strict=False))
+                for number, (top, bottom) in enumerate(ohm)
             ]
         case "small":
-            return [replace(skin, shape=(n, n)) for n in (2, 3) for skin in first]
+            return [Task(group, replace(plan, shape=(n, n))) for n in (2, 3) for plan in plans]
         case "few":
-            return [replace(skin, presses_of=12) for skin in first]
+            return [Task(group, replace(plan, presses_of=12)) for plan in plans]
         case "newtons":
+            behind = [replace(plan, wire_ohm=NOMINAL_WIRE_OHM, lead_ohm=600.0) for plan in plans]
             return [
-                replace(skin, wire_ohm=NOMINAL_WIRE_OHM, lead_ohm=600.0, seed=seed + number)
+                Task(group, replace(plan, seed=seed + number))
                 for number in range(part.of(2))
-                for skin in first[:2]
+                for plan in behind[: len(LAWS)]
             ]
     raise KeyError(group)
 
 
-# ----------------------------------------------------------------------------------------- figures
-
-Shown = list[tuple[Skin, dict[Told, Read]]]
-Figures = dict[str, float | None]
+# Of one skin: what it gives to a figure.
+Of = Callable[[Shown], Iterable[float]]
 
 
-def over(shown: Shown, way: Told, base: Told, bend: int = 0) -> Float:
-    """RMSE of a way over that of another one, of each skin; infinite where one was refused."""
-    shares = np.array([by[way].rmse_n[bend] / by[base].rmse_n[bend] for _, by in shown])
-    return np.where(np.isnan(shares), np.inf, shares)
+class Figure(NamedTuple):
+    """One figure of a group: what `how` makes of all that the skins of the group give to it."""
+
+    group: str
+    name: str
+    of: Of
+    how: Callable[[list[float]], Any]
+    bar: Callable[[str, float], Bar] | None = None
+    limit: float = 0.0
 
 
-def put(
-    figures: Figures, name: str, values: Float | Iterable[float], how: Callable[..., Any]
-) -> None:
-    value = float(how(np.array(values)))
-    figures[name] = round(value, 3) if np.isfinite(value) else None
+def over(
+    method: str,
+    base: Way = TOLD,
+    pairs: Collection[tuple[float, float]] = (),
+    *,
+    rows: int = 0,
+    bent: bool = False,
+) -> Of:
+    """RMSE of a method, told nothing or wrongly, over that of another way.
+
+    pairs, rows: of skins of these wires, and of so many rows; else of all.
+    """
+
+    def of(shown: Shown) -> Iterator[float]:
+        plan = shown.task.plan
+        if (not pairs or plan.wire_ohm in pairs) and rows in (0, plan.shape[0]):
+            way = next(way for way in shown.by if way.method == method and way.factor != 1.0)
+            both = zip(shown.by[way].rmse_n, shown.by[base].rmse_n, strict=True)
+            shares = [np.inf if np.isinf(other) else one / other for one, other in both]
+            yield from shares[1:] if bent else shares[:1]
+
+    return of
 
 
-def of_force(shown: Shown) -> Figures:
-    figures: Figures = {}
-    by_pair = {pair: [one for one in shown if one[0].wire_ohm == pair] for pair in PAIRS}
-    first = [one for pair in PAIRS[:FIRST] for one in by_pair[pair]]
-    for method, way in UNTOLD.items():
-        put(figures, f"{method}_over_told_worst", over(first, way, TOLD), np.max)
-        put(figures, f"{method}_over_told_median", over(first, way, TOLD), np.median)
-        for pair in filter(by_pair.get, PAIRS[FIRST:]):
-            put(figures, f"{method}_over_told_{pair[0]}", over(by_pair[pair], way, TOLD), np.max)
-        others = [one for one in shown if one[0].wire_ohm != (2000, 4000)]
-        put(figures, f"{method}_over_ohm_worst", over(others, way, OHM), np.max)
-        if by_pair[2000, 4000]:
-            put(figures, f"{method}_over_ohm_2000", over(by_pair[2000, 4000], way, OHM), np.max)
-        bent = [over(first, way, TOLD, 1 + bend) for bend in range(len(BENDS))]
-        put(figures, f"{method}_bent_worst", np.concatenate(bent), np.max)
-        put(figures, f"{method}_bent_median", np.concatenate(bent), np.median)
-        put(figures, f"{method}_within_4", [by[way].within for _, by in shown], np.mean)
-        put(figures, f"{method}_wrong", [by[way].wrong for _, by in shown], np.mean)
-        told = Told(method, 1.0)
-        before = [
-            by[told].rmse_n[0] / BEFORE_N[*skin.wire_ohm, skin.law][METHODS.index(method)]
-            for skin, by in shown
-            if (*skin.wire_ohm, skin.law) in BEFORE_N and skin.seed == SEED
-        ]
-        if before:
-            put(figures, f"{method}_told_over_before", before, np.median)
-            put(figures, f"{method}_told_over_before_worst", before, np.max)
-    return figures
+def over_before(method: str) -> Of:
+    def of(shown: Shown) -> Iterator[float]:
+        plan = shown.task.plan
+        before_n = BEFORE_N.get((plan.wire_ohm, plan.law))
+        if before_n is not None and plan.seed == SEED:
+            yield shown.by[Way(method, 1.0)].rmse_n[0] / before_n[METHODS.index(method)]
+
+    return of
 
 
-def of_wrong(shown: Shown) -> Figures:
-    figures: Figures = {}
-    said = []
-    for method in METHODS:
-        shares = []
-        for skin, by in shown:
-            way = next(way for way in by if way.method == method and way.factor != 1.0)
-            shares.append(over([(skin, by)], way, TOLD)[0])
-            said.append("disagree" in by[way].said)
-        put(figures, f"{method}_wrong_worst", shares, np.max)
-        put(figures, f"{method}_wrong_median", shares, np.median)
-    put(figures, "wrong_said", 100 * np.array(said), np.mean)
-    return figures
+def near(shown: Shown) -> Iterator[float]:
+    """Whether the wires that were found are those of the skin, of each layer [%]."""
+    for ohm, true in zip(shown.by[Way("joint")].found.both or (0, 0), shown.true_ohm, strict=True):
+        yield 100.0 * (abs(ohm - true) <= max(30.0, 0.12 * true))
 
 
-def of_wires(shown: Shown) -> Figures:
-    figures: Figures = {}
-    near, stated = [], []
-    for _, by in shown:
-        found = by[UNTOLD["joint"]].found
-        std = found.top_log_std, found.bottom_log_std
-        both = found.both or (0.0, 0.0)
-        for ohm, log_std, true in zip(both, std, by[UNTOLD["joint"]].true_ohm, strict=True):
-            near.append(abs(ohm - true) <= max(30.0, 0.12 * true))
-            stated.append(abs(np.log(max(ohm, 1e-3) / true)) <= 2 * (log_std or 0.0))
-    put(figures, "wires_near", 100 * np.array(near), np.mean)
-    put(figures, "wires_within_2", 100 * np.array(stated), np.mean)
-    return figures
+def stated(shown: Shown) -> Iterator[float]:
+    """Whether they are within two of their deviations [%]."""
+    found = shown.by[Way("joint")].found
+    stds = found.top_log_std or 0.0, found.bottom_log_std or 0.0
+    for ohm, std, true in zip(found.both or (1, 1), stds, shown.true_ohm, strict=True):
+        yield 100.0 * (abs(np.log(ohm / true)) <= 2 * std)
 
 
-def of_small(shown: Shown) -> Figures:
-    figures: Figures = {}
-    for method, size in product(METHODS, (2, 3)):
-        shares = over([one for one in shown if one[0].shape[0] == size], UNTOLD[method], TOLD)
-        put(figures, f"{method}_{size}x{size}_worst", shares, np.max)
-        put(figures, f"{method}_{size}x{size}_median", shares, np.median)
-    return figures
+def figures_of(method: str) -> list[Figure]:
+    """All figures of a method on pressed skins, with their bars."""
+    untold, ratio = Way(method), partial(over, method)
+    rows: list[tuple[Any, ...]] = [
+        ("force", "over_told_worst", ratio(TOLD, FIVE), np.max, at_most, 1.1),
+        ("force", "over_told_median", ratio(TOLD, FIVE), np.median, at_most, 1.04),
+        ("force", "over_told_2000", ratio(TOLD, [LONG]), np.max, at_most, 1.3),
+        ("force", "over_told_10000", ratio(TOLD, [LONGEST]), np.max, at_most, 1.6),
+        ("force", "over_ohm_worst", ratio(OHM, [*FIVE, LONGEST]), np.max, at_most, 0.92),
+        ("force", "over_ohm_2000", ratio(OHM, [LONG]), np.max, at_most, 1.05),
+        ("force", "told_over_before", over_before(method), np.median, at_most, 1.03),
+        ("force", "told_over_before_worst", over_before(method), np.max),
+        ("force", "bent_worst", ratio(TOLD, FIVE, bent=True), np.max, at_most, 1.1),
+        ("force", "bent_median", ratio(TOLD, FIVE, bent=True), np.median),
+        ("force", "within_4", lambda one: [one.by[untold].within], np.mean, at_least, 97),
+        ("force", "wrong", lambda one: [one.by[untold].wrong], np.mean, at_most, 0.5),
+        ("wrong", "wrong_worst", ratio(), np.max, at_most, 1.1),
+        ("wrong", "wrong_median", ratio(), np.median),
+        ("small", "2x2_worst", ratio(rows=2), np.max),
+        ("small", "2x2_median", ratio(rows=2), np.median, at_most, 1.15),
+        ("small", "3x3_worst", ratio(rows=3), np.max, at_most, 1.3),
+        ("small", "3x3_median", ratio(rows=3), np.median, at_most, 1.15),
+        ("few", "few_worst", ratio(), np.max, at_most, 1.3),
+        ("few", "few_median", ratio(), np.median, at_most, 1.05),
+        ("few", "few_over_ohm", ratio(OHM), np.max, at_most, 1.05),
+        ("newtons", "leads_over_ohm", ratio(OHM), np.max, at_most, 0.92),
+    ]
+    return [Figure(group, f"{method}_{name}", *more) for group, name, *more in rows]
 
 
-def of_few(shown: Shown) -> Figures:
-    figures: Figures = {}
-    for method, way in UNTOLD.items():
-        put(figures, f"{method}_few_worst", over(shown, way, TOLD), np.max)
-        put(figures, f"{method}_few_median", over(shown, way, TOLD), np.median)
-        put(figures, f"{method}_few_over_ohm", over(shown, way, OHM), np.max)
-    return figures
+def disagrees(shown: Shown) -> Iterator[float]:
+    """Whether calibrations that were told wrongly said so [%]."""
+    yield from (100.0 * ("disagree" in one.said) for way, one in shown.by.items() if way != TOLD)
 
 
-def of_newtons(shown: Shown) -> Figures:
-    figures: Figures = {}
-    for method, way in UNTOLD.items():
-        put(figures, f"{method}_leads_over_ohm", over(shown, way, OHM), np.max)
-    return figures
+FIGURES = [
+    *(figure for method in METHODS for figure in figures_of(method)),
+    Figure("wrong", "wrong_said", disagrees, np.mean, at_least, 100),
+    Figure("wires", "wires_near", near, np.mean, at_least, 90),
+    Figure("wires", "wires_within_2", stated, np.mean, at_least, 90),
+]
 
 
-OF_SKINS = {
-    "force": of_force,
-    "wrong": of_wrong,
-    "wires": of_wires,
-    "small": of_small,
-    "few": of_few,
-    "newtons": of_newtons,
-}
+def print_skin(shown: Shown) -> None:
+    """RMSE of all ways, as calibrated and bent, and the wires that the last way keeps."""
+    task, plan = shown.task, shown.task.plan
+    ways = [
+        f"{way.method}{'' if way.factor is None else f' told {way.factor:g}'} "
+        + " ".join(f"{rmse_n:.3f}" for rmse_n in one.rmse_n)
+        for way, one in shown.by.items()
+    ]
+    found = " ".join(f"{n:.3g}" for n in list(shown.by.values())[-1].found if n is not None)
+    size, wires = "x".join(map(str, plan.shape)), "/".join(f"{ohm:.0f}" for ohm in plan.wire_ohm)
+    print(f"{task.group} {size} {wires} {plan.law}: {', '.join(ways)}; found {found}", flush=True)
 
 
 # ------------------------------------------------------------------------------------------- leads
@@ -315,36 +304,33 @@ OF_SKINS = {
 class Scene(NamedTuple):
     """Conductances behind leads: a kind of touches, read in a mode by a method."""
 
-    kind: str
     seed: int
     frames: int
-    lead_ohm: float
+    kind: str
     method: str
+    lead_ohm: float
     mode: str = "near"
     told: bool = False
 
 
 def judged(scene: Scene) -> tuple[Scene, Judged, list[bool]]:
     """The answers against the truth, and which frames mislead."""
-    random = np.random.default_rng(scene.seed)
+    random, size = np.random.default_rng(scene.seed), (8, 8)
     if scene.kind == "random":
-        trial = random_trial(8, 8, 6, scene.frames, scene.seed)
+        trial = random_trial(*size, 8, scene.frames, scene.seed)
     else:
-        usual = {"sigma_cells": (0.6, 1.0), "peak_siemens": (3e-5, 3e-4)}
-        trial = finger_trial(8, 8, scene.frames, scene.seed, **usual)
+        peaks = 3e-5, 3e-4
+        trial = finger_trial(
+            *size, scene.frames, scene.seed, sigma_cells=(0.6, 1.0), peak_siemens=peaks
+        )
     circuit = SkinCircuit(with_leads(trial.rest, scene.lead_ohm, random))
-    names = [ENUMS["reading"].values[name] for name in MODES[scene.mode]]
-    cells = [*[trial.rest.cell_siemens] * REST_FRAMES, *trial.cell_siemens]
-    exact = np.array([circuit.readings(cell)[..., names] for cell in cells])
-    ratio = ratio_from_codes(noisy_codes(exact, random))
-    told = WireOhm(lead=scene.lead_ohm) if scene.told else WireOhm()
-    rest_ratio = ratio[:REST_FRAMES].mean(axis=0)
+    cells = np.concatenate([[trial.rest.cell_siemens] * REST_FRAMES, trial.cell_siemens])
+    ratio = ratio_from_codes(codes_of(circuit, cells, scene.mode, random))
     known = SkinKnowledge(
-        8,
-        8,
+        *size,
         adc_bits=ADC_BITS,
-        rest_ratio=rest_ratio,
-        nominal_wire_ohm=told,
+        rest_ratio=ratio[:REST_FRAMES].mean(axis=0),
+        nominal_wire_ohm=WireOhm(lead=scene.lead_ohm if scene.told else None),
         reading_names=MODES[scene.mode],
     )
     with threadpool_limits(limits=1):
@@ -357,125 +343,92 @@ def judged(scene: Scene) -> tuple[Scene, Judged, list[bool]]:
     return scene, judge_trial(answers_of(found), trial), misleads
 
 
-def of_leads(scenes: list[tuple[Scene, Judged, list[bool]]]) -> Figures:
-    figures: Figures = {}
-
-    def all_of(*like: object) -> tuple[Judged, float]:
-        """Of all scenes of this kind, method, mode, told and lead."""
-        chosen = [
-            (one, misleads)
-            for scene, one, misleads in scenes
-            if (scene.kind, scene.method, scene.mode, scene.told, scene.lead_ohm) == like
-        ]
-        wrong = 100 * float(np.mean(np.concatenate([misleads for _, misleads in chosen])))
-        return pooled(one for one, _ in chosen), wrong
-
-    for kind, method in product(("random", "fingers"), METHODS):
+def of_leads(
+    part: Part, seed: int, jobs: int, progress: Progress
+) -> tuple[dict[str, float | None], list[Bar]]:
+    """All figures of conductances behind leads, and their bars."""
+    scenes = [
+        Scene(seed + number, part.of(80), *scene)
+        for number, *scene in product(
+            range(part.of(4)), KINDS, METHODS, (0, *LEADS_OHM), MODES, (False, True)
+        )
+        if scene[-2:] != ["far", True]
+    ]
+    found: defaultdict[tuple[object, ...], list[tuple[Judged, list[bool]]]] = defaultdict(list)
+    for scene, one, misleads in in_processes(judged, scenes, jobs, progress):
+        found[scene[2:]].append((one, misleads))
+    figures: dict[str, float | None] = {}
+    bars = []
+    for kind, method in product(KINDS, METHODS):
         for mode, told in (("near", False), ("near", True), ("far", False)):
-            name = f"{kind}_{method}_{'told' if told else mode}"
-            without, _ = all_of(kind, method, mode, told, 0)
-            shares = []
+            word, shares = "told" if told else mode, []
+            without = pooled(one for one, _ in found[kind, method, 0, mode, told])
             for lead_ohm in LEADS_OHM:
-                one, wrong = all_of(kind, method, mode, told, lead_ohm)
-                shares += [one.error_percent(q) / without.error_percent(q) for q in (0.5, 0.9)]
-                if name.endswith("near"):
-                    figures[f"{name}_{lead_ohm}_median"] = round(one.error_percent(), 2)
-                    figures[f"{name}_{lead_ohm}_p90"] = round(one.error_percent(0.9), 2)
-                    figures[f"{name}_{lead_ohm}_within_4"] = round(one.pressed_within_percent(), 1)
-                    figures[f"{name}_{lead_ohm}_wrong"] = round(wrong, 2)
-            if name.endswith("near"):
-                figures[f"{name}_0_median"] = round(without.error_percent(), 2)
-                figures[f"{name}_0_p90"] = round(without.error_percent(0.9), 2)
-            else:
-                figures[name] = round(max(shares), 2)
-    return figures
+                parts = found[kind, method, lead_ohm, mode, told]
+                every = pooled(one for one, _ in parts)
+                errors = [every.error_percent(quantile) for quantile in (0.5, 0.9)]
+                shares += [
+                    errors[0] / without.error_percent(),
+                    errors[1] / without.error_percent(0.9),
+                ]
+                if word != "near":
+                    continue
+                wrong = 100 * float(np.mean([misleads for _, misleads in parts]))
+                name = f"{kind}_{method}_{lead_ohm}"
+                numbers = (*errors, every.pressed_within_percent(), wrong)
+                for what, number in zip(
+                    ("median", "p90", "within_4", "wrong"), numbers, strict=True
+                ):
+                    figures[f"{name}_{what}"] = round(number, 2)
+                longest = lead_ohm == LEADS_OHM[-1]
+                bars.append(at_least(f"{name}_within_4", 90 if longest else 95))
+                bars.append(at_most(f"{name}_wrong", 10 if longest else 1))
+            if word != "near":
+                figures[f"{kind}_{method}_{word}_over_none"] = round(max(shares), 2)
+                bars.append(at_most(f"{kind}_{method}_{word}_over_none", 1.5))
+    return figures, bars
 
 
-# -------------------------------------------------------------------------------------------- bars
+# -------------------------------------------------------------------------------------------- main
 
 
-def bars() -> list[Bar]:
-    found = [at_least("wires_near", 90), at_least("wires_within_2", 90)]
-    found.append(at_least("wrong_said", 100))
-    for m in METHODS:
-        found += [
-            at_most(f"{m}_over_told_worst", 1.1),
-            at_most(f"{m}_over_told_median", 1.04),
-            at_most(f"{m}_over_told_2000", 1.3),
-            at_most(f"{m}_over_told_10000", 1.6),
-            at_most(f"{m}_over_ohm_worst", 0.92),
-            at_most(f"{m}_over_ohm_2000", 1.05),
-            at_most(f"{m}_bent_worst", 1.1),
-            at_least(f"{m}_within_4", 97),
-            at_most(f"{m}_wrong", 0.5),
-            at_most(f"{m}_told_over_before", 1.03),
-            at_most(f"{m}_wrong_worst", 1.1),
-            at_most(f"{m}_2x2_median", 1.15),
-            at_most(f"{m}_3x3_median", 1.15),
-            at_most(f"{m}_3x3_worst", 1.3),
-            at_most(f"{m}_few_median", 1.05),
-            at_most(f"{m}_few_worst", 1.3),
-            at_most(f"{m}_few_over_ohm", 1.05),
-            at_most(f"{m}_leads_over_ohm", 0.92),
-        ]
-        for kind, lead_ohm in product(("random", "fingers"), LEADS_OHM):
-            within, wrong = (90, 10) if lead_ohm == LEADS_OHM[-1] else (95, 1)
-            found.append(at_least(f"{kind}_{m}_near_{lead_ohm}_within_4", within))
-            found.append(at_most(f"{kind}_{m}_near_{lead_ohm}_wrong", wrong))
-        for kind, how in product(("random", "fingers"), ("told", "far")):
-            found.append(at_most(f"{kind}_{m}_{how}", 1.5))
-    return found
-
-
-def print_table(shown: Shown) -> None:
-    """RMSE of all ways on all skins, and what the presses have found."""
-    for skin, by in shown:
-        place = f"{skin.group} {skin.wire_ohm[0]:.0f}/{skin.wire_ohm[1]:.0f} {skin.law}"
-        size, errors = "x".join(map(str, skin.shape)), []
-        for way, one in by.items():
-            told = "" if way.factor is None else f" told {way.factor:g}"
-            errors.append(f"{way.method}{told} " + " ".join(f"{n:.3f}" for n in one.rmse_n))
-        untold = by.get(UNTOLD["joint"])
-        found = ""
-        if untold is not None and untold.found.both is not None:
-            found = "found " + "/".join(f"{ohm:.0f}" for ohm in untold.found.both)
-        print(f"{place:28} {size} | {' | '.join(errors)} | {found}")
-
-
-def measure(part: Part, only: list[str], seed: int, jobs: int) -> Figures:
-    figures: Figures = {}
+def measure(
+    part: Part, groups: list[str], seed: int, jobs: int
+) -> tuple[dict[str, float | None], list[Bar]]:
+    """All figures of these groups, and their bars."""
 
     def progress(done: int, of: int) -> None:
-        print(f"\r{done} of {of} ", end="" if done < of else "\n", file=sys.stderr)
+        print(f"\r{done} of {of} ", end="" if done < of else "\n", file=sys.stderr, flush=True)
 
-    tasks = [skin for group in only if group in OF_SKINS for skin in skins(group, part, seed)]
-    shown = in_processes(read, tasks, jobs, progress)
-    shown.sort(key=lambda one: tasks.index(one[0]))
-    print_table(shown)
-    for group, figures_of in OF_SKINS.items():
-        if group in only:
-            figures |= figures_of([one for one in shown if one[0].group == group])
-    if "leads" in only:
-        ways = (("near", False), ("near", True), ("far", False))
-        scenes = [
-            Scene(kind, seed + number, part.of(80), lead_ohm, method, mode, told)
-            for kind, number, lead_ohm, method, (mode, told) in product(
-                ("random", "fingers"), range(part.of(4)), (0, *LEADS_OHM), METHODS, ways
-            )
-        ]
-        figures |= of_leads(in_processes(judged, scenes, jobs, progress))
-    return figures
+    tasks = [task for group in groups if group != LEADS for task in tasks_of(group, part, seed)]
+    shown = sorted(in_processes(show, tasks, jobs, progress), key=lambda one: tasks.index(one.task))
+    figures: dict[str, float | None] = {}
+    bars = []
+    for one in shown:
+        print_skin(one)
+    for figure in (figure for figure in FIGURES if figure.group in groups):
+        of_skins = (figure.of(one) for one in shown if one.task.group == figure.group)
+        values = list(chain.from_iterable(of_skins))
+        if values:
+            value = float(figure.how(values))
+            figures[figure.name] = round(value, 3) if np.isfinite(value) else None
+            if figure.bar is not None:
+                bars.append(figure.bar(figure.name, figure.limit))
+    if LEADS in groups:
+        of_conductances, more = of_leads(part, seed, jobs, progress)
+        figures, bars = figures | of_conductances, bars + more
+    return figures, bars
 
 
 def main() -> int:
-    groups = (*OF_SKINS, "leads")
+    groups = [*dict.fromkeys(figure.group for figure in FIGURES), LEADS]
     parser = options(__doc__)
     parser.add_argument("--only", default=",".join(groups), help=f"of {', '.join(groups)}")
     parser.add_argument("--seed", type=int, default=SEED, help="of the first skin")
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one a core")
     asked = parser.parse_args()
-    figures = measure(asked.part, asked.only.split(","), asked.seed, asked.jobs)
-    return finish(asked.part, figures, [bar for bar in bars() if bar.figure in figures])
+    figures, bars = measure(asked.part, asked.only.split(","), asked.seed, asked.jobs)
+    return finish(asked.part, figures, bars)
 
 
 if __name__ == "__main__":

@@ -107,50 +107,6 @@ class PressModel:
         return pressing
 
 
-@dataclass(frozen=True)
-class SeriesModel:
-    """Another law of contact, for whoever must not lean on that of `PressModel`.
-
-    G = c (1 +- play) / (1 + c s),  c = k F^b exp(d):  a power law with a resistor s in series. G
-    lies lower while the force grows, and higher once it falls; d drifts alone, and nothing creeps.
-
-    siemens_at_1n: k [S/N^b]. exponent: b. series_ohm: s. play: to either side.
-    noise, noise_time_s: standard deviation of d, and its time constant.
-    spread, exponent_spread: standard deviations of ln k and ln s, and of ln b, between cells.
-    seed: of the cells and of the noise.
-    """
-
-    siemens_at_1n: float = 30e-6
-    exponent: float = 1.4
-    series_ohm: float = 300.0
-    play: float = 0.04
-    noise: float = 0.03
-    noise_time_s: float = 20.0
-    spread: float = 0.2
-    exponent_spread: float = 0.03
-    seed: int = 0
-
-    def rise(self, time_s: Float, force_n: Float) -> Float:
-        """As `PressModel.rise`."""
-        cells = force_n.reshape(len(time_s), -1)
-        random = np.random.default_rng(self.seed)
-        gain, series, exponent = (
-            middle * np.exp(spread * random.standard_normal(cells.shape[1]))
-            for middle, spread in (
-                (self.siemens_at_1n, self.spread),
-                (self.series_ohm, self.spread),
-                (self.exponent, self.exponent_spread),
-            )
-        )
-        turns = np.sign(np.diff(cells, axis=0, prepend=0.0))
-        last = np.maximum.accumulate(np.where(turns, np.arange(len(cells))[:, None], 0), axis=0)
-        grows = np.take_along_axis(turns, last, axis=0)
-        drift = self.noise * wander(time_s, cells.shape[1], self.noise_time_s, random)
-        contact = gain * cells**exponent * np.exp(drift)
-        rise = contact * (1 - self.play * grows) / (1 + contact * series)
-        return np.asarray(rise).reshape(force_n.shape)
-
-
 def robot_presses(
     peaks_n: Sequence[float], random: np.random.Generator, start_s: float
 ) -> tuple[Float, Float]:

@@ -2,17 +2,18 @@
 """A skin that is calibrated by a recording of presses, as users do it, and touched after that.
 
 A robot presses cell after cell, five times each with about 0.4 to 8 N. `PressedSkin.record` writes
-what a board reads meanwhile, and the forces. `calibrate` runs ``ohmskin calibrate recording`` on
-that, and `PressedSkin.read` reads many touches by a `SkinReader`. Readings are those of the node
-Laplacian (tests/helpers), which shares no code with the estimators, with noise and 10 bits. Every
-resistance of a skin scatters by 10 % about its layer's.
+what a board reads meanwhile, and the forces; `calibrate` runs ``ohmskin calibrate recording`` on
+that; `PressedSkin.read` reads many touches by a `SkinReader`. Readings are those of the node
+Laplacian, which shares no code with the estimators, with noise and 10 bits. Every resistance of a
+skin scatters by 10 % about its layer's.
 """
 
 from __future__ import annotations
 
+import inspect
 import io
 from contextlib import redirect_stdout
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ohmskin
-from network import SkinCircuit  # tests/helpers
+from network import SkinCircuit
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import Skin
+from ohmskin.cli.calibrate import recording as recording_command
 from ohmskin.cli.main import app
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.force.calibration import load_calibration
@@ -33,24 +35,70 @@ from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import ForceSample, Tare
 from studies.judge import STATED_STDS
-from studies.press import LEAVE_S, PressModel, SeriesModel, robot_presses
+from studies.press import LEAVE_S, PressModel, robot_presses, wander
 from studies.trials import NOISE_LSB, SPREAD, skin_at_rest, stretched
 
-# The studies' law has less of its noise here: a reading of 24 % would hide what wires do.
-LAWS: dict[str, PressModel | SeriesModel] = {
-    "studies": PressModel(noise=0.05, drift=0.05),
-    "series": SeriesModel(),
-}
-PACE, RATE_HZ = 2.0, 10.0  # of the scans: nine of a press, of which the lightest ones show six
+# How many times as fast as that of the studies the robot presses; scans/s: twelve of a press.
+PACE, RATE_HZ = 2.0, 10.0
 REST_SCANS, UNTOUCHED_S = 90, 5.0  # scans of the tare; seconds before the first press
 PEAKS_N, PEAK_SPREAD = np.geomspace(0.4, 8.0, 5), 0.1  # of the presses of a cell
-LEADS_CAN_BE_TOLD = False
-SENSOR_NOISE_N = 0.01  # of the force sensor
+SENSOR_NOISE_N = 0.01
 TOUCHES, TOUCH_N = (2, 6), (0.4, 7.0)  # at once, and forces of them: least and most
-# A touch begins, is at its highest, at its force, read, let go and away [s]; half of them are 1.3
-# times as high before, and so are read on the way back.
+# A touch begins, is at its highest, at its force, let go and away [s]; every other one is 1.3 times
+# as high before, and so is read on its way back.
 TOUCH_S, OVER = np.array([0.0, 1.0, 1.3, 1.8, 2.5]), 1.3
-READ_S, NEXT_S = 1.6, 3.0
+READ_S, NEXT_S = 1.6, 3.0  # when it is read; when other touches begin
+
+
+@dataclass(frozen=True)
+class SeriesModel:
+    """Another law of contact, for whoever must not lean on that of `PressModel`.
+
+    G = c (1 +- play) / (1 + c s),  c = k F^b exp(d):  a power law with a resistor s in series. G
+    lies lower while the force grows, and higher once it falls; d drifts slowly, and nothing creeps.
+
+    siemens_at_1n: k [S/N^b]. exponent: b. series_ohm: s. play: to either side.
+    noise, noise_time_s: standard deviation of d, and its time constant.
+    spread, exponent_spread: standard deviations of ln k and ln s, and of ln b, between cells.
+    seed: of the cells and of the noise.
+    """
+
+    siemens_at_1n: float = 30e-6
+    exponent: float = 1.5
+    series_ohm: float = 250.0
+    play: float = 0.04
+    noise: float = 0.03
+    noise_time_s: float = 20.0
+    spread: float = 0.2
+    exponent_spread: float = 0.03
+    seed: int = 0
+
+    def rise(self, time_s: Float, force_n: Float) -> Float:
+        """As `PressModel.rise`."""
+        cells = force_n.reshape(len(time_s), -1)
+        random = np.random.default_rng(self.seed)
+        gain, series, exponent = (
+            middle * np.exp(spread * random.standard_normal(cells.shape[1]))
+            for middle, spread in (
+                (self.siemens_at_1n, self.spread),
+                (self.series_ohm, self.spread),
+                (self.exponent, self.exponent_spread),
+            )
+        )
+        turns = np.sign(np.diff(cells, axis=0, prepend=0.0))
+        last = np.maximum.accumulate(np.where(turns, np.arange(len(cells))[:, None], 0), axis=0)
+        grows = np.take_along_axis(turns, last, axis=0)
+        drift = self.noise * wander(time_s, cells.shape[1], self.noise_time_s, random)
+        contact = gain * cells**exponent * np.exp(drift)
+        rise = contact * (1 - self.play * grows) / (1 + contact * series)
+        return np.asarray(rise).reshape(force_n.shape)
+
+
+# That of the studies has less of its noise here: 24 % would hide what wires do.
+LAWS: dict[str, PressModel | SeriesModel] = {
+    "studies": PressModel(noise=0.03, drift=0.03),
+    "series": SeriesModel(),
+}
 
 
 class Forces(NamedTuple):
@@ -84,52 +132,60 @@ def with_leads(skin: Skin, lead_ohm: float, random: np.random.Generator) -> Skin
     return replace(skin, lead_ohm=leads_ohm)
 
 
-def noisy_codes(ratio: Float, random: np.random.Generator) -> NDArray[np.uint16]:
-    """Codes of exact readings, after the noise of a board."""
-    noise = NOISE_LSB / 2**ADC_BITS * random.standard_normal(ratio.shape)
-    return quantise(ratio + noise)
+def codes_of(
+    circuit: SkinCircuit, cell_siemens: Float, mode: str, random: np.random.Generator
+) -> NDArray[np.uint16]:
+    """What a board reads of these cells, (F, R, C) [S], in a mode, (F, R, C, 4)."""
+    names = [ENUMS["reading"].values[name] for name in MODES[mode]]
+    ratio = np.array([circuit.readings(cell)[..., names] for cell in cell_siemens])
+    return quantise(ratio + NOISE_LSB / 2**ADC_BITS * random.standard_normal(ratio.shape))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is pressed.
+
+    wire_ohm: a segment of the top layer, and of the bottom one. law: a name of `LAWS`.
+    seed: of everything. shape: of the skin. lead_ohm: a lead of every line.
+    presses_of: so many cells, at random, are pressed; None: all.
+    touches: so many frames are read later, each of other touches.
+    """
+
+    wire_ohm: tuple[float, float]
+    law: str
+    seed: int
+    shape: tuple[int, int] = (8, 8)
+    lead_ohm: float = 0.0
+    presses_of: int | None = None
+    touches: int = 100
 
 
 class PressedSkin:
-    """One skin, its presses and touches.
+    """One skin, its presses and touches, by a plan. rest: the untouched skin."""
 
-    wire_ohm: a segment of the top layer, and of the bottom one; lead_ohm: a lead of every line.
-    law: a name of `LAWS`. seed: of everything. presses_of: so many cells, at random, are pressed;
-    None: all. touches: so many frames are read later, each of other touches.
-    """
-
-    def __init__(
-        self,
-        wire_ohm: tuple[float, float],
-        law: str,
-        seed: int,
-        *,
-        shape: tuple[int, int] = (8, 8),
-        lead_ohm: float = 0.0,
-        presses_of: int | None = None,
-        touches: int = 100,
-    ) -> None:
-        keys = [seed, *shape, *map(round, wire_ohm), list(LAWS).index(law)]
+    def __init__(self, plan: Plan) -> None:
+        cells, law = plan.shape[0] * plan.shape[1], LAWS[plan.law]
+        keys = [plan.seed, *plan.shape, *map(round, plan.wire_ohm), list(LAWS).index(plan.law)]
         self._random = random = np.random.default_rng(keys)
-        rest = skin_at_rest(*shape, random, wire_ohm=wire_ohm)
-        self.rest = with_leads(rest, lead_ohm, random)
+        rest = skin_at_rest(*plan.shape, random, wire_ohm=plan.wire_ohm)
+        self.rest = with_leads(rest, plan.lead_ohm, random)
         # Of each cell: times and forces, straight in between.
-        cells = shape[0] * shape[1]
         self._knots: list[list[tuple[float, float]]] = [[(0.0, 0.0)] for _ in range(cells)]
-        end_s = self._press(np.sort(random.permutation(cells)[:presses_of]))
+        end_s = self._press(np.sort(random.permutation(cells)[: plan.presses_of]))
         self._scans_s = np.arange(0.0, end_s, 1 / RATE_HZ)
-        self._read_s = self._touch(end_s, touches)
+        read_s = self._touch(end_s, plan.touches)
         knots_s = [time_s for knots in self._knots for time_s, _ in knots]
         # All corners of the forces: between them the model's steps are exact.
-        steps_s = np.unique(np.concatenate([self._scans_s, self._read_s, knots_s]))
+        steps_s = np.unique(np.concatenate([self._scans_s, read_s, knots_s]))
         forces_n = np.stack([np.interp(steps_s, *np.transpose(k)) for k in self._knots], axis=-1)
         self._sensor = steps_s[steps_s < end_s], forces_n[steps_s < end_s].sum(axis=1)
-        model = replace(LAWS[law], seed=int(random.integers(1 << 32)))
-        rises = model.rise(steps_s, forces_n.reshape(-1, *shape))
+        forces_n = forces_n.reshape(-1, *plan.shape)
+        rises = replace(law, seed=int(random.integers(1 << 32))).rise(steps_s, forces_n)
         self._pressed = rises[np.searchsorted(steps_s, self._scans_s)]
-        touched = np.searchsorted(steps_s, self._read_s)
-        self._touched, self._touch_n = rises[touched], forces_n[touched].reshape(-1, *shape)
-        with ohmskin.open(f"emulator://{shape[0]}x{shape[1]}", start=False) as board:
+        touched = np.searchsorted(steps_s, read_s)
+        self._touched, self._touch_n = rises[touched], forces_n[touched]
+        size = "x".join(map(str, plan.shape))
+        with ohmskin.open(f"emulator://{size}", start=False) as board:
             self._hello = board.info
 
     def _press(self, cells: NDArray[np.intp]) -> float:
@@ -149,32 +205,29 @@ class PressedSkin:
         for start_s in begin_s:
             touches = self._random.integers(least, most + 1)
             for cell in self._random.choice(len(self._knots), touches, replace=False):
-                force_n = np.exp(self._random.uniform(*np.log(TOUCH_N)))
+                force_n = self._random.uniform(*TOUCH_N)
                 highest = self._random.choice([1.0, OVER])
                 shares = np.array([0.0, highest, 1.0, 1.0, 0.0])
                 self._knots[cell] += zip(start_s + TOUCH_S, force_n * shares, strict=True)
         return np.asarray(begin_s + READ_S)
 
     def _codes(self, rises: Float, mode: str, factor: float = 1.0) -> NDArray[np.uint16]:
-        """What the board reads of cells that rise so much (n, R, C) [S], (n, R, C, 4).
+        """What the board reads of cells that rise so much, (n, R, C) [S].
 
         factor: the wires over those at the calibration.
         """
-        circuit = SkinCircuit(stretched(self.rest, factor))
-        names = [ENUMS["reading"].values[name] for name in MODES[mode]]
-        cells = self.rest.cell_siemens + rises
-        ratio = np.array([circuit.readings(cell)[..., names] for cell in cells])
-        return noisy_codes(ratio, np.random.default_rng(len(rises)))
+        random, cells = np.random.default_rng(len(rises)), self.rest.cell_siemens + rises
+        return codes_of(SkinCircuit(stretched(self.rest, factor)), cells, mode, random)
 
     def record(self, path: Path, mode: str = "near") -> None:
         """Write the recording of the presses (.mcap)."""
         rest = self._codes(np.zeros((REST_SCANS, *self.rest.shape)), mode)
+        random = np.random.default_rng(1)
         with Recorder(path, replace(self._hello, mode=mode)) as recorder:
             recorder.add(Tare(ratio_from_codes(rest, ADC_BITS).mean(axis=0), 0.0, mode))
             for number, codes in enumerate(self._codes(self._pressed, mode)):
                 now_s = float(self._scans_s[number])
                 recorder.add(Scan(codes, number, round(1e6 * now_s), now_s, 0, mode=mode))
-            random = np.random.default_rng(1)
             for now_s, force_n in np.transpose(self._sensor).tolist():
                 force_n += SENSOR_NOISE_N * random.standard_normal()
                 recorder.add(ForceSample(force_n, now_s))
@@ -201,7 +254,7 @@ def calibrate(recording: Path, out: Path, method: str, told: WireOhm = NO_WIRES)
     arguments += ["--method", method]
     if told.both:
         arguments += ["--wires", ",".join(f"{ohm:g}" for ohm in told.both)]
-    if told.lead is not None and LEADS_CAN_BE_TOLD:
+    if told.lead is not None and "leads" in inspect.signature(recording_command).parameters:
         arguments += ["--leads", f"{told.lead:g}"]
     with redirect_stdout(io.StringIO()) as said:
         app(arguments, standalone_mode=False)
