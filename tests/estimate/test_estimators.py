@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimators' common interface, `ohm` and `matrix`, on networks whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from network import laplacian_readings
 from ohmskin.circuit.skin import Skin, ratio_from_current, readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import solve_ports, voltage_squared
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.record.readings import estimate_file
-from skins import reference, ten_bits, told
+from skins import reference, ten_bits, told, uniform_skin
 
 REST_OHM = 1e6
 
@@ -333,3 +336,20 @@ def test_an_unknown_method_is_answered_with_the_known_ones() -> None:
 def test_impossible_knowledge_is_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SkinKnowledge(**({"rows": 2, "columns": 2} | wrong))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize("shape", [(3, 3), (6, 6)])
+def test_a_hard_touch_is_one_though_nobody_has_told_the_wires(
+    method: str, shape: tuple[int, int]
+) -> None:
+    """Of what the port shows, the wires may be much or little, but an untouched cell shows 1 uS."""
+    skin, random = uniform_skin(shape), np.random.default_rng(3)
+    knowledge = told(laplacian_readings(skin), wires=False)
+    for ohm in (300.0, 1e3, 3e3):
+        cell = tuple(random.integers(shape))
+        siemens = skin.cell_siemens.copy()
+        siemens[cell] = 1 / ohm
+        ratio = laplacian_readings(replace(skin, cell_siemens=siemens))
+        found = make_estimator(method, knowledge).estimate(ten_bits(ratio))
+        assert np.argwhere(found.touched).tolist() == [list(cell)]

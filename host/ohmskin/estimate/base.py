@@ -18,6 +18,7 @@ from ohmskin.circuit.skin import NEAR, ratio_from_current
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.port_readings import PortReader, PortReadings
+from ohmskin.estimate.prior import REACH_STDS
 
 # The conductance of a touched cell has risen by more than this. Chosen: half of what a cell of one
 # megohm conducts at rest, so that a drift by some percent is no touch.
@@ -149,13 +150,16 @@ class Estimator(ABC):
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
-        A cell is touched if its conductance g has risen by more than noise,
+        A cell is touched if its conductance g has risen, and by more than noise,
 
-            g - g_rest > max(0.5e-6 S, 4 sqrt(std^2 + std_rest^2)) ,
+            g - g_rest > 0.5e-6 S ,   1 / (1 / g + 4 std_ohm) > g_rest ,
 
-        std that of errors downwards, and 0 where it is not known. g_rest is this method's own
-        answer to the rest readings that it was told. It never follows the frames: a cell that stays
-        pressed stays touched.
+            std_ohm = (1 / (g - 2 s) - 1 / g) / 2 ,   s = sqrt(std^2 + std_rest^2) ,
+
+        std that of errors downwards, and 0 where it is not known. Errors are normal in the
+        resistance: behind wires that are not known, a hard touch may well be a light one, but not
+        none. g_rest is this method's own answer to the rest readings that it was told. It never
+        follows the frames: a cell that stays pressed stays touched.
 
         Without rest readings, g_rest is one number for all cells, and taken anew from each frame:
         the median of its cells, with std_rest = 0. This supposes that less than half of the cells
@@ -203,15 +207,19 @@ class Estimator(ABC):
 
         Errors downwards decide: the question is whether the cell may as well be as low as at rest.
         """
-        down = solution.cell_siemens_std_down
-        rise_std = solution.cell_siemens_std if down is None else down
+        siemens, down = solution.cell_siemens, solution.cell_siemens_std_down
+        std = solution.cell_siemens_std if down is None else down
         if self._rest is None:
-            rise = solution.cell_siemens - np.median(solution.cell_siemens)
+            rest_siemens = np.full_like(siemens, np.median(siemens))
         else:
-            rise = solution.cell_siemens - self._rest.cell_siemens
-            rise_std = np.hypot(rise_std, self._rest.cell_siemens_std)
-        # np.fmax passes over a deviation that is NaN.
-        return np.asarray(rise > np.fmax(TOUCH_SIEMENS, TOUCH_STDS * rise_std))
+            rest_siemens = self._rest.cell_siemens
+            std = np.hypot(std, self._rest.cell_siemens_std)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ohm = 1.0 / siemens
+            # Stated deviations reach to this limit. One that is NaN is not known.
+            lower_ohm = 1.0 / np.maximum(siemens - REACH_STDS * np.nan_to_num(std), 0.0)
+            lowest = 1.0 / (ohm + TOUCH_STDS / REACH_STDS * (lower_ohm - ohm))
+        return np.asarray((siemens - rest_siemens > TOUCH_SIEMENS) & (lowest > rest_siemens))
 
     def _chi2(self, ports: PortReadings, current_siemens: Float) -> float:
         """`Estimate.chi2` of a model that gives these currents of ports (R, C) [S]."""
