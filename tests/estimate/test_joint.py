@@ -22,7 +22,6 @@ from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import (
     LAYER_STD,
     LEAD_STD,
-    OWN_LEAD_STD,
     REST_STD,
     SEGMENT_STD,
     CellPrior,
@@ -160,7 +159,7 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
     )
     shared = scipy.linalg.block_diag(*(np.ones((n, n)) for n in (12, 12, 7)))
     stds = np.repeat([LAYER_STD, LAYER_STD, LEAD_STD * 500.0], (12, 12, 7))
-    own = np.repeat([SEGMENT_STD, SEGMENT_STD, OWN_LEAD_STD * 500.0], (12, 12, 7))
+    own = np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * 500.0], (12, 12, 7))
     inverse = np.linalg.inv(shared * stds * stds[:, None] + np.diag(own**2))
     nominal = np.repeat([np.log(100.0), np.log(200.0), 500.0], (12, 12, 7))
     ports = PortReader(known).read(measured)

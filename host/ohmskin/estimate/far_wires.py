@@ -68,7 +68,6 @@ from ohmskin.estimate.prior import (
     FADE_SHARE,
     LAYER_STD,
     MAX_STEP_LOG,
-    OWN_LEAD_STD,
     SEGMENT_STD,
 )
 from ohmskin.estimate.wire_belief import Fit, WireBelief
@@ -133,7 +132,7 @@ class MeasuredWires(WireBelief):
         # t nobody uses: without it, there were no inverse.
         normal, right = np.eye(4), np.zeros(4)
         normal[3, 3], right[3] = 1.0 / lead_variance, lead_ohm / lead_variance
-        own = np.array([SEGMENT_STD, OWN_LEAD_STD * abs(self.means[2])])
+        own = np.array([SEGMENT_STD, SEGMENT_STD * abs(self.means[2])])
         for layer, sign in ((0, 1.0), (1, -1.0)):
             if not self.far[layer]:
                 continue
@@ -202,7 +201,7 @@ class MeasuredWires(WireBelief):
         information += np.matmul(heavy.transpose(0, 2, 1), slopes)
         pull += np.einsum("lpk,lp->lk", heavy, drop)
         variance = np.full(slopes.shape[2], SEGMENT_STD**2)
-        variance[0] = max((OWN_LEAD_STD * lead_ohm) ** 2, 1e-6)
+        variance[0] = max((SEGMENT_STD * lead_ohm) ** 2, 1e-6)
         inverse = np.linalg.inv(np.eye(len(variance)) + information * variance)
         # (1 + L V)^-1 (l - L u_lead), and (1 + L V)^-1 L e, of each line.
         beyond_lead = pull - information[..., 0] * lead_ohm

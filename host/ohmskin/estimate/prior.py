@@ -46,19 +46,18 @@ UNKNOWN_WIRE_OHM: Final = 150.0
 UNKNOWN_LAYER_STD: Final = 0.7
 # Deviation that all segments share, of a layer whose nominal value is told: stretch, temperature.
 LAYER_STD: Final = 0.3
-# Deviation of each segment from what its layer shares.
+# Deviation of each segment from what its layer shares, and of each lead from the mean lead, as a
+# share of that.
 SEGMENT_STD: Final = 0.1
 # A lead that nobody has told: the switch of a CD74HC4067 at 5 V (data sheet: 70 typically, 160 at
 # most), and a crimp.
 UNKNOWN_LEAD_OHM: Final = 100.0
 # Deviation that all leads share, if nobody has told them: a margin of yarn makes kilohms.
-UNKNOWN_LEAD_STD_OHM: Final = 2000.0
+UNKNSEGMENT_STD_OHM: Final = 2000.0
 # The same of usual leads: a switch and a crimp.
 USUAL_LEAD_STD_OHM: Final = 150.0
 # Deviation that all leads share, if they are told, as a share of them.
-LEAD_STD: Final = 0.1
-# Deviation of each lead from the mean lead, as a share of that: crimps differ more than segments.
-OWN_LEAD_STD: Final = 0.2
+LEAD_STD: Final = 0.05
 # Share of what is known of the layers that fades after each lesson, because skins bend.
 FADE_SHARE: Final = 0.1
 

@@ -70,12 +70,11 @@ from ohmskin.estimate.prior import (
     LAYER_STD,
     LEAD_STD,
     MAX_STEP_LOG,
-    OWN_LEAD_STD,
     SEGMENT_STD,
     UNKNOWN_LAYER_STD,
     UNKNOWN_LEAD_OHM,
-    UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
+    UNKNSEGMENT_STD_OHM,
     USUAL_LEAD_STD_OHM,
     WireStds,
 )
@@ -149,7 +148,7 @@ class WireBelief(ABC):
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         # However well wires were measured: since then, the skin may have been stretched.
         layer_stds = np.hypot(layer_std, [wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
-        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM
+        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNSEGMENT_STD_OHM
         self._usual_lead_std_ohm = USUAL_LEAD_STD_OHM
         if wires.lead is not None:
             lead_ohm, lead_std_ohm = wires.lead, wires.lead_std_ohm or LEAD_STD * wires.lead
@@ -250,7 +249,7 @@ class WireBelief(ABC):
 
     def own_std(self, means: Float) -> Float:
         """s, (W,), where the means are these."""
-        own = SEGMENT_STD, SEGMENT_STD, OWN_LEAD_STD * abs(means[2])
+        own = SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * abs(means[2])
         return np.repeat(own, self._counts)
 
     def mean_std(self) -> Float:
@@ -271,7 +270,7 @@ class WireBelief(ABC):
 
         It is noise for a lesson: where leads are large, they also differ by more.
         """
-        return np.asarray(OWN_LEAD_STD * self._known_lead_std_ohm * self._leads_of_ports[ports])
+        return np.asarray(SEGMENT_STD * self._known_lead_std_ohm * self._leads_of_ports[ports])
 
     def per_mean_std(self, slopes: Float) -> Float:
         """J L^T V^1/2, (n, 3), from slopes by the means, J L^T (n, 3)."""
