@@ -299,13 +299,14 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
     whole = layers @ covariance @ layers.T + own
     np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
-    root = belief.per_std(np.eye(17), np.zeros((17, 3)))
+    root = belief.per_std(np.eye(17)[:, :12], np.eye(17)[:, 12:], np.zeros((17, 3)))
     np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(root[:, -3:], belief.per_mean_std(layers), atol=1e-9)
     np.testing.assert_allclose(belief.mean_std(), np.sqrt(covariance.diagonal()))
     away = 0.1 * random.normal(size=20)
-    wires = belief.wires_off(away[-3:], away[:-3])
-    np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=0.01)
+    of_own = np.sqrt(np.diagonal(own)) * away[:-3]
+    wires = belief.wires_off(away[-3:], of_own[:12], of_own[12:])
+    np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=1e-9)
     some = random.normal(size=(3, 17))
     before = np.array([np.log(100.0), np.log(200.0), 50.0])
     moved = belief.moved_since(before, belief.per_mean_std(some @ layers))

@@ -97,12 +97,12 @@ class FullFit:
         self._prior = self._prior.about(self._means)
         self._centre, self._variance = self._prior.normal(self.log_cells)
 
-    def _weighted(self, slopes: Float) -> Float:
+    def _weighted(self, slopes: Float, scale: float = 1.0) -> Float:
         """Slopes of h from those of rho, (RC, ...), which are overwritten.
 
         h = weight / (rho + ref), so dh / d rho is -weight times the modelled current squared.
         """
-        slopes *= (-self._weight * self._modelled**2)[:, None]
+        slopes *= (-scale * self._weight * self._modelled**2)[:, None]
         return slopes
 
     def _linearise(self) -> None:
@@ -114,10 +114,13 @@ class FullFit:
         """
         if self._moved_log > SEGMENT_STD:
             self._moved_log = 0.0
-            by_wire = self._weighted(self._belief.with_leads(self._circuit.by_wires()))
-            self._by_wire = by_wire * self._belief.own_std(self._means)
-            self._noise = gram(self._by_wire)
+            self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
+            self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
+            # N without leads, and what these add for each ohm^2.
+            self._noise = gram(self._by_segment)
             np.einsum("ii->i", self._noise)[:] += 1.0
+            self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
+            self._of_leads = gram(self._by_lead)
         self._by_cell = self._weighted(self._circuit.by_cell())
         by_lead = np.full((self._modelled.size, 1), float(self._belief.leads_of_port))
         by_mean = self._weighted(np.hstack([self._circuit.by_layers(), by_lead]))
@@ -126,15 +129,17 @@ class FullFit:
         self._cell_std = np.sqrt(self._variance)
         self._slopes, self._factor = self._factorised(self._cell_std)
 
-    def _factorised(self, cell_std: Float, more: Float | None = None) -> tuple[Float, Float]:
-        """J for cells of these deviations (RC,), and L. more: a root of more noise, (RC, n)."""
-        noise = self._noise.copy(order="F")
+    def _with_leads(self, own_ohm: float) -> Float:
+        """N, if leads have a deviation of so many ohm of their own."""
+        return self._noise + own_ohm**2 * self._of_leads
+
+    def _factorised(self, cell_std: Float, odd_lead_ohm: float = 0.0) -> tuple[Float, Float]:
+        """J for cells of these deviations (RC,), and L. odd_lead_ohm: what N has not of leads."""
         slopes = np.empty((len(cell_std), len(cell_std) + 3))
         np.multiply(self._by_cell, cell_std, out=slopes[:, :-3])
         slopes[:, -3:] = self._per_mean_std
-        return slopes, cholesky(
-            gram(slopes, onto=noise if more is None else gram(more, onto=noise))
-        )
+        noise = self._with_leads(float(np.hypot(self._own_lead_ohm, odd_lead_ohm)))
+        return slopes, cholesky(gram(slopes, onto=noise))
 
     def _minimise(self) -> None:
         """Steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
@@ -191,7 +196,9 @@ class FullFit:
         The latter was noise of covariance W W^T. Of a residual whose whole covariance is S, its
         most probable share is W^T S^-1 times the residual.
         """
-        return self._belief.wires_off(self._mean_stds, self._weighted_residual @ self._by_wire)
+        segments_off = SEGMENT_STD * (self._weighted_residual @ self._by_segment)
+        leads_off = self._own_lead_ohm**2 * (self._weighted_residual @ self._by_lead)
+        return self._belief.wires_off(self._mean_stds, segments_off, leads_off)
 
     @property
     def modelled(self) -> Float:
@@ -285,7 +292,7 @@ class FullFit:
         cells alone: P J^T (N + J P J^T)^-1 times that, P their prior's variance.
         """
         by_cell = self._by_cell * self._cell_std
-        factor = cholesky(gram(by_cell, onto=self._noise.copy(order="F")))
+        factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
         return -self._cell_std[:, None] * (by_cell.T @ solve(factor, self._by_mean))
 
     @property
@@ -296,5 +303,5 @@ class FullFit:
         # A touched cell is noise without limit; one at rest is known to its drift.
         touched = np.abs(self._prior.rise_stds(self.log_cells)) > TOUCHED_STDS
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
-        _, factor = self._factorised(cell_std, self._weighted(self._belief.odd_leads()))
+        _, factor = self._factorised(cell_std, self._belief.odd_lead_ohm())
         return Lesson(self._per_mean_std, residual, factor)

@@ -244,8 +244,9 @@ class SparseFit:
         by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
         currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
         by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
-        by_wire = belief.with_leads(by_wire) * (self.current**2)[:, None]
-        per_std = belief.per_std(by_wire, by_cell.T @ prior.by_means)
+        by_ohm = (self.current**2)[:, None]
+        by_lead = by_ohm * belief.leads_of_ports
+        per_std = belief.per_std(by_wire * by_ohm, by_lead, by_cell.T @ prior.by_means)
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
         self.path_ohm = belief.believed_wires().path_ohm
@@ -431,7 +432,8 @@ class FewTouches:
         by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, wires[:, -3:])
         # The lesson's S: whatever these touches are, they are noise without limit.
         by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
-        odd_leads = by_ohm * self._skin.belief.odd_leads(ports)
+        belief = self._skin.belief
+        odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
         noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
         unlimited = cholesky(gram(noise, onto=residual_covariance))
         lesson = Lesson(wires[:, -3:], residual, unlimited)
@@ -485,6 +487,7 @@ class FewTouches:
         std = self._std.copy()
         std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
         std[self.cells] = self._reading_std[self.cells]
-        by_wire = skin.belief.with_leads(net.by_wires_of(ports, currents, sensed), ports)
+        by_wire = net.by_wires_of(ports, currents, sensed)
         by_rho = -(square / std[ports])[:, None]
-        return std, skin.belief.per_std(by_rho * by_wire, by_rho * by_mean)
+        by_lead = by_rho * skin.belief.leads_of_ports[ports]
+        return std, skin.belief.per_std(by_rho * by_wire, by_lead, by_rho * by_mean)

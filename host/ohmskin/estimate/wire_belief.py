@@ -58,7 +58,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
@@ -125,12 +124,26 @@ class SkinWires:
     path_ohm: Float
 
 
+@dataclass(eq=False)
+class _State:
+    """What fits take for the wires: m, V, its root, and the wires that follow, once asked for."""
+
+    means: Float
+    covariance: Float
+    wires: SkinWires | None = None
+
+    def __post_init__(self) -> None:
+        self.root: Float = np.asarray(np.linalg.cholesky(self.covariance), np.float64)
+
+
 class WireBelief(ABC):
     """Mean and covariance of the log wire resistances of a skin, whoever has shown them.
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
     means: m, (3,). It is replaced when the belief changes, and never written into.
+    leads_of_ports: which leads are in the readings of each port: those of its lines that are sensed
+        at near ends, (RC, R+C), ones and zeros.
     """
 
     def __init__(
@@ -140,11 +153,9 @@ class WireBelief(ABC):
         self.shape, self.far = shape, far
         rows, columns = shape
         self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
-        # Which leads are in the readings of each port: those of its lines that are sensed at near
-        # ends, (RC, R+C).
         by_row = np.kron(np.eye(rows), np.ones((columns, 1))) * (not far[0])
         by_column = np.tile(np.eye(columns), (rows, 1)) * (not far[1])
-        self._leads_of_ports = np.hstack([by_row, by_column])
+        self.leads_of_ports = np.hstack([by_row, by_column])
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         # However well wires were measured: since then, the skin may have been stretched.
         layer_stds = np.hypot(layer_std, [wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
@@ -164,7 +175,7 @@ class WireBelief(ABC):
         self._believe(self._nominal, self._prior_covariance)
 
     def _believe(self, means: Float, covariance: Float) -> None:
-        """Take these for what is known, (3,) and (3, 3): m and V are these, but for the lead.
+        """Take these for what is known, (3,) and (3, 3).
 
         A lead that nobody told may be anything up to kilohms, and that is how frames teach it. But
         most skins have a usual lead, and frames that tell nothing of it, as under fingertips, are
@@ -172,23 +183,22 @@ class WireBelief(ABC):
         prior has a heavy tail (`prior.CellPrior`). Deviations of answers always have what is known.
         """
         self._known = means, covariance
-        self.expect_usual_leads(True)
-
-    def expect_usual_leads(self, wanted: bool) -> None:
-        """Whether m and V are what fits take under fingertips, or what is known."""
-        means, covariance = self._known
+        self._free = self._usual = _State(means, covariance)
         away_ohm = abs(float(means[2] - self._nominal[2]))
         usual = max(self._usual_lead_std_ohm, away_ohm) ** -2.0 - 1.0 / self._prior_covariance[2, 2]
-        if usual > 0.0 and wanted:
+        if usual > 0.0:
             information = np.linalg.inv(covariance)
             right = information @ means
             information[2, 2] += usual
             right[2] += usual * self._nominal[2]
             covariance = np.linalg.inv(information)
-            means = covariance @ right
-        self.means = means
-        self._root = np.asarray(np.linalg.cholesky(covariance), np.float64)
-        self._believed: SkinWires | None = None
+            self._usual = _State(covariance @ right, covariance)
+        self.expect_usual_leads(True)
+
+    def expect_usual_leads(self, wanted: bool) -> None:
+        """Whether m and V are what fits take under fingertips, or what is known."""
+        self._state = self._usual if wanted else self._free
+        self.means, self._root = self._state.means, self._state.root
 
     @abstractmethod
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
@@ -238,23 +248,25 @@ class WireBelief(ABC):
         """How many leads are in a reading of the near ends: 2, and 0 of far ends."""
         return 2 - sum(self.far)
 
-    def with_leads(self, by_segment: Float, ports: NDArray[np.intp] | slice = slice(None)) -> Float:
-        """Slopes of the resistance of n ports by w, (n, W), of those by log segments, (n, 2RC)."""
-        return np.hstack([by_segment, self._leads_of_ports[ports]])
+    def own_lead_ohm(self, means: Float) -> float:
+        """Deviation of a lead from the mean lead, where the means are these [ohm]."""
+        return SEGMENT_STD * abs(float(means[2]))
 
     @property
     def mean(self) -> Float:
         """Expected wires w, (W,)."""
         return np.repeat(self.means, self._counts)
 
-    def own_std(self, means: Float) -> Float:
-        """s, (W,), where the means are these."""
-        own = SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * abs(means[2])
-        return np.repeat(own, self._counts)
-
     def mean_std(self) -> Float:
         """Standard deviations of the means, (3,)."""
         return np.asarray(np.linalg.norm(self._root, axis=1))
+
+    def odd_lead_ohm(self) -> float:
+        """What a lead may have of its own, as the mean lead is not known [ohm].
+
+        It is noise for a lesson: where leads are large, they also differ by more.
+        """
+        return SEGMENT_STD * self._known_lead_std_ohm
 
     def stds(self) -> WireStds:
         """How well the means are known."""
@@ -265,40 +277,39 @@ class WireBelief(ABC):
     def _known_lead_std_ohm(self) -> float:
         return float(self._known[1][2, 2] ** 0.5)
 
-    def odd_leads(self, ports: NDArray[np.intp] | slice = slice(None)) -> Float:
-        """What leads may have of their own beyond `own_std`, as the mean is not known: (n, R+C).
-
-        It is noise for a lesson: where leads are large, they also differ by more.
-        """
-        return np.asarray(SEGMENT_STD * self._known_lead_std_ohm * self._leads_of_ports[ports])
-
     def per_mean_std(self, slopes: Float) -> Float:
         """J L^T V^1/2, (n, 3), from slopes by the means, J L^T (n, 3)."""
         return slopes @ self._root
 
-    def per_std(self, slopes: Float, of_cells: Float) -> Float:
-        """J P^1/2, (n, W + 3), from J (n, W): by what wires have, by what they share.
+    def per_std(self, by_segment: Float, by_lead: Float, of_cells: Float) -> Float:
+        """J P^1/2, (n, W + 3): by what wires have of their own, by what they share.
 
+        by_segment, by_lead: J of the log segments (n, 2RC) and of the leads (n, R+C).
         of_cells: what the means change in readings by the cells at rest that follow them, (n, 3).
         """
-        root = np.empty((len(slopes), slopes.shape[1] + 3))
-        np.multiply(slopes, self.own_std(self.means), out=root[:, :-3])
-        starts = 0, self._counts[0], 2 * self._counts[0]
-        root[:, -3:] = self.per_mean_std(np.add.reduceat(slopes, starts, axis=1) + of_cells)
+        segments = by_segment.shape[1]
+        root = np.empty((len(by_segment), sum(self._counts) + 3))
+        np.multiply(by_segment, SEGMENT_STD, out=root[:, :segments])
+        np.multiply(by_lead, self.own_lead_ohm(self.means), out=root[:, segments:-3])
+        by_mean = of_cells.copy()
+        by_mean[:, :2] += by_segment.reshape(len(root), 2, -1).sum(axis=2)
+        by_mean[:, 2] += by_lead.sum(axis=1)
+        root[:, -3:] = self.per_mean_std(by_mean)
         return root
 
     def means_off(self, mean_stds: Float) -> Float:
         """The means (3,) that are so many deviations off: m + V^1/2 `mean_stds` (3,)."""
         return self.means + self._root @ mean_stds
 
-    def wires_off(self, mean_stds: Float, own_stds: Float) -> Float:
-        """w (W,) of means that are so far off (3,), and wires (W,)."""
-        means = self.means_off(mean_stds)
-        off_mean = self.own_std(means) * own_stds
+    def wires_off(self, mean_stds: Float, segments_off: Float, leads_off: Float) -> Float:
+        """w (W,) of means that are so many deviations off (3,), and wires, about their means.
+
+        segments_off: of the logs of segments (2RC,). leads_off: of leads (R+C,) [ohm].
+        """
         # What comes from slopes holds as far as readings are linear in the logs.
-        logs = off_mean[: 2 * self._counts[0]]
-        np.clip(logs, -MAX_STEP_LOG, MAX_STEP_LOG, out=logs)
-        return np.repeat(means, self._counts) + off_mean
+        logs_off = np.minimum(np.maximum(segments_off, -MAX_STEP_LOG), MAX_STEP_LOG)
+        common = np.repeat(self.means_off(mean_stds), self._counts)
+        return np.asarray(common + np.concatenate([logs_off, leads_off]))
 
     def moved_since(self, means: Float, per_mean_std: Float) -> Float:
         """What readings have moved since m was `means` (3,): J L^T (m - means), (n,)."""
@@ -319,16 +330,16 @@ class WireBelief(ABC):
         # the wires of such a line do not count.
         by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
         path = by_top * top.cumsum(axis=1) + by_bottom * bottom.cumsum(axis=0)
-        leads = self._leads_of_ports @ np.maximum(wires[2 * self._counts[0] :], 0.0)
+        leads = self.leads_of_ports @ np.maximum(wires[2 * self._counts[0] :], 0.0)
         return SkinWires(segments, segments * self.segment_std(), path.ravel() + leads)
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
-        if self._believed is None:
-            self._believed = wires = self.wires(self.mean)
+        if self._state.wires is None:
+            self._state.wires = wires = self.wires(self.mean)
             for array in (wires.segment_ohm, wires.segment_std_ohm):
                 array.setflags(write=False)  # they are in more than one estimate
-        return self._believed
+        return self._state.wires
 
 
 class LearnedWires(WireBelief):
