@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 import ohmskin
 from network import SkinCircuit
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import Skin
 from ohmskin.cli.calibrate import recording as recording_command
 from ohmskin.cli.main import app
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
@@ -126,12 +125,6 @@ class Forces(NamedTuple):
         return 100 * float(misleads.sum() / np.count_nonzero(self.true_n))
 
 
-def with_leads(skin: Skin, lead_ohm: float, random: np.random.Generator) -> Skin:
-    """This skin, with a lead of about so much at every line."""
-    leads_ohm = lead_ohm * np.exp(SPREAD * random.standard_normal(sum(skin.shape)))
-    return replace(skin, lead_ohm=leads_ohm)
-
-
 def codes_of(
     circuit: SkinCircuit, cell_siemens: Float, mode: str, random: np.random.Generator
 ) -> NDArray[np.uint16]:
@@ -168,7 +161,8 @@ class PressedSkin:
         keys = [plan.seed, *plan.shape, *map(round, plan.wire_ohm), list(LAWS).index(plan.law)]
         self._random = random = np.random.default_rng(keys)
         rest = skin_at_rest(*plan.shape, random, wire_ohm=plan.wire_ohm)
-        self.rest = with_leads(rest, plan.lead_ohm, random)
+        leads_ohm = plan.lead_ohm * np.exp(SPREAD * random.standard_normal(sum(plan.shape)))
+        self.rest = replace(rest, lead_ohm=leads_ohm)
         # Of each cell: times and forces, straight in between.
         self._knots: list[list[tuple[float, float]]] = [[(0.0, 0.0)] for _ in range(cells)]
         end_s = self._press(np.sort(random.permutation(cells)[: plan.presses_of]))
