@@ -53,7 +53,7 @@ SEGMENT_STD: Final = 0.1
 # most), and a crimp.
 UNKNOWN_LEAD_OHM: Final = 100.0
 # Deviation that all leads share, if nobody has told them: a margin of yarn makes kilohms.
-UNKNSEGMENT_STD_OHM: Final = 2000.0
+UNKNOWN_LEAD_STD_OHM: Final = 2000.0
 # The same of usual leads: a switch and a crimp.
 USUAL_LEAD_STD_OHM: Final = 150.0
 # Deviation that all leads share, if they are told, as a share of them.

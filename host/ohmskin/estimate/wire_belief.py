@@ -72,8 +72,8 @@ from ohmskin.estimate.prior import (
     SEGMENT_STD,
     UNKNOWN_LAYER_STD,
     UNKNOWN_LEAD_OHM,
+    UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
-    UNKNSEGMENT_STD_OHM,
     USUAL_LEAD_STD_OHM,
     WireStds,
 )
@@ -159,11 +159,12 @@ class WireBelief(ABC):
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         # However well wires were measured: since then, the skin may have been stretched.
         layer_stds = np.hypot(layer_std, [wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
-        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNSEGMENT_STD_OHM
+        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM
         self._usual_lead_std_ohm = USUAL_LEAD_STD_OHM
         if wires.lead is not None:
             lead_ohm, lead_std_ohm = wires.lead, wires.lead_std_ohm or LEAD_STD * wires.lead
-            self._usual_lead_std_ohm = lead_std_ohm = max(lead_std_ohm, 1e-3)
+            lead_std_ohm = max(lead_std_ohm, 1e-3)
+            self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
         self._prior_covariance = np.diag([*layer_stds, lead_std_ohm]) ** 2
         nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
         self._nominal: Float = np.array([*np.log(nominal), lead_ohm])
