@@ -20,8 +20,8 @@ far_*       the same skins on a board in mode far; there the wires are not told
 *_wrong              frames that are wrong and not flagged [%]: a cell is off by more than 4 stated
                      deviations and by more than half of its value
 *_stated             pressed cells: median of stated deviation over error. Normal errors: 1.5. The
-                     methods expect a layer told without a deviation to be up to 30 % off: here it
-                     is not
+                     methods expect that the skin may have been stretched by up to 30 % since its
+                     wires were told: here it has not
 doctor_share, _std   median of what the doctor measures of the wires over truth, and its deviation
 """
 
@@ -129,7 +129,7 @@ BARS = [
         at_most(f"{name}_{method}_percent", 1.5),
         at_least(f"{name}_{method}_within_4", 98),
         at_most(f"{name}_{method}_wrong", 1),
-        *([] if name == "far" else [at_most(f"{name}_{method}_stated", 2)]),
+        *([] if name == "far" else [at_most(f"{name}_{method}_stated", 2.6)]),
     )
 ]
 
