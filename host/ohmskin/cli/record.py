@@ -112,8 +112,16 @@ def _truth(skin: Device, recorder: Recorder) -> Callable[[Scan], None]:
     if true_force_n is None:
         raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
 
+    offset_s: float | None = None  # from the board's clock to the host's
+
     def look(scan: Scan) -> None:
-        recorder.add(ForceSample(float(true_force_n(scan).sum()), scan.host_time_s, source=TRUTH))
+        nonlocal offset_s
+        board_s = 1e-6 * scan.time_us
+        if offset_s is None:
+            offset_s = scan.host_time_s - board_s
+        # By the board's clock: a scan may arrive late, and several at once.
+        force_n = float(true_force_n(scan).sum())
+        recorder.add(ForceSample(force_n, board_s + offset_s, source=TRUTH))
 
     return look
 

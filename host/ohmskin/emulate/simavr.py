@@ -6,10 +6,13 @@ firmware/sim/README.md lists settings, and what is not modelled: above all cryst
 everything on the USB side of the UART.
 """
 
+import json
 import struct
 import subprocess
 import tempfile
+import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -21,7 +24,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import all_readings, end_admittance
 from ohmskin.emulate.scenes import Scene
 from ohmskin.errors import DeviceLost, PortError
-from ohmskin.files import Closing
+from ohmskin.files import Closing, check_place, naming, read_bounded, whole_file
 from ohmskin.link.serial_port import SerialLink
 
 BOARDS: Final = ("uno", "megaatmega2560")
@@ -40,6 +43,9 @@ _EXIT_TIMEOUT_S: Final = 2.0
 # While touches move, the simulator is told a new skin every so often [s]. Chosen: a scan at 90 Hz
 # takes 11 ms, and solving a skin of 16x16 some milliseconds.
 _TABLE_EVERY_S: Final = 0.02
+# So many of these skins are remembered, for whoever asks what a scan has read. Chosen: 20 s of
+# them, and no scan is as late.
+_SHOWN_TABLES: Final = 1000
 
 
 class SimulationError(RuntimeError):
@@ -55,7 +61,7 @@ class SkinSim(Closing):
     board.
 
     Raises FileNotFoundError if the simulator or the firmware is not built, SimulationError if the
-    simulator does not start. Not thread-safe.
+    simulator does not start. Requests may come from any thread, but after `close` none.
     """
 
     def __init__(self, board: str, elf: Path, *, pty: bool = False, bootloader: str = "") -> None:
@@ -70,6 +76,7 @@ class SkinSim(Closing):
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._requests, self._replies = self._process.stdin, self._process.stdout
+        self._lock = threading.Lock()
         try:
             # Either answer, a path or nothing, shows that the simulator has started.
             self.pty_path = (self._reply("P") if pty else self.request("Z")).decode()
@@ -95,10 +102,7 @@ class SkinSim(Closing):
         Cells beyond the array carry no current: 1, 0, 1, 0. An ideal conversion gives the code
         min(1023, floor(1024 ratio)). Raises SimulationError for a ratio that is not finite.
         """
-        rows, columns, readings = ratio.shape
-        table = np.tile([1.0, 0.0], (16, 16, 4))
-        table[:rows, :columns, :readings] = ratio
-        self.request("T", table.tobytes())
+        self.request("T", _table(ratio))
 
     def set(self, **settings: float | str) -> None:
         """Change settings of the simulator: firmware/sim/README.md lists them.
@@ -113,14 +117,20 @@ class SkinSim(Closing):
 
         Raises SimulationError if it is refused or the simulator is gone.
         """
+        return self.requests((op, payload))[0]
+
+    def requests(self, *of: tuple[str, bytes]) -> list[bytes]:
+        """As `request`, of several operations: hardly any time passes between them."""
         if self._requests.closed:
             raise SimulationError("the simulator is closed")
-        try:
-            self._requests.write(_HEADER.pack(ord(op), len(payload)) + payload)
-            self._requests.flush()
-        except BrokenPipeError:
-            raise self._death() from None
-        return self._reply(op)
+        with self._lock:
+            try:
+                for op, payload in of:
+                    self._requests.write(_HEADER.pack(ord(op), len(payload)) + payload)
+                self._requests.flush()
+            except BrokenPipeError:
+                raise self._death() from None
+            return [self._reply(op) for op, _ in of]
 
     def _reply(self, op: str) -> bytes:
         reply_op, length = _HEADER.unpack(self._read(_HEADER.size))
@@ -150,8 +160,10 @@ class SimavrLink(SerialLink):
 
     board: one of `BOARDS`, with the firmware that `make firmware` builds. settings: `bootloader` of
     `SkinSim` and those of its `set`; with `desk`, the board has its boot loader unless told.
+    `eeprom`: a file that keeps the EEPROM from one link to the next; `close` writes it, whole.
 
     :raises PortError: there is no such board or setting, or firmware or simulator are not built.
+    :raises ValueError: the EEPROM's file cannot be read or written, or is another board's.
     """
 
     def __init__(
@@ -163,11 +175,15 @@ class SimavrLink(SerialLink):
         own = dict(settings)
         # A board on a desk has the boot loader that it is sold with.
         loader = own.pop("bootloader", "board" if "desk" in own else "")
+        self._eeprom = Path(own.pop("eeprom")) if "eeprom" in own else None
         with ExitStack() as opened:
             try:
                 self.sim = opened.enter_context(SkinSim(board, elf, pty=True, bootloader=loader))
                 self.sim.set(**own)
+                self._load_eeprom()
                 self._scene = scene
+                # Since when [s] the board has read the skin of which time of the scene [s].
+                self._shown_s: deque[tuple[float, float]] = deque(maxlen=_SHOWN_TABLES)
                 self._show(0.0)
                 super().__init__(self.sim.pty_path)
                 self.resets_board = bool(loader)
@@ -175,28 +191,72 @@ class SimavrLink(SerialLink):
             except (FileNotFoundError, SimulationError) as exc:
                 raise PortError(str(exc)) from exc
             opened.pop_all()
-        self.begin_s = time.monotonic()
-        self._table_due_s = scene.begin_s
+        self._look_due_s = time.monotonic() if scene.begin_s < float("inf") else float("inf")
         self.name = name or f"simavr://{board}"
+
+    @property
+    def now_s(self) -> float:
+        """The board's time since it was switched on [s]: a busy machine makes it pass slower."""
+        return _simulated_s(self.sim.request("S"))
+
+    def scene_s(self, time_s: float) -> float:
+        """The scene's time that the skin has at a time of the board [s]: it changes in steps."""
+        shown = reversed(self._shown_s)
+        return next((scene_s for since_s, scene_s in shown if since_s <= time_s), 0.0)
 
     def read(self) -> bytes:
         """See `Link.read`; also moves what touches the skin."""
-        elapsed_s = time.monotonic() - self.begin_s
-        if elapsed_s >= self._table_due_s:
-            self._table_due_s = elapsed_s + _TABLE_EVERY_S if self._scene.moves else float("inf")
+        if time.monotonic() >= self._look_due_s:
+            self._look_due_s = time.monotonic() + _TABLE_EVERY_S
             try:
-                self._show(elapsed_s)
+                now_s = self.now_s
+                if now_s >= self._scene.begin_s:
+                    self._show(now_s)
+                    if not self._scene.moves:
+                        self._look_due_s = float("inf")
             except SimulationError as exc:
                 raise DeviceLost(f"{self.name} has ended: {exc}") from exc
         return super().read()
 
-    def _show(self, time_s: float) -> None:
-        skin = self._scene.skin(time_s)
+    def _show(self, scene_s: float) -> None:
+        """Let the board read the skin of a time of the scene [s] from now on."""
+        skin = self._scene.skin(scene_s)
         admittance = end_admittance(skin)
-        self.sim.request("C", bytes([_FAR_ENDS + self._scene.rows]) + admittance.tobytes())
-        self.sim.set_table(all_readings(skin, admittance))
+        currents = bytes([_FAR_ENDS + self._scene.rows]) + admittance.tobytes()
+        table = _table(all_readings(skin, admittance))
+        *_, stats = self.sim.requests(("C", currents), ("T", table), ("S", b""))
+        self._shown_s.append((_simulated_s(stats), scene_s))
+
+    def _load_eeprom(self) -> None:
+        path, size = self._eeprom, len(self.sim.request("E"))
+        if path is None:
+            return
+        check_place(path)
+        if path.exists():
+            with naming(path):
+                content = read_bounded(path, size)
+                if len(content) != size:
+                    raise ValueError(f"is no EEPROM of this board: it has not {size} bytes")
+            self.sim.request("e", bytes(2) + content)
 
     def close(self) -> None:
-        """See `Link.close`."""
+        """See `Link.close`. Raises ValueError where the EEPROM's file cannot be written."""
         super().close()
-        self.sim.close()
+        with self.sim, suppress(SimulationError):  # it is closed already, or gone
+            content = self.sim.request("E")
+            if self._eeprom is not None:
+                with whole_file(self._eeprom) as file:
+                    file.write(content)
+
+
+def _table(ratio: Float) -> bytes:
+    """What the request "T" takes, of readings (rows, columns, n)."""
+    rows, columns, readings = ratio.shape
+    table = np.tile([1.0, 0.0], (16, 16, 4))
+    table[:rows, :columns, :readings] = ratio
+    return table.tobytes()
+
+
+def _simulated_s(stats: bytes) -> float:
+    """The board's time since it was switched on [s], of the reply to "S"."""
+    return float(json.loads(stats)["simulated_s"])

@@ -19,7 +19,6 @@ from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFau
 from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
-from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
 from ohmskin.link.session import Session
 from ohmskin.link.url import PortUrl
@@ -42,7 +41,7 @@ def open_emulator(text: str) -> Session:
         skin: Session = SteppedSkin(SteppedLink(board, text, faults))
     else:
         skin = Session(EmulatorLink(board, text, faults))
-    return _in_scene(skin, scene, lambda scan: board.boot_s + 1e-6 * scan.time_us)
+    return _in_scene(skin, scene, lambda board_s: board.boot_s + board_s)
 
 
 def open_simavr(text: str) -> Session:
@@ -57,13 +56,18 @@ def open_simavr(text: str) -> Session:
         for name in (*_OF_SCENE, "baud"):
             settings.pop(name, None)
         link = SimavrLink(url.place, scene, text, settings)
-        # Its board has a clock of its own, and begins after its boot loader.
-        return _in_scene(Session(link, baud), scene, lambda scan: scan.host_time_s - link.begin_s)
+        skin = Session(link, baud)
+        # A board behind a boot loader has just begun to count, and said hello at once.
+        boot_s = link.now_s if link.resets_board else 0.0
+        return _in_scene(skin, scene, lambda board_s: link.scene_s(boot_s + board_s))
 
 
-def _in_scene(skin: Session, scene: Scene, time_s: Callable[[Scan], float]) -> Session:
-    """The skin, which knows the forces of its scene. time_s: the scene's time at a scan [s]."""
-    skin.true_force_n = lambda scan: scene.force_n(time_s(scan))
+def _in_scene(skin: Session, scene: Scene, scene_s: Callable[[float], float]) -> Session:
+    """The skin, which knows the forces of its scene.
+
+    scene_s: the scene's time [s] at a time of the board's clock [s].
+    """
+    skin.true_force_n = lambda scan: scene.force_n(scene_s(1e-6 * scan.time_us))
     if scene.name == "weights":
         skin.put = scene.put
     return skin
