@@ -75,7 +75,7 @@ def test_a_number_that_python_does_not_read_is_no_board() -> None:
     with served(REST) as client:
         for number in ("9" * 10, "9" * 5000, "\u0663"):
             assert client.delete(f"/boards/{number}", headers={"origin": ORIGIN}).status_code == 204
-            assert client.get(f"/boards/{number}").status_code == 404
+            assert client.get(f"/boards/{number}").status_code == 405
             assert_refused(client, f"/boards/{number}", host=HOST, origin=ORIGIN)
         with panel(client) as page:
             page.scan()

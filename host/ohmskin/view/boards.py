@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
+from importlib import import_module
 from itertools import count, takewhile
 from operator import attrgetter
 from pathlib import Path
@@ -35,6 +36,11 @@ from ohmskin.record.recording import Mark, Tare
 
 # The methods that the page offers. Those of the paper take minutes for a frame of 8x8.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
+# What boards, estimates and contacts need later: see `load_all`.
+_NEEDED_LATER: Final = (
+    *("ohmskin.emulate.urls", "ohmskin.record.replay"),
+    *("scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph"),
+)
 # A page has at most so many boards. Chosen: each is a thread that may use a good part of a core.
 MOST_BOARDS: Final = 16
 # A port that is not there is tried again after this time [s]. Chosen: somebody who plugs a board in
@@ -375,6 +381,17 @@ class ViewedBoard(Closing):
                 open_one.close()
         self._thread.join(_CLOSE_S)
         self._changed()
+
+
+def load_all() -> None:
+    """Import what is otherwise imported when it is first needed, which may fail later.
+
+    A module is a file, and a program that has many connections may have no descriptor left.
+    """
+    for method in LIVE_METHODS:
+        kind_of(method)
+    for name in _NEEDED_LATER:
+        import_module(name)
 
 
 def _methods(reader: SkinReader) -> tuple[str, ...]:

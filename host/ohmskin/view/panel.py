@@ -27,6 +27,9 @@ _GONE_CODE: Final = 4001
 # No page's clock shows more [ms]. Chosen: a page counts from its begin, and 1e15 ms are 30,000
 # years; a number that JavaScript reads as infinite must not be sent back.
 _MOST_MS: Final = 1e15
+# A page may have so many commands under way. Chosen: more than anybody gives in a second; a tare
+# takes one.
+MOST_COMMANDS: Final = 4
 _Command = Callable[[], str]
 
 
@@ -38,6 +41,7 @@ class Panel:
         self._socket = socket
         self._news = asyncio.Event()
         self._sent: Shown | None = None
+        self._under_way = 0  # commands
         self._awaited: int | None = None  # number of the scan that is not yet acknowledged
 
     async def serve(self) -> None:
@@ -94,6 +98,7 @@ class Panel:
 
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
+            await asyncio.sleep(0)  # others come to their turn, however much this page says
             received = await self._socket.receive()
             if received["type"] == "websocket.disconnect":
                 raise WebSocketDisconnect(received.get("code", 1000))
@@ -109,11 +114,18 @@ class Panel:
                 case {"do": "clock", "page_ms": int() | float() as at_ms} if abs(at_ms) < _MOST_MS:
                     await self._say("clock", page_ms=at_ms, host_s=time.monotonic())
                 case _:
-                    if (command := self._asked(message)) is not None:
-                        tasks.start_soon(self._run, *command)
-                        continue
-                    text = "the page has asked for what this program does not know"
-                    await self._say("notice", text=text, good=False, refused="")
+                    await self._take(self._asked(message), tasks)
+
+    async def _take(self, command: tuple[str, _Command] | None, tasks: TaskGroup) -> None:
+        """Begin a command, unless it is none or too many are under way."""
+        if command is not None and self._under_way < MOST_COMMANDS:
+            self._under_way += 1
+            tasks.start_soon(self._run, *command)
+            return
+        text = "one thing at a time: the last ones are not done yet"
+        if command is None:
+            text = "the page has asked for what this program does not know"
+        await self._say("notice", text=text, good=False, refused="")
 
     def _asked(self, message: object) -> tuple[str, _Command] | None:
         board = self._board
@@ -138,4 +150,6 @@ class Panel:
         except (OhmskinError, ValueError, OSError) as exc:
             refused = name if isinstance(exc, TareRefused) else ""
             answer = {"text": str(exc), "good": False, "refused": refused}
+        finally:
+            self._under_way -= 1
         await self._say("notice", **answer)

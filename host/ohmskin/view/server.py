@@ -19,20 +19,19 @@ from pathlib import Path
 from typing import Final
 
 import anyio
-import uvicorn
 from starlette.applications import Starlette
 from starlette.datastructures import MutableHeaders
 from starlette.middleware import Middleware
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from ohmskin.errors import OhmskinError
 from ohmskin.link.serial_port import serial_ports
-from ohmskin.view.boards import LONGEST_TEXT_CHARS, ViewedBoards
+from ohmskin.view.boards import LONGEST_TEXT_CHARS, MOST_BOARDS, ViewedBoards, load_all
+from ohmskin.view.connections import Server, Waiting
 from ohmskin.view.panel import Panel
 
 _PAGE: Final = Path(__file__).parent / "page"
@@ -52,7 +51,11 @@ _HEADERS: Final = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",  # the address may hold the token
     "cache-control": "no-store",  # a page of one version never meets a server of another
+    "connection": "close",  # a page asks for so little that none needs to be kept
 }
+# There are at most so many panels, on all pages. Chosen: four pages of as many boards as there can
+# be; each takes a descriptor, and what is sent to each takes time.
+MOST_PANELS: Final = 4 * MOST_BOARDS
 # Names of this machine for itself. A page that was asked for by another name was made to lead here.
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # Requests that change nothing. Browsers need not say in ``Origin`` which page sends them.
@@ -64,6 +67,7 @@ class _BoardList:
 
     def __init__(self, boards: ViewedBoards) -> None:
         self._boards = boards
+        self._panels = 0
 
     def routes(self) -> list[BaseRoute]:
         """Which request is answered by which method."""
@@ -93,7 +97,7 @@ class _BoardList:
             if not 0 < len(place) <= LONGEST_TEXT_CHARS or not place.isprintable():
                 raise ValueError("a port is a serial port's name or a URL")
             return JSONResponse({"number": self._boards.add(place), "port": place})
-        except (KeyError, TypeError, AttributeError, RecursionError):
+        except (KeyError, TypeError, AttributeError, RecursionError, ClientDisconnect):
             return JSONResponse({"error": "say which port"}, 400)
         except ValueError as exc:
             return JSONResponse({"error": str(exc)}, 400)
@@ -106,10 +110,14 @@ class _BoardList:
     async def panel(self, socket: WebSocket) -> None:
         """Show a board until its page goes."""
         board = self._boards.get(self._number(socket))
-        if board is None:
+        if board is None or self._panels >= MOST_PANELS:
             await socket.close()
-        else:
+            return
+        self._panels += 1
+        try:
             await Panel(board, socket).serve()
+        finally:
+            self._panels -= 1
 
     def _number(self, asked: HTTPConnection) -> int:
         """The number of the board that the path names; -1: there is none.
@@ -126,20 +134,31 @@ def make_app(
     """The page of `boards`, which closes them at its end. host, token: see `Guard`."""
 
     @asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+    async def lifespan(_: Starlette) -> AsyncIterator[dict[str, Waiting]]:
+        await anyio.to_thread.run_sync(load_all)
         started()  # from here on, Ctrl-C ends the server in order
-        yield
+        yield {"waiting": Waiting()}
         await anyio.to_thread.run_sync(boards.close)
 
-    # A page asks for its own parts without its token.
-    public = [f"/{file.name}" for file in _PAGE.iterdir() if file.name != "index.html"]
     mimetypes.add_type("text/javascript", ".js")  # some systems know it by another name
-    files = Route("/{path:path}", StaticFiles(directory=_PAGE, html=True))
+    files = [_file(file) for file in sorted(_PAGE.iterdir())]
+    # A page asks for its own parts without its token.
+    public = [file.path for file in files if file.path != "/"]
     return Starlette(
-        routes=[*_BoardList(boards).routes(), files],
+        routes=[*_BoardList(boards).routes(), *files],
         middleware=[Middleware(Guard, host=host, token=token, public=public)],
         lifespan=lifespan,
     )
+
+
+def _file(file: Path) -> Route:
+    """A file of the page. It is read once: a request needs no descriptor but its own."""
+    content, kind = file.read_bytes(), mimetypes.guess_type(file.name)[0]
+
+    async def send(_: Request) -> Response:
+        return Response(content, media_type=kind)
+
+    return Route("/" if file.name == "index.html" else f"/{file.name}", send)
 
 
 async def _body(request: Request) -> bytes:
@@ -172,17 +191,11 @@ def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], N
             name = socket.gethostname() if host in ("0.0.0.0", "::") else host
             name = f"[{name}]" if ":" in name else name
             url = f"http://{name}:{listening.getsockname()[1]}/?token={token}"
-            config = uvicorn.Config(
-                make_app(boards, host, token, lambda: started(url)),
-                ws="wsproto",
-                ws_max_size=_LONGEST_MESSAGE_BYTES,
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                proxy_headers=False,
-                timeout_graceful_shutdown=_SHUTDOWN_S,
+            app = make_app(boards, host, token, lambda: started(url))
+            with_limits = Server(
+                app, longest_message_bytes=_LONGEST_MESSAGE_BYTES, shutdown_s=_SHUTDOWN_S
             )
-            uvicorn.Server(config).run(sockets=[listening])
+            with_limits.run(sockets=[listening])
 
 
 class Guard:
