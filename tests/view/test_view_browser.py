@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,8 @@ import pytest
 
 from calibrations import half_doubtful, of_scene
 from command_line import ENVIRONMENT, Done, finish
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.record.recording import load_recording
 from ports import Serve
 
@@ -49,7 +52,9 @@ def serving(folder: Path, *arguments: str) -> Iterator[Server]:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("view")
-    of_scene("ghost").save(folder / "skin.json")
+    # Leads that nobody has told make the force of a hard touch uncertain.
+    told = WireOhm(TOP_WIRE_OHM, BOTTOM_WIRE_OHM, lead=0.0)
+    replace(of_scene("ghost"), nominal_wire_ohm=told).save(folder / "skin.json")
     half_doubtful("ghost", unit_id=7).save(folder / "doubtful.json")
     with serving(folder, "--calibration", "skin.json", "--calibration", "doubtful.json") as server:
         yield server
