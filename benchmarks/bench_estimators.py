@@ -41,6 +41,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -226,6 +227,7 @@ def stretched_figures(method: str, skins: int) -> dict[str, float]:
 
 def finger_figures(method: str) -> dict[str, float]:
     scene = Scene("moving", 8, 8, seed=1)
+    scene.rest = replace(scene.rest, lead_ohm=np.array(0.0))  # as `knowledge_of` tells
     rest_siemens = scene.skin(0.0).cell_siemens
     estimator = make_estimator(method, knowledge_of(ratio_from_codes(quantise(scene.rest_ratio))))
     times_s = BEGIN_S + np.arange(360) / DEFAULT_RATE_HZ

@@ -20,7 +20,7 @@ from command_line import Command, Done, Run, assert_one_line, finish, python, we
 from ohmskin.cli.main import app
 from ohmskin.cli.stream import cell_table
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
-from ohmskin.emulate.scenes import BEGIN_S, SCENES, Scene
+from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, LAYOUT_CRC
@@ -425,9 +425,9 @@ TAKES = {
     "stream": "PORT --method --calibration --force --tare --json --scans --seconds",
     "view": "PORT --calibration --force --host --http-port --no-browser",
     "tare": "PORT CALIBRATION --seconds --undo --force",
-    "doctor": "PORT --calibration --wires --press --into --json",
-    "verify": "PORT PLATE --wires --seconds --picture --json --cell-percent --reference-percent "
-    "--settling-lsb --loss",
+    "doctor": "PORT --calibration --wires --leads --press --into --json",
+    "verify": "PORT PLATE --wires --leads --seconds --picture --json --cell-percent "
+    "--reference-percent --settling-lsb --loss",
     "estimate": "READINGS --method --out --cold",
     "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale",
     "export": "RECORDING OUT --begin --end",
@@ -454,7 +454,8 @@ def test_help_of_a_command(run: Run, name: str) -> None:
 
 def test_help_of_emulate_has_a_line_for_each_scene_and_fault(run: Run) -> None:
     lines = [line.strip() for line in run("emulate", "--help").out.splitlines()]
-    known = {**SCENES, **LINE_FAULTS, **SKIN_FAULTS}
+    lead = {"lead": f"ohms of each line's lead, {LEAD_OHM:g} unless told"}
+    known = {**SCENES, **lead, **LINE_FAULTS, **SKIN_FAULTS}
     assert [line for line in lines if line.startswith("- ")] == [
         f"- {name}: {text}" for name, text in known.items()
     ]

@@ -18,6 +18,7 @@ from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place,
 from ohmskin.doctor.gather import gather
 from ohmskin.doctor.signal import Look, Rest, examine_signal, find_hum, second_look
 from ohmskin.emulate.scenes import Scene
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
 from stepped import evidence, stepped
@@ -41,7 +42,7 @@ def test_a_sound_skin_has_no_finding(rows: int, columns: int) -> None:
     for seed, noise in enumerate(NOISES):
         wires = 1 + seed % 2 / 2  # an untouched skin does not show them
         url = f"emulator://{rows}x{columns}?seed={seed}&noise={noise}&wires={wires}"
-        diagnosis = examine(evidence(url, wire_ohm=(100.0, 200.0) if seed % 2 else None))
+        diagnosis = examine(evidence(url, told=WireOhm(100.0, 200.0) if seed % 2 else NO_WIRES))
         assert diagnosis.findings == [], url
         assert diagnosis.wires_hidden
         assert measured_in_words(diagnosis)["wires"].startswith("not known: an untouched skin")

@@ -25,7 +25,7 @@ from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import Step, gather
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import SteppedSkin
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import LEAD_OHM, Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
@@ -125,7 +125,7 @@ def test_wires_of_the_simulated_desk_are_measured() -> None:
     """Behind a boot loader, in real time."""
     scene = PressedWhenAsked("corners", 8, 8, seed=1)
     with Session(SimavrLink("uno", scene, settings={"desk": "1", "seed": "1"})) as skin:
-        diagnosis = examine(gather(skin, scene.report, WireOhm(100.0, 200.0), press=True))
+        diagnosis = examine(gather(skin, scene.report, WireOhm(100.0, 200.0, LEAD_OHM), press=True))
     assert [each.kind.id for each in diagnosis.findings] == ["settling"]  # 100 pF a line
     share, _, std = measured_in_words(diagnosis)["wires"].split()[:3]
     assert float(std) <= 0.06
@@ -184,6 +184,7 @@ def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("doctor", "emulator://8x8?colour=1"), "no option 'colour'")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100"), "two numbers")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "-1", ">= 0")
+    assert_one_line(run("doctor", "emulator://8x8", "--leads", "-1"), "nominal_lead_ohm is -1")
     assert_one_line(run("doctor", "emulator://8x8", "--calibration", "/no/such.json"), "/no/such")
     assert_one_line(run("doctor", "emulator://1x4", "--press"), "1x4", "no rectangle")
     far = run("doctor", "emulator://8x8?mode=far", "--press")

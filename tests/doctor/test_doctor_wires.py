@@ -21,13 +21,15 @@ from ohmskin.doctor.wires import (
     shares_of,
     suggested_corners,
 )
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import LEAD_OHM, Scene
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from places import DATA
 from stepped import evidence, stepped
 
 NOMINAL = (100.0, 200.0)
+TOLD = WireOhm(*NOMINAL, lead=LEAD_OHM)
 EXACT_LSB = 12**-0.5
 HELD = 30  # scans for which corners are held here
 
@@ -68,7 +70,7 @@ def both_pressed(skin: Skin, beside: float = 0.0, time: float = 0.0) -> list[Flo
 
 @cache
 def sound(rows: int, columns: int) -> Evidence:
-    return evidence(f"emulator://{rows}x{columns}", wire_ohm=NOMINAL, settled=None)
+    return evidence(f"emulator://{rows}x{columns}", told=TOLD, settled=None)
 
 
 def read_of(skin: Skin, noise_lsb: float = 0.0, seed: int = 0) -> Evidence:
@@ -91,7 +93,7 @@ def read_of(skin: Skin, noise_lsb: float = 0.0, seed: int = 0) -> Evidence:
 def rest_of(skin: Skin) -> Rest:
     """Of one scan without noise."""
     board, codes = sound(*skin.shape).board, quantise(readings(skin)).astype(np.float64)
-    return Rest(board, codes, 1, EXACT_LSB, NOMINAL)
+    return Rest(board, codes, 1, EXACT_LSB, NOMINAL, told=TOLD)
 
 
 @pytest.mark.parametrize("size", ["2x2", "2x5", "3x3", "4x4", "8x8", "12x4", "16x16"])
@@ -131,7 +133,14 @@ def test_wires_of_circuits_solved_by_ngspice(told: float) -> None:
             for exact in (untouched, ratio)
         )
         nominal = (told * ohm, told * ohm)
-        rest = Rest(sound(3, 3).board, quantise(of_rest).mean(axis=0), 90, 0.42, nominal)
+        rest = Rest(
+            sound(3, 3).board,
+            quantise(of_rest).mean(axis=0),
+            90,
+            0.42,
+            nominal,
+            told=WireOhm(lead=0.0),
+        )
         _, wires = taken(*of_press).measure(rest)
         assert wires.place == Place(rows=(0,), columns=(0,))
         off = np.log(wires.share * told)
@@ -195,7 +204,7 @@ def test_what_is_pressed_in_passing_is_left_out() -> None:
 
 
 def test_without_nominal_wires_none_are_expected() -> None:
-    read = replace(read_of(worn("4x4", 2.0, seed=0)), wire_ohm=None)
+    read = replace(read_of(worn("4x4", 2.0, seed=0)), told=NO_WIRES)
     diagnosis = examine(read)
     assert diagnosis.findings == []
     assert measured_in_words(diagnosis)["wires"].startswith(("1.9", "2.0", "2.1"))

@@ -26,6 +26,7 @@ from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
 from ohmskin.doctor.signal import Rest
 from ohmskin.emulate.driver import SteppedSkin
+from ohmskin.emulate.scenes import LEAD_OHM
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.emulate.urls import emulated
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
@@ -58,15 +59,16 @@ def errors_of(lines: list[LineWire], truth: dict[str, Float]) -> tuple[Float, Fl
     return np.array(share), np.array(in_std), np.concatenate(segments)
 
 
-def diagnosis_of(ratio: Float, noise_lsb: float, scans: int = 225) -> Diagnosis:
+def diagnosis_of(ratio: Float, noise_lsb: float, lead_ohm: float, scans: int = 225) -> Diagnosis:
     """What the means of so many noisy scans of mode far show, readings (R, C, 4)."""
     random = np.random.default_rng(1)
     noisy = ratio + noise_lsb / 1024 * random.standard_normal((scans, *ratio.shape))
     codes = quantise(np.clip(noisy, 0, 1)).mean(axis=0)
     board = replace(stepped(FAR).info, rows=ratio.shape[0], columns=ratio.shape[1])
     seen_lsb = float(np.hypot(noise_lsb, 12**-0.5))
-    rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0)), Diagnosis()
-    examine_far(rest, examine_circuit(near_ends(rest), diagnosis), None, diagnosis)
+    told = WireOhm(lead=lead_ohm)
+    rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0), told=told), Diagnosis()
+    examine_far(rest, examine_circuit(near_ends(rest), diagnosis), diagnosis)
     return diagnosis
 
 
@@ -76,11 +78,12 @@ def diagnosis_of(ratio: Float, noise_lsb: float, scans: int = 225) -> Diagnosis:
 @pytest.mark.parametrize("wires", WIRES)
 @pytest.mark.parametrize("noise", [0, 0.3, 0.5])
 def test_no_sound_skin_has_a_finding_and_lines_are_as_stated(wires: float, noise: float) -> None:
-    """In all, 72 skins of six sizes."""
+    """In all, 72 skins of six sizes; of every other one, the leads are told."""
     in_std = []
     for seed, size in enumerate(("8x8", "8x8", "8x8", "4x12", "3x3", "2x2", "1x1", "16x1")):
         url = f"emulator://{size}?mode=far&seed={seed}&wires={wires}&noise={noise}"
-        diagnosis, skin = examine(evidence(url)), emulated(url)[1].skin(0.0)
+        leads = WireOhm(lead=None if seed % 2 else LEAD_OHM)
+        diagnosis, skin = examine(evidence(url, told=leads)), emulated(url)[1].skin(0.0)
         assert diagnosis.findings == [], url
         assert verdict(diagnosis) == "sound: nothing is wrong"
         assert len(diagnosis.lines) == sum(skin.shape)
@@ -88,7 +91,8 @@ def test_no_sound_skin_has_a_finding_and_lines_are_as_stated(wires: float, noise
         off, deviations, _ = errors_of(diagnosis.lines, truth)
         in_std += deviations.tolist()
         if size == "8x8" and wires >= 1:
-            assert np.median(np.abs(off)) < (0.04 if noise else 0.1)
+            least = 0.1 if seed % 2 else 0.04
+            assert np.median(np.abs(off)) < (least if noise else 0.1)
     assert np.abs(in_std).max() < 4
     assert np.sqrt(np.mean(np.square(in_std))) < 1.2
 
@@ -100,7 +104,7 @@ def test_lines_against_ngspice() -> None:
     far = [names.index(name) for name in "aebf"]
     shares = []
     for k, ratio in [(0, data["rest_ratio"]), *enumerate(data["ratio"])]:
-        diagnosis = diagnosis_of(ratio[..., far], 0.3)
+        diagnosis = diagnosis_of(ratio[..., far], 0.3, 0.0)
         assert [each for each in diagnosis.findings if each.kind is not Kind.TOUCHED] == []
         truth = of_lines(data["top_wire_ohm"][k], data["bottom_wire_ohm"][k])
         off, in_std, of_segments = errors_of(diagnosis.lines, truth)
@@ -122,7 +126,7 @@ def test_touches_show_segments() -> None:
     stds = []
     for each in (replace(untouched, cell_siemens=cells), untouched):
         ratio = all_readings(each, end_admittance(each))[..., [0, 4, 1, 5]]
-        line = diagnosis_of(ratio, 0.4).lines[1]
+        line = diagnosis_of(ratio, 0.4, LEAD_OHM).lines[1]
         assert np.all(
             np.abs(np.subtract(line.segment_ohm, top_ohm[1])) < 3.5 * np.array(line.segment_std_ohm)
         )
@@ -151,7 +155,7 @@ def test_the_firmware_on_a_desk(far_open: int) -> None:
     board = stepped(FAR).info
     noise_lsb = float(np.sqrt(np.mean(np.diff(codes, axis=0) ** 2) / 2))
     rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb, (100.0, 200.0)), Diagnosis()
-    examine_far(rest, examine_circuit(near_ends(rest), diagnosis), None, diagnosis)
+    examine_far(rest, examine_circuit(near_ends(rest), diagnosis), diagnosis)
     if far_open:
         assert [each.kind for each in diagnosis.findings] == [Kind.OPEN_FAR, Kind.OPEN_FAR]
         assert diagnosis.lines == []
@@ -239,7 +243,7 @@ def test_a_bad_segment_and_an_odd_line_are_told_apart() -> None:
         top_ohm[2] = segments
         skin = replace(sound, top_wire_ohm=top_ohm)
         ratio = all_readings(skin, end_admittance(skin))[..., [0, 4, 1, 5]]
-        diagnosis = diagnosis_of(ratio, 0.4)
+        diagnosis = diagnosis_of(ratio, 0.4, LEAD_OHM)
         [finding] = diagnosis.findings
         assert (finding.kind, finding.place.rows) == (kind, (2,))
         if kind is Kind.BAD_SEGMENT:
@@ -252,12 +256,12 @@ def test_a_bad_segment_and_an_odd_line_are_told_apart() -> None:
 
 
 def test_wires_that_are_not_nominal_are_told() -> None:
-    found = evidence(f"{FAR}&wires=2", wire_ohm=(100.0, 200.0))
+    found = evidence(f"{FAR}&wires=2", told=WireOhm(100.0, 200.0))
     rows, columns = examine(found).findings
     assert {rows.kind, columns.kind} == {Kind.LINE_WIRE}
     assert rows.place.rows == columns.place.columns == tuple(range(8))
     assert rows.values["ohm"] == pytest.approx(2 * rows.values["usual_ohm"], rel=0.1)
-    assert examine(replace(found, wire_ohm=(200.0, 400.0))).findings == []
+    assert examine(replace(found, told=WireOhm(200.0, 400.0))).findings == []
 
 
 def test_all_far_ends_are_open_where_there_is_no_second_pair() -> None:
@@ -307,7 +311,7 @@ def test_a_calibration_takes_the_wires_that_far_ends_show(run: Run, tmp_path: Pa
     for wires in (0.6, 4.0, 1.0):
         told.save(path)
         url = f"{FAR}&noise=0.4&wires={wires}"
-        well(run("doctor", url, "--into", str(path)))
+        well(run("doctor", url, "--leads", str(LEAD_OHM), "--into", str(path)))
         kept = load_calibration(path).nominal_wire_ohm
         skin = emulated(url)[1].skin(0.0)
         off = np.log(
@@ -318,9 +322,21 @@ def test_a_calibration_takes_the_wires_that_far_ends_show(run: Run, tmp_path: Pa
         assert stds.max() < 0.1
     crimp = f"{url}&crimp_row=1"  # one bad line does not count
     told.save(path)
-    assert run("doctor", crimp, "--into", str(path)).code == 1
+    assert run("doctor", crimp, "--leads", str(LEAD_OHM), "--into", str(path)).code == 1
     with_crimp = load_calibration(path).nominal_wire_ohm
     np.testing.assert_allclose(with_crimp.both, kept.both, rtol=0.03)
+
+
+@pytest.mark.usefixtures("benches")
+def test_a_calibration_takes_the_leads_that_far_ends_show(run: Run, tmp_path: Path) -> None:
+    """Nobody has told them; and those that are told stay where presses would show the wires."""
+    path = tmp_path / "skin.json"
+    for lead_ohm in (0, 300, 3000):
+        far_calibration().save(path)
+        run("doctor", f"{FAR}&seed=3&wires=2&lead={lead_ohm}", "--into", str(path))
+        kept = load_calibration(path).nominal_wire_ohm
+        assert kept.lead == pytest.approx(lead_ohm, abs=4 * kept.lead_std_ohm)
+        assert kept.lead_std_ohm < 80
 
 
 @pytest.mark.usefixtures("benches")

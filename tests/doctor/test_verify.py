@@ -164,7 +164,7 @@ def test_readings_that_are_not_linear_are_named(
 
 def test_an_emulated_plate_reads_as_ohms_law_says() -> None:
     """The codes are those of the table of docs/hardware.md, made by hand."""
-    for ohm, low, high in ((1e3, 503, 520), (10e3, 438, 585), (100e3, 192, 832), (1e6, 28, 995)):
+    for ohm, low, high in ((1e3, 502, 521), (10e3, 437, 586), (100e3, 191, 832), (1e6, 28, 995)):
         path = Path("/nonexistent")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(

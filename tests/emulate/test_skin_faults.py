@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults of simulated skins: what their readings become, node by node and reading by reading."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from network import Network, laplacian_readings, skin_network
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SKIN_FAULTS, SkinFaults, faults_of
-from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, Scene
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import PortError
 from ohmskin.link.protocol import MODES
@@ -44,14 +46,26 @@ def test_readings_are_those_of_the_network(name: str, mode: str) -> None:
     sound = Scene("rest", R, C, seed=4).skin(0.0)
     of = {"cell": sound.cell_siemens, "top": sound.top_wire_ohm, "bottom": sound.bottom_wire_ohm}
     layers = {layer: values.copy() for layer, values in of.items()}
+    leads = np.full(R + C, LEAD_OHM)
     for layer, (place, value) in changes.items():
         layers[layer][place] = value
     finite = [np.where(np.isinf(layers[layer]), 1e15, layers[layer]) for layer in layers]
-    expected = laplacian_readings(Skin(*finite), joints, MODES[mode])
+    expected = laplacian_readings(Skin(*finite, lead_ohm=leads), joints, MODES[mode])
     found = Scene("rest", R, C, seed=4, faults=faults).ratio(0.0, mode)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     changed = np.abs(found - Scene("rest", R, C, seed=4).ratio(0.0, mode)).max()
     assert changed > 1e-2 or name == "none"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_lines_have_the_leads_that_a_url_gives_them(mode: str) -> None:
+    """All lines one, and a crimp adds to its line's."""
+    url = f"emulator://{R}x{C}?scene=multi&begin=0&seed=4&lead=300&crimp_row=1&crimp_ohm=700"
+    leads = np.full(R + C, 300.0)
+    leads[1] += 700.0
+    touched = replace(Scene("multi", R, C, seed=4).skin(BEGIN_S), lead_ohm=leads)
+    expected = laplacian_readings(touched, names=MODES[mode])
+    np.testing.assert_allclose(emulated(url)[1].ratio(0.0, mode), expected, rtol=0, atol=1e-9)
 
 
 def test_far_ends_that_are_exchanged_or_open_change_no_near_reading() -> None:
@@ -82,6 +96,7 @@ def all_ends(skin: Skin) -> Float:
     network = skin_network(skin)
     top, bottom = np.arange(R + C, network.nodes).reshape(2, R, C)
     ends = [*top[:, -1], *bottom[-1]]
+    references = skin.ref_top_ohm, skin.ref_bottom_ohm
     volt = np.empty((R, C, R + C))
     for i in range(R):
         for j in range(C):
@@ -89,7 +104,7 @@ def all_ends(skin: Skin) -> Float:
                 network.nodes + 2,
                 np.append(network.tail, [network.nodes, R + j]),
                 np.append(network.head, [i, network.nodes + 1]),
-                np.append(network.branch_ohm, [skin.ref_top_ohm, skin.ref_bottom_ohm]),
+                np.append(network.branch_ohm, skin.lead_ohm[[i, R + j]] + references),
             )
             volt[i, j] = whole.node_v({network.nodes: 1.0, network.nodes + 1: 0.0})[ends]
     return volt
@@ -109,10 +124,11 @@ def test_true_references_and_wires() -> None:
     np.testing.assert_allclose(skin.bottom_wire_ohm, 2.5 * sound.bottom_wire_ohm)
     crimps = SkinFaults(crimp_row=1, crimp_column=2, crimp_ohm=700.0)
     crimped = Scene("rest", R, C, faults=crimps).skin(0.0)
-    more = np.zeros((2, R, C))
-    more[0, 1, 0] = more[1, 0, 2] = 700
-    np.testing.assert_allclose(crimped.top_wire_ohm, sound.top_wire_ohm + more[0])
-    np.testing.assert_allclose(crimped.bottom_wire_ohm, sound.bottom_wire_ohm + more[1])
+    more = np.zeros(R + C)
+    more[[1, R + 2]] = 700
+    np.testing.assert_array_equal(sound.lead_ohm, [LEAD_OHM] * (R + C))
+    np.testing.assert_array_equal(crimped.lead_ohm, sound.lead_ohm + more)
+    np.testing.assert_array_equal(crimped.top_wire_ohm, sound.top_wire_ohm)
     ratio = Scene("rest", R, C, faults=SkinFaults(ref_top=33e3)).ratio(0.0)
     np.testing.assert_allclose((1 - ratio[..., 0]) / ratio[..., 1], 1.1)
     np.testing.assert_allclose(ratio[..., 3] / (1 - ratio[..., 2]), 1.1)
@@ -196,6 +212,8 @@ def test_nodes_settle_slot_by_slot_in_mode_far() -> None:
         ("dead=a,b", "two numbers"),
         ("open_row=x", "a number, not 'x'"),
         ("ref_top=0", "from 1e-6 to"),
+        ("lead=-1", "lead_ohm must be finite and not negative"),
+        ("lead=x", "lead must be a number"),
         ("wires=nan", "from 1e-6 to"),
         ("hum=-50", "0, or from 1e-6 to"),
         ("tau_us=inf", "0, or from 1e-6 to"),

@@ -15,6 +15,7 @@ from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import Diagnosis
 from ohmskin.doctor.wires import CornerScans, moved_across, suggested_corners
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Scan
 from stepped import stepped
@@ -84,7 +85,7 @@ def examined(seed: int, nominal: tuple[float, float]) -> Diagnosis:
             _show(rig, replace(rest, cell_siemens=siemens), "near")
             for codes in _scans(rig, LOOK_SCANS):
                 presses.take(Scan(codes, 0, 0, 0.0, 0))
-    return examine(Evidence(board, scans, wire_ohm=nominal, presses=presses))
+    return examine(Evidence(board, scans, told=WireOhm(*nominal, lead=0.0), presses=presses))
 
 
 def _show(rig: Rig, skin: Skin, mode: str) -> None:

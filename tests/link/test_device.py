@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 import ohmskin
+from ohmskin.circuit.skin import readings
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
@@ -411,6 +412,16 @@ def test_the_simulator_keeps_its_eeprom_in_a_file(tmp_path: Path) -> None:
     ):
         with pytest.raises(PortError, match=reason):
             ohmskin.open(wrong)
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize("lines", ["", "&line_pf=1"])
+def test_the_simulator_has_leads_in_its_table_and_in_its_lines(lines: str) -> None:
+    """Without capacitances it reads the table, with them a circuit. 6 kOhm are 30 codes."""
+    with ohmskin.open(f"simavr://uno?scene=single&begin=0&lead=3000{lines}") as skin:
+        codes = take(iter(skin), 5)[-1].codes
+    touched = replace(Scene("single", 8, 8).skin(BEGIN_S), lead_ohm=np.array(3000.0))
+    np.testing.assert_allclose(codes, quantise(readings(touched)), rtol=0, atol=1)
 
 
 # --------------------------------------------------------------------------------- one backend

@@ -20,7 +20,7 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
-from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES
@@ -45,6 +45,10 @@ TERMINAL: Final = Console(soft_wrap=True)
 
 Port = Annotated[str, Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
 Wires = Annotated[str, Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
+Leads = Annotated[
+    float | None,
+    Option(help="nominal ohms from the multiplexer to a line's first crossing; 0: none"),
+]
 
 Scans = Annotated[int, Option(min=0, help="stop after so many; 0: never")]
 Seconds = Annotated[float, Option(min=0, help="stop after so long; 0: never")]
@@ -55,15 +59,13 @@ def asked_for(scans: Iterable[Scan], count: int, seconds: float) -> Iterator[Sca
     return islice(scans_for(scans, seconds or math.inf), count or None)
 
 
-def wires_of(text: str) -> WireOhm:
-    """What `--wires` says; nothing: they are not known."""
-    if not text:
-        return NO_WIRES
+def wires_of(text: str, lead_ohm: float | None) -> WireOhm:
+    """What `--wires` and `--leads` say; nothing: they are not known."""
     try:
-        top, bottom = map(float, text.split(","))
+        top, bottom = map(float, text.split(",")) if text else (None, None)
     except ValueError:
         raise ValueError(f"--wires wants two numbers, as 100,200, not '{text}'") from None
-    return WireOhm(top, bottom).check()
+    return WireOhm(top, bottom, lead_ohm).check()
 
 
 def ports(as_json: Annotated[bool, Option("--json", help="one JSON array")] = False) -> None:

@@ -26,10 +26,11 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.cli.board import TERMINAL, Port, Wires, wires_of
+from ohmskin.cli.board import TERMINAL, Leads, Port, Wires, wires_of
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import cell_table
 from ohmskin.ctrl_c import until_ctrl_c
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
@@ -68,13 +69,14 @@ def weights(
     redo: Annotated[list[str] | None, Option(help="row,column: drop its presses first")] = None,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
+    leads: Leads = None,
     force: Force = False,
 ) -> None:
     """With weights: says which to put on which cell of the skin at PORT, and when it has read it.
 
     Every press is kept at once, in OUT with .presses.csv: after Ctrl-C the same command goes on.
     """
-    calibrator_of = _options(out, method, indenter_mm2, wires, table=True)
+    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table=True)
     forces_n = [1e-3 * mass_g * GRAVITY_M_PER_S2 for mass_g in _grams(grams)]
     kept = _KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
@@ -125,13 +127,14 @@ def recording(
     ] = 0.0,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
+    leads: Leads = None,
     force: Force = False,
 ) -> None:
     """From a recording of presses, with the forces in it or a force sensor's log of the same time.
 
     The two clocks may differ: they are aligned by what both saw.
     """
-    calibrator_of = _options(out, method, indenter_mm2, wires, recording, forces)
+    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), recording, forces)
     given = load_recording(recording)
     log = None if forces is None else load_force_log(forces)
     with naming(recording):
@@ -169,10 +172,11 @@ def table(
     ] = TARE_S,
     method: Method = DEFAULT_METHOD,
     wires: Wires = "",
+    leads: Leads = None,
     force: Force = False,
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
-    calibrator_of = _options(out, method, indenter_mm2, wires, table, table=True)
+    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
         calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s), force)
@@ -212,7 +216,7 @@ def _options(
     out: Path,
     method: str,
     indenter_mm2: float,
-    wires: str,
+    wires: WireOhm,
     *inputs: Path | None,
     table: bool = False,
 ) -> Callable[[Hello, Float, bool], Calibrator]:
@@ -222,7 +226,6 @@ def _options(
     the board says of itself, the readings (R, C, 4) of its untouched skin, and whether they count
     even if cells seem touched.
     """
-    nominal = wires_of(wires)
     if method not in LEVEL_METHODS:
         raise ValueError(f"no method '{method}': there are {', '.join(LEVEL_METHODS)}")
     if table and method == VOLTAGE:
@@ -231,7 +234,7 @@ def _options(
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     check_place(out, *inputs)
     area_m2 = 1e-6 * indenter_mm2
-    return lambda board, rest, force: Calibrator(board, rest, method, area_m2, nominal, force)
+    return lambda board, rest, force: Calibrator(board, rest, method, area_m2, wires, force)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:

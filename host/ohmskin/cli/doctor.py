@@ -14,10 +14,11 @@ from typer import Option
 import ohmskin
 from ohmskin import errors
 from ohmskin.cli import doctor_words as words
-from ohmskin.cli.board import Port, Wires, wires_of
+from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.doctor.examine import examine, measured_wires
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.gather import Report, Step, gather
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 
 _COLOURS: Final = {Severity.FAULT: "red", Severity.WARNING: "yellow", Severity.NOTE: "cyan"}
@@ -37,6 +38,7 @@ def doctor(
         Path | None, Option(help="file (.json) of this board: --press compares with its wires")
     ] = None,
     wires: Wires = "",
+    leads: Leads = None,
     press: Annotated[bool, Option(help="then ask for touches, which show the wires")] = False,
     into: Annotated[Path | None, Option(help="calibration that takes these wires (.json)")] = None,
     as_json: Annotated[bool, Option("--json", help="one JSON object")] = False,
@@ -50,9 +52,10 @@ def doctor(
     """
     calibration = calibration or into
     of_board = None if calibration is None else load_calibration(calibration)
-    wire_ohm = wires_of(wires).both
-    if wire_ohm is None and of_board is not None:
-        wire_ohm = of_board.nominal_wire_ohm.both
+    told = wires_of(wires, leads)
+    if of_board is not None:
+        given = {name: ohm for name, ohm in told._asdict().items() if ohm is not None}
+        told = of_board.nominal_wire_ohm._replace(**given)
     with terminal() as report:
         try:
             device = ohmskin.open(port, start=False)
@@ -65,9 +68,9 @@ def doctor(
                 if device.info.mode == "far":
                     if press:
                         raise ValueError("mode far shows the wires untouched: leave out --press")
-                elif into is not None and not (press and wire_ohm):
+                elif into is not None and not (press and told.both):
                     raise ValueError("in mode near, --into needs --press and nominal --wires")
-                evidence = gather(device, report, wire_ohm, press=press)
+                evidence = gather(device, report, told, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
     if as_json:
@@ -75,16 +78,21 @@ def doctor(
     else:
         print_page(page)
     if into is not None:
-        _keep_wires(diagnosis, into)
+        _keep_wires(diagnosis, told, into)
     if diagnosis.worse:
         raise SystemExit(1)
 
 
-def _keep_wires(diagnosis: Diagnosis, into: Path) -> None:
-    """Write the wires that presses or far ends showed into a calibration, with their deviation."""
+def _keep_wires(diagnosis: Diagnosis, told: WireOhm, into: Path) -> None:
+    """Write the wires that presses or far ends showed into a calibration, with their deviation.
+
+    told: its leads are kept where only far ends would have shown them.
+    """
     wires = measured_wires(diagnosis)
     if wires is None:
         raise ValueError(f"{into} is as it was: neither presses nor far ends have told the wires")
+    if wires.lead is None:
+        wires = wires._replace(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
     replace(load_calibration(into), nominal_wire_ohm=wires).save(into)
 
 

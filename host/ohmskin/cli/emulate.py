@@ -10,13 +10,14 @@ from ohmskin.cli.demo import URL
 from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.emulate.driver import PtyServer
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
-from ohmskin.emulate.scenes import SCENES
+from ohmskin.emulate.scenes import LEAD_OHM, SCENES
 from ohmskin.emulate.urls import emulated, is_stepped
 from ohmskin.errors import PortError
 
 # The options of an emulator:// URL, for the command's help.
 _OPTIONS: Final = {
     "Scenes (scene=ghost)": SCENES,
+    "The skin (lead=300)": {"lead": f"ohms of each line's lead, {LEAD_OHM:g} unless told"},
     "Faults of the line (drop=0.1)": LINE_FAULTS,
     "Faults of the skin (open_row=3)": SKIN_FAULTS,
 }

@@ -13,13 +13,14 @@ from typer import Argument, Option
 import ohmskin
 from ohmskin.circuit.plate import load_plate
 from ohmskin.circuit.skin import CONFIGURATIONS
-from ohmskin.cli.board import Port, Wires, wires_of
+from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
 from ohmskin.cli.stream import numbers
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather_plate
 from ohmskin.doctor.plate import PlateExam, Tolerance
+from ohmskin.emulate.scenes import LEAD_OHM
 from ohmskin.files import check_place, whole_file
 
 _MOST: Final = Tolerance()
@@ -34,6 +35,7 @@ def verify(
     port: Port,
     plate: Annotated[Path, Argument(help="ohms at each crossing (.csv), 'open' for none")],
     wires: Wires = "0,0",
+    leads: Leads = LEAD_OHM,
     seconds: Annotated[float, Option(min=0.5, help="so long losses are counted")] = 60.0,
     picture: Annotated[Path | None, Option(help="PNG to write")] = None,
     json_file: Annotated[str, Option("--json", help="file for all figures; -: here")] = "",
@@ -57,7 +59,7 @@ def verify(
     for path in filter(None, (str(picture or ""), json_file.removeprefix("-"))):
         check_place(Path(path), plate)
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
-    exam = PlateExam(load_plate(plate), wires_of(wires), tolerance)
+    exam = PlateExam(load_plate(plate), wires_of(wires, leads), tolerance)
     with terminal() as report, ohmskin.open(port, start=False) as device:
         evidence = gather_plate(device, exam.plate.shape, report, seconds)
     evidence.loss = loss

@@ -17,12 +17,12 @@ import numpy as np
 
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.doctor.circuit import examine_circuit
-from ohmskin.doctor.far import examine_far, near_ends, segments_of
+from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, merged
 from ohmskin.doctor.signal import Look, Rest, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
-from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 from ohmskin.version import VERSION
 
@@ -41,7 +41,7 @@ class Evidence:
     stats: counts of the connection.
     settled: a look with a longer settle time.
     report: the board's self-test.
-    wire_ohm: nominal wires of a segment, top and bottom [ohm].
+    told: what is told of wires and leads. Wires are at fault only if nominal ones are told.
     presses: scans while somebody pressed corners, after all other looks.
     latency: timer of the USB bridge [ms], and the file that sets it.
     lost: why the board went away meanwhile.
@@ -56,7 +56,7 @@ class Evidence:
     stats: BoardStats = field(default_factory=BoardStats)
     settled: Look | None = None
     report: SelfTestReport | None = None
-    wire_ohm: tuple[float, float] | None = None
+    told: WireOhm = NO_WIRES
     presses: CornerScans | None = None
     latency: tuple[int, str] | None = None
     lost: str = ""
@@ -68,7 +68,7 @@ class Evidence:
 def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     """Add what the scans show of a skin: signal, lines, cells, far ends, and wires.
 
-    usual: the first look. Wires are at fault only if nominal ones are known.
+    usual: the first look.
     """
     settled, presses, far = evidence.settled, evidence.presses, usual.board.mode == "far"
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
@@ -82,11 +82,14 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
     # Unless told otherwise, wires are as those of emulated skins.
-    wire_ohm = evidence.wire_ohm or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
-    rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves)
+    told = evidence.told
+    wire_ohm = told.both or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
+    rest = Rest(
+        scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves=moves, told=told
+    )
     near = examine_circuit(near_ends(rest) if far else rest, diagnosis)
     if far and not moves and not near.wrong.all():
-        examine_far(rest, near, evidence.wire_ohm, diagnosis)
+        examine_far(rest, near, diagnosis)
     # A cell that moves in all may conduct no more on average than one at rest.
     touched = near.touched if near.touched.any() else moved
     if touched.any():
@@ -97,7 +100,7 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     if presses is not None:
         diagnosis.pressed = presses.measure(rest)
     for share in diagnosis.pressed or ():
-        if share.differs and evidence.wire_ohm is not None:  # else nobody says what is nominal
+        if share.differs and told.both is not None:  # else nobody says what is nominal
             diagnosis.add(Kind.WIRES, share.place, share=share, nominal_ohm=wire_ohm)
 
 
@@ -141,7 +144,7 @@ def measured_wires(diagnosis: Diagnosis) -> WireOhm | None:
         top, bottom = (whole.share * ohm for ohm in diagnosis.nominal_ohm)
         log_std = whole.std / whole.share
         return WireOhm(top, bottom, top_log_std=log_std, bottom_log_std=log_std)
-    return segments_of(diagnosis.lines)
+    return diagnosis.wires_by_far_ends
 
 
 def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:

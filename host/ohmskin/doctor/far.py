@@ -13,23 +13,33 @@ symbol shape     meaning
 I      (R, C)    current of a port per Vdd, from readings a and b [S]
 u      (L, n)    loss_ohm: what a line loses between its ends, per current of each of its ports:
                  (a - e) / I of rows, (f - b) / I of columns [ohm]
+l      scalar    lead_ohm: the usual lead of the layer's lines [ohm]
 s      (L, n)    std_ohm: standard deviation of u [ohm]
 w      (L, n)    floating_ohm: what u would be if the far node still had the voltage of the cell
                  that was read before [ohm]
 A      (L, n, n) current_share: share of each port's current in each segment of its line [1]
-r      (L, n)    resistances of the segments [ohm]
+r      (L, n)    resistances of the segments; the first one has what its lead is above the usual
+                 one [ohm]
 m      (L,)      mean of a line's segments, or the usual one of the layer [ohm]
 ====== ========= ===========================================================================
 
-A far end carries no current, so its potential shows what all segments of the line lose: u = A r. On
-an untouched skin, a line draws current at all its crossings alike; a touch draws it at its own.
+A far end carries no current, so its potential shows what the lead and all segments of the line
+lose: u = l + A r. On an untouched skin, a line draws current at all its crossings alike; a touch
+draws it at its own.
+
+A 1 is what segments of 1 ohm lose. With one m for all segments of a line, u = l + m A 1 is a
+straight line over A 1 that begins at the lead. Each line has a lead of its own. The layer's is
+their mean by precision, of those that are near the median: others have a bad crimp. An untouched
+skin shows it badly, so that what the other layer has and what is expected count, too, unless they
+contradict it. A first segment cannot be told from a lead: what a line's lead is above the layer's
+counts as its first segment.
 
 A depends on the cells. The cells follow from the port resistances without their wires, and the
 wires follow from u and A. So the cells, A and the wires are computed in turn, `ROUNDS` times.
 
 The readings alone do not determine n segments. They are taken to scatter about their mean m:
 
-    cost(r) = |(u - A r) / s|^2 + |(r - m) / (SPREAD_SHARE m)|^2
+    cost(r) = |(u - l - A r) / s|^2 + |(r - m) / (SPREAD_SHARE m)|^2
 
 With m free, this gives the segments of a sound line. With the usual m of the layer, and one segment
 that may have any resistance, it finds a bad segment.
@@ -50,7 +60,14 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit import skin as circuit
 from ohmskin.doctor.circuit import LinesAndCells
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, LineWire, Place, lines_of
-from ohmskin.doctor.limits import ADC_ERROR_LSB, CHANGED_SHARE, FEW_STDS, KNOWN_STD, MANY_STDS
+from ohmskin.doctor.limits import (
+    ADC_ERROR_LSB,
+    CHANGED_SHARE,
+    FEW_STDS,
+    KNOWN_STD,
+    MANY_STDS,
+    USUAL_LEAD_STD_OHM,
+)
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
@@ -66,6 +83,9 @@ MODEL_STD: Final = 0.01
 ROUNDS: Final = 3
 # [chi-square] Two faults whose costs differ by less may be either. Chosen: two deviations, squared.
 ALIKE_COST: Final = 4.0
+# [deviations] Leads that differ by more contradict each other. Chosen: the other one hardly pulls
+# where it should not, since rows and columns may have leads of two kinds.
+ALIKE_STDS: Final = 2.5
 # [ohm] No line has more: a fit that says so is of a far end at fault. Chosen: 16 segments of 2 kOhm
 # have less.
 MOST_LINE_OHM: Final = 50e3
@@ -103,16 +123,19 @@ class FarReadings:
         self._matrix = make_estimator("matrix", board)
         self.cell_siemens = self._matrix.estimate(near).cell_siemens
 
-    def current_shares(self, wire_ohm: Float) -> tuple[Float, Float]:
+    def current_shares(self, wire_ohm: Float, leads_ohm: float) -> tuple[Float, Float]:
         """A of rows and of columns, if the segments are `wire_ohm` (2, R, C). Corrects the cells.
 
         `matrix` takes wires for a part of the cells. So it is given what a skin without wires would
         read: each port without the resistance that the wires add to it.
+
+        leads_ohm: both leads of a port.
         """
         refs_ohm = sum(self._refs)
         of_wires = circuit.PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
         of_wires -= circuit.PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
         # At least 1 ohm: in a short, noise may make less than nothing of what is left.
+        of_wires += leads_ohm
         port_ohm = np.maximum(1 / self._current - refs_ohm - of_wires.reshape(self.shape), 1.0)
         ratio = circuit.ratio_from_current(1 / (port_ohm + refs_ohm), *self._refs)
         self.cell_siemens = self._matrix.estimate(ratio).cell_siemens
@@ -120,7 +143,7 @@ class FarReadings:
         return wired.line_current(0), wired.line_current(1)
 
     def ends(self, wire_ohm: Float) -> tuple[Float, Float]:
-        """What u of each line would be if the far end of another line were read for it [ohm].
+        """What u - l of each line would be if the far end of another line were read for it [ohm].
 
         The circuit says this, if the segments are `wire_ohm` (2, R, C). It is how swapped ends are
         found. Axes: the line whose end is read, the line whose u it is, its ports. So the shapes
@@ -144,11 +167,13 @@ class Fit(NamedTuple):
     ohm: the segments, (..., L, n) [ohm].
     covariance: of these, widened where the readings do not fit, (..., L, n, n) [ohm^2].
     cost: the least one, (..., L).
+    by_lead: how the segments follow the lead, (..., L, n) [1].
     """
 
     ohm: Float
     covariance: Float
     cost: Float
+    by_lead: Float
 
 
 class _Layer:
@@ -158,10 +183,12 @@ class _Layer:
     across: the numbers of the lines that cross them.
     shorts: groups of its lines that are shorted, by number.
     loss_ohm, std_ohm, floating_ohm: u, s and w, (L, n) [ohm].
+    lead_ohm, lead_std_ohm: l and its deviation; until `fit_lines`, those expected [ohm].
 
     `fit_lines` sets the others:
 
     current_share: A, (L, n, n).
+    beyond_ohm: u - l, (L, n) [ohm].
     fit: segments of each line that scatter about the line's own mean. Where one bad segment
         explains a line, `report_wires` replaces them.
     lost: which lines have a far end at fault, (L,).
@@ -170,23 +197,33 @@ class _Layer:
     """
 
     def __init__(
-        self, axis: int, kept: list[list[int]], shorts: list[list[int]], loss_std_floating: Float
+        self,
+        axis: int,
+        kept: list[list[int]],
+        shorts: list[list[int]],
+        loss_std_floating: Float,
+        lead_ohm: tuple[float, float],
     ) -> None:
         self.axis, self.numbers, self.across = axis, kept[axis], kept[1 - axis]
         self.loss_ohm, self.std_ohm, self.floating_ohm = loss_std_floating
-        self.shorts = shorts
+        self.shorts, (self.lead_ohm, self.lead_std_ohm) = shorts, lead_ohm
+        # A shorted line has currents of others in its wire, so that u = l + A r does not hold.
+        self._alone = ~np.isin(self.numbers, [n for group in self.shorts for n in group])
 
-    def fit_lines(self, current_share: Float) -> None:
-        """Fit the segments of all lines, and find the lines whose far end is at fault."""
+    def fit_lines(self, current_share: Float, lead_ohm: tuple[float, float]) -> None:
+        """Fit the segments of all lines, and find the lines whose far end is at fault.
+
+        lead_ohm: l and its deviation.
+        """
         self.current_share = current_share
         # A^T / s^2, (L, n, n): times A and times u, it gives both sides of the normal equations.
         self._weighed = (current_share / self.std_ohm[..., None] ** 2).swapaxes(1, 2)
+        self.lead_ohm, self.lead_std_ohm = lead_ohm
+        self.beyond_ohm = self.loss_ohm - self.lead_ohm
         self.fit = self._fit_alike()
-        # A shorted line has currents of others in its wire, so that u = A r does not hold.
-        alone = ~np.isin(self.numbers, [n for group in self.shorts for n in group])
         least_cost = self.fit.cost
-        if len(alone) > 2:  # of two lines, nobody can say which is usual
-            one_bad = self._fit_one_bad(self._median_ohm(alone))
+        if len(self._alone) > 2:  # of two lines, nobody can say which is usual
+            one_bad = self._fit_one_bad(self._median_ohm(self._alone))
             least_cost = np.minimum(least_cost, one_bad.cost.min(axis=0))
         # A connected end has a cost below two limits: MANY_STDS^2 for each reading, and the cost of
         # a floating end. MANY_STDS^2 is added to the second: where wires lose little, both costs
@@ -194,12 +231,37 @@ class _Layer:
         most_of_any = MANY_STDS**2 * max(len(self.across) - 1, 1)
         most_cost = np.minimum(most_of_any, MANY_STDS**2 + self._floating_cost())
         too_much = np.abs(self.fit.ohm.sum(axis=1)) > MOST_LINE_OHM
-        self.lost = alone & ((least_cost > most_cost) | too_much)
-        self.measured = alone & ~self.lost
+        self.lost = self._alone & ((least_cost > most_cost) | too_much)
+        self.measured = self._alone & ~self.lost
         self.usual_ohm = self._median_ohm(self.measured)
 
+    def own_lead(self, current_share: Float) -> tuple[float, float]:
+        """The usual lead of the lines, by these currents A alone, and its deviation [ohm].
+
+        That of a line, and m, come from u = l + m A 1 + v, where v are the noise and what segments
+        have of their own: its covariance is s^2 + (SPREAD_SHARE m)^2 A A^T, for the m of before.
+        """
+        slopes = np.stack([np.ones_like(self.loss_ohm), current_share.sum(axis=2)], axis=2)
+        before_ohm = (self.loss_ohm - self.lead_ohm).mean(axis=1) / slopes[..., 1].mean(axis=1)
+        spread_ohm = SPREAD_SHARE * np.maximum(before_ohm, 1.0)[:, None, None] * current_share
+        covariance = spread_ohm @ spread_ohm.swapaxes(1, 2)
+        np.einsum("lkk->lk", covariance)[:] += self.std_ohm**2
+        columns = np.concatenate([slopes, self.loss_ohm[..., None]], axis=2)
+        products = columns.swapaxes(1, 2) @ np.linalg.solve(covariance, columns)
+        # Both unknowns of each line; a line of one crossing does not tell them apart.
+        by_lead, both, by_mean = products[:, 0, 0], products[:, 0, 1], products[:, 1, 1]
+        precision = by_lead - both**2 / by_mean
+        tells = self._alone & (precision > 1e-9 * by_lead)
+        if not tells.any():
+            return 0.0, np.inf
+        pull = products[:, 0, 2] - both / by_mean * products[:, 1, 2]
+        precision, lead_ohm = precision[tells], pull[tells] / precision[tells]
+        off_stds = np.abs(lead_ohm - np.median(lead_ohm)) * precision**0.5
+        weight = np.where(off_stds < FEW_STDS, precision, 0.0)
+        return float(np.average(lead_ohm, weights=weight)), float(weight.sum() ** -0.5)
+
     def _fit(self, mean_ohm: Float, prior: Float) -> Fit:
-        """The segments of least cost |(u - A r) / s|^2 + (r - mean)^T prior (r - mean).
+        """The segments of least cost |(u - l - A r) / s|^2 + (r - mean)^T prior (r - mean).
 
         mean_ohm: mean of the segments, (..., 1, 1) [ohm].
         prior: inverse of their covariance before the readings, (..., n, n) [1 / ohm^2].
@@ -211,18 +273,19 @@ class _Layer:
         """
         covariance = np.linalg.inv(self._weighed @ self.current_share + prior)
         expected = prior.sum(axis=-1, keepdims=True) * mean_ohm
-        ohm = covariance @ (self._weighed @ self.loss_ohm[..., None] + expected)
-        off = (self.loss_ohm - (self.current_share @ ohm)[..., 0]) / self.std_ohm
+        ohm = covariance @ (self._weighed @ self.beyond_ohm[..., None] + expected)
+        off = (self.beyond_ohm - (self.current_share @ ohm)[..., 0]) / self.std_ohm
         away = ohm - mean_ohm
         cost = np.sum(off**2, axis=-1) + np.sum(away * (prior @ away), axis=(-1, -2))
         misfit = np.maximum(cost / max(ohm.shape[-2] - 1, 1), 1.0)
-        return Fit(ohm[..., 0], covariance * misfit[..., None, None], cost)
+        by_lead = -(covariance @ self._weighed).sum(axis=-1)
+        return Fit(ohm[..., 0], covariance * misfit[..., None, None], cost, by_lead)
 
     def _fit_alike(self) -> Fit:
         """Segments that scatter about the mean of their line. The mean may be anything."""
         # What each segment has if all of a line are equal: one unknown a line, by least squares. It
         # is near m, and stands for it in SPREAD_SHARE m: so the cost stays quadratic in r.
-        both_sides = (self._weighed @ self.loss_ohm[..., None]).sum(axis=1)
+        both_sides = (self._weighed @ self.beyond_ohm[..., None]).sum(axis=1)
         precision = (self._weighed @ self.current_share).sum(axis=(1, 2))
         equal_ohm = (both_sides / precision[:, None])[..., None]
         per_square_ohm = (SPREAD_SHARE * np.maximum(np.abs(equal_ohm), 1.0)) ** -2.0
@@ -274,7 +337,7 @@ class _Layer:
             line = self.numbers.index(group[0])
             near_segments = float(self.current_share[line].sum(axis=1).mean())
             far_segments = near_segments + (len(group) - 1) * len(self.across)
-            loss_ohm = len(group) * self.loss_ohm[line].mean()
+            loss_ohm = len(group) * self.loss_ohm[line].mean() - self.lead_ohm
             if loss_ohm > self.usual_ohm * (near_segments + far_segments) / 2:
                 diagnosis.add(Kind.SHORT_FAR, Place.of_lines(self.axis, group))
 
@@ -287,7 +350,7 @@ class _Layer:
         # A broken yarn explains its far end. Such a line is not reported as swapped or open, too.
         for line in lines_of(self.lost):
             self.lost[line] = not self._report_broken(line, dead, diagnosis)
-        off = (self.loss_ohm - ends_ohm) / self.std_ohm
+        off = (self.beyond_ohm - ends_ohm) / self.std_ohm
         chi2 = np.mean(off**2, axis=2)  # axes: the line whose end may be read, the line
         np.fill_diagonal(chi2, np.inf)  # its own end has been judged
         swapped = self.lost & (chi2.min(axis=0) < MANY_STDS**2)
@@ -328,10 +391,26 @@ class _Layer:
                 if not self._report_segment(line, one_bad, diagnosis):
                     self._compare([line], self.usual_ohm, diagnosis)
         for line in measured:
-            ohm, covariance = self.fit.ohm[line], self.fit.covariance[line]
+            ohm, by_lead = self.fit.ohm[line], self.lead_std_ohm * self.fit.by_lead[line]
+            covariance = self.fit.covariance[line] + np.outer(by_lead, by_lead)
             whole = float(ohm.sum()), float(covariance.sum()) ** 0.5
             segments = ohm.tolist(), (covariance.diagonal() ** 0.5).tolist()
             diagnosis.lines.append(LineWire(self.place([line]), *whole, *segments))
+
+    def usual_segment(self) -> tuple[float, float] | None:
+        """Median segment of the measured lines [ohm], so that one bad line does not count, and the
+        deviation of its log. None if no line is measured.
+        """
+        if not self.measured.any():
+            return None
+        fit, lines = self.fit, self.measured
+        line_ohm = float(np.median(fit.ohm[lines].sum(axis=1)))
+        # The variance of a median is pi / 2 times that of a mean. The lead is off for all alike.
+        own_std_ohm = np.median(fit.covariance[lines].sum(axis=(1, 2)) ** 0.5)
+        own_std_ohm *= (np.pi / 2 / lines.sum()) ** 0.5
+        by_lead = self.lead_std_ohm * np.median(fit.by_lead[lines].sum(axis=1))
+        log_std = float(np.hypot(own_std_ohm, by_lead)) / max(line_ohm, 1e-9)
+        return line_ohm / len(self.across), log_std
 
     def _report_segment(self, line: int, one_bad: Fit, diagnosis: Diagnosis) -> bool:
         """Whether one bad segment explains a line. Then it is added, and its fit is the line's.
@@ -353,6 +432,7 @@ class _Layer:
             return False
         self.fit.ohm[line] = one_bad.ohm[k, line]
         self.fit.covariance[line] = one_bad.covariance[k, line]
+        self.fit.by_lead[line] = one_bad.by_lead[k, line]
         std_ohm = float(one_bad.covariance[k, line, k, k]) ** 0.5
         # Between which lines it is. Before the first one is the electrode, -1.
         between = self.across[k - 1] if k else -1, self.across[candidates[-1]]
@@ -390,54 +470,68 @@ def near_ends(rest: Rest) -> Rest:
     return replace(rest, board=board, codes=codes, offset_lsb=2 * ADC_ERROR_LSB)
 
 
-def segments_of(lines: Sequence[LineWire]) -> WireOhm | None:
-    """Segment of each layer [ohm]: the median of its lines, so that one bad line does not count.
+def _agreed(own: tuple[float, float], *others: tuple[float, float]) -> tuple[float, float]:
+    """Mean by precision of a lead and those others that do not contradict it, with deviations."""
+    ohm, std_ohm = own
+    for other_ohm, other_std_ohm in others:
+        if abs(ohm - other_ohm) < ALIKE_STDS * np.hypot(std_ohm, other_std_ohm):
+            precisions = std_ohm**-2.0, other_std_ohm**-2.0
+            if total := sum(precisions):  # 0: neither is known
+                ohm = (precisions[0] * ohm + precisions[1] * other_ohm) / total
+                std_ohm = total**-0.5
+    return max(ohm, 0.0), std_ohm
 
-    None if it is not known of both layers.
+
+def _wires_of(layers: Sequence[_Layer], lead_ohm: tuple[float, float]) -> WireOhm | None:
+    """Segment of each layer, and the leads [ohm]; None if a segment is not known of both layers.
+
+    lead_ohm: the leads and their deviation.
     """
-    segment_ohm, log_stds = [], []
-    for name in ("rows", "columns"):
-        layer = [line for line in lines if getattr(line.place, name)]
-        if not layer:
-            return None
-        ohm, std_ohm = np.median([(line.ohm, line.std_ohm) for line in layer], axis=0).tolist()
-        segment_ohm.append(ohm / len(layer[0].segment_ohm))
-        # The variance of a median is pi / 2 times that of a mean.
-        log_stds.append(std_ohm / max(ohm, 1e-9) * (np.pi / 2 / len(layer)) ** 0.5)
-    if max(log_stds) > KNOWN_STD:
+    segments = [each for layer in layers if (each := layer.usual_segment()) is not None]
+    if len(segments) < 2 or max(log_std for _, log_std in segments) > KNOWN_STD:
         return None
-    (top, bottom), (top_log_std, bottom_log_std) = segment_ohm, log_stds
-    return WireOhm(top, bottom, top_log_std=top_log_std, bottom_log_std=bottom_log_std)
+    (top, top_log_std), (bottom, bottom_log_std) = segments
+    lead, lead_std_ohm = lead_ohm if np.isfinite(lead_ohm[1]) else (None, None)
+    return WireOhm(top, bottom, lead, top_log_std, bottom_log_std, lead_std_ohm)
 
 
 def examine_far(
     rest: Rest,
     near: LinesAndCells,
-    nominal_ohm: tuple[float, float] | None,
     diagnosis: Diagnosis,
 ) -> None:
     """Add the wires of all lines, and what is wrong with far ends.
 
-    rest: readings of mode far.
+    rest: readings of mode far. Where no wires are told, lines are compared with each other alone.
     near: what the near ends show. Open lines are left out, and all but one of shorted lines.
-    nominal_ohm: a segment of each layer; None: lines are compared with each other alone.
     """
     kept = []
     for is_open, shorts in zip(near.open_lines, near.shorts, strict=True):
         left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
         kept.append([n for n in range(len(is_open)) if n not in left_out])
-    readings = FarReadings(rest, kept)
+    readings, expected_lead = FarReadings(rest, kept), rest.lead_ohm(USUAL_LEAD_STD_OHM)
     layers = [
-        _Layer(axis, kept, near.shorts[axis], loss_std_floating)
+        _Layer(axis, kept, near.shorts[axis], loss_std_floating, expected_lead)
         for axis, loss_std_floating in enumerate(readings.loss_std_floating)
     ]
     wire_ohm: Float = np.zeros((2, *readings.shape))
     for _ in range(ROUNDS):
-        for layer, current_share in zip(layers, readings.current_shares(wire_ohm), strict=True):
-            layer.fit_lines(current_share)
+        leads_ohm = sum(layer.lead_ohm for layer in layers)
+        shares = readings.current_shares(wire_ohm, leads_ohm)
+        own_leads = [each.own_lead(share) for each, share in zip(layers, shares, strict=True)]
+        for layer, current_share, own, of_other in zip(
+            layers, shares, own_leads, own_leads[::-1], strict=True
+        ):
+            layer.fit_lines(current_share, _agreed(own, of_other, expected_lead))
         wire_ohm = np.stack([layers[0].wire_ohm, layers[1].wire_ohm.T])
     ends_ohm = readings.ends(wire_ohm)
-    for layer, ends, nominal in zip(layers, ends_ohm, nominal_ohm or (None, None), strict=True):
+    for layer, ends, nominal in zip(layers, ends_ohm, rest.told.both or (None, None), strict=True):
         layer.report_shorts(diagnosis)
         layer.report_ends(ends, near.dead, diagnosis)
         layer.report_wires(nominal, diagnosis)
+    # What is only usual is not measured.
+    lead_ohm = _agreed(*own_leads, *(() if rest.told.lead is None else (expected_lead,)))
+    diagnosis.wires_by_far_ends = _wires_of(layers, lead_ohm)
+    if np.isfinite(lead_ohm[1]):
+        figures = (round(each) for each in lead_ohm)
+        diagnosis.measured |= dict(zip(("lead_ohm", "lead_std_ohm"), figures, strict=True))

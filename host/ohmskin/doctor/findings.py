@@ -12,6 +12,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from ohmskin.arrays import Bool
+from ohmskin.estimate.knowledge import WireOhm
 
 Cell = tuple[int, int]  # row, column
 
@@ -189,7 +190,7 @@ class LineWire:
     """The wire of a row or a column, from its near end to its far end.
 
     place: the line.
-    ohm: its resistance from end to end [ohm].
+    ohm: its resistance from end to end, without its lead [ohm].
     std_ohm: standard deviation of that [ohm].
     segment_ohm: each of its segments, the one at the near end first [ohm].
     segment_std_ohm: their standard deviations [ohm].
@@ -212,6 +213,7 @@ class Diagnosis:
     pressed: the share of all wires that presses show, then that of each row and column; None if
         nobody was asked to press.
     lines: wires of the lines, where far ends show them.
+    wires_by_far_ends: a segment of each layer and the leads, where far ends show both layers.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -219,6 +221,7 @@ class Diagnosis:
     nominal_ohm: tuple[float, float] | None = None
     pressed: list[WireShare] | None = None
     lines: list[LineWire] = field(default_factory=list)
+    wires_by_far_ends: WireOhm | None = None
 
     def add(self, kind: Kind, place: Place = WHOLE_SKIN, /, **values: Any) -> None:
         """Add a finding with these values."""

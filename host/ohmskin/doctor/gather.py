@@ -14,6 +14,7 @@ from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, NOISE_S, REST_S, SETTLED_S, Look, second_look
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.device import Device, configuration, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS
@@ -48,7 +49,7 @@ Report = Callable[[Step, Any], None]
 def gather(
     device: Device,
     report: Report = lambda step, detail: None,
-    wire_ohm: tuple[float, float] | None = None,
+    told: WireOhm = NO_WIRES,
     *,
     press: bool = False,
     seconds: float = REST_S,
@@ -57,7 +58,7 @@ def gather(
     """What `examine` goes by, as far as the board lets. Leaves the board as it was.
 
     report: is told each step before it is done, and each scan while somebody presses.
-    wire_ohm: nominal wires of a segment, top and bottom.
+    told: what is told of wires and leads.
     press: whether somebody is asked to press corners.
     seconds: how long the first look takes.
     clocks: whether to scan by each ADC clock, too. Only plates have this done.
@@ -67,7 +68,8 @@ def gather(
     board, path = device.info, device.name.partition("?")[0]
     evidence = Evidence(board)
     # Wires without resistance cannot have changed: there is nothing to compare with.
-    evidence.wire_ohm = wire_ohm if wire_ohm and all(wire_ohm) else None
+    is_nominal = told.both is not None and all(told.both)
+    evidence.told = told if is_nominal else told._replace(top=None, bottom=None)
     evidence.latency = None if "://" in path else latency_timer(path)
     presses = CornerScans(board) if press else None
     try:

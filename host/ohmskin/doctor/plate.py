@@ -9,7 +9,7 @@ symbol shape     meaning
 p      (R, C)    plate: conductances of its resistors, 0 where it has none [S]
 g      (R, C)    conductances that `joint` estimates from the mean readings [S]
 s      (R, C, 4) shown: what each reading shows of its current, the reading or what it lacks to Vdd
-                 [LSB]
+                 [LSB]; from the start, as it would be without the leads of both lines
 rho    (R, C)    port resistances of the plate [ohm]
 ====== ========= ===========================================================================
 
@@ -85,7 +85,7 @@ class PlateExam:
     """What a board reads of a plate. `examine` is for `ohmskin.doctor.examine.examine`.
 
     plate: p, (R, C) [S].
-    wire_ohm: wires of a segment of the plate, top and bottom.
+    wire_ohm: wires of a segment of the plate, top and bottom, and leads; none where not told.
     tolerance: what a sound board may have.
 
     `examine` sets the others. Until then they are not known: NaN, or empty.
@@ -94,7 +94,7 @@ class PlateExam:
     std_percent: its stated deviation, (R, C) [%].
     error_percent: its error, (R, C) [%], NaN where no resistor is.
     wrong: which cells have a finding, (R, C).
-    shown_lsb: s as read, (R, C, 4) [LSB].
+    shown_lsb: s as read, but for the leads, (R, C, 4) [LSB].
     predicted_lsb: s by the circuit, (R, C, 4) [LSB].
     lines: slope, offset and largest residual [LSB] of the straight line, by configuration.
     settling_lsb: largest change of a cell's readings with a longer settle time, (R, C) [LSB].
@@ -123,8 +123,11 @@ class PlateExam:
             self.settling_lsb = np.abs(usual.mean - settled.mean).max(axis=2)
             if examine_settling(usual, settled, diagnosis, self.tolerance.settling_lsb):
                 scans = settled
-        knowledge = SkinKnowledge.of(scans.board, nominal_wire_ohm=self.wire_ohm)
+        knowledge = SkinKnowledge.of(scans.board, nominal_wire_ohm=self.wire_ohm._replace(lead=0.0))
         shown = circuit.READING_SIGN * (scans.mean + 0.5 - FULL_LSB * circuit.READING_OFFSET)
+        # 1 / I less the leads, with I = s / 1024 R.
+        per_ohm = circuit.reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) * FULL_LSB
+        shown /= 1 - 2 * (self.wire_ohm.lead or 0.0) * shown / per_ohm
         self.shown_lsb = self._in_order(shown, knowledge, diagnosis)
         knowledge = self._with_references(knowledge, diagnosis)
         as_is = self._examine_cells(_estimate(self.shown_lsb, knowledge), diagnosis)

@@ -36,6 +36,8 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
+from ohmskin.estimate.prior import LEAD_STD, UNKNOWN_LEAD_OHM
 from ohmskin.link.clock import slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -171,6 +173,7 @@ class Rest:
     wire_ohm: nominal wires of a segment, top and bottom [ohm].
     moves: something touches the skin and moves, so that the means are those of no one skin.
     offset_lsb: the converter's, where only one polarity is read: a second one cancels it [LSB].
+    told: what is told of wires and leads.
     """
 
     board: Hello
@@ -180,6 +183,14 @@ class Rest:
     wire_ohm: tuple[float, float]
     moves: bool = False
     offset_lsb: float = 0.0
+    told: WireOhm = NO_WIRES
+
+    def lead_ohm(self, unknown_std_ohm: float) -> tuple[float, float]:
+        """The leads of all lines together, and their deviation, which is given if none is told."""
+        ohm, std_ohm = self.told.lead, self.told.lead_std_ohm
+        if ohm is None:
+            return UNKNOWN_LEAD_OHM, unknown_std_ohm
+        return ohm, max(std_ohm or LEAD_STD * ohm, 1.0)  # 1 ohm: a precision is made of it
 
     @property
     def ratio(self) -> Float:

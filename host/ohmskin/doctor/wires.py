@@ -4,7 +4,7 @@
 Why three corners. Call them (a, b), (a, b') and (a', b), of which (a, b) is between the other two.
 The fourth one, (a', b'), is not pressed, so its port's current takes the way through all three,
 in series. So four ports show four sums of three unknown cells and of wires. If the untouched cells
-conducted nothing, this would be left:
+conducted nothing, and lines had no leads, this would be left:
 
     rho[a,b] + rho[a,b'] + rho[a',b] - rho[a',b'] = 2 (top + bottom)
 
@@ -18,13 +18,14 @@ Symbols. Index 0 is the untouched skin, index 1 the pressed one.
 symbol shape        meaning
 ====== ============ =====================================================================
 y      ()           log of the wires over nominal: what is sought
-z      (RC,)        port resistances as read, less those of the model [ohm]
+z      (RC,)        port resistances as read, less leads and those of the model [ohm]
 n      (RC,)        standard deviations of the port resistances as read [ohm]
 c      (RC,)        log resistances of the untouched cells
 p      (RC,)        what a press adds to these; 0 but for the free cells, which may be pressed
 B      (RC, RC)     slopes of the model's port resistances by the cells' log resistances [ohm]
 W      (RC, 2RC)    slopes of these by the segments' log resistances [ohm]
 V      (RC,)        variance of p: wide for the free cells, narrow for all others
+l      ()           deviation of the leads of a port, which all ports have alike [ohm]
 ====== ============ =====================================================================
 
 The untouched cells are those that explain the untouched skin, whatever the wires are:
@@ -32,10 +33,11 @@ dc = B0^-1 (z0 - W0 dy). The readings of the pressed skin then are
 
     r = z1 - B1 B0^-1 z0 = W dy + B1 dp + noise ,   W = W1 - B1 B0^-1 W0
 
-    S = n1^2 + B1 B0^-1 n0^2 B0^-T B1^T + SEGMENT_STD^2 W W^T + B1 V B1^T
+    S = n1^2 + B1 B0^-1 n0^2 B0^-T B1^T + SEGMENT_STD^2 W W^T + B1 V B1^T + l^2 d d^T
 
-S is the covariance of all that is not y: noise of both skins, what segments have of their own, and
-presses. With w the sum of W over all segments, a Gauss-Newton step is
+S is the covariance of all that is not y: noise of both skins, what segments have of their own,
+presses, and leads, which move r by d = 1 - B1 B0^-1 1. With w the sum of W over all segments, a
+Gauss-Newton step is
 
     dy = w^T S^-1 r / (w^T S^-1 w) ,
 
@@ -55,7 +57,13 @@ from numpy.typing import ArrayLike
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit, current_std
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
-from ohmskin.doctor.limits import CHANGED_SHARE, FEW_STDS, KNOWN_STD, PRESSED_LSB
+from ohmskin.doctor.limits import (
+    CHANGED_SHARE,
+    FEW_STDS,
+    KNOWN_STD,
+    PRESSED_LSB,
+    USUAL_LEAD_STD_OHM,
+)
 from ohmskin.doctor.signal import NOISE_S, Look, Rest, rounding_std_lsb, settling_values
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
@@ -88,12 +96,15 @@ HELD_SHARE: Final = 0.5
 CLOSE_STEP: Final = 1e-4
 
 
-def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Float, Float, Float]:
-    """Port resistances [ohm], their deviations [ohm], log resistances of the cells; (RC,) each.
+def _ports(
+    ratio: Float, std_lsb: Float | float, matrix: Estimator, lead_ohm: float
+) -> tuple[Float, Float, Float]:
+    """Port resistances less leads, their deviations [ohm], log resistances of cells; (RC,) each.
 
     ratio: mean readings, (R, C, 4).
     std_lsb: deviation of a port's reading, one for all or (R, C).
     matrix: the method by that name, which knows the references.
+    lead_ohm: lead of each line.
 
     The currents are those that estimators use: the converter's offset and what floating lines draw
     are taken out of them.
@@ -103,7 +114,8 @@ def _ports(ratio: Float, std_lsb: Float | float, matrix: Estimator) -> tuple[Flo
     loop_ohm = (1 / np.maximum(PortReader(skin).read(ratio).current, 1e-9)).ravel()
     std_siemens = current_std(2.0**-ADC_BITS, skin.ref_top_ohm, skin.ref_bottom_ohm)
     log_ohm = -np.log(matrix.estimate(ratio).cell_siemens.ravel())
-    return loop_ohm - skin.ref_ohm, std_siemens * np.ravel(std_lsb) * loop_ohm**2, log_ohm
+    port_ohm = loop_ohm - skin.ref_ohm - 2 * lead_ohm
+    return port_ohm, std_siemens * np.ravel(std_lsb) * loop_ohm**2, log_ohm
 
 
 def suggested_corners(rows: int, columns: int) -> Corners:
@@ -228,7 +240,8 @@ class CornerScans:
 
     def measure(self, rest: Rest) -> list[WireShare]:
         """The share of all wires, then that of each row and column; empty if none was pressed."""
-        at_rest = _ports(rest.ratio, rest.std_lsb, self._matrix)
+        lead_ohm, lead_std_ohm = rest.lead_ohm(USUAL_LEAD_STD_OHM)
+        at_rest = _ports(rest.ratio, rest.std_lsb, self._matrix, lead_ohm)
         most = max(map(len, self._codes.values()), default=0)
         measured = []
         for corners, codes in self._codes.items():
@@ -240,8 +253,10 @@ class CornerScans:
             variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1)
             std_lsb = np.sqrt(variance + rest.noise_lsb**2 / len(codes))
             ratio = ratio_from_codes(np.mean(codes, axis=0), self._board.adc_bits)
-            pressed, free = _ports(ratio, std_lsb, self._matrix), self._free(corners)
-            measured.append((corners[0], *_pressed_fit(at_rest, pressed, free, rest.wire_ohm)))
+            pressed = _ports(ratio, std_lsb, self._matrix, lead_ohm)
+            free = self._free(corners)
+            found = _pressed_fit(at_rest, pressed, free, rest.wire_ohm, lead_std_ohm)
+            measured.append((corners[0], *found))
         return shares_of(measured)
 
     def _free(self, corners: Corners) -> Bool:
@@ -286,13 +301,18 @@ def shares_of(measured: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
 
 
 def _pressed_fit(
-    rest: tuple[Float, ...], pressed: tuple[Float, ...], free: Bool, wire_ohm: tuple[float, float]
+    rest: tuple[Float, ...],
+    pressed: tuple[Float, ...],
+    free: Bool,
+    wire_ohm: tuple[float, float],
+    lead_std_ohm: float,
 ) -> tuple[float, float]:
     """y and its deviation: how the wires differ from nominal ones, by pressed corners.
 
     rest, pressed: what `_ports` gives of the untouched and of the pressed skin.
     free: which cells may be pressed, (R, C).
     wire_ohm: nominal wires of a segment, top and bottom.
+    lead_std_ohm: deviation of a line's lead, which all lines have alike.
     """
     shape, free = free.shape, free.ravel()
     (rest_ohm, rest_std, untouched), (port_ohm, port_std, touched) = rest, pressed
@@ -316,6 +336,8 @@ def _pressed_fit(
         spread = by_cell * variance  # B1 V
         covariance = spread @ by_cell.T + SEGMENT_STD**2 * by_segment @ by_segment.T
         covariance += (through * rest_std**2) @ through.T + np.diag(port_std**2)
+        by_lead = 2 * lead_std_ohm * (1 - through.sum(axis=1))  # l d
+        covariance += np.outer(by_lead, by_lead)
         weighed = np.linalg.solve(covariance, np.column_stack([slopes, residual]))
         precision = float(slopes @ weighed[:, 0]) + UNLIMITED_STD**-2
         pull = float(slopes @ weighed[:, 1]) - log_share * UNLIMITED_STD**-2

@@ -153,7 +153,7 @@ class SkinFaults:
     swap_far_columns: Annotated[Lines, "the same of columns"] = None
     broken_row: Annotated[Cell, "row and column of the cell before which the row is broken"] = None
     broken_column: Annotated[Cell, "row and column of the cell before which the column is"] = None
-    crimp_row: Annotated[Line, "number of a row whose near contact adds crimp_ohm"] = None
+    crimp_row: Annotated[Line, "number of a row whose lead has crimp_ohm more"] = None
     crimp_column: Annotated[Line, "the same of a column"] = None
     crimp_ohm: Annotated[Positive, "ohms that a bad contact adds, 500 unless told"] = 500.0
     dead: Annotated[Cell, "row and column, as 1,2, of a cell that never conducts"] = None
@@ -189,12 +189,13 @@ class SkinFaults:
             top_ohm[self.broken_row] = OPEN_OHM
         if self.broken_column is not None:
             bottom_ohm[self.broken_column] = OPEN_OHM
-        for what, near_ohm in (("row", top_ohm[:, 0]), ("column", bottom_ohm[0])):
+        rows, lead_ohm = len(cell), skin.lead_ohm.copy()
+        for what, near_ohm in (("row", lead_ohm[:rows]), ("column", lead_ohm[rows:])):
             if (line := getattr(self, f"crimp_{what}")) is not None:
                 near_ohm[line] += self.crimp_ohm
             if (line := getattr(self, f"open_{what}")) is not None:
                 near_ohm[line] = OPEN_OHM
-        return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom)
+        return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom, lead_ohm)
 
     def readings(self, damaged: Skin, mode: str = "near") -> Float:
         """Exact readings (R, C, 4) of a skin that `damaged` has made, with the faults of its ends.
@@ -260,8 +261,9 @@ def _settled(voltage: Float, kept: float) -> Float:
 def joined_readings(skin: Skin, joints: Iterable[Pair], ends: NDArray[np.intp]) -> Float:
     """Readings a to h, (R, C, 8), with pairs of ends joined by 0.1 ohm each.
 
-    Ends are numbered as in `circuit.skin.end_admittance`; ends: where the multiplexers find each. A
-    joint adds its conductance to Y. Cells without contact are taken for `OPEN_OHM`.
+    Ends are numbered as in `circuit.skin.end_admittance`; ends: where the multiplexers find each.
+    Near ends are joined in front of their leads. A joint adds its conductance to Y. Cells without
+    contact are taken for `OPEN_OHM`.
     """
     skin = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, 1 / OPEN_OHM))
     admittance = end_admittance(skin)

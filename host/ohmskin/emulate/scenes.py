@@ -29,6 +29,9 @@ TOP_WIRE_OHM: Final = 100.0
 # Median of the wire segments of columns [ohm]. Chosen: other than that of rows, so that layers that
 # are confused show.
 BOTTOM_WIRE_OHM: Final = 200.0
+# The lead of each line, unless told [ohm]. Chosen: a multiplexer's switch has 70 typically (data
+# sheet of the CD74HC4067, at 4.5 V), and a connector some.
+LEAD_OHM: Final = 80.0
 # Cells and segments scatter about their medians by this share: it is the standard deviation of
 # their logarithm. Chosen: no two are alike, and a cell at rest is far from a touched one.
 _SPREAD_SHARE: Final = 0.1
@@ -141,7 +144,8 @@ class Scene:
         def spread(middle: float) -> Float:
             return middle * np.exp(_SPREAD_SHARE * random.standard_normal((rows, columns)))
 
-        self.rest = Skin(1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM))
+        layers = 1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM)
+        self.rest = Skin(*layers, lead_ohm=np.array(LEAD_OHM))
         self._touches = self._place(random)
         # Of other generators, so that a scene has the same skin and touches whatever else is drawn.
         log_gain = _GAIN_SPREAD * np.random.default_rng([seed, 1]).standard_normal((rows, columns))

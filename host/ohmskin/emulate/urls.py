@@ -7,6 +7,7 @@ here, and those of faults, which `faults` defines.
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,7 @@ from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
-from ohmskin.emulate.scenes import Scene
+from ohmskin.emulate.scenes import LEAD_OHM, Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
 from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
@@ -26,7 +27,7 @@ from ohmskin.link.url import PortUrl
 # Noise of an emulated converter, unless told [LSB]. Chosen: a sound board's converter has as much.
 DEFAULT_NOISE_LSB: Final = 0.3
 # The options of both kinds of boards that say what the skin is and what touches it.
-_OF_SCENE: Final = ("scene", "begin", "plate")
+_OF_SCENE: Final = ("scene", "begin", "plate", "lead")
 # The options of an emulated board that are no faults.
 _OF_BOARD: Final = (*_OF_SCENE, "seed", "rate", "noise", "unit", "mode", "foreign", "speed")
 
@@ -128,4 +129,5 @@ def _scene(url: PortUrl, size: str, faults: SkinFaults | None = None) -> Scene:
             raise ValueError(f"the plate has {cells} cells, the skin {rows}x{columns}")
         no_wires = np.zeros_like(plate)
         scene.rest = Skin(plate, no_wires, no_wires)
+    scene.rest = replace(scene.rest, lead_ohm=np.array(url.number("lead", LEAD_OHM)))
     return scene
