@@ -4,6 +4,7 @@
 import csv
 import os
 import shutil
+import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -35,6 +36,13 @@ def read_bounded(path: PathName, most_bytes: int) -> bytes:
     if len(octets) > most_bytes:
         raise ValueError(f"more than {most_bytes} bytes")
     return octets
+
+
+def require_file(path: PathName) -> None:
+    """Raise OSError if a device or a pipe is there: readers that seek never come to its end."""
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # of a folder the system says what it is
+        raise OSError("it is no file")
 
 
 def check_place(path: Path, *inputs: Path | None) -> None:

@@ -44,6 +44,26 @@ def python(*arguments: str | Path, **variables: str) -> Done:
     return Done(done.returncode, done.stdout, done.stderr)
 
 
+# Not `ru_maxrss`: that of a new process begins with what the one that starts it has.
+_BOUNDED = """
+import atexit, pathlib, re, resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, 4_000_000_000))
+status = pathlib.Path("/proc/self/status")
+atexit.register(lambda: print(re.search(r"VmHWM:\\s+(\\d+)", status.read_text())[1]))
+from ohmskin.cli.main import main
+main()
+"""
+# What a run takes that reads next to nothing [MB]: 75 measured, and some for other versions.
+EMPTY_MB = 90.0
+
+
+def bounded(*arguments: str | Path) -> tuple[Done, float]:
+    """What ``ohmskin ARGUMENTS`` does within 4 GB of addresses, and the most memory it had [MB]."""
+    done = python("-c", _BOUNDED, *arguments, OPENBLAS_NUM_THREADS="1")
+    *lines, peak_kb = done.out.splitlines(keepends=True)
+    return done._replace(out="".join(lines)), int(peak_kb) / 1000
+
+
 def well(done: Done) -> Done:
     """What has ended well, and complained of nothing."""
     assert (done.code, done.err) == (0, ""), done

@@ -2,6 +2,8 @@
 """The readings file: what is read, what is refused and how it is said, what is written."""
 
 import io
+import os
+import struct
 import zipfile
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from command_line import EMPTY_MB, assert_one_line, bounded
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import METHODS
 from ohmskin.record import readings as readings_module
@@ -134,7 +137,7 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD[..., :3]}, "ratio has shape"),
         ({"ratio": GOOD[:0]}, "ratio has 0 frames"),
         ({"ratio": GOOD[:, :0]}, "0x4 cells"),
-        ({"ratio": np.zeros((1, 65, 64, 4))}, "65x64 cells: .* 4096"),
+        ({"ratio": np.zeros((1, 65, 64, 4))}, "65x64 cells, not .* of 1 to 1024 cells"),
         (
             {"ratio": bad_ratio((1, 2, 0, 2), np.nan)},
             r"ratio, frame 1, of cell \(2, 0\), reading C",
@@ -142,12 +145,18 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": bad_ratio((0, 0, 3, 0), 1.5)}, r"ratio, frame 0, of cell \(0, 3\), reading A"),
         ({"ratio": np.array(["a"])}, "ratio cannot be read: it holds <U1"),
         ({"ratio": GOOD + 0j}, "ratio cannot be read: it holds complex128"),
-        ({"ratio": np.array([None])}, "ratio cannot be read: .*allow_pickle=False"),
+        ({"ratio": np.array([None])}, "ratio cannot be read: it holds object"),
         ({"ratio": GOOD, "rest_ratio": GOOD[0, :2]}, "rest_ratio has shape"),
         ({"ratio": GOOD, "rest_ratio": GOOD[:1]}, "rest_ratio has 1 frames, ratio 2"),
         ({"ratio": GOOD, "rest_ratio": GOOD[0] * 3}, r"rest_ratio of cell \(0, 0\)"),
         ({"ratio": GOOD, "rest_ratio": bad_ratio((1, 0, 0, 0), 2)}, r"rest_ratio of cell \(0, 0\)"),
-        ({"ratio": GOOD, "ref_top_ohm": np.ones(2)}, "ref_top_ohm has shape"),
+        (
+            {"ratio": GOOD, "ref_top_ohm": np.ones(2)},
+            "ref_top_ohm .*, not one number",
+        ),
+        ({"ratio": GOOD, "reading_names": list("abcdefgha")}, "9 names of 4 bytes, not some"),
+        ({"ratio": GOOD[..., :0], "reading_names": np.array([], "U1")}, "reading_names are ,"),
+        ({"ratio": np.zeros((200_001, 1, 1, 4))}, "200001 frames of 1x1 cells, not 1 to 200000"),
         ({"ratio": GOOD, "ref_bottom_ohm": 0.0}, "ref_bottom_ohm must be positive"),
         ({"ratio": GOOD, "adc_bits": 10.5}, "adc bits must be"),
         ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),
@@ -207,12 +216,91 @@ def test_an_array_over_the_limit_is_not_unpacked(
     assert path.stat().st_size < 10_000
     with pytest.raises(ValueError, match=r"ratio cannot be read: 819\d\d\d bytes, more than"):
         load_readings(path)
-    # Numbers of one byte take eight when they are computed with.
-    np.savez_compressed(path, ratio=np.zeros((100, 16, 16, 4), np.uint8))
-    with pytest.raises(
-        ValueError, match="ratio cannot be read: 819200 bytes as float64, more than"
-    ):
+    # All arrays together count.
+    half = np.zeros((200, 8, 8, 4))
+    np.savez_compressed(path, ratio=half, rest_ratio=half)
+    with pytest.raises(ValueError, match=r"rest_ratio cannot be read: 409600 bytes, more than"):
         load_readings(path)
+    # Estimates of numbers of a byte take as much memory as those of four.
+    np.savez_compressed(path, ratio=np.zeros((200, 16, 16, 4), np.uint8))
+    with pytest.raises(ValueError, match="ratio cannot be read: 819200 bytes, more than 800000"):
+        load_readings(path)
+
+
+def npy(descr: str, shape: tuple[int, ...], data: bytes = b"") -> bytes:
+    """An array whose header says so, whatever it holds."""
+    file = io.BytesIO()
+    header = {"descr": descr, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + data
+
+
+RATIO = npy("<f8", (1, 1, 1, 4), bytes(32))
+# What a file of some kilobytes could ask for, and what is said of it.
+BOMBS: dict[str, tuple[str, bytes, int, str]] = {
+    "names without letters": ("reading_names", npy("<U0", (10**9,)), 0, "1000000000 names"),
+    "names": ("reading_names", npy("<U1", (49_000_000,)), 196_000_000, "49000000 names"),
+    "a name": ("reading_names", npy("<U49000000", (1,)), 196_000_000, "1 names of 196000000"),
+    "numbers": ("ref_top_ohm", npy("<f2", (24_000_000,)), 48_000_000, "not one number"),
+    "a header": ("adc_bits", b"\x93NUMPY\2\0\0\0\0\x70", 100_000_000, "another version"),
+    "frames": ("ratio", npy("<f2", (6_000_000, 1, 1, 4)), 48_000_000, "6000000 frames"),
+    "cells": ("ratio", npy("<f8", (1, 64, 64, 4)), 8 * 4 * 4096, "64x64 cells"),
+}
+
+
+@pytest.mark.parametrize("what", BOMBS)
+def test_a_small_file_takes_little_memory(tmp_path: Path, what: str) -> None:
+    """Text took 1.6 GB of 610 bytes, as it passed before the limits."""
+    name, begins, more, said = BOMBS[what]
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        if name != "ratio":
+            archive.writestr("ratio.npy", RATIO)
+        archive.writestr(f"{name}.npy", begins + bytes(more))
+    command = "estimate", path, "--method", "matrix", "--out", tmp_path / "out.npz"
+    done, peak_mb = bounded(*command)
+    assert_one_line(done, said)
+    assert peak_mb < EMPTY_MB + 250
+
+
+def test_a_directory_of_any_stated_size_is_not_read(tmp_path: Path) -> None:
+    """A file of holes has room for it."""
+    path, size = tmp_path / "sparse.npz", 1_400_000_000
+    with path.open("wb") as file:
+        file.seek(size)
+        file.write(struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 9, 9, size, 0, 0))
+    done, peak_mb = bounded("estimate", path, "--method", "ohm", "--out", tmp_path / "out.npz")
+    assert_one_line(done, "Bad magic number for central directory")
+    assert peak_mb < EMPTY_MB + 250
+
+
+def test_what_has_no_end_is_not_read(tmp_path: Path) -> None:
+    for path in (Path("/dev/zero"), tmp_path / "pipe"):
+        if not path.exists():
+            os.mkfifo(path)
+        with pytest.raises(ValueError, match="the archive cannot be read: it is no file"):
+            load_readings(path)
+
+
+def test_methods_without_a_bound_are_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "packed.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("ratio.npy", RATIO)
+    with pytest.raises(ValueError, match="packed by a method that numpy does not write"):
+        load_readings(path)
+
+
+def test_single_precision_is_estimated_in_double(tmp_path: Path) -> None:
+    """A file of it takes half of the memory, and says the same."""
+    exact = load_readings(DATA / "random_4x6.npz")
+    single = exact.ratio.astype(np.float32)
+    arrays = {"rest_ratio": exact.rest_ratio, "nominal_top_wire_ohm": np.float32(100.1)}
+    read = load_readings(write(tmp_path / "single.npz", ratio=single, **arrays))
+    assert read.ratio.dtype == np.float32
+    assert type(read.knowledge(0).nominal_wire_ohm.top) is np.float64
+    double = load_readings(write(tmp_path / "d.npz", ratio=single.astype(float), **arrays))
+    one, other = (estimate_file(each, "joint")["cell_siemens"] for each in (read, double))
+    np.testing.assert_array_equal(one, other)
 
 
 def test_frames_that_are_right_are_not_checked_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,16 +316,12 @@ def test_frames_that_are_right_are_not_checked_one_by_one(monkeypatch: pytest.Mo
 
 
 def test_a_header_that_promises_more_than_the_file_holds_is_refused(tmp_path: Path) -> None:
-    header = io.BytesIO()
-    shape = (10**9, 1, 1, 4)
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": shape}
-    )
     path = tmp_path / "promise.npz"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("ratio.npy", header.getvalue())
-    with pytest.raises(ValueError, match=r"ratio cannot be read: "):
-        load_readings(path)
+    for frames, said in ((10**9, "bytes, more than"), (100, "EOF")):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("ratio.npy", npy("<f8", (frames, 1, 1, 4)))
+        with pytest.raises(ValueError, match=f"ratio cannot be read: .*{said}"):
+            load_readings(path)
 
 
 def test_saved_arrays_come_back_and_nothing_else_is_left(tmp_path: Path) -> None:

@@ -36,6 +36,8 @@ iterations, seconds                           F       how long it took
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from io import FileIO
+from math import prod
 from typing import Any, Final
 
 import numpy as np
@@ -43,21 +45,34 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR
-from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.files import PathName, naming, whole_file
+from ohmskin.files import PathName, naming, require_file, whole_file
 from ohmskin.link.protocol import ENUMS
 
-# Largest array that is read or written. Chosen: it fits into the memory of any machine several
-# times, and is 18 minutes of a 16x16 skin.
+# All arrays that are read of a file, together, or the readings that are written. Chosen: it fits
+# into the memory of any machine several times, and is 36 minutes of an 8x8 skin at 90 Hz.
 MAX_ARRAY_BYTES: Final = 200_000_000
-# Cells of the largest skin. The estimators' matrices grow with the square: 4096 cells make 134 MB.
-MAX_CELLS: Final = 4096
+# A number of a file counts as so many bytes at least. Chosen: of shorter ones, the estimates of a
+# file would take more than ten times its readings.
+_LEAST_ITEM_BYTES: Final = 4
+# Frames of a file. Chosen: 37 minutes at 90 Hz; what every frame costs, besides its readings, then
+# takes seconds and 100 MB.
+MAX_FRAMES: Final = 200_000
+# Cells of the largest skin: 32x32. Chosen: four times those of the largest board. The estimators'
+# matrices grow with the square of it, and their time with the cube.
+MAX_CELLS: Final = 1024
+# The archive is read in pieces of so many bytes at most, and its directory is one piece. Chosen: a
+# directory of ten thousand arrays has a tenth.
+_PIECE_BYTES: Final = 4_000_000
+# A name of a reading has four bytes. Chosen: whoever writes a wrong one shall read it in the error.
+_MOST_NAME_BYTES: Final = 80
 _NAMES: Final = tuple(ENUMS["reading"].values)
 # What may be given for each frame, and how many dimensions it has where it is given once.
 _WIRES: Final = WIRE_FIELDS[:3]
 _ONCE_NDIM: Final = {"rest_ratio": 3} | dict.fromkeys(_WIRES, 0)
+_SCALARS: Final = {"ref_top_ohm", "ref_bottom_ohm", "adc_bits"}
+_RATIOS: Final = ("ratio", "rest_ratio")
 # The arrays that go out, in this order.
 _OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
 _OF_WIRES: Final = ("top_wire_ohm", "bottom_wire_ohm", "top_wire_ohm_std", "bottom_wire_ohm_std")
@@ -80,18 +95,19 @@ class Readings:
 
     def __post_init__(self) -> None:
         names, count = self.reading_names, len(self.reading_names)
-        if len({*names} & {*_NAMES}) != count:
+        if not count or len({*names} & {*_NAMES}) != count:
             raise ValueError(f"reading_names are {' '.join(names):.80}, not some of {_NAMES}")
         if self.ratio.ndim != 4 or self.ratio.shape[-1] != count:
             raise ValueError(f"ratio has shape {self.ratio.shape}, not (F, rows, columns, {count})")
         frames, rows, columns, _ = self.ratio.shape
-        if frames < 1 or not 1 <= rows * columns <= MAX_CELLS:
+        if not (1 <= frames <= MAX_FRAMES and 1 <= rows * columns <= MAX_CELLS):
             given = f"{frames} frames of {rows}x{columns} cells"
-            raise ValueError(f"ratio has {given}: at least 1 frame and 1 to {MAX_CELLS} cells")
-        # All at once, because a check of each frame takes a minute for a file of a million.
-        good = ((self.ratio >= 0) & (self.ratio <= 1)).all(axis=(1, 2, 3))
-        for frame in np.flatnonzero(~good).tolist():
-            check_ratio(self.ratio[frame], rows, columns, name=f"ratio, frame {frame},", of=names)
+            can_be = f"1 to {MAX_FRAMES} frames of 1 to {MAX_CELLS} cells"
+            raise ValueError(f"ratio has {given}, not {can_be}: cut it into parts")
+        if not _in_range(self.ratio):  # asked of all at once, which takes no memory
+            for frame, ratio in enumerate(self.ratio):
+                if not _in_range(ratio):
+                    check_ratio(ratio, rows, columns, name=f"ratio, frame {frame},", of=names)
         rest = self.rest_ratio
         if rest is not None and rest.ndim == 4 and len(rest) != frames:
             raise ValueError(f"rest_ratio has {len(rest)} frames, ratio {frames}")
@@ -99,7 +115,9 @@ class Readings:
             wire_ohm = getattr(self, name)
             if wire_ohm is not None and wire_ohm.shape not in ((), (frames,)):
                 raise ValueError(f"{name} has shape {wire_ohm.shape}, not () or ({frames},)")
-        for frame in range(frames if self.one_skin_per_frame else 1):
+        wires_ohm, most_ohm = (getattr(self, name) for name in _WIRES), np.finfo(float).max
+        each_is_good = _in_range(rest) and all(_in_range(each, most_ohm) for each in wires_ohm)
+        for frame in range(1 if each_is_good else frames):
             self.knowledge(frame)  # checks itself
 
     @property
@@ -130,7 +148,7 @@ class Readings:
 
 
 def load_readings(path: PathName) -> Readings:
-    """Read a readings file. Nothing in it is executed; no array may exceed 2e8 bytes.
+    """Read a readings file. Nothing in it is executed; the module's constants bound its arrays.
 
     Raises ValueError, one line that names the file and the array, for whatever is wrong with it.
     """
@@ -138,44 +156,64 @@ def load_readings(path: PathName) -> Readings:
     name = "the archive"
     with naming(path):
         try:
-            with zipfile.ZipFile(path) as archive:
+            require_file(path)
+            with _Pieces(path) as file, zipfile.ZipFile(file) as archive:
                 present = {info.filename: info for info in archive.infolist()}
+                left_bytes = MAX_ARRAY_BYTES
                 for name in Readings.__dataclass_fields__:
                     info = present.get(f"{name}.npy")
                     if info is not None:
-                        arrays[name] = _read_array(archive, info)
+                        arrays[name] = _read_array(archive, info, left_bytes)
+                        left_bytes -= arrays[name].nbytes
         except Exception as error:  # damage may raise nearly anything in zipfile, zlib and numpy
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise ValueError(f"{name} cannot be read: {reason}") from error
         if "ratio" not in arrays:
             raise ValueError("no array 'ratio'")
-        for name in ("ref_top_ohm", "ref_bottom_ohm", "adc_bits"):
-            if name in arrays:
-                if arrays[name].size != 1:
-                    raise ValueError(f"{name} has shape {arrays[name].shape}, not one number")
-                arrays[name] = arrays[name].item()
+        for name in _SCALARS & arrays.keys():
+            arrays[name] = arrays[name].item()
         if "reading_names" in arrays:
             arrays["reading_names"] = tuple(arrays["reading_names"].ravel().tolist())
         return Readings(**arrays)
 
 
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """An array of the archive, as float64 or as text.
+class _Pieces(FileIO):
+    """A file that gives a piece at most. zipfile asks for a whole directory, of any stated size."""
 
-    zipfile never yields more than the size that the archive states, so the first check bounds what
-    is unpacked.
+    def read(self, size: int | None = -1, /) -> bytes:
+        is_piece = size is not None and 0 <= size <= _PIECE_BYTES
+        return super().read(size if is_piece else _PIECE_BYTES) or b""
+
+
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, most_bytes: int) -> NDArray[Any]:
+    """An array of the archive: of text, of the real numbers that the file has, or of float64.
+
+    What its header states is judged before anything else is read: then numpy reads no more.
     """
-    if info.file_size > MAX_ARRAY_BYTES:
-        raise ValueError(f"{info.file_size} bytes, more than {MAX_ARRAY_BYTES}")
+    name = info.filename.removesuffix(".npy")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("it is packed by a method that numpy does not write")  # and has no bound
+    with archive.open(info) as member:
+        if np.lib.format.read_magic(member) != (1, 0):  # others may have headers of gigabytes
+            raise ValueError("its header is of another version than 1.0")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+    count, is_text = prod(shape), name == "reading_names"
+    if dtype.kind not in ("U" if is_text else "fiu"):
+        raise ValueError(f"it holds {dtype}, not {'text' if is_text else 'real numbers'}")
+    if min(shape, default=0) < 0 or (name in _SCALARS and count != 1):
+        raise ValueError(f"its shape is {shape}" + ", not one number" * (name in _SCALARS))
+    if is_text and (count > len(_NAMES) or dtype.itemsize > _MOST_NAME_BYTES):
+        raise ValueError(f"{count} names of {dtype.itemsize} bytes, not some of {_NAMES}")
+    if (size := count * max(dtype.itemsize, _LEAST_ITEM_BYTES)) > most_bytes:
+        raise ValueError(f"{size} bytes, more than {MAX_ARRAY_BYTES} with those before it")
     with archive.open(info) as member:
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
-    if info.filename == "reading_names.npy" and array.dtype.kind == "U":
-        return array
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"it holds {array.dtype}, not real numbers")
-    if 8 * array.size > MAX_ARRAY_BYTES:
-        raise ValueError(f"{8 * array.size} bytes as float64, more than {MAX_ARRAY_BYTES}")
-    return array.astype(np.float64, copy=False)
+    # Readings stay as they are until a frame is estimated: float32 takes half of the memory.
+    return array if is_text or name in _RATIOS else array.astype(np.float64)
+
+
+def _in_range(values: Float | None, most: float = 1.0) -> bool:
+    return values is None or bool(values.min() >= 0 and values.max() <= most)  # NaN is neither
 
 
 def estimate_file(
@@ -192,15 +230,21 @@ def estimate_file(
     Raises ValueError for an unknown method.
     """
     estimator = make_estimator(method, readings.knowledge(0))
-    estimates: list[Estimate] = []
+    out: dict[str, NDArray[Any]] = {}
     for frame, ratio in enumerate(watch(readings.ratio)):
         if frame and readings.one_skin_per_frame:
             estimator = make_estimator(method, readings.knowledge(frame))
         elif cold:
             estimator.reset()
-        estimates.append(estimator.estimate(ratio))
-    names = (*_OF_CELLS, *_OF_WIRES, *_OF_FRAMES)
-    return {name: np.array([getattr(one, name) for one in estimates]) for name in names}
+        estimate = estimator.estimate(ratio)
+        for name in (*_OF_CELLS, *_OF_WIRES, *_OF_FRAMES):
+            value = getattr(estimate, name)
+            if not frame:
+                like = np.asarray(value, dtype=object if name == "message" else None)
+                out[name] = np.empty((len(readings.ratio), *like.shape), like.dtype)
+            out[name][frame] = value
+    out["message"] = out["message"].astype(str)
+    return out
 
 
 def save_arrays(path: PathName, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -63,7 +63,7 @@ from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 # Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
 # 0.2 MB, and tools that write files anew make chunks of 4 MB.
 LARGEST_RECORD_BYTES: Final = 16_000_000
-# Largest message, unpacked. Chosen: a tare of `MAX_CELLS` cells is 0.4 MB.
+# Largest message, unpacked. Chosen: a tare of `MAX_CELLS` cells is 0.1 MB.
 _LARGEST_MESSAGE_BYTES: Final = 1_000_000
 # Chunks unpack to at most so many times the file's bytes. Chosen: codes without noise pack best,
 # 115 times.
