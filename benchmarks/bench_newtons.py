@@ -10,10 +10,11 @@ the true middle of both layers; else nobody has told anything. --only takes some
 
 force     METHOD_over_told: RMSE over that of `joint` told, of the first five pairs, of 2000/4000
           and of 10000/10000. METHOD_over_ohm: over that of `ohm`. METHOD_told_over_before: told,
-          over the same before calibrations learned wires. METHOD_bent: wires 0.75 and 1.35 of those
-          at the calibration, over `joint` told on the same frames. within_4, wrong: touched cells
-          within 4 stated deviations; cells off by half, by 0.5 N and by 4 deviations in frames that
-          converged, for 100 touched ones.
+          over the same before calibrations learned wires; no_leads: `joint`, told wires, but not
+          that there are no leads. METHOD_bent: wires 0.75 and 1.35 of those at the calibration,
+          over `joint` told on the same frames. within_4, wrong: touched cells within 4 stated
+          deviations; cells off by half, by 0.5 N and by 4 deviations in frames that converged, for
+          100 touched ones.
 wrong     METHOD_wrong: told twice the wires, or half of them, over `joint` told rightly. Five
           pairs. wrong_said: how often ``calibrate`` says that presses and told wires disagree [%].
 wires     20 skins, wires of 20 ohm to 2 kohm: how often those of a layer that ``calibrate`` has
@@ -88,13 +89,21 @@ BEFORE_N: dict[tuple[tuple[float, float], str], tuple[float, float]] = {
 
 
 class Way(NamedTuple):
-    """A method, and what ``calibrate`` is told: the wires over the true ones; None: nothing."""
+    """A method, and what ``calibrate`` is told.
+
+    factor: the wires told over the true ones; None: nothing is told. leads: are told with them.
+    """
 
     method: str
     factor: float | None = None
+    leads: bool = True
+
+    def __str__(self) -> str:
+        told = "" if self.factor is None else f" told {self.factor:g}"
+        return self.method + told + ("" if self.leads else ", no leads")
 
 
-OHM, TOLD = Way("ohm"), Way("joint", 1.0)
+OHM, TOLD, NO_LEADS = Way("ohm"), Way("joint", 1.0), Way("joint", 1.0, leads=False)
 COMPARED = (OHM, TOLD, *map(Way, METHODS))
 # Told wrongly: twice the wires, or half of them.
 WRONG = dict(zip(LAWS, (2.0, 0.5), strict=True))
@@ -141,7 +150,8 @@ def show(task: Task) -> Shown:
             told = NO_WIRES
             if way.factor is not None:
                 top, bottom = plan.wire_ohm
-                told = WireOhm(way.factor * top, way.factor * bottom, plan.lead_ohm)
+                lead_ohm = plan.lead_ohm if way.leads else None
+                told = WireOhm(way.factor * top, way.factor * bottom, lead_ohm)
             try:
                 said = calibrate(recording, file, way.method, told)
             except ValueError as refusal:
@@ -153,7 +163,9 @@ def show(task: Task) -> Shown:
             found = load_calibration(file).nominal_wire_ohm
             by[way] = Read(rmse_n, flat.within_percent(), flat.wrong_percent(), said, found)
     rest = pressed.rest
-    return Shown(task, by, (float(rest.top_wire_ohm.mean()), float(rest.bottom_wire_ohm.mean())))
+    shown = Shown(task, by, (float(rest.top_wire_ohm.mean()), float(rest.bottom_wire_ohm.mean())))
+    print_skin(shown)
+    return shown
 
 
 def tasks_of(group: str, part: Part, seed: int) -> list[Task]:
@@ -166,10 +178,11 @@ def tasks_of(group: str, part: Part, seed: int) -> list[Task]:
     ]
     match group:
         case "force":
-            return [Task(group, plan, (*COMPARED, Way("touch", 1.0)), BENDS) for plan in plans]
+            ways = (*COMPARED, Way("touch", 1.0), NO_LEADS)
+            return [Task(group, plan, ways, BENDS) for plan in plans]
         case "wrong":
-            ways = {law: tuple(Way(method, WRONG[law]) for method in METHODS) for law in LAWS}
-            return [Task(group, plan, (TOLD, *ways[plan.law])) for plan in plans]
+            wrong = {law: tuple(Way(method, WRONG[law]) for method in METHODS) for law in LAWS}
+            return [Task(group, plan, (TOLD, *wrong[plan.law])) for plan in plans]
         case "wires":
             random = np.random.default_rng(seed)
             ohm = np.exp(random.uniform(np.log(20), np.log(2000), (part.of(20), 2))).tolist()
@@ -234,12 +247,12 @@ def over(
     return of
 
 
-def over_before(method: str) -> Of:
+def over_before(way: Way) -> Of:
     def of(shown: Shown) -> Iterator[float]:
         plan = shown.task.plan
         before_n = BEFORE_N.get((plan.wire_ohm, plan.law))
         if before_n is not None and plan.seed == SEED:
-            yield shown.by[Way(method, 1.0)].rmse_n[0] / before_n[METHODS.index(method)]
+            yield shown.by[way].rmse_n[0] / before_n[METHODS.index(way.method)]
 
     return of
 
@@ -260,7 +273,7 @@ def stated(shown: Shown) -> Iterator[float]:
 
 def figures_of(method: str) -> list[Figure]:
     """All figures of a method on pressed skins, with their bars."""
-    untold, ratio = Way(method), partial(over, method)
+    untold, before, ratio = Way(method), over_before(Way(method, 1.0)), partial(over, method)
     rows: list[tuple[Any, ...]] = [
         ("force", "over_told_worst", ratio(TOLD, FIVE), np.max, at_most, 1.1),
         ("force", "over_told_median", ratio(TOLD, FIVE), np.median, at_most, 1.04),
@@ -268,8 +281,8 @@ def figures_of(method: str) -> list[Figure]:
         ("force", "over_told_10000", ratio(TOLD, [LONGEST]), np.max, at_most, 1.6),
         ("force", "over_ohm_worst", ratio(OHM, [*FIVE, LONGEST]), np.max, at_most, 0.92),
         ("force", "over_ohm_2000", ratio(OHM, [LONG]), np.max, at_most, 1.05),
-        ("force", "told_over_before", over_before(method), np.median, at_most, 1.03),
-        ("force", "told_over_before_worst", over_before(method), np.max),
+        ("force", "told_over_before", before, np.median, at_most, 1.03),
+        ("force", "told_over_before_worst", before, np.max),
         ("force", "bent_worst", ratio(TOLD, FIVE, bent=True), np.max, at_most, 1.1),
         ("force", "bent_median", ratio(TOLD, FIVE, bent=True), np.median),
         ("force", "within_4", lambda one: [one.by[untold].within], np.mean, at_least, 97),
@@ -295,6 +308,10 @@ def disagrees(shown: Shown) -> Iterator[float]:
 
 FIGURES = [
     *(figure for method in METHODS for figure in figures_of(method)),
+    Figure(
+        *("force", "no_leads_told_over_before", over_before(NO_LEADS), np.median, at_most, 1.03)
+    ),
+    Figure("force", "no_leads_told_over_before_worst", over_before(NO_LEADS), np.max),
     Figure("wrong", "wrong_said", disagrees, np.mean, at_least, 100),
     Figure("wires", "wires_near", near, np.mean, at_least, 90),
     Figure("wires", "wires_within_2", stated, np.mean, at_least, 90),
@@ -302,16 +319,16 @@ FIGURES = [
 
 
 def print_skin(shown: Shown) -> None:
-    """RMSE of all ways, as calibrated and bent, and the wires that the last way keeps."""
+    """RMSE of all ways, as calibrated and bent, and the wires that `joint` untold keeps."""
     task, plan = shown.task, shown.task.plan
     ways = [
-        f"{way.method}{'' if way.factor is None else f' told {way.factor:g}'} "
-        + " ".join(f"{rmse_n:.3f}" for rmse_n in one.rmse_n)
+        f"{way} " + " ".join(f"{rmse_n:.3f}" for rmse_n in one.rmse_n)
         for way, one in shown.by.items()
     ]
-    found = " ".join(f"{n:.3g}" for n in list(shown.by.values())[-1].found if n is not None)
+    found = shown.by.get(Way("joint"), next(iter(shown.by.values()))).found
+    kept = " ".join(f"{number:.3g}" for number in found if number is not None)
     size, wires = "x".join(map(str, plan.shape)), "/".join(f"{ohm:.0f}" for ohm in plan.wire_ohm)
-    print(f"{task.group} {size} {wires} {plan.law}: {', '.join(ways)}; found {found}", flush=True)
+    print(f"{task.group} {size} {wires} {plan.law}: {', '.join(ways)}; keeps {kept}", flush=True)
 
 
 # ------------------------------------------------------------------------------------------- leads
@@ -374,9 +391,10 @@ def read_behind(scene: Scene) -> tuple[Scene, Behind]:
 def of_leads(part: Part, seed: int, jobs: int, progress: Progress) -> tuple[Numbers, list[Bar]]:
     """All figures of conductances behind leads, and their bars."""
     conditions = list(product(KINDS, METHODS, READOUTS))
+    leads_ohm = LEADS_OHM[: part.of(len(LEADS_OHM))]
     scenes = [
         Scene(seed + number, part.of(80), *condition, lead_ohm)
-        for number, condition, lead_ohm in product(range(part.of(4)), conditions, (0, *LEADS_OHM))
+        for number, condition, lead_ohm in product(range(part.of(4)), conditions, (0, *leads_ohm))
     ]
     found: defaultdict[tuple[object, ...], list[Behind]] = defaultdict(list)
     for scene, one in in_processes(read_behind, scenes, jobs, progress):
@@ -387,7 +405,7 @@ def of_leads(part: Part, seed: int, jobs: int, progress: Progress) -> tuple[Numb
     bars, far_off = [], []
     for condition in conditions:
         kind, method, readout = condition
-        for lead_ohm in LEADS_OHM if readout == "near" else ():
+        for lead_ohm in leads_ohm if readout == "near" else ():
             key, name = (*condition, lead_ohm), f"{kind}_{method}_{lead_ohm}"
             wrong = 100 * float(np.mean([one.misleads for one in found[key]]))
             within = judged[key].pressed_within_percent()
@@ -396,11 +414,11 @@ def of_leads(part: Part, seed: int, jobs: int, progress: Progress) -> tuple[Numb
             least, most = (90, 10) if lead_ohm == LEADS_OHM[-1] else (95, 1)
             bars += [at_least(f"{name}_within_4", least), at_most(f"{name}_wrong", most)]
         if readout != "near":
-            shares = [error[*condition, lead_ohm] / error[*condition, 0] for lead_ohm in LEADS_OHM]
+            shares = [error[*condition, lead_ohm] / error[*condition, 0] for lead_ohm in leads_ohm]
             figures[f"{kind}_{method}_{readout}_over_none"] = np.max(shares)
             bars.append(at_most(f"{kind}_{method}_{readout}_over_none", 1.5))
         if (kind, readout) == ("random", "far"):
-            parts = chain.from_iterable(found[*condition, lead_ohm] for lead_ohm in LEADS_OHM)
+            parts = chain.from_iterable(found[*condition, lead_ohm] for lead_ohm in leads_ohm)
             far_off += [100 * abs(one.lead_share - 1) for one in parts]
     figures["leads_by_far_ends_percent"] = max(far_off)
     bars.append(at_most("leads_by_far_ends_percent", 10))
@@ -417,11 +435,9 @@ def measure(part: Part, groups: list[str], seed: int, jobs: int) -> tuple[Number
         print(f"\r{done} of {of} ", end="" if done < of else "\n", file=sys.stderr, flush=True)
 
     tasks = [task for group in groups if group != LEADS for task in tasks_of(group, part, seed)]
-    shown = sorted(in_processes(show, tasks, jobs, progress), key=lambda one: tasks.index(one.task))
+    shown = in_processes(show, tasks, jobs, progress)
     figures: Numbers = {}
     bars = []
-    for one in shown:
-        print_skin(one)
     for figure in (figure for figure in FIGURES if figure.group in groups):
         of_skins = (figure.of(one) for one in shown if one.task.group == figure.group)
         values = list(chain.from_iterable(of_skins))
