@@ -207,10 +207,12 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
         done = run("doctor", url, "--calibration", str(path), "--press", "--json", *more)
         assert [each["id"] for each in json.loads(done.out)["findings"]] == names
         assert done.code == len(names)
-    assert run("doctor", url, "--wires", "100,200", "--press", "--into", str(path)).code == 1
+    told_now = ("--wires", "100,200", "--leads", str(LEAD_OHM))
+    assert run("doctor", url, *told_now, "--press", "--into", str(path)).code == 1
     kept = load_calibration(path).nominal_wire_ohm
-    assert kept.both == pytest.approx((150, 300), rel=0.1)
-    assert (kept.top_log_std, kept.bottom_log_std) == pytest.approx((0.05, 0.05), abs=0.045)
+    assert kept.both == pytest.approx((150, 300), rel=0.07)
+    assert (kept.top_log_std, kept.bottom_log_std) == pytest.approx((0.04, 0.04), abs=0.035)
+    assert kept.lead == LEAD_OHM
     assert_one_line(run("doctor", url, "--into", str(path)), "--press")
 
 
