@@ -73,7 +73,7 @@ def test_a_recording_and_its_forces_make_a_calibration(
     assert (found.unit_id, found.method) == (3, "joint")
     assert found.indenter_area_m2 == pytest.approx(80e-6)
     assert found.nominal_wire_ohm.both == pytest.approx((100.0, 200.0), rel=0.3)
-    assert "wires, as presses tell: " in done.out
+    assert "ohm a segment by 12 presses, " in done.out
     assert not found.model.pooled.any()
     rest_siemens = PRESSES.skin(0.0).cell_siemens
     np.testing.assert_allclose(found.rest.level, rest_siemens, rtol=0.1)

@@ -19,10 +19,12 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.regression import ForceRegression
 from ohmskin.calibrate.rules import check_cell, check_cells_differ
 from ohmskin.calibrate.tables import ForceLog, PressTable
+from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
 from ohmskin.errors import TareRefused
-from ohmskin.estimate.base import TOUCH_SIEMENS, TOUCH_STDS
+from ohmskin.estimate.base import TOUCH_SIEMENS, TOUCH_STDS, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_readings import PortReader
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.reader import DEFAULT_METHOD, now, touched_cells
@@ -55,6 +57,10 @@ TOUCHED_TIMES: Final = 8.0
 # A cell that has lost more than this share of its rest in the later scans was touched at rest.
 # Chosen: no rest drifts by as much in a session.
 LOST_SHARE: Final = 0.5
+# The method whose levels find the presses. Chosen: it takes no wires, and knows all cells at once.
+WIRELESS: Final = "matrix"
+# Passes things on, one after another, and shows how many have been.
+Progress = Callable[[Iterable[Scan]], Iterable[Scan]]
 # Stands for a cell, or a press, where a scan has none. Chosen: no index is negative.
 _NOTHING: Final = -1
 
@@ -68,6 +74,7 @@ class Presses:
     rise_std: standard deviation of `rise`, (n,).
     force_n: on that cell, (n,) [N].
     press: number of the press that the row is of, (n,).
+    scan: number of the scan that the row is, (n,).
     shape: (R, C) of the skin.
     shared: how many scans were left out because two cells were pressed.
     zero_n: what the force sensor showed without touch, already taken off [N].
@@ -78,6 +85,7 @@ class Presses:
     rise_std: Float
     force_n: Float
     press: NDArray[np.intp]
+    scan: NDArray[np.intp]
     shape: tuple[int, int]
     shared: int = 0
     zero_n: float = 0.0
@@ -144,6 +152,7 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
         # Below zero is the sensor's noise: `ForceLog` refuses more than that.
         force_n=np.maximum(force_n[good] - zero_n, 0.0),
         press=press[good],
+        scan=every[good],
         shape=(rows, columns),
         shared=int(np.count_nonzero(shared)),
         zero_n=zero_n,
@@ -219,6 +228,7 @@ class Calibrator:
 
     estimator: of this method, for this skin.
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
+    found: the wires by presses; None before `learn_wires`.
 
     No earlier rest says how the untouched skin reads. So a cell counts as touched if it conducts
     far more than most others do, g > `TOUCHED_TIMES` max(quantile of g, 0.5e-6 S), whatever wires
@@ -235,12 +245,17 @@ class Calibrator:
     force: bool = False
 
     def __post_init__(self) -> None:
-        self._knowledge = SkinKnowledge.of(self.board, self.rest_ratio, self.nominal_wire_ohm)
+        self.found: FoundWires | None = None
+        self._tell(self.nominal_wire_ohm)
         at_rest = make_estimator(DEFAULT_METHOD, self._knowledge).rest()
         assert at_rest is not None  # the readings are known
         siemens = at_rest.cell_siemens
         untouched = float(np.quantile(siemens, UNTOUCHED_SHARE, method="lower"))
         self._refuse(siemens > TOUCHED_TIMES * max(untouched, TOUCH_SIEMENS))
+
+    def _tell(self, wires: WireOhm) -> None:
+        """Make the estimator, which knows these wires."""
+        self._knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires)
         self.estimator = make_estimator(self.method, self._knowledge)
         self.rest_level = self.estimator.rest_level()
 
@@ -250,23 +265,56 @@ class Calibrator:
             remedy = "measure rest with nothing on the skin, or say --force if nothing was on it"
             raise TareRefused(f"{touched_cells(touched)} at rest", remedy)
 
-    def measure(
-        self, scans: list[Scan], progress: Callable[[Iterable[Scan]], Iterable[Scan]] = iter
-    ) -> LevelHistory:
-        """What all scans show above rest. progress: passes them on, one after another.
+    @property
+    def shows_wires(self) -> bool:
+        """Whether the estimator measures the wires by itself: far ends are read."""
+        return self.board.mode != "near"
+
+    def look(self, scans: list[Scan], progress: Progress = iter) -> LevelHistory:
+        """What all scans show to a method that wires hardly mislead, so that presses are found.
+
+        progress: passes scans on, one after another. Raises ValueError and TareRefused as
+        `measure`.
+        """
+        if self.shows_wires:
+            return self.measure(scans, progress)
+        estimator = make_estimator(WIRELESS, self._knowledge)
+        return self._history(estimator, estimator.rest_level(), progress(scans))
+
+    def measure(self, scans: list[Scan], progress: Progress = iter) -> LevelHistory:
+        """What all scans show above rest. progress: as for `look`.
 
         Raises ValueError for scans of another size than the untouched skin, and TareRefused where
         it was touched.
         """
-        levels = []
-        for scan in progress(scans):
-            answer = self.estimator.estimate(scan.ratio)
-            levels.append((answer.level - self.rest_level, answer.level_std, answer.touched))
-        history = LevelHistory(scan_times_s(scans), *map(np.array, zip(*levels, strict=True)))
+        return self._history(self.estimator, self.rest_level, progress(scans))
+
+    def _history(self, estimator: Estimator, rest: Float, scans: Iterable[Scan]) -> LevelHistory:
+        levels, read = [], []
+        for scan in scans:
+            answer = estimator.estimate(scan.ratio)
+            levels.append((answer.level - rest, answer.level_std, answer.touched))
+            read.append(scan)
+        history = LevelHistory(scan_times_s(read), *map(np.array, zip(*levels, strict=True)))
         # Single cells are pressed: each is untouched in most scans.
         rise, std = np.median(history.rise, axis=0), np.median(history.rise_std, axis=0)
-        self._refuse(-rise > np.fmax(LOST_SHARE * self.rest_level, TOUCH_STDS * std))
+        self._refuse(-rise > np.fmax(LOST_SHARE * rest, TOUCH_STDS * std))
         return history
+
+    def learn_wires(self, ratios: Iterable[Float], presses: Presses) -> None:
+        """Find the wires by presses, and tell them the estimator.
+
+        ratios: readings (R, C, 4) of each row of `presses`. Raises ValueError where no press is
+        clear.
+        """
+        reader, cells = PortReader(self._knowledge), presses.cells
+        current = np.empty((2, cells.size))
+        for row, ratio in enumerate(ratios):
+            ports = reader.read(ratio, in_order=True)
+            current[:, row] = ports.current.flat[cells[row]], ports.current_std.flat[cells[row]]
+        readings = PressReadings(cells, presses.press, presses.force_n, *current)
+        self.found = find_wires(self._knowledge, readings)
+        self._tell(self.found.wires)
 
     def presses_in_table(self, table: PressTable) -> Presses:
         """The presses of a table, each of its rows one.
@@ -284,6 +332,7 @@ class Calibrator:
             rise_std=table["conductance_std"],
             force_n=table["force_n"],
             press=np.arange(cells.size),
+            scan=np.arange(cells.size),
             shape=(rows, columns),
         )
 
@@ -303,7 +352,7 @@ class Calibrator:
         )
         pressed = np.argwhere(presses.counts).tolist()
         check_cells_differ({(row, column) for row, column in pressed}, presses.shape)
-        date = now()
+        date, told = now(), self._knowledge.nominal_wire_ohm
         calibration = Calibration(
             unit_id=self.board.unit_id,
             date=date,
@@ -311,7 +360,8 @@ class Calibrator:
             rest=Rest.of(self.method, self._knowledge, date),
             model=regression.model_,
             indenter_area_m2=self.indenter_area_m2,
-            nominal_wire_ohm=self.estimator.wires(),
+            # Single presses teach `joint` nothing that the fit of all presses does not know.
+            nominal_wire_ohm=self.estimator.wires() if self.shows_wires else told,
             mode=self.board.mode,
         )
         return calibration, regression.message_

@@ -148,9 +148,13 @@ def recording(
             samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
             log = ForceLog(*samples.T)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s), force)
-        history = calibrator.measure(given.scans, progress("scans"))
+        history = calibrator.look(given.scans, progress("presses"))
         alignment = align(history.time_s, history.of_skin, log)
         presses = find_presses(history, log, alignment.offset_s)
+        if not calibrator.shows_wires:
+            calibrator.learn_wires((given.scans[n].ratio for n in presses.scan), presses)
+            history = calibrator.measure(given.scans, progress("scans"))
+            presses = find_presses(history, log, alignment.offset_s)
     note = (
         f"offset of the clocks {alignment.offset_s:+.3f} s, correlation "
         f"{alignment.correlation:.2f} over {alignment.overlap_s:.0f} s; zero of the force sensor "
@@ -281,15 +285,34 @@ def _finish(
         TERMINAL.print(
             message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else "")
         )
-    wires = calibration.nominal_wire_ohm
-    if wires.top_log_std is not None:
-        TERMINAL.print(
-            f"wires, as presses tell: {wires.top:.0f}, {wires.bottom:.0f} Ohm, "
-            f"+- {100 * wires.top_log_std:.0f} %"
-        )
-    elif wires.both is None:
-        TERMINAL.print("wires are not told (--wires): forces' standard deviations are wide")
+    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator), markup=False)
     TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
+
+
+def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
+    """What the calibration keeps of the wires, and what has shown them."""
+    found = calibrator.found
+    if wires.both is None:
+        why = "presses in a table do not tell them"
+        return f"wires are not told (--wires), and {why}: forces' standard deviations are wide"
+    line = f"wires: {wires.top:.0f} and {wires.bottom:.0f} ohm a segment"
+    if wires.top_log_std is None or wires.bottom_log_std is None:
+        return f"{line}, as told"
+    percent = [f"{100 * std:.0f} %" for std in (wires.top_log_std, wires.bottom_log_std)]
+    source = "far ends" if found is None else f"{found.presses} presses"
+    line += f" by {source}, {' and '.join(dict.fromkeys(percent))}"
+    if found is None:
+        return line
+    if found.told.both is not None:
+        words = "they disagree" if found.disagrees else "they agree"
+        line += f"; told: {found.told.top:g}, {found.told.bottom:g}: {words}"
+    if found.unclear:
+        layers = " and ".join(found.unclear)
+        line += (
+            f"\npresses tell little of the wires of the {layers} layer: press hard, cells near its "
+            "electrodes and cells far from them"
+        )
+    return line
 
 
 # -------------------------------------------------------------------------------- with weights

@@ -1,0 +1,457 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wires of a skin, from presses of single cells by known forces.
+
+A cell conducts alike under a force wherever it lies, but for its scatter. What its port shows is
+less the more wire lies in series: j+1 segments of its row, i+1 of its column. So one law of all
+cells, from force to conductance, and the wires are found together: whoever takes the wires for less
+than they are finds cells far from the electrodes too soft, and all the more under large forces.
+
+Symbols. A press has up to `LEVELS` rows, each of them the mean of its scans at about one force.
+
+======== ====== ========================================================================= =======
+symbol   shape  meaning                                                                   unit
+======== ====== ========================================================================= =======
+F, x     (n,)   force; its log, less the mean of all rows                                 N, 1
+I, I0    (n,)   current of the pressed cell's port per Vdd; that of the untouched skin    S
+y        (n,)   log(I - I0)                                                               log S
+p        (7,)   logs of a top and a bottom segment; a lead over `UNKNOWN_LEAD_OHM`; k, b,
+                q; log r
+G        (n,)   conductance of the contact                                                S
+r               what no force lowers, in series with the contact                          ohm
+d        (n,)   conductance that the press adds to the cell                               S
+rho0, M  (n,)   as in `sparse_fit`: of the untouched skin, at the port of the pressed     ohm
+H        (n,)   cell, and that cell alone
+S        (n,)   dy / d log G                                                              1
+U        (n,)   dy / d ohm, of what is in series with the whole port                      1/ohm
+K        (c, c) covariance of what is in series with the c pressed cells: segments and    ohm^2
+                leads differ from their means by `SEGMENT_STD`, r by `SERIES_SPREAD`
+v               variances of log G: of a cell's factor, of its exponent, of a press, of   1
+                a row; and that of a force [N^2]
+C        (n, n) covariance of y                                                           1
+======== ====== ========================================================================= =======
+
+    log G = k + b x + q (x^2 - mean x^2) ,    1 / d = r + 1 / G ,
+    rho = rho0 - H^2 / (1 / d + M) ,          I = 1 / (rho + 2 lead + references) .
+
+For each trial of the wires, the untouched cells are those that explain the rest readings, and the
+network is solved once (`RestNetwork`). A pressed cell is a change of rank 1.
+
+    C = N + S S^T * [same cell] (v_cell + v_exponent x x^T + v_press [same press]
+                                 + (v_row + v_force / F^2) [same row]) + U U^T * K ,
+
+N the noise of the readings, * by elements, and [...] 1 where it is so, else 0. Minimised is
+(y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits the variances v are made those
+of most likelihood. Two leads and r add to one series resistance, so presses tell their sum alone,
+and the prior of r decides: what a lead adds to the usual r is taken for the lead.
+
+The covariance of p is that of least squares. It is one of small changes in ohm: wires of 30 +- 12
+ohm are rarely 6 ohm, but often in a log-normal. So the deviation of the log is stated by the lower
+limit of `REACH_STDS` deviations, as in `prior.siemens_std`.
+"""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Bool, Float
+from ohmskin.circuit.skin import PortCircuit, wire_coupling_ohm
+from ohmskin.circuit.small import one_blas_thread, solve_positive
+from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, SkinKnowledge, WireOhm
+from ohmskin.estimate.port_readings import PortReader
+from ohmskin.estimate.prior import (
+    HIGHEST_TOUCH_SIEMENS,
+    LAYER_STD,
+    LEAD_STD,
+    MAX_STEP_LOG,
+    REACH_STDS,
+    SEGMENT_STD,
+    UNKNOWN_LEAD_OHM,
+    UNKNOWN_WIRE_OHM,
+    UNTOUCHED_STD,
+    rest_level,
+)
+from ohmskin.estimate.sparse_fit import RestNetwork
+
+# Rows.
+# The forces of a press are divided, by their log, into so many parts. Chosen: its scans are not
+# independent, and a curve bends between the least and the largest force.
+LEVELS: Final = 4
+# Forces below this share of the largest one are left out. Chosen: there a sensor's zero and the
+# memory of a contact are as large as the force.
+LEAST_FORCE_SHARE: Final = 0.05
+# Scans whose current rises by fewer deviations are left out. Chosen: logs of less are skewed.
+LEAST_RISE_STDS: Final = 6.0
+
+# Priors: centres, and deviations of logs.
+# Wires that nobody has told. Chosen: two deviations are a factor of twenty either way.
+UNTOLD_STD: Final = 1.5
+# A lead that nobody has told [ohm]. Chosen: margins of yarn have kilohms.
+UNTOLD_LEAD_STD_OHM: Final = 1500.0
+# What no force lowers [ohm], as of the cell in docs/force.md. Chosen deviation: a factor of e.
+SERIES_OHM, SERIES_STD = 250.0, 1.0
+# By which share r differs from cell to cell. Chosen: as a cell's factor, `SCATTER`.
+SERIES_SPREAD: Final = 0.2
+# Exponent b: linear contacts have 1, rough ones up to 2. Chosen.
+EXPONENT, EXPONENT_STD = 1.5, 1.0
+# Bend q. Chosen: from 0.4 to 8 N, it changes the exponent by 0.3.
+BEND_STD: Final = 0.1
+# Deviations of log G, and of a force [N], and how far their logs may be off. Chosen: cells of one
+# skin scatter by some ten percent, presses by less.
+SCATTER: Final[Float] = np.array([0.2, 0.03, 0.05, 0.08, 0.03])
+SCATTER_LOG_STD: Final[Float] = np.array([0.5, 0.7, 1.0, 1.0, 1.0])
+
+# Wires whose log is uncertain by more are unclear, if it matters. Chosen: a factor of 1.6.
+UNCLEAR_LOG: Final = 0.5
+
+# The search.
+# Both layers start from these [ohm]. Chosen: from wires that are too small, it finds larger ones;
+# the others are for minima that nobody has seen.
+STARTS_OHM: Final = (50.0, 1000.0)
+# Fits, each with the scatter by the one before. Chosen: a fifth moves wires by less than 1 %.
+ROUNDS: Final = 4
+# Newton steps for the untouched cells of a trial, which starts from those of the one before, and
+# the step that is the last.
+_REST_STEPS, _CLOSE_STEP = 20, 1e-6
+# Step of p for slopes by differences.
+_DIFFERENCE: Final = 1e-3
+# A log that is off by so much is a factor of e^14: no fit gets there but by going astray.
+_LIMIT: Final = 14.0
+
+
+class PressReadings(NamedTuple):
+    """What n scans of pressed cells show, arrays (n,).
+
+    cells: flat index of the pressed cell. press: number of its press. force_n: on it [N].
+    current, current_std: of its port per Vdd, and the standard deviation [S].
+    """
+
+    cells: NDArray[np.intp]
+    press: NDArray[np.intp]
+    force_n: Float
+    current: Float
+    current_std: Float
+
+
+@dataclass(frozen=True)
+class FoundWires:
+    """What presses tell of the wires, together with what was told.
+
+    wires: most likely, with their deviations. told: before. presses: how many.
+    unclear: layers whose wires are uncertain by half, and by so much that their longest line is by
+        more than the hardest touch has.
+    """
+
+    wires: WireOhm
+    told: WireOhm
+    presses: int
+    unclear: tuple[str, ...]
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether wires were told and others are found, by more than skins stretch."""
+        found = self.wires
+        if self.told.both is None or found.both is None:
+            return False
+        off = np.log(np.array(found.both) / np.maximum(self.told.both, 1e-3))
+        stds = np.array([found.top_log_std or 0.0, found.bottom_log_std or 0.0])
+        return bool((np.abs(off) > np.maximum(LAYER_STD, REACH_STDS * stds)).any())
+
+
+class _Rows(NamedTuple):
+    """Arrays (n,) of the module's table. variance: of y, by the readings' noise."""
+
+    cells: NDArray[np.intp]
+    press: NDArray[np.intp]
+    log_force: Float
+    y: Float
+    variance: Float
+
+
+class _Trial(NamedTuple):
+    """The skin with some wires: rho0, H^2 and M of the pressed cells (n,), and K (c, c)."""
+
+    rest_ohm: Float
+    square_volt: Float
+    cell_volt: Float
+    path_variance: Float
+
+
+class _Expected(NamedTuple):
+    """y of the model, S and U, (n,); K (c, c)."""
+
+    y: Float
+    by_contact: Float
+    by_path: Float
+    path_variance: Float
+
+
+@one_blas_thread
+def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
+    """The wires by presses. knowledge: of the skin, with its rest readings and what was told.
+
+    Raises ValueError where no scan shows a press.
+    """
+    assert knowledge.rest_ratio is not None
+    rest = PortReader(knowledge).read(knowledge.rest_ratio)
+    rows = _rows(readings, rest.current.ravel())
+    fit = _PressFit(knowledge, rows, rest.current.ravel(), rest.current_std.ravel())
+    p, covariance = min(map(fit.minimised, STARTS_OHM), key=lambda found: found[0])[1:]
+    std = np.sqrt(covariance.diagonal())
+    lines = np.exp(p[:2]) * std[:2] * (knowledge.columns, knowledge.rows)
+    unclear = (std[:2] > UNCLEAR_LOG) & (lines > 1 / HIGHEST_TOUCH_SIEMENS)
+    layers = tuple(np.array(["top", "bottom"])[unclear].tolist())
+    return FoundWires(
+        fit.wires(p, std), knowledge.nominal_wire_ohm, np.unique(readings.press).size, layers
+    )
+
+
+def _rows(readings: PressReadings, rest_current: Float) -> _Rows:
+    """The means of each press at its levels of force."""
+    cells, press, force_n, current, current_std = readings
+    rise = current - rest_current[cells]
+    good = rise > LEAST_RISE_STDS * current_std
+    good &= force_n > LEAST_FORCE_SHARE * force_n.max()
+    if not good.any():
+        raise ValueError("no scan shows a press clearly")
+    cells, press, rise = cells[good], press[good], rise[good]
+    x, y = np.log(force_n[good]), np.log(rise)
+    variance = (current_std[good] / rise) ** 2
+    presses, number = np.unique(press, return_inverse=True)
+    least, most = np.full(presses.size, np.inf), np.full(presses.size, -np.inf)
+    np.minimum.at(least, number, x)
+    np.maximum.at(most, number, x)
+    level = LEVELS * (x - least[number]) / np.maximum(most - least, 1e-9)[number]
+    row = number * LEVELS + np.minimum(level.astype(np.intp), LEVELS - 1)
+    _, first, row = np.unique(row, return_index=True, return_inverse=True)
+    count = np.bincount(row)
+    # Noise of scans averages out, but for the rounding, which is alike in them.
+    means = (np.bincount(row, values) / count for values in (x, y, variance))
+    return _Rows(cells[first], press[first], *means)
+
+
+class _PressFit:
+    """Fits wires and law to the rows of presses."""
+
+    def __init__(
+        self, knowledge: SkinKnowledge, rows: _Rows, rest_current: Float, rest_std: Float
+    ) -> None:
+        self._shape, self._ref_ohm = (knowledge.rows, knowledge.columns), knowledge.ref_ohm
+        self._rows, self._rest_current, self._rest_std = rows, rest_current, rest_std
+        self._x = rows.log_force - rows.log_force.mean()
+        self._bend = self._x**2 - np.mean(self._x**2)
+        level = rest_level(rest_current.reshape(self._shape), self._ref_ohm)
+        self._log_siemens = np.full(rest_current.size, np.log(level))
+        self._trials: dict[tuple[float, ...], _Trial] = {}
+        self._set_priors(knowledge.nominal_wire_ohm)
+        self._set_blocks()
+
+    def _set_priors(self, told: WireOhm) -> None:
+        """Centre and deviation of p, by what was told."""
+        centre, std = [], []
+        for ohm, log_std in zip(told[:2], told[3:5], strict=True):
+            centre.append(np.log(UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3)))
+            std.append(UNTOLD_STD if ohm is None else np.hypot(LAYER_STD, log_std or 0.0))
+        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNTOLD_LEAD_STD_OHM
+        if told.lead is not None:
+            lead_ohm, lead_std_ohm = told.lead, told.lead_std_ohm or LEAD_STD * told.lead
+        centre.append(lead_ohm / UNKNOWN_LEAD_OHM)
+        std.append(max(lead_std_ohm, 1e-3) / UNKNOWN_LEAD_OHM)
+        # The level k of the law is free: -10 is 45 microsiemens.
+        self._centre = np.array([*centre, -10.0, EXPONENT, 0.0, np.log(SERIES_OHM)])
+        self._std = np.array([*std, 10.0, EXPONENT_STD, BEND_STD, SERIES_STD])
+        self._lowest, self._highest = self._centre - _LIMIT, self._centre + _LIMIT
+        self._lowest[2], self._highest[2] = 0.0, np.inf
+
+    def _set_blocks(self) -> None:
+        """Rows of one cell stand side by side, (c, m): where a cell has fewer than m, padded."""
+        cells, number = np.unique(self._rows.cells, return_inverse=True)
+        order = np.argsort(number, kind="stable")
+        count = np.bincount(number)
+        place = np.arange(number.size) - np.repeat(np.cumsum(count) - count, count)
+        self._cells = cells
+        self._block: NDArray[np.intp] = np.zeros((cells.size, count.max()), dtype=np.intp)
+        self._is_row: Bool = np.zeros(self._block.shape, dtype=bool)
+        self._block[number[order], place] = order
+        self._is_row[number[order], place] = True
+
+    # ------------------------------------------------------------------------------ the model
+
+    def _trial(self, wires: Float) -> _Trial:
+        """The skin with these wires, p[:3]."""
+        key = tuple(wires.tolist())
+        if key not in self._trials:
+            if len(self._trials) > 8:  # more than one step and its slopes need
+                self._trials.clear()
+            top_ohm, bottom_ohm = np.exp(wires[:2]).tolist()
+            self._trials[key] = self._solved(top_ohm, bottom_ohm, float(wires[2]))
+        return self._trials[key]
+
+    def _solved(self, top_ohm: float, bottom_ohm: float, leads: float) -> _Trial:
+        series_ohm = self._ref_ohm + 2 * leads * UNKNOWN_LEAD_OHM
+        log_siemens = self._log_siemens
+        for _ in range(_REST_STEPS):
+            siemens = np.exp(log_siemens).reshape(self._shape)
+            circuit = PortCircuit(siemens, top_ohm, bottom_ohm)
+            current = 1.0 / (circuit.port_ohm + series_ohm)
+            slopes = (current**2 / self._rest_std)[:, None] * circuit.by_cell()
+            off = (self._rest_current - current) / self._rest_std
+            from_level = (log_siemens - np.median(log_siemens)) / UNTOUCHED_STD**2
+            system = slopes.T @ slopes + np.eye(off.size) / UNTOUCHED_STD**2
+            step = solve_positive(system, slopes.T @ off - from_level)
+            log_siemens = log_siemens + np.clip(step, -MAX_STEP_LOG, MAX_STEP_LOG)
+            limits = np.log([MIN_CELL_SIEMENS, HIGHEST_TOUCH_SIEMENS])
+            log_siemens = np.clip(log_siemens, *limits)
+            if np.abs(step).max() < _CLOSE_STEP:
+                break
+        self._log_siemens = log_siemens
+        net = RestNetwork(np.exp(log_siemens).reshape(self._shape), top_ohm, bottom_ohm)
+        top, bottom = (np.full(self._shape, (SEGMENT_STD * w) ** 2) for w in (top_ohm, bottom_ohm))
+        of_lead = (SEGMENT_STD * leads * UNKNOWN_LEAD_OHM) ** 2
+        top[:, 0] += of_lead
+        bottom[0] += of_lead
+        path_variance = wire_coupling_ohm(top, bottom, self._shape)[
+            np.ix_(self._cells, self._cells)
+        ]
+        cells = self._rows.cells
+        at_port = net.port_ohm[cells], net.own_slope[cells], net.cell_volt[cells, cells]
+        return _Trial(at_port[0] + series_ohm, *at_port[1:], path_variance)
+
+    def _expected(self, p: Float) -> _Expected:
+        trial = self._trial(p[:3])
+        log_contact = p[3] + p[4] * self._x + p[5] * self._bend
+        rest_current = 1.0 / trial.rest_ohm
+
+        def y(log_siemens: Float) -> tuple[Float, Float]:
+            added_ohm = np.exp(p[6]) + np.exp(-log_siemens)
+            missing = trial.square_volt / (added_ohm + trial.cell_volt)
+            current = 1.0 / np.maximum(trial.rest_ohm - missing, 1.0)
+            return np.log(np.maximum(current - rest_current, 1e-15)), current
+
+        middle, current = y(log_contact)
+        half = 0.5 * SEGMENT_STD
+        by_contact = (y(log_contact + half)[0] - y(log_contact - half)[0]) / (2 * half)
+        own = (SERIES_SPREAD * np.exp(p[6])) ** 2 * np.eye(self._cells.size)
+        # d(I - I0) / d ohm = I0^2 - I^2, and so by log(I - I0):
+        return _Expected(middle, by_contact, -(current + rest_current), trial.path_variance + own)
+
+    def _whitener(self, model: _Expected, scatter: Float) -> "_Whitener":
+        """For residuals of y, at this model, with this scatter (5,)."""
+        block, is_row, rows = self._block, self._is_row, self._rows
+        x, press = self._x[block], rows.press[block]
+        cell, exponent, of_press, of_row, of_force = scatter**2
+        covariance = cell + exponent * x[:, :, None] * x[:, None]
+        covariance += of_press * (press[:, :, None] == press[:, None])
+        own = of_row + of_force * np.exp(-2 * rows.log_force[block])
+        diagonal = np.einsum("kii->ki", covariance)
+        diagonal += own
+        slope = np.where(is_row, model.by_contact[block], 0.0)
+        covariance *= slope[:, :, None] * slope[:, None]
+        diagonal += np.where(is_row, rows.variance[block] + 1e-12, 1.0)
+        by_path = np.where(is_row, model.by_path[block], 0.0)
+        return _Whitener(np.linalg.cholesky(covariance), by_path, model.path_variance)
+
+    # ----------------------------------------------------------------------------- the search
+
+    def minimised(self, start_ohm: float) -> tuple[float, Float, Float]:
+        """From wires of so much: -2 log likelihood, p, and its covariance (7, 7)."""
+        from scipy.optimize import least_squares
+
+        p, scatter = self._start(start_ohm), SCATTER
+        for _ in range(ROUNDS):
+            whitener = self._whitener(self._expected(p), scatter)
+            found = least_squares(
+                self._residual,
+                p,
+                self._slopes,
+                (self._lowest, self._highest),
+                x_scale="jac",
+                max_nfev=50,
+                ftol=1e-6,
+                xtol=1e-5,
+                args=(whitener,),
+            )
+            p = found.x
+            scatter, score = self._scatter(p, scatter)
+        from_centre = (p - self._centre) / self._std
+        return score + float(from_centre @ from_centre), p, np.linalg.inv(found.jac.T @ found.jac)
+
+    def _start(self, start_ohm: float) -> Float:
+        """p with these wires, and the level of the law by the median row."""
+        p = self._centre.copy()
+        p[:2] = np.log(start_ohm)
+        for _ in range(_REST_STEPS):
+            model = self._expected(p)
+            off = (self._rows.y - model.y) / np.maximum(model.by_contact, 0.1)
+            p[3] += np.clip(np.median(off), -MAX_STEP_LOG, MAX_STEP_LOG)
+        return np.asarray(np.clip(p, self._lowest, self._highest))
+
+    def _residual(self, p: Float, whitener: "_Whitener") -> Float:
+        off = (self._rows.y - self._expected(p).y)[self._block]
+        whitened = whitener(np.where(self._is_row, off, 0.0)).ravel()
+        return np.asarray(np.concatenate([whitened, (p - self._centre) / self._std]))
+
+    def _slopes(self, p: Float, whitener: "_Whitener") -> Float:
+        """Of the residual, by differences: a step as small as p may be would show rounding."""
+        here = self._residual(p, whitener)
+        steps = _DIFFERENCE * np.eye(p.size)
+        return (
+            np.column_stack([self._residual(p + h, whitener) - here for h in steps]) / _DIFFERENCE
+        )
+
+    def _scatter(self, p: Float, scatter: Float) -> tuple[Float, float]:
+        """The scatter (5,) of most likelihood at p, and -2 log of that likelihood."""
+        from scipy.optimize import minimize
+
+        model = self._expected(p)
+        off = np.where(self._is_row, (self._rows.y - model.y)[self._block], 0.0)
+
+        def score(logs: Float) -> float:
+            whitener = self._whitener(model, SCATTER * np.exp(SCATTER_LOG_STD * logs))
+            return float(np.sum(whitener(off) ** 2) + whitener.log_determinant + logs @ logs)
+
+        start = np.log(scatter / SCATTER) / SCATTER_LOG_STD
+        found = minimize(score, start, method="L-BFGS-B", bounds=[(-5.0, 5.0)] * start.size)
+        return SCATTER * np.exp(SCATTER_LOG_STD * found.x), float(found.fun)
+
+    # ----------------------------------------------------------------------------- the answer
+
+    def wires(self, p: Float, std: Float) -> WireOhm:
+        """The wires of this p and its deviations (7,), with those that are stated."""
+        lowest = np.maximum(1 - REACH_STDS * std[:2], np.exp(-REACH_STDS * self._std[:2]))
+        log_stds = np.maximum(std[:2], -np.log(lowest) / REACH_STDS)
+        top_log_std, bottom_log_std = log_stds.tolist()
+        lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
+        top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
+        return WireOhm(top_ohm, bottom_ohm, lead_ohm, top_log_std, bottom_log_std, lead_std_ohm)
+
+
+class _Whitener:
+    """Makes residuals (c, m) of unit variance: L^-1 of them, with L L^T = C.
+
+    C = blocks + U K U^T. With each cell's U whitened by its own block, of length u and direction d:
+    C' = 1 + d (u K u) d^T, and the factor of 1 + u K u whitens what residuals have along d.
+
+    log_determinant: of C.
+    """
+
+    def __init__(self, factors: Float, by_path: Float, path_variance: Float) -> None:
+        """factors: of the blocks, (c, m, m). by_path: U (c, m). path_variance: K (c, c)."""
+        self._factors = factors
+        along = self._by_block(by_path)
+        length = np.maximum(np.linalg.norm(along, axis=1), 1e-12)
+        self._along = along / length[:, None]
+        common = np.eye(length.size) + length[:, None] * path_variance * length
+        self._common = np.linalg.cholesky(common)
+        diagonals = np.einsum("kii->ki", factors), self._common.diagonal()
+        self.log_determinant = 2 * float(sum(np.log(diagonal).sum() for diagonal in diagonals))
+
+    def _by_block(self, values: Float) -> Float:
+        return np.asarray(np.linalg.solve(self._factors, values[..., None])[..., 0])
+
+    def __call__(self, residual: Float) -> Float:
+        whitened = self._by_block(residual)
+        along = np.einsum("km,km->k", self._along, whitened)
+        change = np.linalg.solve(self._common, along) - along
+        return np.asarray(whitened + self._along * change[:, None])

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wires found from presses, against readings of the node Laplacian and two models of presses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from network import SkinCircuit
+from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
+from ohmskin.circuit.skin import Skin, current_from_ratio
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.force.calibration import load_calibration
+from pressed_skin import LAWS, Plan, PressedSkin, calibrate
+
+FORCES_N = np.geomspace(0.5, 8.0, 6)
+REF_OHM = 30_000.0
+
+
+def skin(shape: tuple[int, int], top_ohm: float, bottom_ohm: float, lead_ohm: float = 0.0) -> Skin:
+    ones = np.ones(shape)
+    leads = np.full(sum(shape), lead_ohm)
+    return Skin(1e-6 * ones, top_ohm * ones, bottom_ohm * ones, lead_ohm=leads)
+
+
+def found_by(
+    of: Skin, told: WireOhm, cells: list[int], scatter: float = 0.0, seed: int = 0
+) -> FoundWires:
+    """From presses of these cells, each by all forces: a power law with 250 ohm in series.
+
+    scatter: of what a cell conducts under any force, and a sixth of it of each press.
+    """
+    random = np.random.default_rng(seed)
+    circuit, rest = SkinCircuit(of), of.cell_siemens
+    currents, factor = [], np.exp(scatter * random.standard_normal(rest.size))
+    for cell in cells:
+        for force_n in FORCES_N:
+            contact = 30e-6 * factor[cell] * force_n**1.5
+            contact *= np.exp(scatter / 6 * random.standard_normal())
+            pressed = rest.copy()
+            pressed.flat[cell] += contact / (1 + 250.0 * contact)
+            ratio = circuit.readings(pressed)[..., :4]
+            currents.append(current_from_ratio(ratio, REF_OHM, REF_OHM).flat[cell])
+    readings = PressReadings(
+        np.repeat(cells, FORCES_N.size),
+        np.arange(len(currents)),
+        np.tile(FORCES_N, len(cells)),
+        np.array(currents),
+        np.full(len(currents), 1e-9),
+    )
+    rest_ratio = circuit.readings(rest)[..., :4]
+    knowledge = SkinKnowledge(*of.shape, rest_ratio=rest_ratio, nominal_wire_ohm=told)
+    return find_wires(knowledge, readings)
+
+
+@pytest.mark.parametrize("wires", [(30.0, 60.0), (200.0, 100.0), (3000.0, 9000.0)])
+def test_exact_presses_give_exact_wires(wires: tuple[float, float]) -> None:
+    """Whatever the wires are, from no knowledge of them, and with leads that are told.
+
+    That presses scatter is expected, so exact ones do not outweigh the rest of what is expected.
+    """
+    found = found_by(skin((5, 4), *wires, 300.0), WireOhm(lead=300.0), list(range(20)))
+    assert found.wires.both == pytest.approx(wires, rel=0.02, abs=6.0)
+    assert found.wires.lead == pytest.approx(300.0, rel=0.05)
+    assert (found.presses, found.unclear, found.disagrees) == (120, (), False)
+
+
+def test_leads_are_what_the_usual_contact_leaves_in_series() -> None:
+    found = found_by(skin((5, 4), 100.0, 200.0, 600.0), WireOhm(), list(range(20)))
+    assert found.wires.both == pytest.approx((100.0, 200.0), rel=0.05)
+    assert found.wires.lead == pytest.approx(600.0, rel=0.1)
+    assert found.wires.lead_std_ohm is not None
+    assert 60 < found.wires.lead_std_ohm < 300  # the contact may have more or less than 250 ohm
+
+
+def test_stated_deviations_are_those_of_repeated_skins() -> None:
+    """Cells scatter by 20 %, presses by 3 %, and nothing is told."""
+    true = np.log([100.0, 200.0])
+    of, off = skin((5, 4), 100.0, 200.0), []
+    for seed in range(12):
+        wires = found_by(of, WireOhm(), list(range(20)), 0.2, seed).wires
+        stds = wires.top_log_std, wires.bottom_log_std
+        off.append((np.log(wires.both or 1) - true) / np.array(stds, np.float64))
+    assert np.mean(np.abs(off) < 2) > 0.9
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_cells_of_one_row_tell_little_of_the_columns() -> None:
+    found = found_by(skin((5, 4), 300.0, 300.0), WireOhm(), [0, 1, 2, 3], 0.2)
+    assert found.unclear == ("bottom",)
+    assert found.wires.bottom_log_std is not None
+    assert found.wires.bottom_log_std > 0.5
+
+
+@pytest.mark.parametrize(("factor", "disagrees"), [(1.0, False), (2.0, True), (0.5, True)])
+def test_told_wires_are_one_more_piece_of_evidence(factor: float, disagrees: bool) -> None:
+    told = WireOhm(factor * 300.0, factor * 600.0)
+    found = found_by(skin((5, 4), 300.0, 600.0), told, list(range(20)), 0.2)
+    assert found.wires.both == pytest.approx((300.0, 600.0), rel=0.15)
+    assert found.disagrees is disagrees
+    # Where presses tell nothing, what was told stays.
+    found = found_by(skin((5, 4), 300.0, 600.0), told, [0, 1], 0.2)
+    assert found.wires.bottom == pytest.approx(factor * 600.0, rel=0.35)
+
+
+def test_what_shows_no_press_is_refused() -> None:
+    rest = SkinCircuit(skin((2, 2), 100.0, 100.0)).readings(np.full((2, 2), 1e-6))[..., :4]
+    nothing = PressReadings(*(np.zeros(9, np.intp),) * 2, np.ones(9), np.zeros(9), np.ones(9))
+    with pytest.raises(ValueError, match="no scan shows a press clearly"):
+        find_wires(SkinKnowledge(2, 2, rest_ratio=rest), nothing)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("wires", [(200.0, 400.0), (10_000.0, 10_000.0)])
+def test_recordings_tell_the_wires(law: str, wires: tuple[float, float], tmp_path: Path) -> None:
+    """Through the command: at 10 kilohms a segment, too, clocks are aligned and presses found."""
+    pressed = PressedSkin(Plan(wires, law, 3, shape=(4, 4), touches=1))
+    true = [layer.mean() for layer in (pressed.rest.top_wire_ohm, pressed.rest.bottom_wire_ohm)]
+    recording, out = tmp_path / "presses.mcap", tmp_path / "skin.json"
+    pressed.record(recording)
+    said = calibrate(recording, out, "touch")
+    found = load_calibration(out).nominal_wire_ohm
+    np.testing.assert_allclose(found.both, true, rtol=0.12, atol=30.0)
+    words = f"wires: {found.top:.0f} and {found.bottom:.0f} ohm a segment by 80 presses, "
+    assert words in said
+    assert "told" not in said
+    # Other wires are told: it says so, and finds the same.
+    told = wires[0] / 2, wires[1] / 2
+    said = calibrate(recording, out, "ohm", WireOhm(*told))
+    assert f"; told: {told[0]:g}, {told[1]:g}: they disagree" in said
+    found = load_calibration(out).nominal_wire_ohm
+    np.testing.assert_allclose(found.both, true, rtol=0.12, atol=30.0)
+
+
+@pytest.mark.parametrize("method", ["voltage", "ohm", "matrix"])
+def test_methods_without_wires_learn_the_same_curves(method: str, tmp_path: Path) -> None:
+    pressed = PressedSkin(Plan((200.0, 400.0), "series", 3, shape=(2, 3), touches=1))
+    recording, curves = tmp_path / "presses.mcap", []
+    pressed.record(recording)
+    for told in (WireOhm(), WireOhm(700.0, 100.0)):
+        calibrate(recording, tmp_path / "skin.json", method, told)
+        curves.append(load_calibration(tmp_path / "skin.json").model.slope)
+    np.testing.assert_array_equal(*curves)
