@@ -362,6 +362,20 @@ def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> No
         assert state["tared"]
 
 
+def test_the_newest_scan_is_there_while_the_next_is_estimated() -> None:
+    """It was not: where estimates take longer than scans, half of them were never sent."""
+    with ViewedBoards([REST]) as boards:
+        board = boards.get(0)
+        assert board is not None
+        board.watchers.add(lambda: None)
+        until(lambda: board.shown is not None)
+        first, number = board.shown, 0
+        while number < 50:
+            assert board.shown is not None
+            assert first is not None
+            number = board.shown.number - first.number
+
+
 def test_nothing_is_left_when_boards_are_closed(nothing_left: None, tmp_path: Path) -> None:
     with ViewedBoards([GHOST, "/dev/ttyACM99"], folder=tmp_path) as boards:
         board = boards.get(0)

@@ -335,9 +335,10 @@ class ViewedBoard(Closing):
             try:
                 while not self.closing.is_set():
                     scan, running = skin.latest(), self._running()
-                    self.shown = None
-                    # An estimate takes a good part of a core: none is made while nobody looks.
-                    if self.watchers:
+                    if not self.watchers:
+                        # An estimate takes a good part of a core: none is made while nobody looks.
+                        self.shown = None
+                    else:
                         force_scan = reader.read(scan)  # the method may be another from now on
                         near_ratio = as_near(scan.ratio, scan.reading_names)
                         more = {
