@@ -48,7 +48,7 @@ def doctor(
     Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
     it says when and where to press. Any rectangle will do: its lines are measured. In mode far, the
     wires of all lines are measured without, and --into takes them. Exit code 0: sound; 1: something
-    is wrong.
+    is wrong, or nobody pressed.
     """
     calibration = calibration or into
     of_board = None if calibration is None else load_calibration(calibration)
@@ -79,7 +79,7 @@ def doctor(
         print_page(page)
     if into is not None:
         _keep_wires(diagnosis, told, into)
-    if diagnosis.worse:
+    if not diagnosis.sound:
         raise SystemExit(1)
 
 
@@ -134,7 +134,7 @@ def as_object(port: str, diagnosis: Diagnosis) -> dict[str, Any]:
     """What ``--json`` prints, with places and shares that `asdict` takes apart."""
     return {
         "port": port,
-        "sound": not diagnosis.worse,
+        "sound": diagnosis.sound,
         "verdict": words.verdict(diagnosis),
         "findings": [
             {"id": each.kind.id, "severity": each.kind.severity}

@@ -107,6 +107,8 @@ def verdict(diagnosis: Diagnosis) -> str:
         return f"not sound: {len(worse)} finding{'s' if len(worse) > 1 else ''}, first {first}"
     if any(finding.kind is Kind.TOUCHED for finding in diagnosis.findings):
         return "no fault found, but something touches the skin: let go, and run this again"
+    if diagnosis.pressed == []:
+        return "no fault found, but nobody pressed three corners of a rectangle: run this again"
     if diagnosis.wires_hidden:
         return "sound: nothing is wrong that an untouched skin shows; --press shows its wires"
     return "sound: nothing is wrong"

@@ -27,7 +27,7 @@ class Severity(StrEnum):
 
 _FAULT, _WARNING, _NOTE = Severity
 _CELLS: Final = "worst cell_ohm plate_ohm off_percent most_percent"  # of resistors of a plate
-_CHANGE: Final = "change_lsb most_lsb settle_us longer_us needed_us pressed"
+_CHANGE: Final = "change_lsb most_lsb mean settle_us longer_us needed_us pressed"
 
 
 class Kind(Enum):
@@ -210,8 +210,8 @@ class Diagnosis:
     findings: all that was found.
     measured: figures by name, None for one that could not be had.
     nominal_ohm: nominal wires of a segment, top and bottom; None if touches or faults hide wires.
-    pressed: the share of all wires that presses show, then that of each row and column; None if
-        nobody was asked to press.
+    pressed: the share of all wires that presses show, then that of each row and column; empty if
+        nobody pressed, None if nobody was asked to.
     lines: wires of the lines, where far ends show them.
     wires_by_far_ends: a segment of each layer and the leads, where far ends show both layers.
     """
@@ -231,6 +231,11 @@ class Diagnosis:
     def worse(self) -> list[Finding]:
         """The findings that are more than notes: with any, the skin is not sound."""
         return [one for one in self.findings if one.kind.severity is not Severity.NOTE]
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong, and all was done that was asked for."""
+        return not self.worse and self.pressed != []
 
     @property
     def wires_hidden(self) -> bool:

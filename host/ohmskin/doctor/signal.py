@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
+from ohmskin.circuit.skin import READING_SIGN
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
@@ -107,6 +108,8 @@ NOISY_SHARE: Final = 1.7
 MOVED_LSB: Final = 3.0
 # [LSB] A longer settle time changes settled readings by less. Chosen: a code.
 UNSETTLED_LSB: Final = 1.0
+# [1] Of readings A to D, this makes the mean of what they show of the current, (4, 1).
+_CURRENT: Final = READING_SIGN[:, None] / READING_SIGN.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,27 +408,36 @@ def second_look(board: Hello) -> dict[str, Any] | None:
 
 
 def examine_settling(
-    usual: Look, settled: Look, diagnosis: Diagnosis, most_lsb: float = UNSETTLED_LSB
+    usual: Look, settled: Look, diagnosis: Diagnosis, each_lsb: float | None = None
 ) -> bool:
-    """Whether means change with a longer settle time by more than `most_lsb`, noise apart.
+    """Whether means change with a longer settle time by more than they may, noise apart.
 
     Adds it if they do: then the usual settle time is too short.
+
+    each_lsb: by how much each reading may change; None: by `UNSETTLED_LSB`, and in mode near, the
+        mean of a cell's four readings counts, as in estimates. What floating lines draw while they
+        charge changes each reading, but hardly their mean.
     """
     diagnosis.measured["settling_lsb"] = 0.0
     if settled.board.settle_us <= NOT_LONGER * usual.board.settle_us:
         return False
-    change = np.abs(usual.mean - settled.mean)
-    scatter = np.maximum(usual.codes.std(axis=0), settled.codes.std(axis=0))
+    mean = each_lsb is None and usual.board.mode == "near"
+    looks = [look.codes @ (_CURRENT if mean else np.eye(4)) for look in (usual, settled)]
+    change = np.abs(looks[0].mean(axis=0) - looks[1].mean(axis=0))
+    scatter = np.maximum(*(codes.std(axis=0) for codes in looks))
     # The deviation of a difference of two means is that of a scan times this.
     per_scatter = (1 / len(usual.codes) + 1 / len(settled.codes)) ** 0.5
     clear = change - ALL_STDS * np.maximum(scatter, ROUNDING_LSB) * per_scatter
     diagnosis.measured["settling_lsb"] = round(max(float(clear.max()), 0.0), 2)
+    most_lsb = UNSETTLED_LSB if each_lsb is None else each_lsb
     cells = (clear > most_lsb).any(axis=2)
     if cells.any():
         # Where most cells have not settled, a list of them would say less.
         place = WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells)
-        values = settling_values(usual, settled, float(change.max()))
-        diagnosis.add(Kind.SETTLING, place, most_lsb=most_lsb, pressed=False, **values)
+        change_lsb = float(np.abs(usual.mean - settled.mean).max())
+        values = settling_values(usual, settled, change_lsb)
+        limits = {"most_lsb": most_lsb, "mean": mean}
+        diagnosis.add(Kind.SETTLING, place, pressed=False, **limits, **values)
     return bool(cells.any())
 
 

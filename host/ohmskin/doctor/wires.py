@@ -236,7 +236,9 @@ class CornerScans:
         diagnosis.measured["settling_pressed_lsb"] = round(max(clear_lsb, 0.0), 2)
         if clear_lsb > PRESSED_LSB:
             values = settling_values(looks[0], looks[1], change_lsb)
-            diagnosis.add(Kind.SETTLING_PRESSED, most_lsb=PRESSED_LSB, pressed=True, **values)
+            diagnosis.add(
+                Kind.SETTLING_PRESSED, most_lsb=PRESSED_LSB, mean=False, pressed=True, **values
+            )
 
     def measure(self, rest: Rest) -> list[WireShare]:
         """The share of all wires, then that of each row and column; empty if none was pressed."""
