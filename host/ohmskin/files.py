@@ -7,7 +7,7 @@ import shutil
 import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
 from secrets import token_hex
@@ -43,6 +43,18 @@ def require_file(path: PathName) -> None:
     mode = os.stat(path).st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # of a folder the system says what it is
         raise OSError("it is no file")
+
+
+def stored_bytes(file: BinaryIO) -> int:
+    """Bytes of a file without its holes, as far as the system knows them. It stays at its begin."""
+    stored, at, end = 0, 0, os.fstat(file.fileno()).st_size
+    with suppress(OSError):  # there is nothing but a hole from there on
+        while hasattr(os, "SEEK_DATA") and at < end:
+            begin = os.lseek(file.fileno(), at, os.SEEK_DATA)
+            at = os.lseek(file.fileno(), begin, os.SEEK_HOLE)
+            stored += at - begin
+    os.lseek(file.fileno(), 0, os.SEEK_SET)
+    return stored if hasattr(os, "SEEK_DATA") else end
 
 
 def check_place(path: Path, *inputs: Path | None) -> None:

@@ -273,7 +273,7 @@ def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
     beyond = scan(1)
     beyond.codes[0, 0, 0] = 1024
     write_recording(path, hello, [scan(0), beyond])
-    with pytest.raises(RecordingError, match="a code is out of range"):
+    with pytest.raises(RecordingError, match="codes: one is out of range"):
         replayed(path)
 
 

@@ -41,6 +41,8 @@ from ohmskin.record.recording import export as export_recording
 # With a force sensor the first scans are a tare of so many seconds [s], unless told. Chosen: a
 # person who starts the command still takes a hand away in the first second.
 FORCE_TARE_S: Final = 2.0
+# So many characters of a line that was typed become a mark. Chosen: a terminal takes 4096.
+_MOST_TYPED: Final = 1000
 # In place of a force sensor's port: the forces that a simulated skin knows.
 TRUTH: Final = "truth"
 
@@ -180,7 +182,8 @@ def _take_marks(recorder: Recorder) -> None:
         while typed := os.read(sys.stdin.fileno(), 4096):
             *lines, text = (text + typed).split(b"\n")
             for line in lines:
-                recorder.add(Mark(line.decode(errors="replace").strip(), recorder.now_s()))
+                typed_text = line.decode(errors="replace").strip()[:_MOST_TYPED]
+                recorder.add(Mark(typed_text, recorder.now_s()))
 
 
 def export(

@@ -32,6 +32,8 @@ _MAX_SCAN_S = 10
 # No sound board says that it has a larger reference resistor. Chosen: through one, the leakage of
 # the converter's input, 1 uA at most by the ATmega328P's data sheet, would be all that is read.
 _MAX_REF_OHM = 10_000_000
+# No sound board has longer names of itself. Chosen: three times as long as all causes of a reset.
+_MOST_LETTERS = 100
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,11 @@ class Hello:
             "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,
             "adc_prescaler": self.adc_prescaler in protocol.ENUMS["adc_prescaler"].values,
             "mode": self.mode in protocol.MODES,
+            "board": len(self.board) <= _MOST_LETTERS,
+            "settings": len(self.settings) <= _MOST_LETTERS,
+            "reset_cause": len("".join(self.reset_cause)) <= _MOST_LETTERS,
         }
-        odd = [f"{name} {getattr(self, name)}" for name, can in can_be.items() if not can]
+        odd = [f"{name} {getattr(self, name)!s:.40}" for name, can in can_be.items() if not can]
         return odd[0] if odd else ""
 
 

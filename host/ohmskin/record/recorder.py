@@ -30,6 +30,7 @@ from ohmskin.record.recording import (
     ForceSample,
     Recorded,
     Tare,
+    check_size,
 )
 
 # Messages are kept for so long before they are written. A recording that is killed lacks them, and
@@ -112,6 +113,7 @@ class Recorder(Closing):
         """Keep a message.
 
         :raises RecordingError: the file can no longer be written.
+        :raises ValueError: a mark is longer than readers take.
         """
         name = next(name for name, kind in KINDS.items() if isinstance(message, kind))
         content = {"host_time_s": self.now_s(), **vars(message)}
@@ -122,6 +124,7 @@ class Recorder(Closing):
         number = content.get("number", 0) & 0xFFFFFFFF  # MCAP has 32 bits for it
         content = {key: content[key] for key in SCHEMAS[name]}
         octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+        check_size(name, octets)
         log_ns = self._epoch_ns + round(content["host_time_s"] * 1e9)
         with self._writing():
             if self._closed.is_set():

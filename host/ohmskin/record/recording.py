@@ -26,8 +26,8 @@ Files come from anywhere, so nothing in one is believed before it was checked:
 =============  ===============================================================================
 by             what could go wrong without it
 =============  ===============================================================================
-`_Bounded`     a length or a chunk that states more bytes than there are fills the memory
-`_records`     the library raises whatever its packers raise, in many kinds
+`_records`     a length that states more bytes than there are fills the memory
+`_Allowance`   a small file unpacks to more than the memory holds
 `_message`     a field that is missing, of another type or beyond any range gets into a `Scan`
 =============  ===============================================================================
 """
@@ -36,25 +36,24 @@ import json
 import math
 import os
 import struct
+import zlib
+from array import array
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any, Final, TypeVar, cast
+from typing import Any, BinaryIO, Final, TypeVar
 
 import lz4.frame
 import numpy as np
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Chunk, Footer, McapRecord
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
-from ohmskin.files import PathName, save_table
+from ohmskin.files import PathName, require_file, save_table, stored_bytes
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import LARGEST_CODE, MODES
@@ -63,22 +62,33 @@ from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
 # Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
 # 0.2 MB, and tools that write files anew make chunks of 4 MB.
 LARGEST_RECORD_BYTES: Final = 16_000_000
-# Largest message, unpacked. Chosen: a tare of `MAX_CELLS` cells is 0.1 MB.
-_LARGEST_MESSAGE_BYTES: Final = 1_000_000
-# Chunks unpack to at most so many times the file's bytes. Chosen: codes without noise pack best,
-# 115 times.
-_MOST_UNPACKED: Final = 200
+# Largest message, unpacked, without readings and with them. Chosen: a mark is a line of text, and
+# the readings of `MAX_CELLS` in a tare are 4096 numbers of at most 24 characters.
+_LARGEST_MESSAGE_BYTES: Final = (10_000, 120_000)
+# Any file may unpack to so much. Chosen: a message alone may pack better than those of a skin.
+_UNPACKED_BYTES: Final = 1_000_000
+# Chunks unpack to at most so many times the file's bytes, besides. Chosen: codes without noise pack
+# best, 115 times.
+_MOST_UNPACKED: Final = 150
 # Counters are kept in 64 bits.
 _LARGEST_COUNTER: Final = np.iinfo(np.int64).max
 # What `export` writes.
 FORMATS: Final = (".npz", ".csv")
 # What both formats have of each scan, besides its readings: attributes of `Scan`.
 _OF_SCAN: Final = ("number", "time_us", "host_time_s", "missed")
-# What mcap and its packers raise for bytes that are no MCAP file.
-_DAMAGE: Final = (
-    *(CRCValidationError, McapError, struct.error, UnicodeDecodeError),
-    *(zstandard.ZstdError, RuntimeError, MemoryError),
-)
+# A record of a chunk counts as so many bytes at least. Chosen: what a scan of one cell, or a force,
+# takes in memory; they pack to more than ten bytes.
+_LEAST_RECORD_BYTES: Final = 1000
+# The format, by mcap.dev/spec: what files begin with; what records begin with, opcode and length;
+# a chunk, without its times; what is before a channel's topic and before a message's content.
+_MAGIC: Final = b"\x89MCAP0\r\n"
+_HEAD: Final = struct.Struct("<BQ")
+_CHUNK: Final = struct.Struct("<16xQI")
+_CHANNEL_BYTES: Final = 4
+_MESSAGE_BYTES: Final = 22
+_READ: Final = frozenset((Opcode.FOOTER, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK))
+# What damaged bytes raise in what unpacks them.
+_DAMAGE: Final = (struct.error, UnicodeDecodeError, zstandard.ZstdError, RuntimeError, MemoryError)
 _T = TypeVar("_T")
 
 
@@ -215,101 +225,125 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
     topics: dict[int, str] = {}  # by the id of their channel
     has_hello = is_whole = False
     try:
+        require_file(path)
         with open(path, "rb") as file:
-            for record in _records(_Bounded(file)):
-                match record:
-                    case Channel(message_encoding="json", topic=topic) if topic.startswith(TOPIC):
-                        topics[record.id] = topic.removeprefix(TOPIC)
-                    case McapMessage() if topics.get(record.channel_id) in SCHEMAS:
-                        message = _message(topics[record.channel_id], record.data)
-                        if not has_hello and not isinstance(message, Hello):
-                            raise ValueError("no board says hello in it before the first message")
-                        has_hello = True
-                        yield message
-                    case Footer():
-                        is_whole = True
+            allowance = _Allowance(file)
+            for opcode, content in _records(file, allowance):
+                number = int.from_bytes(content[:2], "little")  # of the channel
+                if opcode == Opcode.CHANNEL:
+                    topic, at = _text(content, _CHANNEL_BYTES)
+                    name = topic.removeprefix(TOPIC)
+                    if name in SCHEMAS and (topic, _text(content, at)[0]) == (TOPIC + name, "json"):
+                        topics[number] = name
+                elif opcode == Opcode.MESSAGE and number in topics:
+                    name, octets = topics[number], content[_MESSAGE_BYTES:]
+                    message = _message(name, octets)
+                    if name != "scan":  # texts, and lists of zeros, take four times their JSON
+                        allowance.spend(3 * len(octets))
+                    if not has_hello and not isinstance(message, Hello):
+                        raise ValueError("no board says hello in it before the first message")
+                    has_hello = True
+                    yield message
+                is_whole = opcode == Opcode.FOOTER
         if not has_hello:
             raise ValueError("no recording of a skin, or cut off before a board says hello in it")
         if is_whole:
             yield None
     except OSError as exc:
         raise RecordingError(f"{path}: cannot be read: {exc.strerror or exc}") from exc
+    except _DAMAGE as exc:
+        raise RecordingError(f"{path}: damaged: {exc}") from exc
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as exc:
         text = f"no field {exc}" if isinstance(exc, KeyError) else str(exc).partition("\n")[0]
         raise RecordingError(f"{path}: {text}") from exc
 
 
-class _Bounded:
-    """A file, and how much may be made of it: what it holds, and so many times that when unpacked.
+class _Allowance:
+    """How much may still be made of a file. Chunks and what they hold spend it."""
 
-    A length that is stated in the file is compared with what is there before memory is taken for
-    it. Without that, a file of 100 bytes could ask for gigabytes.
-    """
+    def __init__(self, file: BinaryIO) -> None:
+        self._left_bytes = _UNPACKED_BYTES + _MOST_UNPACKED * stored_bytes(file)
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self._unread_bytes = os.fstat(file.fileno()).st_size
-        # What chunks may still unpack to. A message alone may pack better than those of a skin.
-        self._may_unpack_bytes = _LARGEST_MESSAGE_BYTES
-
-    def read(self, size: int) -> bytes:
-        """So many bytes, never less. Raises EndOfFile where there are fewer."""
-        if size > self._unread_bytes:
-            raise EndOfFile
-        self._unread_bytes -= size
-        self._may_unpack_bytes += _MOST_UNPACKED * size
-        return self._file.read(size)
-
-    def unpacked(self, chunk: Chunk) -> list[McapRecord]:
-        """The records of a chunk, if it states its true size, and that is not out of proportion.
-
-        It is unpacked to one byte more than it states at most, which is enough to see that it lied.
-        """
-        size = chunk.uncompressed_size
-        self._may_unpack_bytes -= size
-        if size > LARGEST_RECORD_BYTES:
-            raise ValueError("damaged: a chunk larger than any recorder writes")
-        if self._may_unpack_bytes < 0:
+    def spend(self, octets: int) -> None:
+        self._left_bytes -= octets
+        if self._left_bytes < 0:
             raise ValueError(f"damaged: it unpacks to over {_MOST_UNPACKED} times its size")
-        octets = chunk.data
-        if chunk.compression == "zstd":
-            unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_RECORD_BYTES)
-            octets = unpacker.stream_reader(octets).read(size + 1)
-        elif chunk.compression == "lz4":
-            octets = lz4.frame.LZ4FrameDecompressor().decompress(octets, size + 1)
-        if len(octets) != size:
-            raise ValueError(f"damaged: a chunk that states {size} bytes has not as many")
-        try:
-            return breakup_chunk(replace(chunk, compression="", data=octets), validate_crc=True)
-        except EndOfFile as exc:  # a record goes beyond the chunk: the file is not cut off here
-            raise ValueError(f"damaged: {exc}") from exc
 
 
-def _records(file: _Bounded) -> Iterator[McapRecord]:
-    """The records of an MCAP file, up to its footer or to where it was cut off.
+def _records(file: BinaryIO, allowance: _Allowance) -> Iterator[tuple[int, bytes]]:
+    """Opcodes and contents of the records that matter, up to the footer or where it was cut off.
 
-    Raises ValueError for a file that is damaged, or of another kind.
+    All lengths inside of a record are lengths of what was read: none takes memory.
     """
-    source, limit = cast(IO[bytes], file), LARGEST_RECORD_BYTES
-    reader = StreamReader(source, emit_chunks=True, record_size_limit=limit)
-    is_first = True
-    try:
-        for record in reader.records:
-            is_first = False
-            yield from file.unpacked(record) if isinstance(record, Chunk) else [record]
-            if isinstance(record, Footer):
-                return
-    except EndOfFile:
-        if is_first:
-            raise ValueError("the file is cut off before its first record") from None
-    except _DAMAGE as exc:
-        raise ValueError("no MCAP file" if is_first else f"damaged: {exc}") from exc
+    if (magic := file.read(len(_MAGIC))) != _MAGIC:
+        cut_off = "the file is cut off before its first record"
+        raise ValueError(cut_off if _MAGIC.startswith(magic) else "no MCAP file")
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        opcode, size = _HEAD.unpack(head)
+        if not opcode:
+            return  # what a system that fell left of its last writes
+        if size > LARGEST_RECORD_BYTES:
+            raise ValueError(f"damaged: a record of {size} bytes, more than any recorder writes")
+        if opcode not in _READ:
+            file.seek(size, os.SEEK_CUR)
+            continue
+        content = file.read(size)
+        if len(content) < size:
+            return
+        if opcode == Opcode.CHUNK:
+            yield from _unpacked(content, allowance)
+        else:
+            yield opcode, content
+        if opcode == Opcode.FOOTER:
+            return
+
+
+def _unpacked(content: bytes, allowance: _Allowance) -> Iterator[tuple[int, bytes]]:
+    """The records of a chunk, if it states its true size, and that is not out of proportion.
+
+    It is unpacked to one byte more than it states at most, which is enough to see that it lied.
+    """
+    size, crc = _CHUNK.unpack_from(content)
+    kind, at = _text(content, _CHUNK.size)
+    octets = content[at + 8 : at + 8 + int.from_bytes(content[at : at + 8], "little")]
+    if size > LARGEST_RECORD_BYTES:
+        raise ValueError("damaged: a chunk larger than any recorder writes")
+    allowance.spend(size)
+    if kind == "zstd":
+        unpacker = zstandard.ZstdDecompressor(max_window_size=LARGEST_RECORD_BYTES)
+        octets = unpacker.stream_reader(octets).read(size + 1)
+    elif kind == "lz4":
+        octets = lz4.frame.LZ4FrameDecompressor().decompress(octets, size + 1)
+    if len(octets) != size:
+        raise ValueError(f"damaged: a chunk that states {size} bytes has not as many")
+    if crc not in (0, zlib.crc32(octets)):
+        raise ValueError("damaged: a chunk is not what was written")
+    at = 0
+    while at < size:
+        opcode, length = _HEAD.unpack_from(octets, at)
+        at += _HEAD.size + length
+        if not opcode or at > size:
+            raise ValueError("damaged: a record goes beyond its chunk")
+        allowance.spend(max(_LEAST_RECORD_BYTES - length, 0))
+        if opcode in _READ:
+            yield opcode, octets[at - length : at]
+
+
+def _text(content: bytes, at: int) -> tuple[str, int]:
+    """The text that stands there, and where it ends."""
+    end = at + 4 + int.from_bytes(content[at : at + 4], "little")
+    return content[at + 4 : end].decode(), end
+
+
+def check_size(name: str, octets: bytes) -> None:
+    """Raise ValueError if this is no message of this topic, by its size."""
+    if len(octets) > _LARGEST_MESSAGE_BYTES["rows" in SCHEMAS[name] and name != "hello"]:
+        raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
 
 
 def _message(name: str, octets: bytes) -> Recorded:
     """The message of a topic. Raises ValueError or KeyError for what no recorder writes."""
-    if len(octets) > _LARGEST_MESSAGE_BYTES:
-        raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
+    check_size(name, octets)
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
@@ -319,9 +353,9 @@ def _message(name: str, octets: bytes) -> Recorded:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
     if name == "hello":
         return _hello(values)
-    for array in {"codes", "rest_ratio"} & values.keys():
+    for of_cells in {"codes", "rest_ratio"} & values.keys():
         shape = values.pop("rows"), values.pop("columns"), READINGS_PER_CELL
-        values[array] = _cells(array, values[array], shape)
+        values[of_cells] = _cells(of_cells, values[of_cells], shape)
     return KINDS[name](**values)
 
 
@@ -339,14 +373,16 @@ def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
     rows, columns, _ = shape
     if rows * columns > MAX_CELLS:
         raise ValueError(f"{name}: no {rows}x{columns} cells")
-    readings = np.array(values) if name == "codes" else np.array(values, np.float64)
-    if readings.size != math.prod(shape):
-        raise ValueError(f"{readings.size} {name} do not make {rows}x{columns} cells")
-    if name == "codes":
-        if readings.dtype.kind != "i" or readings.min() < 0 or readings.max() > LARGEST_CODE:
-            raise ValueError("a code is out of range")
-        readings = readings.astype(np.uint16)
-    return readings.reshape(shape)
+    try:
+        # As `array`, because that takes integers alone, and a third of numpy's time.
+        readings = array("H" if name == "codes" else "d", values)
+    except (TypeError, OverflowError):
+        raise ValueError(f"{name}: one is out of range") from None
+    if len(readings) != math.prod(shape):
+        raise ValueError(f"{len(readings)} {name} do not make {rows}x{columns} cells")
+    if name == "codes" and max(readings) > LARGEST_CODE:
+        raise ValueError("codes: one is out of range")
+    return np.array(readings).reshape(shape)
 
 
 def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
