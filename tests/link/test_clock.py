@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board's clock on the host's, against known clocks."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -154,3 +156,17 @@ def test_scan_times_bridge_a_pause() -> None:
     board_s = np.concatenate([np.arange(0, 20, 1 / HZ), np.arange(600, 620, 1 / HZ)])
     host_s = 9.0 + 1.0001 * board_s
     np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=2e-6)
+
+
+@pytest.mark.parametrize("jump_s", [1e6, 1e9, 4.6e12])
+def test_scan_times_of_a_clock_that_jumps(jump_s: float) -> None:
+    """A recording may say any time: a knot every 15 s of it would take 2 TiB."""
+    host_s = np.arange(400) / HZ
+    board_s = host_s + jump_s * (np.arange(400) // 100)
+    tracemalloc.start()
+    times_s = scan_times_s(scans_at(board_s, host_s))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # Of a large time, a double keeps fewer digits.
+    np.testing.assert_allclose(times_s, host_s, atol=2e-6 + 4 * np.spacing(3 * jump_s))
+    assert most < 1_000_000

@@ -228,13 +228,16 @@ def scan_times_s(scans: list[Scan]) -> Float:
     All are late by about a scan. Here, unlike in `BoardClock`, a line can be fitted to what came
     later as well. At every half `FIT_WINDOW_S` of the board's clock there is a knot, whose time is
     by the line that fits the window around it. Between knots, times are interpolated. A board that
-    is reset begins its clock anew, so scans before and after a reset are taken separately.
+    is reset begins its clock anew, so scans before and after a reset are taken separately; and so
+    are those before and after a pause of a window, across which no line is fitted. Therefore there
+    are no more than two knots a scan, whatever the times are.
     """
     host_s = np.array([scan.host_time_s for scan in scans])
     board_s = 1e-6 * np.array([scan.time_us for scan in scans])
     times_s, half_s = np.empty_like(host_s), FIT_WINDOW_S / 2
-    restarts = np.flatnonzero(np.diff(board_s) <= 0) + 1
-    for part in np.split(np.arange(host_s.size), restarts):
+    steps_s = np.diff(board_s)
+    breaks = np.flatnonzero((steps_s <= 0) | (steps_s > FIT_WINDOW_S)) + 1
+    for part in np.split(np.arange(host_s.size), breaks):
         u_s, t_s = board_s[part], host_s[part]
         count = 2 + int((u_s[-1] - u_s[0]) / half_s)
         knots: list[_Point] = []
