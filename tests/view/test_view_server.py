@@ -224,6 +224,23 @@ def test_a_port_that_is_taken(run: Run) -> None:
     assert_one_line(run("view", "--calibration", "/no/such.json"), "/no/such.json")
 
 
+def test_without_a_port_the_next_free_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever had a page open and began another was told to say a port."""
+    urls = list[str]()
+
+    def started(url: str) -> None:
+        urls.append(url)
+        signal.raise_signal(signal.SIGINT)
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(server, "HTTP_PORT", port)
+        with pytest.raises(KeyboardInterrupt):
+            server.serve(ViewedBoards(), "127.0.0.1", None, started)
+    (found,) = re.findall(r":(\d+)/", urls[0])
+    assert port < int(found) < port + 100
+
+
 def test_without_the_extra_it_says_what_to_install() -> None:
     program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__"
     assert_one_line(python("-c", program, "view"), "pip install '.[view]'")

@@ -14,8 +14,6 @@ from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.errors import OhmskinError
 from ohmskin.force.calibration import load_calibration
 
-# The port at which the page is, unless told. Chosen: few other programs use it.
-HTTP_PORT: Final = 8765
 # Where Linux says that a browser has somewhere to open.
 _DISPLAYS: Final = {"DISPLAY", "WAYLAND_DISPLAY"}
 
@@ -30,7 +28,10 @@ def view(
     ] = None,
     force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
     host: Annotated[str, Option(help="address at which the page listens")] = "127.0.0.1",
-    http_port: Annotated[int, Option(min=0, max=65535, help="its port; 0: any free")] = HTTP_PORT,
+    http_port: Annotated[
+        int | None,
+        Option(min=0, max=65535, help="its port; 0: any free; default: 8765, or the next free"),
+    ] = None,
     no_browser: Annotated[bool, Option("--no-browser", help="only print its address")] = False,
 ) -> None:
     """Show skins live on a page in the browser: heat map, contacts, tare, recording.

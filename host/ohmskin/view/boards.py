@@ -53,7 +53,7 @@ _CLOSE_S: Final = 1.0
 # longer than anybody types, and short enough for a line of an error.
 LONGEST_TEXT_CHARS: Final = 1000
 # What the page says of a board.
-_OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns")
+_OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns", "mode")
 # What it says of a contact.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
 # Boards that agree in all of these read the same skin: method, rest and tare stay good.

@@ -13,7 +13,7 @@ import re
 import secrets
 import socket
 from collections.abc import AsyncIterator, Callable, Collection
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -34,6 +34,10 @@ from ohmskin.view.boards import LONGEST_TEXT_CHARS, MOST_BOARDS, ViewedBoards, l
 from ohmskin.view.connections import Server, Waiting
 from ohmskin.view.panel import Panel
 
+# The port at which the page is, unless told. Chosen: few other programs use it.
+HTTP_PORT: Final = 8765
+# So many ports from there on are tried. Chosen: nobody has as many pages open.
+_PORTS_TRIED: Final = 100
 _PAGE: Final = Path(__file__).parent / "page"
 # A page's message has at most so many bytes. Chosen: a text of `LONGEST_TEXT_CHARS` has at most
 # 4000 in UTF-8, and names are added.
@@ -171,31 +175,45 @@ async def _body(request: Request) -> bytes:
     return octets
 
 
-def serve(boards: ViewedBoards, host: str, port: int, started: Callable[[str], None]) -> None:
-    """Serve until SIGINT or SIGTERM; then the boards are closed. SIGINT raises KeyboardInterrupt.
-
-    port: 0: any that is free. started: is called with the page's address when it can be opened.
+def _listen(host: str, port: int | None) -> socket.socket:
+    """A socket that listens at `port`; None: at `HTTP_PORT`, or the next that is free.
 
     :raises OhmskinError: the address cannot be had.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with boards:
+    if port is not None:
         try:
-            listening = socket.create_server((host, port), family=family)
+            return socket.create_server((host, port), family=family)
         except OSError as exc:
             problem = f"{host} port {port} cannot be had: {exc.strerror or exc}"
             remedy = "say another with --http-port; 0 is any that is free"
             raise OhmskinError(problem, remedy) from exc
-        with listening:
-            token = secrets.token_urlsafe(16)
-            name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-            name = f"[{name}]" if ":" in name else name
-            url = f"http://{name}:{listening.getsockname()[1]}/?token={token}"
-            app = make_app(boards, host, token, lambda: started(url))
-            with_limits = Server(
-                app, longest_message_bytes=_LONGEST_MESSAGE_BYTES, shutdown_s=_SHUTDOWN_S
-            )
-            with_limits.run(sockets=[listening])
+    for tried in range(HTTP_PORT, HTTP_PORT + _PORTS_TRIED):
+        with suppress(OSError):
+            return socket.create_server((host, tried), family=family)
+    return _listen(host, HTTP_PORT)  # says why not
+
+
+def serve(
+    boards: ViewedBoards, host: str, port: int | None, started: Callable[[str], None]
+) -> None:
+    """Serve until SIGINT or SIGTERM; then the boards are closed. SIGINT raises KeyboardInterrupt.
+
+    port: 0: any that is free; None: `HTTP_PORT`, or the next that is free.
+    started: is called with the page's address when it can be opened.
+
+    :raises OhmskinError: the address cannot be had.
+    """
+    with boards, _listen(host, port) as listening:
+        token = secrets.token_urlsafe(16)
+        name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        name = f"[{name}]" if ":" in name else name
+        url = f"http://{name}:{listening.getsockname()[1]}/?token={token}"
+        app = make_app(boards, host, token, lambda: started(url))
+        with_limits = Server(
+            app, longest_message_bytes=_LONGEST_MESSAGE_BYTES, shutdown_s=_SHUTDOWN_S
+        )
+        with_limits.run(sockets=[listening])
 
 
 class Guard:

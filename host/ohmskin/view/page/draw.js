@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // The heat map, its bar and the curve, on canvases that keep to the screen's own pixels.
 
-import { colourAt, inkAt, isAbove, isHatched, isUncertain, written } from "./scale.js";
+import { colourAt, inkAt, isAbove, isHatched, isUncertain, written, writtenWith } from "./scale.js";
 
 // Room at the edge of a map, for the numbers of rows and columns [px]. Chosen.
 const EDGE_PX = 20;
-// The largest width and height of a map [px]: two maps and the lists beside them fit on a laptop.
-const MAP_PX = 480;
 // Above this, the numbers in the cells would touch each other. They are shown on hover.
 const COLUMNS_WITH_NUMBERS = 12;
+// Room for what is written beside a contact [px]: "uncertain" is the longest. Chosen.
+const AMOUNT_PX = 90;
 const FONT = "system-ui, 'DejaVu Sans', sans-serif";
 
 // The context of a canvas of so many CSS pixels, cleared.
@@ -29,7 +29,9 @@ export class HeatMap {
   constructor(map) {
     this.cells = map.querySelector(".cells");
     this.digits = map.querySelector(".digits");
+    this.figure = map.parentNode;
     this.width = 0;
+    this.texts = [];
     new ResizeObserver(([entry]) => {
       this.width = Math.floor(entry.contentRect.width);
     }).observe(map);
@@ -39,8 +41,9 @@ export class HeatMap {
   plan(rows, columns) {
     if (this.rows === rows && this.columns === columns && this.planned === this.width) return;
     [this.rows, this.columns, this.planned] = [rows, columns, this.width];
-    const width = Math.min(this.width - EDGE_PX, MAP_PX);
-    this.size = Math.max(4, Math.floor(Math.min(width / columns, MAP_PX / rows)));
+    this.figure.style.setProperty("--shape", columns / rows); // page.css bounds its width by that
+    this.size = Math.max(4, Math.floor((this.width - EDGE_PX) / columns));
+    this.texts = [];
     this.height = EDGE_PX + this.size * rows;
     for (const canvas of [this.cells, this.digits]) canvas.style.height = `${this.height}px`;
   }
@@ -76,6 +79,7 @@ export class HeatMap {
         context.strokeRect(x + 2.5, y + 2.5, size - 6, size - 6);
       }
     }
+    if (chosen === null) return;
     const [x, y] = this.at(Math.floor(chosen / this.columns), chosen % this.columns);
     context.strokeStyle = styleOf("--accent");
     context.lineWidth = 3;
@@ -111,8 +115,23 @@ export class HeatMap {
     context.restore();
   }
 
-  // The numbers: less often, because nobody reads sixty a second.
+  // What is written in the cells: changed less often, because nobody reads sixty a second.
   write(scale, { values, std, touched }) {
+    const size = this.size;
+    this.texts = [];
+    if (size < 28 || this.columns > COLUMNS_WITH_NUMBERS) return;
+    this.texts = Array.from(values, (value, cell) => {
+      const shown = std && [scale, value, std[cell], touched[cell]];
+      if (shown && isUncertain(...shown)) return ["?"];
+      if (!shown || size < 42 || !(touched[cell] || isHatched(...shown)))
+        return [written(scale.show(value))];
+      const [text, spread] = writtenWith(scale.show(value), scale.std(value, std[cell]));
+      return [text, `±${spread}`];
+    });
+  }
+
+  // Numbers of rows and columns, and the texts of the cells in the ink of the colours that are shown.
+  drawTexts(scale, { values }) {
     const context = fit(this.digits, this.width, this.height);
     const size = this.size;
     context.textAlign = "center";
@@ -126,28 +145,55 @@ export class HeatMap {
     for (let column = 0; column < this.columns; column += every) {
       context.fillText(column, EDGE_PX + (column + 0.5) * size, EDGE_PX / 2);
     }
-    if (size < 28 || this.columns > COLUMNS_WITH_NUMBERS) return;
-    for (let cell = 0; cell < values.length; cell++) {
-      const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
-      const middle = x + (size - 1) / 2;
-      const shown = std && [scale, values[cell], std[cell], touched[cell]];
-      const uncertain = shown && isUncertain(...shown);
-      const withStd = shown && size >= 42 && !uncertain && (touched[cell] || isHatched(...shown));
-      context.fillStyle = inkAt(scale.position(values[cell]) || 0);
-      context.globalAlpha = touched[cell] ? 1 : 0.6;
-      context.font = `${size >= 42 ? 13 : 10}px ${FONT}`;
-      const text = uncertain ? "?" : written(scale.show(values[cell]));
-      context.fillText(text, middle, y + size * (withStd ? 0.4 : 0.5));
-      if (withStd) {
-        context.font = `10px ${FONT}`;
-        context.fillText(
-          `±${written(scale.std(values[cell], std[cell]))}`,
-          middle,
-          y + size * 0.72,
-        );
-      }
-      context.globalAlpha = 1;
+    for (const [large, lines] of [
+      [size >= 42 ? 13 : 10, 0],
+      [10, 1],
+    ]) {
+      context.font = `${large}px ${FONT}`;
+      this.texts.forEach((texts, cell) => {
+        if (texts[lines] === undefined) return;
+        const [x, y] = this.at(Math.floor(cell / this.columns), cell % this.columns);
+        const middle = y + size * (texts.length === 1 ? 0.5 : lines ? 0.72 : 0.4);
+        const position = Number.isFinite(values[cell]) ? scale.position(values[cell]) : 0;
+        const half = context.measureText(texts[lines]).width / 2 + 1;
+        context.fillStyle = colourAt(position); // hatching must not cross a number
+        context.fillRect(x + (size - 1) / 2 - half, middle - large / 2, 2 * half, large);
+        context.fillStyle = inkAt(position);
+        context.fillText(texts[lines], x + (size - 1) / 2, middle);
+      });
     }
+  }
+}
+
+// A circle around each contact, and its force beside it.
+export class Touches {
+  constructor(list) {
+    this.list = list;
+    this.items = new Map();
+  }
+
+  // texts: of each contact, by its number, in place of those that were given before.
+  draw(map, contacts, texts) {
+    const ring = Math.max(28, Math.round(1.3 * map.size));
+    this.list.style.setProperty("--ring", `${ring}px`);
+    for (const [identity, item] of this.items) {
+      if (contacts.some((contact) => contact[0] === identity)) continue;
+      item.remove();
+      this.items.delete(identity);
+    }
+    contacts.forEach(([identity, row, column], index) => {
+      let item = this.items.get(identity);
+      if (!item) {
+        item = this.list.appendChild(document.createElement("li"));
+        item.append(document.createElement("i"), document.createElement("b"));
+        this.items.set(identity, item);
+      }
+      const [x, y] = map.at(row + 0.5, column + 0.5);
+      item.style.transform = `translate(${x}px, ${y}px)`;
+      item.classList.toggle("left", x + ring / 2 + AMOUNT_PX > map.width);
+      if (texts || !item.lastChild.textContent)
+        item.lastChild.textContent = (texts ?? [])[index] ?? "";
+    });
   }
 }
 
@@ -236,20 +282,15 @@ export class History {
     context.strokeStyle = styleOf("--accent");
     context.lineWidth = 1.5;
     context.stroke();
-    for (const [edge, off, word] of [
-      [top, (at) => at > 1, "above"],
-      [bottom, (at) => at < 0, "below"],
-    ]) {
-      const beyond = known.filter((scan) => off(scale.position(scan[scale.plane][cell])));
-      if (!beyond.length) continue;
-      // Where the curve is off the scale: a thick edge, and the furthest value in words.
-      context.fillStyle = styleOf("--bad");
-      for (const scan of beyond) context.fillRect(x(scan) - 2, edge - 2, 4, 4);
-      const values = beyond.map((scan) => scan[scale.plane][cell]);
-      const furthest = word === "above" ? Math.max(...values) : Math.min(...values);
-      context.textAlign = "left";
-      const text = `${word} the scale: ${written(scale.show(furthest))} ${scale.unit}`;
-      context.fillText(text, left + 4, word === "above" ? edge + 10 : edge - 10);
-    }
+    // Where the curve is above the scale: a thick edge, and the highest value in words. Below it is
+    // the noise of a cell that nothing touches.
+    const above = known.filter((scan) => isAbove(scale, scan[scale.plane][cell]));
+    if (!above.length) return;
+    context.fillStyle = styleOf("--bad");
+    for (const scan of above) context.fillRect(x(scan) - 2, top - 2, 4, 4);
+    const highest = Math.max(...above.map((scan) => scan[scale.plane][cell]));
+    context.textAlign = "left";
+    const text = `above the scale: ${written(scale.show(highest))} ${scale.unit}`;
+    context.fillText(text, left + 4, top + 10);
   }
 }

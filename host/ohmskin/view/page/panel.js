@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // One board: its controls, its maps, and what is said of it.
 
-import { drawBar, HeatMap, History } from "./draw.js";
-import { scaleOf, TOPS_N, withStd, written } from "./scale.js";
+import { drawBar, HeatMap, History, Touches } from "./draw.js";
+import { scaleOf, TOPS_N, withStd, written, writtenWith } from "./scale.js";
 import { Connection } from "./wire.js";
 
 // How often numbers, the table and spoken messages change [ms]: nobody reads sixty a second.
@@ -17,6 +17,10 @@ const STATUS = {
   ended: "ended",
 };
 const MOVES = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+// Where this browser keeps which parts of a panel are shown.
+const SWITCHES = "ohmskin-switches";
+// Up to this chi-square a model is said to fit: it is about 1 where it does. Chosen.
+const FITS = 3;
 // Scans whose latency is shown as their median: a second at 90 Hz.
 const LATENCIES = 90;
 // Frames that were drawn are counted over this time [ms].
@@ -29,6 +33,14 @@ function options(select, names, chosen, text = (name) => name) {
     select.replaceChildren(...wanted.map(([value, label]) => new Option(label, value)));
   }
   if (select.value !== String(chosen)) select.value = chosen;
+}
+
+function switches() {
+  try {
+    return JSON.parse(localStorage.getItem(SWITCHES)) ?? {};
+  } catch {
+    return {}; // it keeps nothing, or what is no JSON
+  }
 }
 
 function say(element, text) {
@@ -44,6 +56,7 @@ export class Panel {
     this.find = (query) => this.element.querySelector(query);
     this.raw = new HeatMap(this.find(".raw .map"));
     this.estimate = new HeatMap(this.find(".estimate .map"));
+    this.touches = new Touches(this.find(".touches"));
     this.history = new History();
     this.chosen = null;
     this.quantity = null; // what the user has chosen
@@ -99,7 +112,7 @@ export class Panel {
       canvas.setAttribute(
         "aria-label",
         `Heat map of the ${text}: arrow keys choose a cell, ` +
-          "whose value is spoken; all values are in the table below",
+          "whose value is spoken; the switch 'Table' adds one of all values",
       );
     }
   }
@@ -131,6 +144,12 @@ export class Panel {
       this.rescale();
     });
     options(this.find(".top-n"), TOPS_N, this.topN, (top) => `0 to ${top} N`);
+    const kept = switches();
+    for (const box of this.element.querySelectorAll(".switches input")) {
+      box.checked = kept[box.name] === true;
+      this.element.classList.toggle(`with-${box.name}`, box.checked);
+      box.addEventListener("change", () => this.switch(box));
+    }
     for (const map of [this.raw, this.estimate]) {
       map.cells.addEventListener("pointerdown", (event) => {
         const cell = map.cellAt(event.offsetX, event.offsetY);
@@ -140,6 +159,21 @@ export class Panel {
       map.cells.addEventListener("pointermove", (event) => this.hover(map, event));
       map.cells.addEventListener("pointerleave", () => this.hover(map, null));
     }
+  }
+
+  switch({ name, checked }) {
+    this.element.classList.toggle(`with-${name}`, checked);
+    this.barsMs = this.writtenMs = this.tableMs = 0;
+    this.dirty = true;
+    try {
+      localStorage.setItem(SWITCHES, JSON.stringify({ ...switches(), [name]: checked }));
+    } catch {
+      // A browser that keeps nothing: it shows the parts until it is closed.
+    }
+  }
+
+  shows(name) {
+    return this.element.classList.contains(`with-${name}`);
   }
 
   // The value under the pointer: numbers of many columns have no room.
@@ -204,7 +238,8 @@ export class Panel {
       this.find(".board"),
       board
         ? `${board.board}, unit ${board.unit_id}, ${board.rows} × ` +
-            `${board.columns} cells, firmware ${board.version}`
+            `${board.columns} cells, firmware ${board.version}` +
+            (board.mode === "far" ? ", mode far: lines are sensed at both ends" : "")
         : "",
     );
     options(this.find(".method"), state.methods, state.method, (name) =>
@@ -213,12 +248,17 @@ export class Panel {
     const recording = this.find(".record");
     recording.textContent = state.recording ? "Stop recording" : "Record";
     recording.setAttribute("aria-pressed", Boolean(state.recording));
+    this.element.classList.toggle("recorded", Boolean(state.recording));
     this.enable(true);
     this.sayFile();
     const date = state.rest_date?.slice(0, 19).replace("T", " ");
     say(
       this.find(".rest"),
-      !date ? "not known: tare" : `${state.tared ? "tare" : "calibration"}\n${date}`,
+      !date ? "not known" : `by ${state.tared ? "tare" : "calibration"}\n${date}`,
+    );
+    say(
+      this.find(".advice"),
+      date || !board ? "" : "Press Tare while nothing touches the skin: light touches show better.",
     );
     if (state.note) this.notice({ text: state.note });
     this.rescale();
@@ -260,7 +300,7 @@ export class Panel {
     this.find(".full-scale").hidden = wanted !== "newtons";
     this.scale = scaleOf(wanted, this.topN);
     this.rawScale = scaleOf(wanted === "newtons" ? "siemens" : wanted, this.topN);
-    say(this.find(".amount"), withForce ? "force [N]" : "rise [µS]");
+    say(this.find(".amount"), withForce ? "force" : "above rest");
     this.barsMs = this.writtenMs = 0;
     this.dirty = true;
   }
@@ -288,7 +328,7 @@ export class Panel {
     const sizes = `${this.raw.width} ${this.estimate.width} ${devicePixelRatio}`;
     if (sizes !== this.sizes)
       [this.sizes, this.dirty, this.writtenMs, this.barsMs] = [sizes, true, 0, 0];
-    if (!this.dirty || !this.raw.width) return;
+    if (!this.dirty || !this.estimate.width) return;
     this.dirty = false;
     const cells = scan.rows * scan.columns;
     if (this.chosen === null || this.chosen >= cells) {
@@ -301,21 +341,33 @@ export class Panel {
       std: scan[`${scale.plane}_std`],
       touched: scan.touched,
     };
-    this.raw.draw(scan, this.rawScale, raw, this.chosen);
-    this.estimate.draw(scan, scale, estimate, this.chosen);
-    this.history.draw(this.find(".plot"), scale, this.chosen);
-    if (!this.barsMs) {
-      this.barsMs = nowMs;
-      drawBar(this.find(".raw .bar"), this.rawScale);
-      drawBar(this.find(".estimate .bar"), scale);
+    // The cell whose curve is shown, or that the keyboard has chosen.
+    const focused =
+      document.activeElement?.closest(".maps") && this.element.matches(":focus-within");
+    const chosen = this.shows("curve") || focused ? this.chosen : null;
+    const drawn = [[this.estimate, scale, estimate, ".estimate .bar"]];
+    if (this.shows("raw") && this.raw.width)
+      drawn.push([this.raw, this.rawScale, raw, ".raw .bar"]);
+    const writes = nowMs - (this.writtenMs || 0) >= DIGITS_EVERY_MS || !this.writtenMs;
+    for (const [map, itsScale, values, bar] of drawn) {
+      map.draw(scan, itsScale, values, chosen);
+      if (writes && this.shows("numbers")) map.write(itsScale, values);
+      if (!this.shows("numbers")) map.texts = [];
+      map.drawTexts(itsScale, values);
+      if (!this.barsMs) drawBar(this.find(bar), itsScale);
     }
-    if (nowMs - (this.writtenMs || 0) >= DIGITS_EVERY_MS || !this.writtenMs) {
+    this.barsMs ||= nowMs;
+    this.touches.draw(
+      this.estimate,
+      scan.contacts,
+      writes ? this.amounts(scan, { briefly: true }) : null,
+    );
+    if (this.shows("curve")) this.history.draw(this.find(".plot"), scale, this.chosen);
+    if (writes) {
       this.writtenMs = nowMs;
-      this.raw.write(this.rawScale, raw);
-      this.estimate.write(scale, estimate);
       this.write(scan, nowMs);
     }
-    if (this.find(".values").open && nowMs - (this.tableMs || 0) >= TABLE_EVERY_MS) {
+    if (this.shows("table") && nowMs - (this.tableMs || 0) >= TABLE_EVERY_MS) {
       this.tableMs = nowMs;
       this.table(scan, scale);
     }
@@ -344,7 +396,24 @@ export class Panel {
     channel.port2.postMessage(0);
   }
 
+  // The force of each contact, or how far it is above rest: with its deviation, or briefly.
+  amounts({ force, contacts }, { briefly }) {
+    const [unit, size] = force ? ["N", 1] : ["µS", 1e6];
+    return contacts.map(([, , , amount, std]) => {
+      if (!(std <= amount)) return "uncertain";
+      const [text, spread] = writtenWith(size * amount, size * std);
+      return briefly ? `${text} ${unit}` : `${text} ± ${spread} ${unit}`;
+    });
+  }
+
+  health(scan) {
+    const missed = scan.missed ? `${scan.missed} scans missed` : "nothing missed";
+    const late = this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–";
+    return `${scan.rate_hz.toFixed(0)} Hz, ${missed}, ${late}`;
+  }
+
   write(scan, nowMs) {
+    say(this.find(".health"), this.health(scan));
     const count = (touched) => touched.reduce((sum, each) => sum + each, 0);
     const cells = (number, seem) => `${number} ${number === 1 ? "cell" : "cells"} ${seem}touched`;
     say(this.find(".raw .count"), cells(count(scan.raw_touched), "seemingly "));
@@ -360,21 +429,20 @@ export class Panel {
     );
     say(this.find(".shown"), `${((1000 * this.drawnAt.length) / DRAWN_MS).toFixed(0)} a second`);
     say(this.find(".takes"), `${(1000 * scan.estimate_s).toFixed(1)} ms`);
-    say(this.find(".chi2"), scan.chi2 === null ? "–" : scan.chi2.toPrecision(2));
+    const { chi2 } = scan;
+    const fit = chi2 === null ? "–" : `${chi2 <= FITS ? "well" : "badly"} (${chi2.toPrecision(2)})`;
+    say(this.find(".chi2"), fit);
     if (nowMs - (this.messageMs || 0) >= MESSAGE_EVERY_MS) {
       this.messageMs = nowMs;
       say(this.find(".message"), this.message);
       this.message = "";
     }
-    const force = scan.force !== undefined;
-    const rows = scan.contacts.map(([identity, row, column, amount, std]) => {
-      const [value, spread] = force ? [amount, std] : [1e6 * amount, 1e6 * std];
-      return [
-        identity,
-        `${row.toFixed(1)}, ${column.toFixed(1)}`,
-        !(std <= amount) ? "uncertain" : `${written(value)} ± ${written(spread)}`,
-      ];
-    });
+    const amounts = this.amounts(scan, { briefly: false });
+    const rows = scan.contacts.map(([identity, row, column], index) => [
+      identity,
+      `${row.toFixed(1)}, ${column.toFixed(1)}`,
+      amounts[index],
+    ]);
     fill(this.find(".contacts tbody"), rows.length ? rows : [["–", "no contact", ""]]);
     this.sayFile();
     for (const map of [this.raw, this.estimate]) this.sayHovered(map);

@@ -28,8 +28,12 @@ const RAMP = Array.from({ length: STEPS }, (_, step) => {
   );
 });
 const COLOURS = RAMP.map((rgb) => `rgb(${rgb})`);
-// Whether dark ink is read better on a colour: its luma (ITU-R BT.601) against a chosen limit.
-const IS_LIGHT = RAMP.map(([r, g, b]) => 0.299 * r + 0.587 * g + 0.114 * b > 140);
+// Relative luminance (WCAG 2.2), and whether black is read better than white on a colour: the better
+// of them has a contrast of at least 4.58 on any, where lighter and darker meet at sqrt(1.05 * 0.05).
+const linear = (part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4);
+const luminance = (rgb) =>
+  rgb.reduce((sum, part, k) => sum + [0.2126, 0.7152, 0.0722][k] * linear(part / 255), 0);
+const IS_LIGHT = RAMP.map((rgb) => luminance(rgb) > Math.sqrt(1.05 * 0.05) - 0.05);
 
 function step(position) {
   const index = Math.round((STEPS - 1) * Math.min(1, Math.max(0, position)));
@@ -37,7 +41,7 @@ function step(position) {
 }
 
 export const colourAt = (position) => COLOURS[step(position)];
-export const inkAt = (position) => (IS_LIGHT[step(position)] ? "#1b1014" : "#fff");
+export const inkAt = (position) => (IS_LIGHT[step(position)] ? "#000" : "#fff");
 export const onTheme = (call) => dark.addEventListener("change", call);
 
 // Three digits, without an exponent.
@@ -45,6 +49,19 @@ export function written(value) {
   if (!Number.isFinite(value)) return "–";
   const size = Math.abs(value);
   return value.toFixed(size < 9.995 ? 2 : size < 99.95 ? 1 : 0);
+}
+
+// A value and its deviation with the digits that mean something, at most two after the point: the
+// deviation has two where they are 10 to 35, otherwise one (Particle Data Group, Introduction, 5.3).
+export function writtenWith(value, std) {
+  if (!(std > 0) || !Number.isFinite(value + std)) return [written(value), written(std)];
+  const size = Math.floor(Math.log10(std));
+  const lead = std / 10 ** size;
+  const last = Math.max(-2, lead < 3.55 ? size - 1 : size);
+  const unit = 10 ** last;
+  return [value, Math.max(std, unit)].map((number) =>
+    (Math.round(number / unit) * unit).toFixed(Math.max(0, -last)),
+  );
 }
 
 // The scale of conductances, in siemens: 1 MOhm, about an untouched cell, to 1 kOhm, a hard touch.
@@ -103,5 +120,6 @@ export const isAbove = (scale, value) => scale.position(value) > 1;
 export function withStd(scale, value, std, touched) {
   if (isUncertain(scale, value, std, touched)) return "uncertain";
   const above = isAbove(scale, value) ? ", off the scale" : "";
-  return `${written(scale.show(value))} ± ${written(scale.std(value, std))} ${scale.unit}${above}`;
+  const [text, spread] = writtenWith(scale.show(value), scale.std(value, std));
+  return `${text} ± ${spread} ${scale.unit}${above}`;
 }
