@@ -2,6 +2,7 @@
 """Forces from a board: what open promises with a calibration, tare, and replay bit for bit."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -12,7 +13,9 @@ import pytest
 
 import ohmskin
 from calibrations import NEWTON_SIEMENS, calibration, of_scene
+from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.emulate.urls import emulated
 from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.estimate.knowledge import NO_WIRES
 from ohmskin.estimate.methods import LEVEL_METHODS
@@ -22,7 +25,7 @@ from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from recordings import write_recording
-from stepped import stepped
+from stepped import stepped, stepped_link
 
 GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 Record = Callable[[int, int], str]
@@ -236,3 +239,39 @@ def test_a_tare_at_the_end_of_a_replay_says_so(recorded: Record) -> None:
         assert len(list(board)) == 5
         with pytest.raises(DeviceLost, match="gives no more scans"):
             board.tare()
+
+
+@pytest.mark.parametrize("other", ["8x8?scene=multi&begin=0&unit=77", "4x4?unit=77"])
+def test_another_unit_behind_the_same_line_ends_the_forces(other: str) -> None:
+    """They were silently those of the calibration of the unit before."""
+    link = stepped_link(GHOST)
+    with CalibratedSkin(SteppedSkin(link), of_scene("ghost")) as skin:
+        scans = iter(skin)
+        assert np.nansum(next(scans).force_n) > 0
+        link.board.reset()
+        link.board, _, _ = emulated(f"emulator://{other}")
+        with pytest.raises(DeviceLost, match=r"unit 77 has come in place of unit 0: open it again"):
+            deque(scans, maxlen=0)
+
+
+def test_the_same_unit_goes_on_after_a_reset_and_under_a_new_name() -> None:
+    link = stepped_link(GHOST)
+    with CalibratedSkin(SteppedSkin(link), of_scene("ghost")) as skin:
+        scans = iter(skin)
+        next(scans)
+        link.board.reset()
+        assert len(list(islice(scans, 20))) == 20
+        assert skin.stats.restarts == 1
+        skin.device.set_unit_id(5)
+        assert len(list(islice(scans, 20))) == 20
+
+
+def test_another_unit_in_a_recording_ends_its_forces(tmp_path: Path) -> None:
+    board = stepped(GHOST)
+    scans = list(islice(board, 3))
+    path = tmp_path / "two.mcap"
+    write_recording(path, board.info, [*scans, replace(board.info, unit_id=77), *scans])
+    with ohmskin.open(f"replay://{path}?speed=0", calibration=of_scene("ghost")) as skin:
+        played = iter(skin)
+        with pytest.raises(DeviceLost, match="unit 77 has come in place of unit 0"):
+            deque(played, maxlen=0)

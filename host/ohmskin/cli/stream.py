@@ -74,6 +74,7 @@ def stream(
         reader = None
         if method != "none":
             reader = SkinReader(skin.info, loaded, method=method, force=force)
+            skin.only_unit = None if loaded is None else skin.info.unit_id
             if tare_s:
                 # Without a calibration the rest is unknown, and cells may seem touched.
                 reader.tare(skin.mean_ratio(tare_s), force=loaded is None)

@@ -283,7 +283,8 @@ class CalibratedSkin(Closing):
     """A device whose scans carry forces, and which can be tared. Made by ``ohmskin.open``.
 
     device: the board or recording alone, with all its commands. force: take the calibration of
-    another unit. Iterating and `latest` are those of `Device`, with forces.
+    another unit. Iterating and `latest` are those of `Device`, with forces. Where another unit
+    comes behind the same line, they end by DeviceLost.
 
     :raises ValueError: the calibration is of another unit or geometry.
     """
@@ -293,6 +294,7 @@ class CalibratedSkin(Closing):
         self.name = device.name
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
+        device.only_unit = device.info.unit_id
         self._lock = threading.Lock()  # a reader takes one scan at a time
 
     @property

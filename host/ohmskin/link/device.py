@@ -54,6 +54,8 @@ class Device(Closing):
         """Gives the force on each cell (R, C) [N] at a scan, where a simulation knows it."""
         self.put: Callable[[tuple[tuple[int, int], float] | None], None] | None = None
         """Presses a cell by a force [N], or none, where a simulated skin lets a program do so."""
+        self.only_unit: int | None = None
+        """The unit that is meant: another that says hello ends the device. None: any may come."""
         self._stats = stats
         self._changed = threading.Condition()
         self._hello: Hello | None = None
@@ -211,6 +213,8 @@ class Device(Closing):
         """Name this skin; `save` makes the name last."""
         with self._commands:
             self._command("set_unit_id", unit_id=unit_id)
+            if self.only_unit is not None:
+                self.only_unit = unit_id
             self._refresh()
 
     def save(self) -> None:
@@ -268,6 +272,16 @@ class Device(Closing):
         """Ask for `hello`. It comes before the answer to the command, so `info` is new then."""
         self._command("get_hello")
         return self.info
+
+    def _check_unit(self, hello: Hello) -> None:
+        """Raise DeviceLost if this is not `only_unit`.
+
+        Behind an adapter that stays plugged, boards may change, and no port goes away.
+        """
+        if self.only_unit not in (None, hello.unit_id):
+            came = f"unit {hello.unit_id} has come in place of unit {self.only_unit}"
+            remedy = "open it again, with a calibration of this unit's skin"
+            raise DeviceLost(f"{self.name}: {came}", remedy)
 
     def close(self) -> None:
         """Stop the board and give the port back. May be called again."""

@@ -194,6 +194,8 @@ class Session(Device):
 
     def _keep(self, message: Message) -> None:
         """Give a message to who waits for it. Raises ProtocolError for what no board can say."""
+        if isinstance(message, Hello):
+            self._check_unit(message)
         match message:
             case Hello() if odd := message.impossible():
                 raise ProtocolError(f"{self.name}: hello says {odd}, which cannot be", _BROKEN)

@@ -87,6 +87,7 @@ class Replay(Device):
                     rest_ratio = tare.rest_ratio if tare and tare.is_of(message) else None
                     self._play_scan(replace(message, rest_ratio=rest_ratio))
                 case Hello():
+                    self._check_unit(message)
                     self._hello = message
                 case Tare():
                     tare = message

@@ -331,6 +331,7 @@ class ViewedBoard(Closing):
         with opening.open(self.port) as skin:
             reader = self._reader_of(skin)
             self._reader, self._skin = reader, skin
+            skin.only_unit = skin.info.unit_id  # another one is opened anew, with its calibration
             raw = make_estimator("ohm", SkinKnowledge.of(replace(reader.board, mode="near")))
             try:
                 while not self.closing.is_set():
