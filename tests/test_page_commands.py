@@ -8,6 +8,7 @@ run as well. How a command is run here, and what is compared:
   and verify get one in simulated time. The port's name is put back into what is printed. An
   emulator:// URL stays; where it has a fault, the doctor finds something.
 - Each command has a folder of its own, in which `files` made what a command before it would have.
+  But those of `IN_ORDER` run one after another in one folder.
 - A command that goes on until Ctrl-C is stopped after some tables or lines. Times for which a port
   is recorded are shorter.
 - Lines of a block below a command are what it prints: each is among the printed lines, in this
@@ -35,7 +36,7 @@ import pytest
 
 import ohmskin
 from calibrations import of_scene
-from command_line import ENVIRONMENT, Command, Run, finish
+from command_line import ENVIRONMENT, Command, Run, finish, well
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.record.recording import ForceSample, Tare, load_recording
 from places import ROOT
@@ -88,10 +89,11 @@ STOPPED = {
 
 
 class Shown(NamedTuple):
-    """What pages show below a command."""
+    """What pages show below a command, and its words."""
 
     page: str
     lines: tuple[str, ...]
+    words: list[str]
 
 
 def texts() -> Iterator[tuple[str, str]]:
@@ -109,7 +111,7 @@ def steps() -> dict[str, list[Shown]]:
         plain = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
         for span in SPAN.findall(BLOCK.sub("", plain)):
             words = shlex.split(span.replace("PORT", "/dev/ttyACM0"))
-            found[" ".join(words)].append(Shown(page, ()))
+            found[" ".join(words)].append(Shown(page, (), words))
         for block in BLOCK.findall(plain):
             lines = [line.strip() for line in block.strip("\n").splitlines()]
             if not COMMAND.match(lines[0]):
@@ -121,11 +123,12 @@ def steps() -> dict[str, list[Shown]]:
                     command = re.sub(r"^(ohmskin \w+)\s{3,}.*", r"\1 --help", command)
                 words = shlex.split(command, comments=True)
                 shown = tuple(line for line in lines[start + 1 : end] if line and line[0] != "#")
-                found[" ".join(words)].append(Shown(page, shown))
+                found[" ".join(words)].append(Shown(page, shown, words))
     return found
 
 
 STEPS = steps()
+IN_ORDER = [line for line in STEPS if re.search(r"\b(?:robot|weights)\.(?:mcap|json)", line)]
 
 
 def is_shown(line: str, printed: str) -> bool:
@@ -262,7 +265,7 @@ def printed_by(
 
 
 @pytest.mark.usefixtures("place")
-@pytest.mark.parametrize("line", [line for line in STEPS if line not in NOT_RUN])
+@pytest.mark.parametrize("line", [line for line in STEPS if line not in (*NOT_RUN, *IN_ORDER)])
 def test_a_command_prints_what_its_pages_show(
     line: str,
     run: Run,
@@ -272,7 +275,7 @@ def test_a_command_prints_what_its_pages_show(
     attach: Attach,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    words, names = line.split(" "), {}
+    words, names = list(STEPS[line][0].words), {}
     if words[0] == "make":  # what the target does, without what it needs
         dry = (*words, "-n", "--no-print-directory")
         made = subprocess.check_output(dry, cwd=ROOT, text=True).splitlines()
@@ -287,8 +290,23 @@ def test_a_command_prints_what_its_pages_show(
     printed = printed_by(words, run, command, monkeypatch)
     for path, name in names.items():
         printed = printed.replace(path, name)
-    for page, lines in STEPS[line]:
+    for page, lines, _ in STEPS[line]:
         assert missing(lines, printed) is None, (page, printed)
+
+
+def test_an_emulated_skin_is_calibrated_as_a_page_says(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert [line.split(" ")[1] for line in IN_ORDER] == [
+        *("record", "calibrate", "stream"),
+        *("calibrate", "stream"),
+    ]
+    for line in IN_ORDER:
+        [(page, lines, words)] = STEPS[line]
+        stop = ("--seconds", "1") if words[1] == "stream" else ()
+        done = well(run(*words[1:], *stop))
+        assert missing(lines, done.out) is None, (page, done.out)
 
 
 def test_what_is_not_run_is_on_a_page() -> None:
