@@ -14,11 +14,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from typer import Argument, Option
 
 import ohmskin
+from ohmskin.cli.terminal import Terminal
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
@@ -41,7 +42,7 @@ _FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # there is none but i
 _RETRY_S: Final = 0.2
 
 # Where commands print what people read. No line is broken, so that a pipe gets messages whole.
-TERMINAL: Final = Console(soft_wrap=True)
+TERMINAL: Final = Terminal(soft_wrap=True)
 
 Port = Annotated[str, Argument(envvar="OHMSKIN_PORT", help="serial port or URL")]
 Wires = Annotated[str, Option(help="nominal ohms of a wire segment, TOP,BOTTOM: 100,200")]
@@ -107,7 +108,8 @@ def info(
         table.add_row("findings", ", ".join(findings) or "none")
     TERMINAL.print(table)
     for finding in findings:
-        TERMINAL.print(f"[red]{finding}[/]: {ENUMS['finding'].docs[finding]}")
+        doc = ENUMS["finding"].docs.get(finding, "a finding of a newer firmware")
+        TERMINAL.print(Text(finding, "red") + f": {doc}")
     if findings:
         raise SystemExit(1)
 
@@ -182,7 +184,7 @@ def flash(
     packages = _ROOT / ".pio" / "core"  # where `make setup` puts them
     environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
     for baud, command in _uploads(board, port).items():
-        TERMINAL.print(f"flashing {board} at {port}, {baud} baud", markup=False)
+        TERMINAL.print(f"flashing {board} at {port}, {baud} baud")
         if not subprocess.run(command, env=environment | os.environ).returncode:
             break
     else:
@@ -190,7 +192,7 @@ def flash(
     hello = _answer(port)
     if hello.board != ("uno" if board == "nano" else board):  # the same chip, and the same wiring
         raise OhmskinError(f"{port} answers as '{hello.board}', not as {board}: flash that one")
-    TERMINAL.print(f"{port}: {board}, firmware {hello.version}, answers", markup=False)
+    TERMINAL.print(f"{port}: {board}, firmware {hello.version}, answers")
 
 
 def _uploads(board: str, port: str) -> dict[int, list[str]]:

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 from rich.columns import Columns
-from rich.console import Console
 
 import ohmskin
 from ohmskin.arrays import Bool, Float
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import FULL_SCALE_USIEMENS, WIDE, coloured
+from ohmskin.cli.terminal import Terminal
 from ohmskin.emulate.urls import emulated
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -22,7 +22,7 @@ from ohmskin.link.device import scans_for
 
 # The methods that are compared: one that shows ghosts, and one that does not.
 _METHODS: Final = ("ohm", "joint")
-_out = Console()
+_out = Terminal()
 
 
 def compare(port: str, seconds: float, picture: Path) -> None:
@@ -63,7 +63,7 @@ def compare(port: str, seconds: float, picture: Path) -> None:
         _save_picture(picture, views, title)
     except ImportError:
         hint = "run pip install '.[plot]' in the checkout, or 'FILE.whl[plot]' of a wheel"
-        out.print(f"no picture: pictures need matplotlib: {hint}", markup=False)
+        out.print(f"no picture: pictures need matplotlib: {hint}")
     else:
         out.print(f"picture: {picture}")
 

@@ -8,13 +8,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from rich.console import Console
 from typer import Option
 
 import ohmskin
 from ohmskin import errors
 from ohmskin.cli import doctor_words as words
 from ohmskin.cli.board import Leads, Port, Wires, wires_of
+from ohmskin.cli.terminal import Terminal
 from ohmskin.doctor.examine import examine, measured_wires
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
 from ohmskin.doctor.gather import Report, Step, gather
@@ -29,7 +29,7 @@ _UNANSWERED: Final = {
     errors.ProtocolMismatch: Kind.PROTOCOL_MISMATCH,
 }
 
-_out = Console(soft_wrap=True, markup=False, highlight=False)
+_out = Terminal(soft_wrap=True, highlight=False)
 
 
 def doctor(
@@ -112,7 +112,7 @@ def terminal() -> Iterator[Report]:
 
     Elsewhere progress is of no use: each request to a person is printed, once.
     """
-    console, said = Console(stderr=True, markup=False, highlight=False), {""}
+    console, said = Terminal(stderr=True, highlight=False), {""}
     status = console.status("connecting") if console.is_terminal else None
 
     def report(step: Step, detail: Any) -> None:

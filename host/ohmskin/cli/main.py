@@ -113,5 +113,7 @@ def run(commands: Callable[..., Any], program: str) -> None:
 
 
 def _fail(program: str, text: str) -> None:
-    print(f"{program}: {' '.join(text.split())}", file=sys.stderr)  # noqa: T201
+    from ohmskin.cli.terminal import printable  # with rich, which a command that fails may not need
+
+    print(printable(f"{program}: {' '.join(text.split())}"), file=sys.stderr)  # noqa: T201
     sys.exit(2)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.progress import track
 from rich.text import Text
@@ -22,6 +22,7 @@ import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
 from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
+from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.base import Estimator
@@ -105,7 +106,7 @@ def record(
         done += f", {recorder.forces} forces"
     if sensor is not None and sensor.damaged:
         done += f", {sensor.damaged} lines that are no numbers"
-    TERMINAL.print(f"{file}: {done}", markup=False)
+    TERMINAL.print(f"{file}: {done}")
 
 
 def _truth(skin: Device, recorder: Recorder) -> Callable[[Scan], None]:
@@ -130,7 +131,7 @@ def _truth(skin: Device, recorder: Recorder) -> Callable[[Scan], None]:
 
 def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
     """Passes things on; in a terminal, a bar says how many have been."""
-    console = Console(stderr=True)
+    console = Terminal(stderr=True)
     hidden = not console.is_terminal
     return partial(track, description=what, console=console, transient=True, disable=hidden)
 
@@ -200,7 +201,7 @@ def export(
         scans = export_recording(given, out, begin_s, end_s)
     except RecordingError as exc:
         raise RecordingError(f"{recording}: {exc}") from exc
-    TERMINAL.print(f"{out}: {scans} scans", markup=False)
+    TERMINAL.print(f"{out}: {scans} scans")
     if given.cut_off:
         print(f"{recording} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
 

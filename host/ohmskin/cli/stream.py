@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -21,6 +21,7 @@ from typer import Option
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.cli.board import Port, Scans, Seconds, asked_for
+from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
@@ -29,9 +30,9 @@ from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
-_out = Console()
+_out = Terminal()
 # For tables in a file or pipe, which have no width: 16 columns, or three tables of 8 side by side.
-WIDE: Final = Console(width=160)
+WIDE: Final = Terminal(width=160)
 # Conductance at which a table's colours end [microsiemens]. Chosen: a firm press makes 5 kOhm.
 FULL_SCALE_USIEMENS: Final = 200.0
 # Force at which a table's colours end [N]. Chosen: more than a fingertip usually presses.

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from rich.console import Console
 from typer import Argument, Option
 
 import ohmskin
@@ -17,6 +16,7 @@ from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
 from ohmskin.cli.stream import numbers
+from ohmskin.cli.terminal import Terminal
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather_plate
 from ohmskin.doctor.plate import PlateExam, Tolerance
@@ -24,7 +24,7 @@ from ohmskin.emulate.scenes import LEAD_OHM
 from ohmskin.files import check_place, whole_file
 
 _MOST: Final = Tolerance()
-_out = Console(soft_wrap=True, markup=False, highlight=False)
+_out = Terminal(soft_wrap=True, highlight=False)
 
 
 def _most(what: str) -> Any:
