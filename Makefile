@@ -28,7 +28,7 @@ PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons far orders desk force \
-                view boards quick)
+                view strangers boards quick)
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
@@ -166,6 +166,9 @@ bench-force: setup-host ## measure the way from scan to force: time, ten minutes
 
 bench-view: setup ## measure the page: latency to the screen, frames, load
 	$(BENCH)/bench_view.py
+
+bench-strangers: setup-host ## measure what those without the token can do to the page
+	$(BENCH)/bench_strangers.py
 
 bench-boards: setup-host ## measure one process that reads eight boards at once: five minutes
 	$(BENCH)/bench_boards.py
