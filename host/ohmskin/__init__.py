@@ -8,8 +8,9 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
+from __future__ import annotations
+
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from ohmskin.errors import (
     CommandRefused,
@@ -25,7 +26,10 @@ from ohmskin.errors import (
 )
 from ohmskin.version import VERSION
 
+TYPE_CHECKING = False  # for type checkers: to import typing takes longer than all of this
 if TYPE_CHECKING:
+    from typing import Any
+
     from ohmskin.emulate.driver import SteppedSkin
     from ohmskin.estimate.base import Estimate, Estimator
     from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm

@@ -98,3 +98,30 @@ def test_ctrl_c_that_was_handled_does_not_end_the_process_as_a_signal() -> None:
     handled = "try: exec('raise KeyboardInterrupt')\nexcept KeyboardInterrupt: pass\n"
     program = f"from ohmskin.cli import main\nmain.run = lambda *_: exec({handled!r})\nmain.main()"
     assert python("-c", program).code == 0
+
+
+# Ctrl-C comes when the command line begins to import this module, or has ended.
+INTERRUPTED = """
+import atexit, builtins, os, signal, sys
+from ohmskin.__main__ import main
+at, real = sys.argv.pop(1), builtins.__import__
+def interrupt(): os.kill(os.getpid(), signal.SIGINT)
+def imports(name, *more):
+    if name == at: interrupt()
+    return real(name, *more)
+builtins.__import__ = imports
+if at == "end": atexit.register(interrupt)
+main()
+"""
+
+
+@pytest.mark.parametrize("at", ["typer", "numpy", "end"])
+def test_ctrl_c_amid_imports_shows_no_traceback(at: str) -> None:
+    done = python("-c", INTERRUPTED, at, "demo")
+    assert done.code in (130, -signal.SIGINT)
+    assert done.err == ""
+
+
+def test_ctrl_c_that_was_ignored_stays_so() -> None:
+    done = python("-c", f"import signal; signal.signal(2, signal.SIG_IGN)\n{INTERRUPTED}", "typer")
+    assert (done.code, done.err) == (2, "")
