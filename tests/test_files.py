@@ -2,6 +2,7 @@
 """Whatever is saved: the file is whole, or the old one."""
 
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,19 +76,28 @@ def test_a_link_in_place_of_the_file_beside_is_not_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "token_hex", lambda _: "0")
-    (tmp_path / ".file.0.part").symlink_to(tmp_path / "other")
+    (tmp_path / ".ohmskin-0.part").symlink_to(tmp_path / "other")
     with pytest.raises(ValueError, match="file: cannot be written: File exists"):
         save_bytes(tmp_path / "file")
     assert not (tmp_path / "other").exists()
 
 
 def test_what_a_killed_program_left_hinders_no_other(tmp_path: Path) -> None:
-    """In a container, programs have the same number again and again."""
-    left = tmp_path / f".file.{os.getpid()}.part"
-    left.write_bytes(b"begun")
+    """It goes with a later save, when nobody can be writing it any more."""
+    young, old, foreign = (tmp_path / f".{name}.part" for name in ("ohmskin-1", "ohmskin-2", "x"))
+    for left in (young, old, foreign):
+        left.write_bytes(b"begun")
+    for left in (old, foreign):
+        os.utime(left, (0, time.time() - 4000))
     save_bytes(tmp_path / "file")
     assert (tmp_path / "file").read_bytes() == b"new"
-    assert left.read_bytes() == b"begun"
+    assert {each.name for each in tmp_path.iterdir()} == {"file", young.name, foreign.name}
+
+
+def test_a_name_may_be_as_long_as_the_system_takes(tmp_path: Path) -> None:
+    save_bytes(tmp_path / ("x" * 255))
+    with pytest.raises(ValueError, match="cannot be written: File name too long"):
+        save_bytes(tmp_path / ("x" * 256))
 
 
 @pytest.mark.parametrize("what", SAVERS)

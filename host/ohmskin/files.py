@@ -5,15 +5,19 @@ import csv
 import os
 import shutil
 import stat
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
 from secrets import token_hex
-from typing import BinaryIO, Self
+from typing import BinaryIO, Final, Self
 
 PathName = str | os.PathLike[str]
+# A file that somebody began to write was left for good if it is so old [s]. Chosen: an hour, which
+# no file of ours takes.
+_LEFT_S: Final = 3600.0
 
 
 @contextmanager
@@ -69,12 +73,17 @@ def check_place(path: Path, *inputs: Path | None) -> None:
 def whole_file(path: PathName) -> Iterator[BinaryIO]:
     """A file to write beside `path`, which takes its place at the end if nothing was raised.
 
-    It keeps the permissions of the file that was there, and a link leads to it as before. Raises
-    ValueError, which names the path, if it cannot be written, or is there and no file.
+    It keeps the permissions of the file that was there, and a link leads to it as before. What a
+    program that was killed has left beside it goes after `_LEFT_S`. Raises ValueError, which names
+    the path, if it cannot be written, or is there and no file.
     """
     target = Path(os.path.realpath(path))
-    partial = target.with_name(f".{target.name}.{token_hex(8)}.part")
+    partial = target.with_name(f".ohmskin-{token_hex(8)}.part")  # short, whatever the file's name
     try:
+        for left in target.parent.glob(".ohmskin-*.part"):
+            with suppress(FileNotFoundError):  # another program has removed it
+                if time.time() - left.lstat().st_mtime > _LEFT_S:
+                    left.unlink()
         if target.exists() and not target.is_file():
             raise OSError("it is no file")
         try:

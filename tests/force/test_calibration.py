@@ -196,6 +196,7 @@ def test_edited_files_are_refused_by_field(
         (b"", "no JSON of ours: "),
         (b"\x89PNG\r\n\x1a\n", "no JSON of ours: "),
         (b"[" * 100_000, "no JSON of ours: "),
+        (b'{"unit_id": 1, "a": {"b": 1, "b": 2}}', "no JSON of ours: field 'b' stands twice"),
         (b'{"a": ' + b"9" * 5000 + b"}", "no JSON of ours: "),
         (b"[]", "no calibration: field 'format' is not 'ohmskin calibration'"),
         (b"{}", "no calibration: field 'format' is not 'ohmskin calibration'"),

@@ -214,10 +214,20 @@ def load_calibration(path: PathName) -> Calibration:
     with naming(path):
         octets = read_bounded(path, MAX_FILE_BYTES)
         try:
-            content = json.loads(octets)
+            content = json.loads(octets, object_pairs_hook=_once)
         except (ValueError, RecursionError) as error:
             raise ValueError(f"no JSON of ours: {error}") from error
         return _from_content(content)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON. Raises ValueError for a field that stands in it twice."""
+    content: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in content:
+            raise ValueError(f"field '{name[:40]}' stands twice")
+        content[name] = value
+    return content
 
 
 def _from_content(content: Any) -> Calibration:
