@@ -8,7 +8,7 @@ the first are left out, because nothing tells how two cells share a force.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -254,8 +254,12 @@ class Calibrator:
         self._refuse(siemens > TOUCHED_TIMES * max(untouched, TOUCH_SIEMENS))
 
     def _tell(self, wires: WireOhm) -> None:
-        """Make the estimator, which knows these wires."""
-        self._knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires)
+        """Make the estimator, which knows these wires.
+
+        While it is pressed, the skin is as its presses show it: not bent since.
+        """
+        knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires)
+        self._knowledge = replace(knowledge, may_be_bent=False)
         self.estimator = make_estimator(self.method, self._knowledge)
         self.rest_level = self.estimator.rest_level()
 

@@ -70,7 +70,8 @@ class JointEstimator(Estimator):
         self._shape = (knowledge.rows, knowledge.columns)
         far = self._reader.far
         believe = MeasuredWires if any(far) else LearnedWires
-        self._belief: WireBelief = believe(self._shape, knowledge.nominal_wire_ohm, far)
+        wires, bent = knowledge.nominal_wire_ohm, knowledge.may_be_bent
+        self._belief: WireBelief = believe(self._shape, wires, far, may_be_bent=bent)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
         self._rest_wires_log_std = 0.0  # the most that wires have in a cell's deviation at rest

@@ -76,6 +76,7 @@ class SkinKnowledge:
     rest_ratio: readings of the untouched skin (R, C, 4) [V/Vdd]; None: not known.
     nominal_wire_ohm: what is known of the wires.
     reading_names: the names of the readings of each cell, in their order.
+    may_be_bent: whether the skin may have been bent since its wires were measured.
     """
 
     rows: int
@@ -86,6 +87,7 @@ class SkinKnowledge:
     rest_ratio: Float | None = None
     nominal_wire_ohm: WireOhm = NO_WIRES
     reading_names: tuple[str, ...] = NEAR
+    may_be_bent: bool = True
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:

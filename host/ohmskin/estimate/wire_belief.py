@@ -147,9 +147,14 @@ class WireBelief(ABC):
     """
 
     def __init__(
-        self, shape: tuple[int, int], wires: WireOhm, far: tuple[bool, bool] = (False, False)
+        self,
+        shape: tuple[int, int],
+        wires: WireOhm,
+        far: tuple[bool, bool] = (False, False),
+        *,
+        may_be_bent: bool = True,
     ) -> None:
-        """wires: what is known of them before any frame."""
+        """wires: what is known of them before any frame. may_be_bent: since they were measured."""
         self.shape, self.far = shape, far
         rows, columns = shape
         self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
@@ -157,8 +162,12 @@ class WireBelief(ABC):
         by_column = np.tile(np.eye(columns), (rows, 1)) * (not far[1])
         self.leads_of_ports = np.hstack([by_row, by_column])
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
-        # However well wires were measured: since then, the skin may have been stretched.
-        layer_stds = np.hypot(layer_std, [wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
+        layer_stds = np.array([wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
+        # However well wires were measured: since then, the skin may have been stretched. No
+        # measurement is believed to be better than 1 %.
+        if may_be_bent or not layer_stds.all():
+            layer_stds = np.hypot(layer_std, layer_stds)
+        layer_stds = np.maximum(layer_stds, 0.01)
         lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM
         self._usual_lead_std_ohm = USUAL_LEAD_STD_OHM
         if wires.lead is not None:
