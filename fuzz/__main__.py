@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m fuzz [SECONDS [TARGET...]]``: fuzz the targets, guided by coverage, each its share.
 
-It ends with the first input that raises, takes more than a second, or more than 500 MB. What
-atheris finds on its way is kept in build/fuzz. An input that broke something goes into
-fuzz/corpus/TARGET: every run begins with that, and `make test` runs it.
+Each run goes other ways, by a seed that it prints. It ends with the first input that raises, takes
+more than a second, or more than 500 MB. What atheris finds on its way is kept in build/fuzz. An
+input that broke something goes into fuzz/corpus/TARGET: every run begins with that, and
+`make test` runs it.
 """
 
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -17,6 +20,8 @@ MOST_MB = 500
 # compared, and each emulated board compares several: 36 MB in a million inputs of `urls`.
 ARITHMETIC = ["ohmskin.circuit.skin"]
 MOST_S = 1
+# The variable of the environment that says which ways a run goes.
+SEED = "FUZZ_SEED"
 
 
 def fuzz(target: str, seconds: int) -> None:
@@ -35,7 +40,7 @@ def fuzz(target: str, seconds: int) -> None:
     kept = [str(CORPUS / target)] if (CORPUS / target).is_dir() else []
     options = (f"-max_total_time={seconds}", f"-timeout={MOST_S}", f"-rss_limit_mb={MOST_MB}")
     more = (
-        "-seed=1",
+        f"-seed={int(os.environ[SEED])}",
         "-max_len=20000",
         "-print_final_stats=1",
         f"-artifact_prefix={FOUND}/broken-{target}-",
@@ -56,6 +61,8 @@ def main() -> None:
             seconds, named = "600", []
     from fuzz.targets import TARGETS
 
+    seed = os.environ.setdefault(SEED, str(int(time.time())))
+    print(f"{SEED}={seed} goes the same ways again", flush=True)
     for target in named or TARGETS:
         share = max(int(seconds) // len(named or TARGETS), 1)
         print(f"{target}: {share} s", flush=True)

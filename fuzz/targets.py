@@ -7,13 +7,16 @@ lies behind checksums and packing. `seeds` gives inputs that are right, to begin
 
 import atexit
 import json
+import os
 import shutil
 import struct
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -26,7 +29,7 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link import framing, protocol
-from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
+from ohmskin.link.clock import BoardClock, line_delay_s, scan_s, scan_times_s
 from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
 from ohmskin.record.force_sensor import ForceLineDecoder
@@ -39,6 +42,9 @@ _MEMORY = Path("/dev/shm")
 _FOLDER = Path(tempfile.mkdtemp(dir=_MEMORY if _MEMORY.is_dir() else None))
 atexit.register(shutil.rmtree, _FOLDER)
 _PACKED = tuple(CompressionType)
+# The byte for a file with a hole behind it, and its size with that: more than any limit of memory.
+_SPARSE = bytes([len(_PACKED)])
+_HOLE_BYTES = 3_000_000_000
 _KINDS = tuple(SCHEMAS)
 _FRAMES = tuple(protocol.FRAMES_BY_ID)
 
@@ -109,9 +115,14 @@ def forces(octets: bytes) -> None:
 
 
 def recordings(octets: bytes) -> None:
-    """A recording. 0 to 2: messages, a line each, packed so; else the file as it is."""
+    """A recording. 0 to 2: messages, a line each, packed so; 3: a file with a hole behind it.
+
+    Else the file as it is.
+    """
     how, path = octets[:1], file_of(octets[1:], ".mcap")
-    if how and how[0] < len(_PACKED):
+    if how == _SPARSE:
+        os.truncate(path, _HOLE_BYTES)
+    elif how and how[0] < len(_PACKED):
         with path.open("wb") as file:
             writer = Writer(file, compression=_PACKED[how[0]])
             writer.start()
@@ -123,6 +134,8 @@ def recordings(octets: bytes) -> None:
             writer.finish()
     try:
         recording = load_recording(path)
+        if recording.scans:  # as a calibration does of it
+            assert len(scan_times_s(recording.scans)) == len(recording.scans)
         for suffix in (".npz", ".csv"):
             with suppress(RecordingError):
                 export(recording, path.with_suffix(suffix))
@@ -134,9 +147,19 @@ def recordings(octets: bytes) -> None:
 
 
 def readings(octets: bytes) -> None:
-    """A readings file."""
+    """A readings file. 0: its arrays, each a line of name, type, shape and data; else as it is."""
+    path = file_of(octets[1:], ".npz")
+    if octets[:1] == b"\0":
+        with ZipFile(path, "w", ZIP_DEFLATED) as archive, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a name that stands twice
+            for line in octets[1:].split(b"\n"):
+                name, descr, shape, data = (*line.split(b"|", 3), b"", b"", b"")[:4]
+                header = b"{'descr':'%b','fortran_order':False,'shape':(%b)}\n" % (descr, shape)
+                begin = b"\x93NUMPY\1\0" + struct.pack("<H", len(header) % 2**16)
+                name_text = name.decode(errors="replace").replace("\0", "")
+                archive.writestr(f"{name_text}.npy", begin + header + data)
     with suppress(ValueError):
-        load_readings(file_of(octets, ".npz"))
+        load_readings(path)
 
 
 def calibrations(octets: bytes) -> None:
@@ -220,9 +243,12 @@ def seeds() -> dict[str, Sequence[bytes]]:
         "forces": [b"1.5\r\n-2 N\n\n3e-1N\nabc\n"],
         "recordings": [
             *(bytes([how]) + lines for how in range(len(_PACKED))),
-            b"\xff" + recorded.read_bytes(),
+            *(how + recorded.read_bytes() for how in (_SPARSE, b"\xff")),
         ],
-        "readings": [out.read_bytes()],
+        "readings": [
+            b"\xff" + out.read_bytes(),
+            b"\0ratio|<f8|1,1,1,4|" + bytes(32) + b"\nreading_names|<U1|4,|a\0\0\0b\0\0\0",
+        ],
         "calibrations": [(_FOLDER / "input.json").read_bytes()],
         "tables": [presses.encode(), log.encode()],
         "urls": [

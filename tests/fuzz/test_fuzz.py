@@ -48,7 +48,7 @@ def test_make_fuzz_runs(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout.splitlines()[1].split()[1]) > 100
+    assert int(done.stdout.splitlines()[2].split()[1]) > 100
     assert list((tmp_path / "build/fuzz/urls").iterdir())
 
 

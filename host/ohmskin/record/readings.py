@@ -165,6 +165,9 @@ def load_readings(path: PathName) -> Readings:
                     if info is not None:
                         arrays[name] = _read_array(archive, info, left_bytes)
                         left_bytes -= arrays[name].nbytes
+            name = "reading_names"
+            if name in arrays:  # only now does numpy see whether these are letters
+                arrays[name] = tuple(arrays[name].ravel().tolist())
         except Exception as error:  # damage may raise nearly anything in zipfile, zlib and numpy
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise ValueError(f"{name} cannot be read: {reason}") from error
@@ -172,8 +175,6 @@ def load_readings(path: PathName) -> Readings:
             raise ValueError("no array 'ratio'")
         for name in _SCALARS & arrays.keys():
             arrays[name] = arrays[name].item()
-        if "reading_names" in arrays:
-            arrays["reading_names"] = tuple(arrays["reading_names"].ravel().tolist())
         return Readings(**arrays)
 
 
