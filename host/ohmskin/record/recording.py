@@ -57,7 +57,7 @@ from ohmskin.files import PathName, require_file, save_table, stored_bytes
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import LARGEST_CODE, MODES
-from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, save_arrays
+from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, MAX_FRAMES, save_arrays
 
 # Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
 # 0.2 MB, and tools that write files anew make chunks of 4 MB.
@@ -439,11 +439,12 @@ def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
     exact in it.
     """
     board = recording.hellos[0]
-    codes = np.array([scan.codes for scan in scans])
-    ratio = ratio_from_codes(codes, board.adc_bits).astype(np.float32)
-    if ratio.nbytes > MAX_ARRAY_BYTES:
+    if len(scans) > MAX_FRAMES or 4 * len(scans) * scans[0].codes.size > MAX_ARRAY_BYTES:
         many = f"{len(scans)} scans are more than a readings file holds"
         raise RecordingError(f"{many}: export a part of them, --begin and --end")
+    ratio = np.empty((len(scans), *scans[0].codes.shape), np.float32)
+    for frame, scan in enumerate(scans):  # one by one: all in double precision take thrice as much
+        ratio[frame] = ratio_from_codes(scan.codes, board.adc_bits)
     arrays: dict[str, Any] = {
         "ratio": ratio,
         "reading_names": scans[0].reading_names,
