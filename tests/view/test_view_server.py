@@ -242,7 +242,7 @@ def test_without_a_port_the_next_free_one_is_taken(monkeypatch: pytest.MonkeyPat
 
 
 def test_without_the_extra_it_says_what_to_install() -> None:
-    program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__"
+    program = "import sys; sys.modules['starlette'] = None; import ohmskin.__main__ as m; m.main()"
     assert_one_line(python("-c", program, "view"), "pip install '.[view]'")
 
 
