@@ -2,7 +2,8 @@
 """From an emulated skin to newtons by commands alone, and how near they come to the truth."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ import pytest
 
 from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
+from ohmskin.emulate.driver import SteppedSkin
+from ohmskin.force.calibration import load_calibration
+from ohmskin.link.messages import Scan
 from ohmskin.record.recording import load_recording
 
 INDENTER = ("--indenter-mm2", "80")
@@ -71,3 +75,17 @@ def test_only_a_simulated_skin_has_a_truth(run: Run, tmp_path: Path) -> None:
     well(run("record", "emulator://2x2?speed=0", str(recording), "--scans", "5"))
     again = ("record", f"replay://{recording}?speed=0", str(tmp_path / "b.mcap"))
     assert_one_line(run(*again, "--force-port", "truth"), "only emulator:// and simavr:// know it")
+
+
+def test_a_simulated_board_may_be_slower_than_the_host(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy machine simulates two seconds in three: what it records has the board's times."""
+    every_scan = SteppedSkin.__iter__
+
+    def late(skin: SteppedSkin) -> Iterator[Scan]:
+        return (replace(scan, host_time_s=1.5 * scan.host_time_s) for scan in every_scan(skin))
+
+    monkeypatch.setattr(SteppedSkin, "__iter__", late)
+    out = by_robot(run, "2x2", tmp_path)
+    assert load_calibration(out).model.held_out_rmse.max() < 0.5

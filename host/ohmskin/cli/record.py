@@ -5,8 +5,9 @@ import os
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
@@ -19,6 +20,7 @@ from rich.text import Text
 from typer import Argument, Option
 
 import ohmskin
+from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
 from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
@@ -30,7 +32,6 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import check_place
 from ohmskin.force.reader import DEFAULT_METHOD
-from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
@@ -75,16 +76,17 @@ def record(
         tare_s = FORCE_TARE_S if force_port else 0.0
     with ExitStack() as stack:
         skin, sensor = stack.enter_context(ohmskin.open(port, start=False)), None
-        if force_port and force_port != TRUTH:
+        truth = skin.true_force_n if force_port == TRUTH else None
+        if force_port == TRUTH and truth is None:
+            raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
+        if force_port and truth is None:
             sensor = stack.enter_context(ForceSensor(force_port, force_baud, force_scale))
             sensor.wait()
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
             recorder.add(Mark(text, recorder.now_s()))
         look = None
-        if force_port == TRUTH:
-            look = _truth(skin, recorder)
-        elif sensor is not None:
+        if sensor is not None:
             TERMINAL.print(
                 f"touch nothing for {tare_s:g} s, then press single cells; Ctrl-C ends it"
             )
@@ -98,6 +100,8 @@ def record(
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
             given = asked_for(until_ctrl_c(skin), scans, seconds)
+            if truth is not None:
+                given = _with_truth(given, truth, recorder)
             recording.record(skin, recorder, given, tare_s=tare_s, sensor=sensor, beside=look)
         except DeviceLost as exc:
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
@@ -109,24 +113,21 @@ def record(
     TERMINAL.print(f"{file}: {done}")
 
 
-def _truth(skin: Device, recorder: Recorder) -> Callable[[Scan], None]:
-    """Records the true force on a simulated skin, as a force sensor under it would show it."""
-    true_force_n = skin.true_force_n
-    if true_force_n is None:
-        raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
+def _with_truth(
+    scans: Iterable[Scan], true_force_n: Callable[[Scan], Float], recorder: Recorder
+) -> Iterator[Scan]:
+    """Pass scans on, and record the whole force on the simulated skin beside each.
 
-    offset_s: float | None = None  # from the board's clock to the host's
-
-    def look(scan: Scan) -> None:
-        nonlocal offset_s
+    Both have the board's clock, because a scan may arrive late, and the board of a simulator may be
+    slower than the host's clock.
+    """
+    begin_s: float | None = None  # of the board's clock, by the host's
+    for scan in scans:
         board_s = 1e-6 * scan.time_us
-        if offset_s is None:
-            offset_s = scan.host_time_s - board_s
-        # By the board's clock: a scan may arrive late, and several at once.
+        begin_s = scan.host_time_s - board_s if begin_s is None else begin_s
         force_n = float(true_force_n(scan).sum())
-        recorder.add(ForceSample(force_n, board_s + offset_s, source=TRUTH))
-
-    return look
+        recorder.add(ForceSample(force_n, begin_s + board_s, source=TRUTH))
+        yield replace(scan, host_time_s=begin_s + board_s)
 
 
 def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
