@@ -105,8 +105,8 @@ def frames(octets: bytes) -> None:
 
 
 def forces(octets: bytes) -> None:
-    """What a force sensor prints."""
-    decoder = ForceLineDecoder()
+    """What a force sensor prints; the first byte says which column is wanted."""
+    decoder = ForceLineDecoder(column=("", "3", "Fz", "")[octets[0] % 4] if octets else "")
     for at in range(0, len(octets), 7):
         assert np.isfinite(decoder.feed(octets[at : at + 7])).all()
 
@@ -240,7 +240,7 @@ def seeds() -> dict[str, Sequence[bytes]]:
     log = "time_s,force_n\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(12))
     return {
         "frames": [stream, _stretch(255, board.advance(0.2))],
-        "forces": [b"1.5\r\n-2 N\n\n3e-1N\nabc\n"],
+        "forces": [b"1.5\r\n-2 N\n\n3e-1N\nabc\n", b"2\nt,Fz\n1,2 g\n", b"0\nST,GS,+  1 kg\n9,5\n"],
         "recordings": [
             *(bytes([how]) + lines for how in range(len(_PACKED))),
             *(how + recorded.read_bytes() for how in (_SPARSE, b"\xff")),

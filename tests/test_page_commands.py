@@ -75,6 +75,8 @@ NOT_RUN = {
     "make bench-quick": "takes minutes; tests/benchmarks runs a part of it",
     "make bench-tables": "takes minutes; tests/benchmarks has a quick run of it",
     "ohmskin flash uno --port /dev/ttyACM0": "needs a boot loader; tests/cli/test_flash.py has one",
+    "ohmskin calibrate scale /dev/ttyUSB0 --grams 200,500": "asks for weights; "
+    "tests/record/test_force_sensor.py puts them on",
     "python examples/lsl_outlet.py emulator://8x8?scene=moving skin.json": "needs liblsl; "
     "tests/test_examples.py runs it with a stand-in",
     "python examples/ros2_node.py --ros-args -p calibration:=skin.json -p "

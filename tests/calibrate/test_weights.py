@@ -180,9 +180,9 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
     for options, words in (
         ({"--method": "voltage"}, ["a table has conductances, which 'voltage'"]),
         ({"--method": "magic"}, ["no method 'magic'", "joint"]),
-        ({"--grams": "50,no"}, ["--grams '50,no': give weights above 0"]),
-        ({"--grams": "50,-1"}, ["give weights above 0"]),
-        ({"--grams": "50,50"}, ["stands twice: say --repeats"]),
+        ({"--grams": "50,no"}, ["--grams '50,no': give 1 or more above 0"]),
+        ({"--grams": "50,-1"}, ["give 1 or more above 0"]),
+        ({"--grams": "50,50"}, ["a weight stands twice"]),
         (
             {"--grams": "50", "--repeats": "9"},
             ["--grams, --repeats, --cells: all 18 forces are"],

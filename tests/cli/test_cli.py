@@ -429,11 +429,12 @@ TAKES = {
     "verify": "PORT PLATE --wires --leads --seconds --picture --json --cell-percent "
     "--reference-percent --settling-lsb --loss",
     "estimate": "READINGS --method --out --cold",
-    "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale",
+    "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale"
+    " --force-unit --force-column",
     "export": "RECORDING OUT --begin --end",
     "emulate": "URL --seconds",
     "demo": "--seconds --port --picture",
-    "calibrate": "recording table weights",
+    "calibrate": "recording scale table weights",
 }
 NAMES = {"stream": METHODS, "estimate": METHODS, "export": (".npz", ".csv")}
 

@@ -48,28 +48,91 @@ pytestmark = pytest.mark.usefixtures("nothing_left")
         (b" +3 N\r", [3.0]),
         (b".5N\n", [0.5]),
         (b"1.5e1\n", [15.0]),
+        (b"12.3 kg\r\n", [12.3 * 9.80665]),
+        # Scales: A&D, CAS, Mettler, Ohaus, Sartorius, Dini Argeo.
+        (b"ST,GS,+  123.4 g\r\n", [1.2101406]),
+        (b"US,NT,-0.12 kg\r\n", [-1.176798]),
+        (b"ST,+00123.45  g\r\n", [1.21063094]),
+        (b"US,GS,  5.5\r\n", [5.5]),
+        (b"S S     100.00 g\r\n", [0.980665]),
+        (b"S D      99.50 g\r\n", [0.97576168]),
+        (b"    123.4 g  ?\r\n", [1.2101406]),
+        (b"N     +   123.4 g  \r\n", [1.2101406]),
+        (b"ST,GS,    123.4,kg\r\n", [1210.14061]),
+        # Sketches that print the time first.
+        (b"1042,12.3\n", [12.3]),
+        (b"1042, -7\n1052;8 g\n1062\t9.5N", [-7.0, 0.0784532]),
         (b"\r\n\r\n", []),
     ],
 )
 def test_a_line_with_one_number_is_a_force(line: bytes, forces: list[float]) -> None:
     decoder = ForceLineDecoder()
-    assert decoder.feed(b"4.2\r\n" + line) == forces
+    assert decoder.feed(b"4.2\r\n" + line) == pytest.approx(forces)
     assert decoder.damaged == 0
     doubled = ForceLineDecoder(newtons_per_unit=2.0)
-    assert doubled.feed(b"\n" + line) == [2 * force_n for force_n in forces]
+    assert doubled.feed(b"\n" + line) == pytest.approx([2 * force_n for force_n in forces])
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        *(b"Reading: 12.3 g", b"12.3 g", b"1,5", b"1 2", b"nan", b"1e999", b"--1", b"\xff", b"1_0"),
-        *(b".", b"1" * 65, b"x" * 100_000),
+        *(
+            b"Reading: 12.3 g",
+            b"12.3 lb",
+            b"1,5",
+            b"1 2",
+            b"nan",
+            b"1e999",
+            b"--1",
+            b"\xff",
+            b"1_0",
+        ),
+        *(b".", b"1" * 257, b"x" * 100_000, b"1,2,3", b"1 g,2", b"a,2", b"\xb2", b"1,", b"1,5 g"),
+        *(b"OL,GS,+  999.9 g", b"ST,TR,+  123.4 g", b"S I", b"QT,+00000123 PC", b"ST,GS,", b"+"),
     ],
 )
 def test_another_line_is_counted_and_the_next_is_read(line: bytes) -> None:
     decoder = ForceLineDecoder()
     assert decoder.feed(b"\n" + line + b"\r\n7\r\n") == [7.0]
     assert decoder.damaged == 1
+
+
+def test_two_numbers_may_be_one_with_a_decimal_comma() -> None:
+    """The first of them is a time only if it rises as a time does."""
+    decoder = ForceLineDecoder()
+    assert decoder.feed(b"\n0,02\n0,01\n0,02\n1,35\n3,50\n3,51\n0,2\n") == []
+    assert decoder.damaged == 7
+    assert decoder.feed(b"100,8421\n110,8422\n120,8423\n130,-2\n140,8425\n") == [-2.0]
+    assert decoder.damaged == 11
+    lines = b"".join(b"%d,%d\n" % (150 + 10 * n, n) for n in range(10))
+    assert decoder.feed(lines) == [2, 3, 4, 5, 6, 7, 8, 9]
+
+
+def test_a_scale_that_leaves_the_unit_out_is_not_guessed() -> None:
+    lines = b"\n100.0 g\n 150.0  \n200.0 g\n"
+    decoder = ForceLineDecoder()
+    assert decoder.feed(lines) == pytest.approx([0.980665, 1.96133])
+    assert (decoder.damaged, decoder.last_damaged) == (1, " 150.0  ")
+    told = ForceLineDecoder(unit="g")
+    assert told.feed(lines) == pytest.approx([0.980665, 1.4709975, 1.96133])
+    assert ForceLineDecoder(unit="kg").feed(lines)[0] == pytest.approx(0.980665)  # as it says
+    assert ForceLineDecoder(unit="kg").feed(b"\n1\n") == [9.80665]
+    with pytest.raises(ValueError, match="no unit 'lb' of force: there are N, g, kg"):
+        ForceLineDecoder(unit="lb")
+
+
+def test_a_column_is_named_or_numbered() -> None:
+    lines = b"\ntime_s, Fx, Fy, Fz\n0.1,1,2,-3.5\n0.2,1,2\n0.3,1,x,-4\n\n0.4,1,2,3,4\n0.5,1,2,z\n"
+    named = ForceLineDecoder(-1.0, column="fz")
+    assert named.feed(lines) == [3.5, 4.0]
+    assert (named.damaged, named.last_damaged) == (3, "0.5,1,2,z")
+    numbered = ForceLineDecoder(column="4")
+    assert numbered.feed(lines) == [-3.5, -4.0]
+    assert numbered.damaged == 4  # the header, too
+    for column in ("Fq", "0", "9"):
+        decoder = ForceLineDecoder(column=column)
+        assert decoder.feed(lines) == []
+        assert decoder.damaged == 6
 
 
 def test_the_first_line_may_be_a_part_and_counts_for_nothing() -> None:
@@ -287,8 +350,8 @@ class ScriptedSensor(Closing):
         self._skin = skin
         self._taken = 0
 
-    def opened(self, path: str, baud: int, newtons_per_unit: float) -> Self:
-        assert (path, baud, newtons_per_unit) == ("scale", 57_600, 2.0)
+    def opened(self, *options: object) -> Self:
+        assert options == ("scale", 57_600, 2.0, "g", "3")
         return self
 
     def wait(self) -> None:
@@ -318,9 +381,10 @@ def test_a_recorded_force_sensor_calibrates(
     monkeypatch.setattr(ohmskin, "open", lambda url, start: skin)
     monkeypatch.setattr("ohmskin.cli.record.ForceSensor", ScriptedSensor(skin).opened)
     force = ("--force-port", "scale", "--force-baud", "57600", "--force-scale", "2")
+    force += ("--force-unit", "g", "--force-column", "3")
     done = well(run("record", "fast", str(file), *force, "--tare", "1.5", "--seconds", "16.5"))
     assert "touch nothing for 1.5 s" in done.out
-    counts = r"presses\.mcap: 66\d scans, missed 0, \d+ bytes, 66\d forces, 2 lines that are no num"
+    counts = r"presses\.mcap: 66\d scans, missed 0, \d+ bytes, 66\d forces, 2 lines that could"
     assert re.search(counts, done.out)
     recording = load_recording(file)
     assert not recording.cut_off
@@ -365,14 +429,14 @@ def test_a_display_counts_what_is_pressed(tmp_path: Path) -> None:
 
 
 @contextmanager
-def speaking(sketch: PtySensor, line: bytes) -> Iterator[None]:
+def speaking(sketch: PtySensor, line: bytes | Callable[[], bytes]) -> Iterator[None]:
     """A sensor prints a line again and again meanwhile, until it vanishes."""
     done = threading.Event()
 
     def speak() -> None:
         with suppress(IndexError, OSError):
             while not done.wait(0.01):
-                sketch.print(line)
+                sketch.print(line if isinstance(line, bytes) else line())
 
     thread = threading.Thread(target=speak)
     thread.start()
@@ -429,9 +493,55 @@ def test_sensors_that_say_nothing(
 
     silent = "for 0.5 s (0 damaged lines): the force sensor must print one number"
     assert_one_line(recorded(sketch.path), silent)
-    with speaking(sketch, b"12 g\n"):
+    with speaking(sketch, b"12 lb\n"):
         done = recorded(sketch.path, "--force-baud", "9600")
-    assert_one_line(done, "no number from", "damaged lines)", "at 9600 baud")
+    assert_one_line(done, "no force from", "damaged lines, the last one '12 lb')", "at 9600 baud")
     assert_one_line(recorded("/dev/ttyNONE"), "no port /dev/ttyNONE")
     assert_one_line(recorded(sketch.path, "--force-scale", "0"), "scale is 0")
     assert list(tmp_path.iterdir()) == []
+
+
+# ----------------------------------------------------------------------- ohmskin calibrate scale
+
+
+def weighed(run: Run, sketch: PtySensor, monkeypatch: pytest.MonkeyPatch, units: float) -> Done:
+    """What the command says of a load cell whose numbers are so many units a gram.
+
+    The second weight shows twice the number that it should, if units is below 0.
+    """
+    on_it, asked = [0.0], list[str]()
+    random = np.random.default_rng(1)
+
+    def prompt(text: str, **_: object) -> str:
+        asked.append(text)
+        mass = re.search(r"put (\d+) g", text)
+        on_it[0] = float(mass[1]) * (2 if mass[1] == "500" and units < 0 else 1) if mass else 0.0
+        return ""
+
+    def line() -> bytes:
+        return b"%d\r\n" % round(84_000 + units * on_it[0] + 20 * random.standard_normal())
+
+    monkeypatch.setattr("typer.prompt", prompt)
+    with speaking(sketch, line):
+        done = run("calibrate", "scale", sketch.path, "--grams", "200,500")
+    assert [text.split(",")[0] for text in asked] == [
+        *("take off what is not always on it", "put 200 g on it", "put 500 g on it")
+    ]
+    return done
+
+
+def test_two_weights_tell_what_a_number_is(
+    run: Run, sketch: PtySensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = well(weighed(run, sketch, monkeypatch, 420.0))
+    found = re.search(r"--force-scale (\S+) \(the weights agree within 0\.\d %\)", done.out)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.00980665 / 420, rel=1e-3)
+    done = weighed(run, sketch, monkeypatch, -420.0)
+    assert_one_line(done, "the weights disagree by", "(200 g: -8", "500 g: -4", "): weigh again")
+
+
+@pytest.mark.parametrize("grams", ["200", "200,0", "a,b", "200,200"])
+def test_a_scale_needs_two_weights(run: Run, grams: str) -> None:
+    done = run("calibrate", "scale", "/dev/ttyNONE", "--grams", grams)
+    assert_one_line(done, f"--grams '{grams}': ")

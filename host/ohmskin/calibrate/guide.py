@@ -182,13 +182,23 @@ class Guide:
         if len(window) < MIN_READING_SCANS or window[-1][0] - window[0][0] < READING_S:
             return step
         x = np.array([rise for _, rise in window])
-        mean, half = float(x.mean()), x.size // 2
-        noise = float(np.mean(np.diff(x) ** 2)) / 2
-        change = abs(float(x[half:].mean() - x[:half].mean()))
-        step = step._replace(change=change / mean)
-        creeps = change > MAX_CHANGE_SHARE * mean + 2 * math.sqrt(4 * noise / x.size)
-        if creeps or float(x.var()) - noise > (MAX_SCATTER_SHARE * mean) ** 2:
+        change, is_steady = steady(x)
+        step = step._replace(change=change)
+        if not is_steady:
             return step
         self._is_read = True
         std = float(x.std(ddof=1)) / math.sqrt(x.size)
-        return step._replace(state=State.TAKE_OFF, rise=mean, rise_std=std)
+        return step._replace(state=State.TAKE_OFF, rise=float(x.mean()), rise_std=std)
+
+
+def steady(x: Float) -> tuple[float, bool]:
+    """Change of a window (n,) from half to half, as a share of its mean; and if it is steady.
+
+    By the equations of `Guide`.
+    """
+    mean, half = abs(float(x.mean())), x.size // 2
+    noise = float(np.mean(np.diff(x) ** 2)) / 2
+    change = abs(float(x[half:].mean() - x[:half].mean()))
+    creeps = change > MAX_CHANGE_SHARE * mean + 2 * math.sqrt(4 * noise / x.size)
+    wiggles = float(x.var()) - noise > (MAX_SCATTER_SHARE * mean) ** 2
+    return change / max(mean, 1e-300), not (creeps or wiggles)

@@ -28,6 +28,7 @@ from ohmskin.calibrate.tables import (
 )
 from ohmskin.cli.board import TERMINAL, Leads, Port, Wires, wires_of
 from ohmskin.cli.record import progress
+from ohmskin.cli.scale import grams_of, scale
 from ohmskin.cli.stream import cell_table
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.estimate.knowledge import WireOhm
@@ -36,10 +37,9 @@ from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello
+from ohmskin.record.force_sensor import NEWTONS
 from ohmskin.record.recording import Recording, load_recording
 
-# Standard gravity [m/s^2], by its definition (CGPM, 1901).
-GRAVITY_M_PER_S2: Final = 9.80665
 # Rest is measured so long [s] after somebody is asked to let go. Chosen: long enough to let go.
 COUNT_DOWN_S: Final = 3
 
@@ -53,6 +53,7 @@ calibrate = typer.Typer(
     no_args_is_help=True,
     help="Learn forces from presses of single cells: a calibration file (.json).",
 )
+calibrate.command()(scale)
 
 
 # -------------------------------------------------------------------------------- the commands
@@ -77,7 +78,7 @@ def weights(
     Every press is kept at once, in OUT with .presses.csv: after Ctrl-C the same command goes on.
     """
     calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table=True)
-    forces_n = [1e-3 * mass_g * GRAVITY_M_PER_S2 for mass_g in _grams(grams)]
+    forces_n = [mass_g * NEWTONS["g"] for mass_g in grams_of(grams)]
     kept = _KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         shape = skin.info.rows, skin.info.columns
@@ -387,7 +388,7 @@ def _step_in_words(step: Step) -> tuple[str, str]:
         rise = f"{1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} microsiemens above rest"
         line = f"{rise}: take it off"
     elif step.state is State.PUT:
-        weight = f"{1e3 * press.force_n / GRAVITY_M_PER_S2:.6g} g ({press.force_n:.3f} N)"
+        weight = f"{press.force_n / NEWTONS['g']:.6g} g ({press.force_n:.3f} N)"
         row, column = press.cell
         line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
     elif step.state is State.WRONG:
@@ -397,18 +398,6 @@ def _step_in_words(step: Step) -> tuple[str, str]:
     elif step.change is not None:
         now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
     return line, now
-
-
-def _grams(text: str) -> list[float]:
-    try:
-        masses_g = [float(part) for part in text.split(",")]
-    except ValueError:
-        masses_g = []
-    if not masses_g or not all(math.isfinite(mass_g) and mass_g > 0 for mass_g in masses_g):
-        raise ValueError(f"--grams {text!r:.60}: give weights above 0, such as 50,100,200")
-    if len(set(masses_g)) < len(masses_g):
-        raise ValueError(f"--grams {text!r:.60}: a weight stands twice: say --repeats instead")
-    return masses_g
 
 
 def _cells(text: str, shape: tuple[int, int]) -> Cells:

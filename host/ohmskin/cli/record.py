@@ -34,7 +34,7 @@ from ohmskin.files import check_place
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
-from ohmskin.record.force_sensor import DEFAULT_BAUD, ForceSensor
+from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.readings import estimate_file, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import FORMATS, ForceSample, Mark, load_recording
@@ -47,6 +47,14 @@ FORCE_TARE_S: Final = 2.0
 _MOST_TYPED: Final = 1000
 # In place of a force sensor's port: the forces that a simulated skin knows.
 TRUTH: Final = "truth"
+
+ForceBaud = Annotated[int, Option(help="speed of the force sensor's port")]
+ForceScale = Annotated[
+    float,
+    Option(help="the force is so many times what it says: 'ohmskin calibrate scale' finds it"),
+]
+ForceUnit = Annotated[str, Option(help=f"{' | '.join(NEWTONS)}: where its lines state none")]
+ForceColumn = Annotated[str, Option(help="which field of its lines: a name, or a number from 1")]
 
 _T = TypeVar("_T")
 
@@ -64,8 +72,10 @@ def record(
         str,
         Option(help="a force sensor's serial port: a number a line; of a simulated skin: truth"),
     ] = "",
-    force_baud: Annotated[int, Option(help="speed of that port")] = DEFAULT_BAUD,
-    force_scale: Annotated[float, Option(help="newtons a unit; of grams: 0.00980665")] = 1.0,
+    force_baud: ForceBaud = DEFAULT_BAUD,
+    force_scale: ForceScale = 1.0,
+    force_unit: ForceUnit = "",
+    force_column: ForceColumn = "",
 ) -> None:
     """Record every scan at PORT. Ctrl-C ends it; a line typed becomes a mark.
 
@@ -80,7 +90,8 @@ def record(
         if force_port == TRUTH and truth is None:
             raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
         if force_port and truth is None:
-            sensor = stack.enter_context(ForceSensor(force_port, force_baud, force_scale))
+            says = force_baud, force_scale, force_unit, force_column
+            sensor = stack.enter_context(ForceSensor(force_port, *says))
             sensor.wait()
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
@@ -109,7 +120,7 @@ def record(
     if force_port:
         done += f", {recorder.forces} forces"
     if sensor is not None and sensor.damaged:
-        done += f", {sensor.damaged} lines that are no numbers"
+        done += f", {sensor.damaged} lines that could not be read"
     TERMINAL.print(f"{file}: {done}")
 
 

@@ -1,8 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A force sensor at a serial port, which prints one number a line, as sketches for the HX711 do.
+"""A force sensor at a serial port: a load cell's board, a scale, a force-torque sensor.
 
-The HX711 is the usual converter of load cells. A sample's time is that of its arrival here, on the
-same clock as the scans, so that both can be recorded side by side (`recorder.record`).
+A sample's time is that of its arrival here, on the same clock as the scans, so that both can be
+recorded side by side (`recorder.record`). These lines are read (`ForceLineDecoder`):
+
+======================  ============================================================================
+line                    of
+======================  ============================================================================
+``12.3``                sketches for the HX711, the usual converter of load cells
+``1042,12.3``           the same, with the time first
+``ST,GS,+  123.4 g``    scales that print by themselves; ``S S 100.00 g``, ``N + 12.3 g`` alike
+``0.1,-0.2,12.3``       force-torque sensors, by the column that the user names
+======================  ============================================================================
 """
 
 import math
@@ -29,24 +38,57 @@ _LONGEST_STEP_S: Final = 0.1
 # Times of samples rise by so much at least, even where the clock has the same time for two of them.
 # Chosen: shorter than the steps of any sensor.
 _SHORTEST_STEP_S: Final = 1e-6
-# A number, perhaps with the unit N. "nan" and "inf" are none.
-_NUMBER: Final = re.compile(rb"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*N?\s*")
+# Newtons of each unit [N]. Weights are those of standard gravity (CGPM, 1901).
+NEWTONS: Final = {"N": 1.0, "g": 0.00980665, "kg": 9.80665}
+_NEWTONS_BY_LOWER: Final = {unit.lower(): newtons for unit, newtons in NEWTONS.items()}
+# A number, perhaps with its unit. "nan" and "inf" are none, nor is what has more digits than any
+# sensor. Scales set signs apart.
+_NUMBER: Final = r"(?P<number>[-+]? *(?:\d{1,20}\.?\d{0,20}|\.\d{1,20})(?:E[-+]?\d{1,3})?)"
+_UNIT: Final = r"(?P<unit>kg|g|N)"
+_FIELD: Final = re.compile(rf"\s*{_NUMBER}\s*{_UNIT}?\s*", re.IGNORECASE)
+# What a scale prints says before the number whether it is stable, and gross or net; some say "?"
+# after it. What else a scale may say (that it is overloaded, a preset tare) is no force.
+_STATE: Final = r"(?:(?:ST|US|S|D)[ ,]+)?(?:(?:S|D|GS|NT|G|N)[ ,]+)?"
+_OF_SCALE: Final = re.compile(rf"\s*{_STATE}{_NUMBER}(?:[\s,]*{_UNIT})?[\s?]*", re.IGNORECASE)
+_COMMAS: Final = re.compile(r"[,;\t]")
+# These may be one number with a decimal comma.
+_DECIMAL_COMMA: Final = re.compile(r"[-+\s]*\d+,\d+[^.\d]*")
+# They are a time and a number if the first of the two has risen so often without a break. Chosen:
+# the whole part of a force does not, not even while somebody presses.
+_RISES_OF_TIME: Final = 8
+# An error text shows so many characters of a line. Chosen: enough to know it by.
+_SHOWN_CHARS: Final = 40
 
 
 class ForceLineDecoder:
-    """Forces from what a serial sensor prints: one number a line, perhaps with the unit N.
+    """Forces from what a serial sensor prints: see the module for its lines.
+
+    newtons_per_unit: the force is so many times what a line says.
+    unit: of lines that state none, a key of `NEWTONS`; "": newtons, unless other lines state one.
+    column: which field of a line has the force: its name in a header, or its number from 1; "": the
+        only one, or the second of two.
 
     What comes before the first end of a line is perhaps the end of a number: it is dropped. No more
     than `LARGEST_LINE_BYTES` are held, whatever comes.
 
-    damaged: how many lines were no such number, blank ones apart.
+    damaged: how many lines were no such number, blank ones and headers apart.
+    last_damaged: the newest of them, cut.
+
+    :raises ValueError: no such unit.
     """
 
-    LARGEST_LINE_BYTES: Final = 64
+    LARGEST_LINE_BYTES: Final = 256
 
-    def __init__(self, newtons_per_unit: float = 1.0) -> None:
+    def __init__(self, newtons_per_unit: float = 1.0, unit: str = "", column: str = "") -> None:
+        if unit and unit not in NEWTONS:
+            raise ValueError(f"no unit '{unit:.20}' of force: there are {', '.join(NEWTONS)}")
         self.damaged = 0
-        self._newtons_per_unit = newtons_per_unit
+        self.last_damaged = ""
+        self._newtons_per_unit, self._unit, self._column = newtons_per_unit, unit, column
+        self._place = int(column) - 1 if column.isdecimal() else -1  # -1: no header has come
+        self._fields = 0  # of a line with columns; 0: none has come
+        self._is_stated = False  # whether a line has stated its unit
+        self._time, self._rises = math.inf, 0  # that of the last line, perhaps, and its rises
         self._partial = b""
         self._skips = True  # to the end of this line: it is the first one, or too long
 
@@ -54,20 +96,67 @@ class ForceLineDecoder:
         """The forces [N] of the lines that these bytes complete, in order."""
         forces_n: list[float] = []
         *lines, self._partial = re.split(rb"[\r\n]", self._partial + octets)
-        for line in lines:
-            if line.strip() and not self._skips:
-                number = _NUMBER.fullmatch(line) if len(line) <= self.LARGEST_LINE_BYTES else None
-                force_n = self._newtons_per_unit * float(number[1]) if number else math.inf
+        for each in lines:
+            line = each[: self.LARGEST_LINE_BYTES + 1].decode("ascii", "replace")
+            if line.strip() and not self._skips and not self._is_header(line):
+                force_n = self._force_n(line) if len(line) <= self.LARGEST_LINE_BYTES else math.inf
                 if math.isfinite(force_n):
                     forces_n.append(force_n)
                 else:
-                    self.damaged += 1
+                    self._damage(line)
             self._skips = False
         if len(self._partial) > self.LARGEST_LINE_BYTES:
+            if not self._skips:
+                self._damage(self._partial[:_SHOWN_CHARS].decode("ascii", "replace"))
             self._partial = b""
-            self.damaged += not self._skips
             self._skips = True
         return forces_n
+
+    def _damage(self, line: str) -> None:
+        self.damaged += 1
+        self.last_damaged = line[:_SHOWN_CHARS]
+
+    def _is_header(self, line: str) -> bool:
+        """Whether it names the column that is wanted, whose place is noted then."""
+        names = [name.strip().lower() for name in _COMMAS.split(line)]
+        if not self._column or self._column.isdecimal() or self._column.lower() not in names:
+            return False
+        self._place, self._fields = names.index(self._column.lower()), len(names)
+        return True
+
+    def _force_n(self, line: str) -> float:
+        """The force that a line states [N]; infinite: it states none, or none for sure."""
+        found = self._in_column(line) if self._column else self._alone(line)
+        if found is None:
+            return math.inf
+        unit = (found["unit"] or "").lower()
+        if unit:
+            self._is_stated = True
+        elif self._is_stated and not self._unit:  # some scales leave it out while they are moved
+            return math.inf
+        scale = self._newtons_per_unit * _NEWTONS_BY_LOWER[unit or self._unit.lower() or "n"]
+        return scale * float(found["number"].replace(" ", ""))
+
+    def _in_column(self, line: str) -> re.Match[str] | None:
+        """The field of the wanted column, in a line that has as many fields as the others."""
+        fields = _COMMAS.split(line)
+        self._fields = self._fields or len(fields)
+        if not 0 <= self._place < len(fields) == self._fields:
+            return None
+        return _FIELD.fullmatch(fields[self._place])
+
+    def _alone(self, line: str) -> re.Match[str] | None:
+        """The number of a line that has no other, but for a time before it."""
+        if found := _OF_SCALE.fullmatch(line):
+            return found
+        time, *others = map(_FIELD.fullmatch, _COMMAS.split(line))
+        if time is None or time["unit"] or len(others) != 1:
+            return None
+        time_s = float(time["number"].replace(" ", ""))
+        self._rises = self._rises + 1 if time_s > self._time else 0
+        self._time = time_s
+        unsure = _DECIMAL_COMMA.fullmatch(line) and self._rises < _RISES_OF_TIME
+        return None if unsure else others[0]
 
 
 class ForceSensor(Closing):
@@ -75,22 +164,29 @@ class ForceSensor(Closing):
 
     path: serial port.
     baud: speed of its line.
-    newtons_per_unit: force of one unit of the printed number [N]; below 0 where the sensor is
-        mounted upside down.
+    newtons_per_unit, unit, column: as for `ForceLineDecoder`; newtons_per_unit is below 0 where the
+        sensor is mounted upside down.
 
     :raises PortError: as `SerialLink`.
-    :raises ValueError: newtons_per_unit is 0 or not finite.
+    :raises ValueError: newtons_per_unit is 0 or not finite, or there is no such unit.
     """
 
-    def __init__(self, path: str, baud: int = DEFAULT_BAUD, newtons_per_unit: float = 1.0) -> None:
+    def __init__(
+        self,
+        path: str,
+        baud: int = DEFAULT_BAUD,
+        newtons_per_unit: float = 1.0,
+        unit: str = "",
+        column: str = "",
+    ) -> None:
         if not (math.isfinite(newtons_per_unit) and newtons_per_unit):
             raise ValueError(f"scale is {newtons_per_unit:g}: give the newtons of one unit")
         self.path = path
         self.dropped = 0
         """Samples that nobody took in time."""
         self._baud = baud
+        self._decoder = ForceLineDecoder(newtons_per_unit, unit, column)
         self._link = SerialLink(path, baud)
-        self._decoder = ForceLineDecoder(newtons_per_unit)
         self._changed = threading.Condition()
         self._waiting: deque[ForceSample] = deque(maxlen=QUEUE_SAMPLES)
         self._last_s = time.monotonic()
@@ -100,7 +196,7 @@ class ForceSensor(Closing):
 
     @property
     def damaged(self) -> int:
-        """How many lines were no number."""
+        """How many lines could not be read."""
         return self._decoder.damaged
 
     def take(self) -> list[ForceSample]:
@@ -130,10 +226,15 @@ class ForceSensor(Closing):
         if time.monotonic() - self._last_s <= SILENCE_TIMEOUT_S:
             return
         trouble = (
-            f"no number from {self.path} for {SILENCE_TIMEOUT_S:g} s ({self.damaged} damaged lines)"
+            f"no force from {self.path} for {SILENCE_TIMEOUT_S:g} s ({self.damaged} damaged lines"
         )
-        remedy = f"the force sensor must print one number a line, and that at {self._baud} baud"
-        raise DeviceLost(trouble, remedy)
+        if self.damaged:
+            trouble += f", the last one {self._decoder.last_damaged!r}"
+        remedy = (
+            f"the force sensor must print one number a line at {self._baud} baud, without being "
+            "asked; of several numbers, say the --force-column"
+        )
+        raise DeviceLost(f"{trouble})", remedy)
 
     def _read(self) -> None:
         try:

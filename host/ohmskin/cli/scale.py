@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin calibrate scale``: what a load cell's numbers are in newtons, by known weights."""
+
+import math
+from collections import deque
+from typing import Annotated, Final
+
+import numpy as np
+import typer
+from typer import Argument, Option
+
+from ohmskin.calibrate.guide import MIN_READING_SCANS, READING_S, steady
+from ohmskin.cli.board import TERMINAL
+from ohmskin.cli.record import ForceBaud, ForceColumn, ForceUnit
+from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
+from ohmskin.record.recording import ForceSample
+
+# Weights may disagree by this share about what a number means. Chosen: a load cell is a hundred
+# times better, and a finger that helps is worse.
+_OFF_SHARE: Final = 0.05
+
+
+def grams_of(text: str, least: int = 1) -> list[float]:
+    """The weights that ``--grams`` names [g], rising or not. Raises ValueError."""
+    try:
+        masses_g = [float(part) for part in text.split(",")]
+    except ValueError:
+        masses_g = []
+    good = len(masses_g) >= least and all(0 < mass_g < math.inf for mass_g in masses_g)
+    if not good:
+        raise ValueError(f"--grams {text!r:.60}: give {least} or more above 0, such as 50,100,200")
+    if len(set(masses_g)) < len(masses_g):
+        raise ValueError(f"--grams {text!r:.60}: a weight stands twice")
+    return masses_g
+
+
+def scale(
+    port: Annotated[str, Argument(help="serial port of the load cell or scale")],
+    grams: Annotated[str, Option(help="two known weights or more, in gram, such as 200,500")],
+    force_baud: ForceBaud = DEFAULT_BAUD,
+    force_unit: ForceUnit = "",
+    force_column: ForceColumn = "",
+) -> None:
+    """Find the --force-scale of a load cell, by known weights: what its numbers are in newtons.
+
+    Skin and plate may lie on it. It asks for one weight after the other.
+    """
+    masses_g = grams_of(grams, least=2)
+    with ForceSensor(port, force_baud, 1.0, force_unit, force_column) as sensor:
+        sensor.wait()
+        empty = _shown(sensor, "take off what is not always on it")
+        shown = np.array([_shown(sensor, f"put {g:g} g on it, alone", empty) for g in masses_g])
+    forces_n = NEWTONS["g"] * np.array(masses_g)
+    factor = float(forces_n @ shown / max(shown @ shown, 1e-300))
+    off = np.abs(factor * shown / forces_n - 1)
+    if not off.max() <= _OFF_SHARE:
+        each = ", ".join(f"{g:g} g: {x:.6g}" for g, x in zip(masses_g, shown, strict=True))
+        raise ValueError(f"the weights disagree by {100 * off.max():.0f} % ({each}): weigh again")
+    TERMINAL.print(f"--force-scale {factor:.6g} (the weights agree within {100 * off.max():.1f} %)")
+
+
+def _shown(sensor: ForceSensor, wish: str, empty: float | None = None) -> float:
+    """Mean number above that of the empty scale when the wish is fulfilled, and it is steady."""
+    typer.prompt(f"{wish}, then press Enter", default="", show_default=False, prompt_suffix="")
+    sensor.take()
+    window: deque[ForceSample] = deque()
+    while True:
+        sensor.wait()
+        window += sensor.take()
+        long_s = window[-1].host_time_s - window[0].host_time_s
+        if len(window) >= MIN_READING_SCANS and long_s >= READING_S:
+            numbers = np.array([sample.force_n for sample in window]) - (empty or 0.0)
+            if empty is None or steady(numbers)[1]:
+                return float(numbers.mean())
+            window.clear()
