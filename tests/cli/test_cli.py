@@ -20,6 +20,7 @@ from command_line import Command, Done, Run, assert_one_line, finish, python, we
 from ohmskin.cli.main import app
 from ohmskin.cli.stream import cell_table
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
+from ohmskin.emulate.scale import SCALE_OPTIONS
 from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -456,7 +457,7 @@ def test_help_of_a_command(run: Run, name: str) -> None:
 def test_help_of_emulate_has_a_line_for_each_scene_and_fault(run: Run) -> None:
     lines = [line.strip() for line in run("emulate", "--help").out.splitlines()]
     lead = {"lead": f"ohms of each line's lead, {LEAD_OHM:g} unless told"}
-    known = {**SCENES, **lead, **LINE_FAULTS, **SKIN_FAULTS}
+    known = {**SCENES, **lead, **SCALE_OPTIONS, **LINE_FAULTS, **SKIN_FAULTS}
     assert [line for line in lines if line.startswith("- ")] == [
         f"- {name}: {text}" for name, text in known.items()
     ]

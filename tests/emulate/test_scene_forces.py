@@ -57,3 +57,20 @@ def test_the_robot_presses_each_cell_as_often_as_a_curve_needs() -> None:
     assert peaks_n.max() <= 8.0
     assert np.unique(np.round(np.diff(times_s[begins]), 2)).size > 10  # at irregular times
     assert not force_n[-1].any()
+
+
+def test_fingertips_come_to_all_cells_and_press_them_together() -> None:
+    scene = Scene("knead", 8, 8, seed=4)
+    times_s = np.arange(0.0, 6 + 130, 0.02)
+    force_n = np.array([scene.force_n(time_s) for time_s in times_s])
+    total_n = force_n.sum(axis=(1, 2)).round(6)
+    assert not total_n[times_s < 6].any()
+    peaks_n = total_n[1:-1][(total_n[1:-1] > total_n[:-2]) & (total_n[1:-1] >= total_n[2:])]
+    assert 110 < peaks_n.size < 180
+    assert 0.8 < peaks_n.min() < 1.3
+    assert 11.0 < peaks_n.max() <= 12.0
+    assert force_n.max(axis=0).min() > 0.5  # no cell is left out
+    assert 3 <= np.median(np.count_nonzero(force_n[total_n > 1.0] > 0.05, axis=(1, 2))) <= 12
+    middle = [np.tensordot(force_n, at, 2) / np.maximum(total_n, 1e-9) for at in np.mgrid[:8, :8]]
+    held = (total_n[1:] > 0.9) & (total_n[1:] == total_n[:-1])
+    assert np.hypot(*np.diff(middle))[held].mean() > 0.01  # they move

@@ -17,6 +17,7 @@ from io import DEFAULT_BUFFER_SIZE
 
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
+from ohmskin.emulate.scale import EmulatedScale
 from ohmskin.errors import DeviceLost, PortError
 from ohmskin.files import Closing
 from ohmskin.link.serial_port import READ_TIMEOUT_S
@@ -148,7 +149,9 @@ class SteppedSkin(Session):
 
 
 class PtyServer(_Running, Closing):
-    """Serves a running board at `path`, while `serve` runs.
+    """Serves a running board at `path`, and a scale at `scale_path`, while `serve` runs.
+
+    scale: under the skin; None: there is none, and its path is "".
 
     Bytes that no program takes are thrown away, as a serial port does that nobody has open;
     `lost_bytes` counts them.
@@ -156,19 +159,31 @@ class PtyServer(_Running, Closing):
     :raises PortError: this system has no pseudo-terminals.
     """
 
-    def __init__(self, board: EmulatedBoard, faults: LineFaults | None = None) -> None:
+    def __init__(
+        self,
+        board: EmulatedBoard,
+        faults: LineFaults | None = None,
+        scale: EmulatedScale | None = None,
+    ) -> None:
+        super().__init__(board, faults)
+        self.lost_bytes = 0
+        self._closing, self._serving = False, threading.Lock()
+        self._files: list[int] = []
+        self._scale = scale
+        self._master, self.path = self._open()
+        self._scale_master, self.scale_path = (-1, "") if scale is None else self._open()
+
+    def _open(self) -> tuple[int, str]:
+        """A new pseudo-terminal: our end, and the path of the other one."""
         try:
             import tty
         except ImportError as exc:
             raise PortError("this system has no pseudo-terminals: use emulator:// itself") from exc
-        super().__init__(board, faults)
-        self.lost_bytes = 0
-        self._closing, self._serving = False, threading.Lock()
-        self._master, slave = os.openpty()
-        self._files = [self._master, slave]
+        master, slave = os.openpty()
+        self._files += [master, slave]
         tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(slave)
+        os.set_blocking(master, False)
+        return master, os.ttyname(slave)
 
     def serve(self, seconds: float = float("inf")) -> None:
         """Serve for `seconds`, until `close`, or until the faults let the board vanish."""
@@ -177,17 +192,20 @@ class PtyServer(_Running, Closing):
             while not self._closing and (now_s := self.now_s()) < end_s:
                 if self._faults.vanished(now_s):
                     break
-                self._write(self.board.heard(self._faults, now_s))
+                self._write(self._master, self.board.heard(self._faults, now_s))
                 wake_s = min(now_s + READ_TIMEOUT_S, end_s, self.board.next_scan_s or end_s)
+                if self._scale is not None:
+                    self._write(self._scale_master, self._scale.heard(now_s))
+                    wake_s = min(wake_s, self._scale.next_s)
                 if select.select([self._master], [], [], max(0.0, wake_s - self.now_s()))[0]:
-                    self._write(self.board.heard(self._faults, self.now_s()))
+                    self._write(self._master, self.board.heard(self._faults, self.now_s()))
                     # More than a pseudo-terminal keeps: Linux has 4096 bytes for us.
                     self.board.receive(os.read(self._master, DEFAULT_BUFFER_SIZE))
 
-    def _write(self, octets: bytes) -> None:
+    def _write(self, master: int, octets: bytes) -> None:
         taken = 0
         with suppress(BlockingIOError):
-            taken = os.write(self._master, octets)
+            taken = os.write(master, octets)
         self.lost_bytes += len(octets) - taken
 
     def close(self) -> None:

@@ -76,12 +76,24 @@ _ROBOT_PEAK_N: Final = (0.4, 8.0)
 _ROBOT_PRESS_S: Final = (0.0, 0.2, 0.4, 0.6)
 # Least and longest pause before a press [s]. Chosen: presses at even times could not be aligned.
 _ROBOT_PAUSE_S: Final = (0.15, 0.45)
+# The fingertips of the scene "knead" press, all cells together, with these forces [N], least and
+# largest. Chosen: those of people who knead.
+_TIP_N: Final = (1.0, 12.0)
+# A fingertip's pressure falls to 1/e so far from its middle [cells]. Chosen: it covers some five.
+_TIP_WIDTH_CELLS: Final = 0.9
+# Less than this share of its highest pressure is none. Chosen: the skin does not show it.
+_TIP_LEAST_SHARE: Final = 0.01
+# While it presses, its middle moves so far [cells]. Chosen: as a hand that kneads.
+_TIP_MOVES_CELLS: Final = 1.5
+# After so many fingertips for each cell, they come again. Chosen: four minutes on 8x8.
+_TIPS_A_CELL: Final = 4
 
 # When touches begin, where it is not at `BEGIN_S` [s].
 _BEGIN_S: Final = {
     "rest": float("inf"),
     "corners": _CORNERS_BEGIN_S,
     "presses": _ROBOT_BEGIN_S,
+    "knead": _ROBOT_BEGIN_S,
     "weights": 0.0,
 }
 
@@ -96,6 +108,8 @@ SCENES: Final = {
     f"{_MOVING_PERIOD_S:g} s",
     "presses": f"after {_ROBOT_BEGIN_S:g} s, a robot presses cell after cell {ROBOT_PRESSES} times "
     f"with {_ROBOT_PEAK_N[0]:g} to {_ROBOT_PEAK_N[1]:g} N, which takes some 4.5 s a cell",
+    "knead": f"after {_ROBOT_BEGIN_S:g} s, one fingertip after another with {_TIP_N[0]:g} to "
+    f"{_TIP_N[1]:g} N, which moves while it presses; over the whole skin, again and again",
     "weights": "the weights that 'ohmskin calibrate weights' asks for",
 }
 
@@ -133,7 +147,7 @@ class Scene:
         self.name = name
         self.rows = rows
         self.columns = columns
-        self.moves = name in ("corners", "moving", "presses", "weights")
+        self.moves = name in ("corners", "moving", "presses", "knead", "weights")
         self.begin_s = _BEGIN_S.get(name, BEGIN_S) if begin_s is None else begin_s
         if not self.begin_s >= 0:
             raise ValueError(f"begin must be 0 s or later, not {begin_s}")
@@ -150,7 +164,13 @@ class Scene:
         # Of other generators, so that a scene has the same skin and touches whatever else is drawn.
         log_gain = _GAIN_SPREAD * np.random.default_rng([seed, 1]).standard_normal((rows, columns))
         self._siemens_at_1n = _SIEMENS_AT_1N * np.exp(log_gain)
-        self._robot_peaks_n, self._robot_starts_s = _robot_presses(rows * columns, seed)
+        cells = rows * columns
+        self._robot = _Presses(ROBOT_PRESSES * cells, _ROBOT_PEAK_N, [seed, 2])
+        self._tips = _Presses(_TIPS_A_CELL * cells, _TIP_N, [seed, 3])
+        # Cell after cell in an order without order, so that none waits for long.
+        order = np.random.default_rng([seed, 4])
+        self._tip_cells = np.concatenate([order.permutation(cells) for _ in range(_TIPS_A_CELL)])
+        self._tip_ways = order.uniform(0, 2 * np.pi, self._tip_cells.size)
         self._still_ratio = lru_cache(
             lambda at_s, mode: self.faults.readings(self.skin(at_s), mode)
         )
@@ -174,7 +194,11 @@ class Scene:
         force_n = np.zeros((self.rows, self.columns))
         if weight is not None:
             force_n[weight[0]] = weight[1]
-        self._touches = self._siemens_at_1n * force_n**_EXPONENT
+        self._touches = self._by_force(force_n)
+
+    def _by_force(self, force_n: Float) -> Float:
+        """What forces (rows, columns) [N] add to the cells [S]."""
+        return np.asarray(self._siemens_at_1n * force_n**_EXPONENT)
 
     def touched(self, time_s: float) -> NDArray[np.bool_]:
         """Cells, (rows, columns), to which a touch adds as much as a cell has at rest, 1 uS."""
@@ -197,7 +221,11 @@ class Scene:
             case "moving":
                 return self._finger(time_s)
             case "presses":
-                return self._robot(time_s)
+                cell, _, force_n = self._robot.at(time_s - self.begin_s)
+                of_cells = np.arange(self._touches.size) == cell // ROBOT_PRESSES
+                return self._by_force(force_n * of_cells.reshape(self._touches.shape))
+            case "knead":
+                return self._by_force(self._fingertip(time_s - self.begin_s))
         return self._touches
 
     def _place(self, random: np.random.Generator) -> Float:
@@ -227,31 +255,49 @@ class Scene:
             touches[cell] = (1 + _TREMBLE_SHARE * np.sin(2 * np.pi * hz * time_s)) / ohm
         return touches
 
-    def _robot(self, time_s: float) -> Float:
-        force_n = np.zeros((self.rows, self.columns))
-        robot_s = time_s - self.begin_s
-        press = int(np.searchsorted(self._robot_starts_s, robot_s, side="right")) - 1
-        if press >= 0:
-            peak_n, into_s = self._robot_peaks_n[press], robot_s - self._robot_starts_s[press]
-            shape_n = (0.0, peak_n, peak_n, 0.0)
-            force_n.flat[press // ROBOT_PRESSES] = np.interp(into_s, _ROBOT_PRESS_S, shape_n)
-        return np.asarray(self._siemens_at_1n * force_n**_EXPONENT)
+    def _fingertip(self, knead_s: float) -> Float:
+        """Forces (rows, columns) [N], so long after the fingertips have begun."""
+        number, share, force_n = self._tips.at(knead_s % self._tips.end_s)
+        row, column = np.divmod(self._tip_cells[number], self.columns)
+        moved, way = _TIP_MOVES_CELLS * (share - 0.5), self._tip_ways[number]
+        row = np.clip(row + moved * np.sin(way), 0, self.rows - 1)
+        column = np.clip(column + moved * np.cos(way), 0, self.columns - 1)
+        pressure = np.exp(-self._away(row, column) / _TIP_WIDTH_CELLS**2)
+        pressure[pressure < _TIP_LEAST_SHARE * pressure.max()] = 0.0
+        return np.asarray(force_n * pressure / pressure.sum())
+
+    def _away(self, row: float, column: float) -> Float:
+        """Square distances of the cells from a place, (rows, columns) [cells^2]."""
+        away = np.arange(self.rows)[:, None] - row, np.arange(self.columns) - column
+        return np.asarray(away[0] ** 2 + away[1] ** 2)
 
     def _finger(self, time_s: float) -> Float:
         angle = 2 * np.pi * (time_s - self.begin_s) / _MOVING_PERIOD_S
         row = (self.rows - 1) * (0.5 + 0.4 * np.sin(angle))
         column = (self.columns - 1) * (0.5 + 0.4 * np.sin(2 * angle))
-        away = (np.arange(self.rows)[:, None] - row) ** 2 + (np.arange(self.columns) - column) ** 2
+        away = self._away(row, column)
         return np.asarray(_FINGER_SIEMENS * np.exp(-away / (2 * _FINGER_STD_CELLS**2)))
 
 
-def _robot_presses(cells: int, seed: int) -> tuple[Float, Float]:
-    """Peaks [N], and when each press begins after the robot has [s]; each (n,), cell after cell."""
-    random, count = np.random.default_rng([seed, 2]), ROBOT_PRESSES * cells
-    least_n, most_n = _ROBOT_PEAK_N
-    peaks_n = least_n * (most_n / least_n) ** random.uniform(size=count)
-    before_s = random.uniform(*_ROBOT_PAUSE_S, count)
-    return peaks_n, np.cumsum(before_s + _ROBOT_PRESS_S[-1]) - _ROBOT_PRESS_S[-1]
+class _Presses:
+    """So many presses, one after another, whose peaks are drawn between two forces [N].
+
+    end_s: when the last one is over, after the first may begin [s].
+    """
+
+    def __init__(self, count: int, peaks_n: tuple[float, float], seed: list[int]) -> None:
+        random, (least_n, most_n) = np.random.default_rng(seed), peaks_n
+        self._peaks_n = least_n * (most_n / least_n) ** random.uniform(size=count)
+        ends_s = np.cumsum(random.uniform(*_ROBOT_PAUSE_S, count) + _ROBOT_PRESS_S[-1])
+        self._starts_s = ends_s - _ROBOT_PRESS_S[-1]
+        self.end_s = float(ends_s[-1])
+
+    def at(self, time_s: float) -> tuple[int, float, float]:
+        """Which press is the newest at a time; the share of it that is over; its force [N]."""
+        press = max(int(np.searchsorted(self._starts_s, time_s, side="right")) - 1, 0)
+        into_s, peak_n = time_s - self._starts_s[press], self._peaks_n[press]
+        force_n = np.interp(into_s, _ROBOT_PRESS_S, (0.0, peak_n, peak_n, 0.0))
+        return press, float(np.clip(into_s / _ROBOT_PRESS_S[-1], 0, 1)), float(force_n)
 
 
 def _two_of(count: int) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
+from ohmskin.emulate.scale import DEFAULTS, SCALE_OPTIONS, EmulatedScale
 from ohmskin.emulate.scenes import LEAD_OHM, Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
@@ -82,7 +83,7 @@ def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
     url = PortUrl.of(text)
     if url.scheme != "emulator":
         raise PortError(f"{text} is not emulated: write emulator://8x8")
-    url.check_options(*_OF_BOARD, *SKIN_FAULTS, *LINE_FAULTS)
+    url.check_options(*_OF_BOARD, *SKIN_FAULTS, *LINE_FAULTS, *SCALE_OPTIONS)
     with url.blamed():
         if url.options.get("speed", "1") not in ("0", "1"):
             raise ValueError("speed must be 1, or 0: as fast as scans are taken")
@@ -104,6 +105,20 @@ def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
             says={"layout_crc": LAYOUT_CRC ^ url.number("foreign", 0)},
         )
         return board, scene, faults_of(LineFaults, url.options, seed=seed)
+
+
+def scale_under(scene: Scene, text: str) -> EmulatedScale:
+    """The scale under the skin of a scene, by the options of its ``emulator://`` URL.
+
+    :raises PortError: the URL is wrong.
+    """
+    url = PortUrl.of(text)
+    with url.blamed():
+        rate_hz, lag_s, noise_g = (url.number(name, usual) for name, usual in DEFAULTS.items())
+        seed = url.number("seed", 0)
+        return EmulatedScale(
+            lambda time_s: float(scene.force_n(time_s).sum()), rate_hz, lag_s, noise_g, seed
+        )
 
 
 def is_stepped(text: str) -> bool:
