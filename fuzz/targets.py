@@ -32,9 +32,10 @@ from ohmskin.link import framing, protocol
 from ohmskin.link.clock import BoardClock, line_delay_s, scan_s, scan_times_s
 from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.record.export import export
 from ohmskin.record.force_sensor import ForceLineDecoder
 from ohmskin.record.readings import load_readings
-from ohmskin.record.recording import SCHEMAS, TOPIC, export, load_recording
+from ohmskin.record.recording import SCHEMAS, TOPIC, load_recording
 
 Target = Callable[[bytes], None]
 # Readers take names of files. They are made here: in memory, where there is a place for that.
@@ -138,7 +139,7 @@ def recordings(octets: bytes) -> None:
             assert len(scan_times_s(recording.scans)) == len(recording.scans)
         for suffix in (".npz", ".csv"):
             with suppress(RecordingError):
-                export(recording, path.with_suffix(suffix))
+                export(path, path.with_suffix(suffix))
                 if suffix == ".npz":
                     with suppress(ValueError):  # a rest from elsewhere may be out of range
                         load_readings(path.with_suffix(suffix))

@@ -18,7 +18,7 @@ from ohmskin.calibrate.tables import (
     load_press_table,
     save_press_table,
 )
-from ohmskin.record.readings import MAX_CELLS
+from ohmskin.record.readings import MAX_LINES
 
 ROWS = [f"{0.1 * k:.1f},{k % 5}" for k in range(12)]
 HEADER = "row,column,force_n,conductance"
@@ -224,7 +224,7 @@ def test_a_table_is_read_in_any_order_of_columns(tmp_path: Path) -> None:
     assert found.tolist() == [(0, 3, 2.5, 1e-5, 0.0), (15, 1, 0.0, 0.0, 0.0)]
 
 
-_CELL = st.integers(0, MAX_CELLS - 1)
+_CELL = st.integers(0, MAX_LINES - 1)
 _SIEMENS = st.floats(0, 1)
 _PRESS = st.tuples(_CELL, _CELL, st.floats(0, 1e60), _SIEMENS, _SIEMENS)
 

@@ -137,7 +137,8 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD[..., :3]}, "ratio has shape"),
         ({"ratio": GOOD[:0]}, "ratio has 0 frames"),
         ({"ratio": GOOD[:, :0]}, "0x4 cells"),
-        ({"ratio": np.zeros((1, 65, 64, 4))}, "65x64 cells, not .* of 1 to 1024 cells"),
+        ({"ratio": np.zeros((1, 33, 32, 4))}, "33x32 cells: at most 1024 cells in 64 rows"),
+        ({"ratio": np.zeros((1, 1, 65, 4))}, "no skin has 1x65 cells"),
         (
             {"ratio": bad_ratio((1, 2, 0, 2), np.nan)},
             r"ratio, frame 1, of cell \(2, 0\), reading C",
@@ -156,7 +157,7 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ),
         ({"ratio": GOOD, "reading_names": list("abcdefgha")}, "9 names of 4 bytes, not some"),
         ({"ratio": GOOD[..., :0], "reading_names": np.array([], "U1")}, "reading_names are ,"),
-        ({"ratio": np.zeros((200_001, 1, 1, 4))}, "200001 frames of 1x1 cells, not 1 to 200000"),
+        ({"ratio": np.zeros((200_001, 1, 1, 4))}, "200001 frames, not 1 to 200000"),
         ({"ratio": GOOD, "ref_bottom_ohm": 0.0}, "ref_bottom_ohm must be positive"),
         ({"ratio": GOOD, "adc_bits": 10.5}, "adc bits must be"),
         ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),

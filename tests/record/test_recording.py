@@ -23,6 +23,7 @@ from command_line import Command, Done, Run, assert_one_line, finish, well
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import (
@@ -30,7 +31,6 @@ from ohmskin.record.recording import (
     ForceSample,
     Mark,
     Tare,
-    export,
     load_recording,
     messages,
 )
@@ -64,9 +64,9 @@ def test_scans_keep_their_mode(tmp_path: Path, path: Path, hello: Hello) -> None
     for found in (load_recording(path).scans, replayed(path)):
         assert [each.mode for each in found] == modes
     with pytest.raises(RecordingError, match=r"cells or mode change after 0\.005 s"):
-        export(load_recording(path), tmp_path / "both.npz")
+        export(path, tmp_path / "both.npz")
     for out in (tmp_path / "far.npz", tmp_path / "far.csv"):
-        export(load_recording(path), out, begin_s=0.004)
+        export(path, out, begin_s=0.004)
     readings = load_readings(tmp_path / "far.npz")
     assert readings.reading_names == ("a", "e", "b", "f")
     np.testing.assert_array_equal(readings.ratio, [each.ratio for each in scans[2:]])
@@ -259,7 +259,7 @@ def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) 
         assert [each.rest_ratio is None for each in played] == 5 * [False] + 5 * [True]
         assert skin.info.rows == 2
     with pytest.raises(RecordingError, match="cells or mode change after "):
-        export(load_recording(path), tmp_path / "a.npz")
+        export(path, tmp_path / "a.npz")
 
 
 def test_wrong_replays(tmp_path: Path, path: Path, hello: Hello) -> None:
@@ -303,10 +303,10 @@ def test_a_tare_is_the_rest_of_scans_of_its_mode_alone(
     first, other, last = (each.rest_ratio for each in replayed(path))
     assert other is None
     np.testing.assert_array_equal([first, last], [each.rest_ratio for each in tares])
-    export(load_recording(path), tmp_path / "far.npz", begin_s=0.004)
+    export(path, tmp_path / "far.npz", begin_s=0.004)
     np.testing.assert_array_equal(load_readings(tmp_path / "far.npz").rest_ratio, last)
     write_recording(tmp_path / "near.mcap", far, [tares[0], *of_far])
-    export(load_recording(tmp_path / "near.mcap"), tmp_path / "none.npz")
+    export(tmp_path / "near.mcap", tmp_path / "none.npz")
     assert load_readings(tmp_path / "none.npz").rest_ratio is None
 
 
@@ -342,7 +342,7 @@ def recorded(path: Path) -> Path:
 def test_export_is_estimated(tmp_path: Path, recorded: Path) -> None:
     out = tmp_path / "a.npz"
     recording = load_recording(recorded)
-    assert export(recording, out) == 5
+    assert export(recorded, out).scans == 5
     readings = load_readings(out)
     expected = [each.ratio for each in recording.scans]
     np.testing.assert_array_equal(readings.ratio, expected)
@@ -356,7 +356,7 @@ def test_export_is_estimated(tmp_path: Path, recorded: Path) -> None:
 def test_export_as_a_table(tmp_path: Path, recorded: Path) -> None:
     out = tmp_path / "a.csv"
     recording = load_recording(recorded)
-    export(recording, out)
+    export(recorded, out)
     header = out.read_text().splitlines()[0].split(",")
     assert header[:6] == ["number", "time_us", "host_time_s", "missed", "r0c0a", "r0c0b"]
     assert header[-1] == "r2c3d"
@@ -370,12 +370,12 @@ def test_export_as_a_table(tmp_path: Path, recorded: Path) -> None:
 def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     recording = load_recording(recorded)
     times_s = [each.host_time_s - recording.scans[0].host_time_s for each in recording.scans]
-    part = export(recording, tmp_path / "a.npz", begin_s=times_s[1], end_s=times_s[3] + 1e-6)
-    assert part in (3, 2)  # the first may fall to rounding
+    part = export(recorded, tmp_path / "a.npz", begin_s=times_s[1], end_s=times_s[3] + 1e-6)
+    assert part.scans in (3, 2)  # the first may fall to rounding
     with pytest.raises(RecordingError, match="no scans"):
-        export(recording, tmp_path / "b.npz", begin_s=1000)
+        export(recorded, tmp_path / "b.npz", begin_s=1000)
     with pytest.raises(ValueError, match="no format"):
-        export(recording, tmp_path / "b.txt")
+        export(recorded, tmp_path / "b.txt")
     assert not list(tmp_path.glob("b*"))
 
 

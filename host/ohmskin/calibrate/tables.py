@@ -39,7 +39,7 @@ from ohmskin.calibrate.rules import require_forces, require_rows
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.files import PathName, naming, read_bounded, save_table
 from ohmskin.force.calibration import MAX_NUMBER
-from ohmskin.record.readings import MAX_CELLS
+from ohmskin.record.readings import MAX_LINES
 
 # A larger file is not read. Chosen: an hour of a sensor at 1 kHz, with columns of other things.
 MAX_TABLE_BYTES: Final = 100_000_000
@@ -148,8 +148,8 @@ def load_press_table(path: PathName) -> PressTable:
             if name == "force_n":
                 require_forces(values, rows)
             elif name in _CELL:  # which cells there are, the skin knows: see `check_cell`
-                whole = (values >= 0) & (values < MAX_CELLS) & (values == np.floor(values))
-                must = f"a whole number from 0 to {MAX_CELLS - 1}"
+                whole = (values >= 0) & (values < MAX_LINES) & (values == np.floor(values))
+                must = f"a whole number from 0 to {MAX_LINES - 1}"
                 require_rows(name, values, whole, must, rows)
             else:
                 # Estimators state no more: a larger conductance is a number in another unit.

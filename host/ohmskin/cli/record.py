@@ -26,7 +26,7 @@ from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import until_ctrl_c
-from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
+from ohmskin.errors import DeviceLost, OhmskinError
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
@@ -34,11 +34,12 @@ from ohmskin.files import check_place
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
+from ohmskin.record.export import FORMATS
+from ohmskin.record.export import export as export_recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.readings import estimate_file, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import FORMATS, ForceSample, Mark, load_recording
-from ohmskin.record.recording import export as export_recording
+from ohmskin.record.recording import ForceSample, Mark
 
 # With a force sensor the first scans are a tare of so many seconds [s], unless told. Chosen: a
 # person who starts the command still takes a hand away in the first second.
@@ -208,13 +209,9 @@ def export(
     end_s: Annotated[float, Option("--end", min=0, help="until then, in s; 0: to the last")] = 0.0,
 ) -> None:
     """Write a recording's scans as readings (.npz) or as a table (.csv)."""
-    given = load_recording(recording)
-    try:
-        scans = export_recording(given, out, begin_s, end_s)
-    except RecordingError as exc:
-        raise RecordingError(f"{recording}: {exc}") from exc
-    TERMINAL.print(f"{out}: {scans} scans")
-    if given.cut_off:
+    written = export_recording(recording, out, begin_s, end_s)
+    TERMINAL.print(f"{out}: {written.scans} scans")
+    if written.cut_off:
         print(f"{recording} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
 
 

@@ -56,7 +56,7 @@ from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import FRAMES, MODES
-from ohmskin.record.readings import MAX_CELLS
+from ohmskin.record.readings import check_size
 
 FORMAT: Final = "ohmskin calibration"
 # Version of the file's layout, which is described above; a file of another one is refused. Chosen:
@@ -147,8 +147,7 @@ class Calibration:
         for name, rest in (("rest", self.rest), ("tare", self.tare)):
             if rest is not None and rest.level.shape != shape:
                 raise ValueError(f"{name} has shape {rest.level.shape}, the model {shape}")
-        if self.rest.level.size > MAX_CELLS:
-            raise ValueError(f"{self.rows}x{self.columns} cells, more than {MAX_CELLS}")
+        check_size(self.rows, self.columns)
         if not (np.isfinite(self.indenter_area_m2) and self.indenter_area_m2 > 0):
             raise ValueError(f"indenter_area_m2 is {self.indenter_area_m2}, it must be above 0")
         self.nominal_wire_ohm.check()

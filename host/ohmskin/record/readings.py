@@ -62,6 +62,9 @@ MAX_FRAMES: Final = 200_000
 # Cells of the largest skin: 32x32. Chosen: four times those of the largest board. The estimators'
 # matrices grow with the square of it, and their time with the cube.
 MAX_CELLS: Final = 1024
+# Rows of the largest skin, and columns. Chosen: four times those of the largest board. The circuit
+# of 1x1024 cells has more ports and nodes than others: its matrices take twice those of 32x32.
+MAX_LINES: Final = 64
 # The archive is read in pieces of so many bytes at most, and its directory is one piece. Chosen: a
 # directory of ten thousand arrays has a tenth.
 _PIECE_BYTES: Final = 4_000_000
@@ -100,10 +103,9 @@ class Readings:
         if self.ratio.ndim != 4 or self.ratio.shape[-1] != count:
             raise ValueError(f"ratio has shape {self.ratio.shape}, not (F, rows, columns, {count})")
         frames, rows, columns, _ = self.ratio.shape
-        if not (1 <= frames <= MAX_FRAMES and 1 <= rows * columns <= MAX_CELLS):
-            given = f"{frames} frames of {rows}x{columns} cells"
-            can_be = f"1 to {MAX_FRAMES} frames of 1 to {MAX_CELLS} cells"
-            raise ValueError(f"ratio has {given}, not {can_be}: cut it into parts")
+        if not 1 <= frames <= MAX_FRAMES:
+            raise ValueError(f"ratio has {frames} frames, not 1 to {MAX_FRAMES}: cut it into parts")
+        check_size(rows, columns)
         if not _in_range(self.ratio):  # asked of all at once, which takes no memory
             for frame, ratio in enumerate(self.ratio):
                 if not _in_range(ratio):
@@ -145,6 +147,13 @@ class Readings:
         if array is None:
             return None
         return array[frame] if array.ndim > _ONCE_NDIM[name] else array[()]
+
+
+def check_size(rows: int, columns: int) -> None:
+    """Raise ValueError for a skin that has no cell, or more than anything of ours estimates."""
+    if not (1 <= rows <= MAX_LINES and 1 <= columns <= MAX_LINES and rows * columns <= MAX_CELLS):
+        can_be = f"at most {MAX_CELLS} cells in {MAX_LINES} rows and columns"
+        raise ValueError(f"no skin has {rows}x{columns} cells: {can_be}")
 
 
 def load_readings(path: PathName) -> Readings:

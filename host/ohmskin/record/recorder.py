@@ -30,7 +30,7 @@ from ohmskin.record.recording import (
     ForceSample,
     Recorded,
     Tare,
-    check_size,
+    check_message,
 )
 
 # Messages are kept for so long before they are written. A recording that is killed lacks them, and
@@ -124,7 +124,7 @@ class Recorder(Closing):
         number = content.get("number", 0) & 0xFFFFFFFF  # MCAP has 32 bits for it
         content = {key: content[key] for key in SCHEMAS[name]}
         octets = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-        check_size(name, octets)
+        check_message(name, octets)
         log_ns = self._epoch_ns + round(content["host_time_s"] * 1e9)
         with self._writing():
             if self._closed.is_set():

@@ -18,8 +18,7 @@ other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were a
 ``host_time_s`` is that of `Scan`; log times are the same instants since 1970.
 
 `recorder` writes them; `messages` reads one by one, `load_recording` all at once. A file
-that was cut off anywhere is read up to its last whole chunk. `export` writes readings files (.npz),
-for `ohmskin estimate`, and tables (.csv).
+that was cut off anywhere is read up to its last whole chunk. `export` makes other files of one.
 
 Files come from anywhere, so nothing in one is believed before it was checked:
 
@@ -40,8 +39,6 @@ import zlib
 from array import array
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, fields
-from operator import attrgetter
-from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar
 
 import lz4.frame
@@ -53,11 +50,10 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
-from ohmskin.files import PathName, require_file, save_table, stored_bytes
-from ohmskin.link.codes import ratio_from_codes
+from ohmskin.files import PathName, require_file, stored_bytes
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import LARGEST_CODE, MODES
-from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_CELLS, MAX_FRAMES, save_arrays
+from ohmskin.record.readings import check_size
 
 # Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
 # 0.2 MB, and tools that write files anew make chunks of 4 MB.
@@ -69,13 +65,9 @@ _LARGEST_MESSAGE_BYTES: Final = (10_000, 120_000)
 _UNPACKED_BYTES: Final = 1_000_000
 # Chunks unpack to at most so many times the file's bytes, besides. Chosen: codes without noise pack
 # best, 115 times.
-_MOST_UNPACKED: Final = 150
+_MOST_UNPACKED: Final = 130
 # Counters are kept in 64 bits.
 _LARGEST_COUNTER: Final = np.iinfo(np.int64).max
-# What `export` writes.
-FORMATS: Final = (".npz", ".csv")
-# What both formats have of each scan, besides its readings: attributes of `Scan`.
-_OF_SCAN: Final = ("number", "time_us", "host_time_s", "missed")
 # A record of a chunk counts as so many bytes at least. Chosen: what a scan of one cell, or a force,
 # takes in memory; they pack to more than ten bytes.
 _LEAST_RECORD_BYTES: Final = 1000
@@ -335,7 +327,7 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : end].decode(), end
 
 
-def check_size(name: str, octets: bytes) -> None:
+def check_message(name: str, octets: bytes) -> None:
     """Raise ValueError if this is no message of this topic, by its size."""
     if len(octets) > _LARGEST_MESSAGE_BYTES["rows" in SCHEMAS[name] and name != "hello"]:
         raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
@@ -343,7 +335,7 @@ def check_size(name: str, octets: bytes) -> None:
 
 def _message(name: str, octets: bytes) -> Recorded:
     """The message of a topic. Raises ValueError or KeyError for what no recorder writes."""
-    check_size(name, octets)
+    check_message(name, octets)
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
@@ -371,8 +363,7 @@ def _hello(values: dict[str, Any]) -> Hello:
 def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
     """The readings of all cells, of this shape, from the list that stands for them."""
     rows, columns, _ = shape
-    if rows * columns > MAX_CELLS:
-        raise ValueError(f"{name}: no {rows}x{columns} cells")
+    check_size(rows, columns)
     try:
         # As `array`, because that takes integers alone, and a third of numpy's time.
         readings = array("H" if name == "codes" else "d", values)
@@ -380,9 +371,10 @@ def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
         raise ValueError(f"{name}: one is out of range") from None
     if len(readings) != math.prod(shape):
         raise ValueError(f"{len(readings)} {name} do not make {rows}x{columns} cells")
-    if name == "codes" and max(readings) > LARGEST_CODE:
+    cells = np.array(readings).reshape(shape)
+    if name == "codes" and cells.max() > LARGEST_CODE:
         raise ValueError("codes: one is out of range")
-    return np.array(readings).reshape(shape)
+    return cells
 
 
 def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
@@ -396,73 +388,3 @@ def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
             raise ValueError(f"{name} is {value!r:.40}, not a number")
         return float(value)
     return str(value) if form["type"] == "string" else value
-
-
-# ------------------------------------------------------------------------- to other programs
-
-
-def export(recording: Recording, out: Path, begin_s: float = 0.0, end_s: float = 0.0) -> int:
-    """Write the scans from `begin_s` to `end_s` [s after the first; 0: to the last] to `out`.
-
-    The file is complete or not there. Returns the number of scans.
-
-    :raises RecordingError: there are none, or they have not all the same size.
-    :raises ValueError: an unknown format, or `out` cannot be written.
-    """
-    if out.suffix not in FORMATS:
-        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
-    scans = _between(recording.scans, begin_s, end_s)
-    if out.suffix == ".csv":
-        _save_csv(scans, out)
-    else:
-        save_arrays(out, _arrays(recording, scans))
-    return len(scans)
-
-
-def _between(scans: list[Scan], begin_s: float, end_s: float) -> list[Scan]:
-    first_s = scans[0].host_time_s if scans else 0.0
-    last_s = first_s + end_s if end_s else float("inf")
-    scans = [scan for scan in scans if first_s + begin_s <= scan.host_time_s <= last_s]
-    if not scans:
-        raise RecordingError("no scans: neither in the recording nor in this part of it")
-    for scan in scans:
-        if scan.kind != scans[0].kind:
-            change = f"cells or mode change after {scan.host_time_s - first_s:.3f} s"
-            raise RecordingError(f"{change}: export each part by itself, --begin and --end")
-    return scans
-
-
-def _arrays(recording: Recording, scans: list[Scan]) -> dict[str, NDArray[Any]]:
-    """The arrays of a readings file, and those of `_OF_SCAN` besides.
-
-    `rest_ratio` is the last tare of this size and mode. Single precision has 24 bits, so `ratio` is
-    exact in it.
-    """
-    board = recording.hellos[0]
-    if len(scans) > MAX_FRAMES or 4 * len(scans) * scans[0].codes.size > MAX_ARRAY_BYTES:
-        many = f"{len(scans)} scans are more than a readings file holds"
-        raise RecordingError(f"{many}: export a part of them, --begin and --end")
-    ratio = np.empty((len(scans), *scans[0].codes.shape), np.float32)
-    for frame, scan in enumerate(scans):  # one by one: all in double precision take thrice as much
-        ratio[frame] = ratio_from_codes(scan.codes, board.adc_bits)
-    arrays: dict[str, Any] = {
-        "ratio": ratio,
-        "reading_names": scans[0].reading_names,
-        "ref_top_ohm": float(board.ref_top_ohm),
-        "ref_bottom_ohm": float(board.ref_bottom_ohm),
-        "adc_bits": board.adc_bits,
-        **{name: [getattr(scan, name) for scan in scans] for name in _OF_SCAN},
-    }
-    for tare in recording.tares:
-        if tare.is_of(scans[0]):
-            arrays["rest_ratio"] = tare.rest_ratio
-    return {name: np.array(values) for name, values in arrays.items()}
-
-
-def _save_csv(scans: list[Scan], out: Path) -> None:
-    """A row a scan: its times, then the codes of each cell, named by row, column and reading."""
-    cells = np.ndindex(*scans[0].codes.shape)
-    names = [f"r{row}c{column}{scans[0].reading_names[k]}" for row, column, k in cells]
-    times = attrgetter(*_OF_SCAN)
-    rows = ([*times(scan), *scan.codes.reshape(-1).tolist()] for scan in scans)
-    save_table(out, [*_OF_SCAN, *names], rows)
