@@ -57,7 +57,7 @@ def test_leads_that_are_told_cost_little(method: str) -> None:
     usual = np.median(errors(without, estimates(without, method, 0.0)[0])[0])
     assert np.median(errors(behind, estimates(behind, method, 600.0)[0])[0]) < 1.5 * usual
     silent = np.median(errors(behind, estimates(behind, method, 0.0)[0])[0])
-    assert silent > 3 * usual  # they matter
+    assert silent > 2 * usual  # they matter
 
 
 @pytest.mark.parametrize("ohm", [0.0, 300.0, 1000.0])

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.stats
 
 from network import Network, skin_network  # tests/helpers
 from ohmskin.arrays import Float
@@ -13,7 +14,14 @@ from ohmskin.circuit.skin import PortCircuit, Skin, port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.prior import FADE_SHARE, LAYER_STD, SEGMENT_STD
+from ohmskin.estimate.prior import (
+    AGILE_FADE,
+    AGILE_SHARE,
+    LAYER_STD,
+    MEMORY,
+    SEGMENT_STD,
+    STEADY_FADE,
+)
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
 from ohmskin.estimate.wire_belief import LearnedWires, Lesson
 from ohmskin.record.readings import estimate_file
@@ -113,11 +121,17 @@ def test_touch_agrees_with_joint_within_its_standard_deviation(name: str) -> Non
 
 
 def test_touch_models_no_more_cells_than_are_touched() -> None:
-    """On simulated frames of up to five touches: the pressed cells, and hardly ever another."""
+    """On simulated frames of up to five touches: the pressed cells, and hardly ever another.
+
+    The wires are known: else frames that want them better known would be for `joint`.
+    """
     trial = random_trial(8, 8, 5, 40, seed=3)
-    out = estimate_file(trial.rounded(10), "touch")
-    rest = np.median(out["cell_siemens"], axis=0)
-    off_rest = ~np.isclose(out["cell_siemens"], rest, rtol=1e-6)
+    knowledge = trial.rounded(10).knowledge(0)
+    wires = knowledge.nominal_wire_ohm._replace(top_log_std=0.03, bottom_log_std=0.03)
+    knowledge = replace(knowledge, nominal_wire_ohm=wires, may_be_bent=False)
+    estimator = make_estimator("touch", knowledge)
+    found = np.array([estimator.estimate(r).cell_siemens for r in trial.rounded(10).ratio])
+    off_rest = ~np.isclose(found, np.median(found, axis=0), rtol=1e-6)
     assert np.all(off_rest[trial.pressed])
     exact = np.all(off_rest == trial.pressed, axis=(1, 2))
     assert np.mean(exact) >= 0.85  # the others are for `joint`
@@ -275,30 +289,43 @@ def test_wires_that_touch_reports_are_those_that_it_has_learned() -> None:
     assert few > 3
 
 
-def test_the_belief_of_wires_is_a_kalman_filter() -> None:
-    """Against the textbook's covariance form, two lessons, with what fades after each."""
+def test_the_belief_of_wires_is_of_two_kalman_filters() -> None:
+    """Against the textbook's covariance form and likelihood: two lessons, each after a fade."""
     random = np.random.default_rng(8)
     belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0, lead_std_ohm=20.0))
     layers = scipy.linalg.block_diag(*(np.ones((n, 1)) for n in (6, 6, 5)))
-    mean = np.array([np.log(100.0), np.log(200.0), 50.0])
     prior = np.diag([LAYER_STD, LAYER_STD, 20.0]) ** 2
-    covariance, scale = prior.copy(), np.repeat([1.0, 1.0, 0.01], (6, 6, 5))
+    mean = before = np.array([np.log(100.0), np.log(200.0), 50.0])
+    means, covariances, scores = [mean, mean], [prior, prior], [0.0, 0.0]
+    covariance, scale = prior, np.repeat([1.0, 1.0, 0.01], (6, 6, 5))
     for _ in range(2):
-        slopes, residual = scale * random.normal(size=(4, 17)), random.normal(size=4)
         own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
-        noise = np.diag(random.uniform(1, 2, 4))
-        whole = layers @ covariance @ layers.T + own
-        gain = covariance @ layers.T @ slopes.T @ np.linalg.inv(slopes @ whole @ slopes.T + noise)
-        mean = mean + gain @ residual
-        covariance = covariance - gain @ slopes @ layers @ covariance
-        faded = prior.copy()
-        faded[2, 2] = covariance[2, 2]
-        covariance += FADE_SHARE * (faded - covariance)
-        factor = np.linalg.cholesky(slopes @ (whole @ slopes.T) + noise)
-        belief.take(Lesson(belief.per_mean_std(slopes @ layers), residual, factor))
+        slopes, at_mean = scale * random.normal(size=(4, 17)), random.normal(size=4)
+        noise = slopes @ own @ slopes.T + np.diag(random.uniform(1, 2, 4))
+        by_mean = slopes @ layers
+        factor = np.linalg.cholesky(by_mean @ covariance @ by_mean.T + noise)
+        belief.take(Lesson(belief.per_mean_std(by_mean), at_mean, factor))
+        for which, fade in enumerate((STEADY_FADE, AGILE_FADE)):
+            residual = at_mean - by_mean @ (means[which] - mean)
+            widest = prior.copy()
+            widest[2, 2] = covariances[which][2, 2]
+            faded = (1 - fade) * covariances[which] + fade * widest
+            expected = by_mean @ faded @ by_mean.T + noise
+            likelihood = scipy.stats.multivariate_normal(np.zeros(4), expected).logpdf(residual)
+            gain = faded @ by_mean.T @ np.linalg.inv(expected)
+            means[which] = means[which] + gain @ residual
+            covariances[which] = faded - gain @ by_mean @ faded
+            scores[which] = MEMORY * scores[which] + likelihood
+        shares = np.exp(scores) * (1 - AGILE_SHARE, AGILE_SHARE)
+        shares /= shares.sum()
+        mean = shares @ means
+        covariance = sum(
+            share * (own_covariance + np.outer(one - mean, one - mean))
+            for share, own_covariance, one in zip(shares, covariances, means, strict=True)
+        )
+    np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
     own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
     whole = layers @ covariance @ layers.T + own
-    np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
     root = belief.per_std(np.eye(17)[:, :12], np.eye(17)[:, 12:], np.zeros((17, 3)))
     np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(root[:, -3:], belief.per_mean_std(layers), atol=1e-9)
@@ -308,9 +335,28 @@ def test_the_belief_of_wires_is_a_kalman_filter() -> None:
     wires = belief.wires_off(away[-3:], of_own[:12], of_own[12:])
     np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=1e-9)
     some = random.normal(size=(3, 17))
-    before = np.array([np.log(100.0), np.log(200.0), 50.0])
     moved = belief.moved_since(before, belief.per_mean_std(some @ layers))
     np.testing.assert_allclose(moved, some @ (belief.mean - layers @ before), rtol=1e-9)
+
+
+def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
+    """Twenty lessons of the same wires, then five of wires that are twice as large."""
+    random = np.random.default_rng(3)
+    belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=0.0))
+    stds, errors = [], []
+    for lesson in range(25):
+        true = np.array([np.log(130.0), np.log(170.0), 0.0])
+        true[:2] += np.log(2.0) * (lesson >= 20)
+        slopes = random.normal(size=(4, 3)) * (5.0, 5.0, 0.01)
+        residual = slopes @ (true - belief.means) + random.normal(size=4)
+        per_std = belief.per_mean_std(slopes)
+        factor = np.linalg.cholesky(per_std @ per_std.T + np.eye(4))
+        belief.take(Lesson(per_std, residual, factor))
+        stds.append(belief.mean_std()[:2].max())
+        errors.append(np.abs(belief.means - true)[:2].max())
+    assert stds[19] < 0.07
+    assert max(stds[20:]) > 1.7 * stds[19]
+    assert errors[24] < 0.15
 
 
 def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:

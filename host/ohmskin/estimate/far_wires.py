@@ -59,18 +59,23 @@ touch is a lesson once, and its error would stay. Here, each frame measures the 
 the sums L and l a noisy frame counts for little, because it is weighed by its noise.
 """
 
+from typing import Final
+
 import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    FADE_SHARE,
     LAYER_STD,
     MAX_STEP_LOG,
     SEGMENT_STD,
 )
 from ohmskin.estimate.wire_belief import Fit, WireBelief
+
+# Share of what is known of the layers that fades after each lesson, because skins bend. Chosen: as
+# each frame measures the layers, little depends on it.
+FADE_SHARE: Final = 0.1
 
 
 class MeasuredWires(WireBelief):

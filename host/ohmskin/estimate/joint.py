@@ -32,7 +32,7 @@ from ohmskin.estimate.ohm import conductance_from_current
 from ohmskin.estimate.port_faults import cell_of
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    HIDDEN_LOG,
+    CLEAR_LOG,
     HIGHEST_TOUCH_SIEMENS,
     LAYER_STD,
     MAX_CHI2,
@@ -283,6 +283,6 @@ class TouchEstimator(JointEstimator):
         touched = None if self.knowledge.rest_ratio is None else touches.explain()
         if touched is None:
             return None
-        if touched.log_cells_std[touched.cells].max(initial=0.0) > HIDDEN_LOG:
+        if touched.log_cells_std[touched.cells].max(initial=0.0) > CLEAR_LOG:
             return None
         return touched

@@ -32,8 +32,11 @@ TOUCHED_STDS: Final = 2.0
 # Deviation of a touched cell before it is read, because nobody knows how hard the touch is: a
 # factor of twenty, either way.
 UNLIMITED_STD: Final = 3.0
-# A rise that must not go unnoticed, and how well `touch` has to know a cell.
+# A rise that must not go unnoticed.
 HIDDEN_LOG: Final = 0.3
+# How well `touch` has to know a cell, else it asks `joint`: by what few touches leave out, it is
+# less precise.
+CLEAR_LOG: Final = 0.1
 # Under fingertips a larger share of the cells is touched: the frame is crowded.
 CROWDED_SHARE: Final = 0.3
 # Under soft fingertips, the rises of neighbours in a crowded frame correlate by more.
@@ -58,8 +61,14 @@ UNKNOWN_LEAD_STD_OHM: Final = 2000.0
 USUAL_LEAD_STD_OHM: Final = 150.0
 # Deviation that all leads share, if they are told, as a share of them.
 LEAD_STD: Final = 0.05
-# Share of what is known of the layers that fades after each lesson, because skins bend.
-FADE_SHARE: Final = 0.1
+# Share of what is known of the layers that fades before each lesson, because skins bend: where the
+# skin is still, and where it has just been bent.
+STEADY_FADE: Final = 0.01
+AGILE_FADE: Final = 0.3
+# How likely it is before any lesson that a skin bends.
+AGILE_SHARE: Final = 0.3
+# Share of what lessons have said of that, which is left after each lesson.
+MEMORY: Final = 0.8
 
 # Steps of a fit, after which it gives up: it bounds the time of a frame.
 MAX_ITERATIONS: Final = 40

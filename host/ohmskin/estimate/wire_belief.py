@@ -49,8 +49,20 @@ information A, the inverse of a covariance:
 V^1/2 the Cholesky factor of V, and V^T/2 its transpose.
 
 A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
-cells as noise without limit. After a lesson V grows back towards V0, but for the lead: a skin
-bends. What single wires have of their own is not learned: frames of near ends say too little of it.
+cells as noise without limit. What single wires have of their own is not learned: frames of near
+ends say too little of it.
+
+A skin bends, so before a lesson V grows back towards V0 by a share f, but for the lead. Most skins
+are still, and are known best where little fades; some have just been bent. So there are two
+filters, steady and agile, each with its own f, m and V. How well a filter has expected a lesson is
+its log likelihood, less what is the same for both. With g_0 = L J^T N^-1 z at the mean that the
+fit had, n = m - that mean, V before and V' after the lesson, and g = g_0 - A n,
+
+    score = n . g_0 - n . A n / 2 + (g . V' g - log det(1 + V A)) / 2 .
+
+Believed is the mixture of both: its mean and its covariance. The odds of agile are those before any
+lesson, times exp of the difference of both sums of scores, which forget (a multiple-model filter:
+Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, chapter 11).
 """
 
 from abc import ABC, abstractmethod
@@ -65,11 +77,14 @@ from ohmskin.circuit.small import solve, solve_lower
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    FADE_SHARE,
+    AGILE_FADE,
+    AGILE_SHARE,
     LAYER_STD,
     LEAD_STD,
     MAX_STEP_LOG,
+    MEMORY,
     SEGMENT_STD,
+    STEADY_FADE,
     UNKNOWN_LAYER_STD,
     UNKNOWN_LEAD_OHM,
     UNKNOWN_LEAD_STD_OHM,
@@ -352,6 +367,14 @@ class WireBelief(ABC):
         return self._state.wires
 
 
+class _Filter(NamedTuple):
+    """One of the two filters: m and V; score: the sum of how well it has expected the lessons."""
+
+    means: Float
+    covariance: Float
+    score: float = 0.0
+
+
 class LearnedWires(WireBelief):
     """Wires at near ends: touches that share wires reveal the layers, a Kalman step a touch."""
 
@@ -359,7 +382,7 @@ class LearnedWires(WireBelief):
         """Back to the nominal wires."""
         super().reset()
         self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
-        self._before_lesson = self._known
+        self._filters = self._before_lesson = [_Filter(*self._known)] * 2
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Nothing: before its touches are known, a frame of near ends shows no wires."""
@@ -389,7 +412,7 @@ class LearnedWires(WireBelief):
             that says nothing undoes nothing.
         """
         if not replace_last:
-            self._before_lesson = self._known
+            self._before_lesson = self._filters
         per_mean_std, residual, factor = lesson
         # One reading shows its own touch, of unknown resistance, and so nothing of the wires.
         if len(residual) < 2:
@@ -402,14 +425,29 @@ class LearnedWires(WireBelief):
         gain = solve(factor, per_mean_std).T
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(3) - gain @ per_mean_std) @ gain
-        information = weights @ per_mean_std @ per_log
-        before, covariance = self._before_lesson
-        # z is the residual at the mean that the fit had, which is `self.means`. At the mean
-        # that the step starts from, the residual differs by what the mean has moved since.
-        pull = weights @ residual + information @ (self.means - before)
-        covariance = np.linalg.inv(np.linalg.inv(covariance) + information)
-        means = before + covariance @ pull
-        faded = self._prior_covariance.copy()
-        faded[2, 2] = covariance[2, 2]  # a bend does not change leads
-        covariance += FADE_SHARE * (faded - covariance)
-        self._believe(means, covariance)
+        information, pull = weights @ per_mean_std @ per_log, weights @ residual
+        fades = STEADY_FADE, AGILE_FADE
+        self._filters = [
+            self._stepped(before, fade, information, pull)
+            for before, fade in zip(self._before_lesson, fades, strict=True)
+        ]
+        steady, agile = self._filters
+        agile_odds = AGILE_SHARE / (1 - AGILE_SHARE) * np.exp(min(agile.score - steady.score, 50.0))
+        share = agile_odds / (1 + agile_odds)
+        apart = agile.means - steady.means
+        covariance = (1 - share) * steady.covariance + share * agile.covariance
+        covariance += share * (1 - share) * np.outer(apart, apart)
+        self._believe(steady.means + share * apart, covariance)
+
+    def _stepped(self, before: _Filter, fade: float, information: Float, pull: Float) -> _Filter:
+        """One filter after a lesson. information: A, (3, 3). pull: g_0 at `self.means`, (3,)."""
+        widest = self._prior_covariance.copy()
+        widest[2, 2] = before.covariance[2, 2]  # a bend does not change leads
+        faded = before.covariance + fade * (widest - before.covariance)
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(faded) + information), np.float64)
+        off = before.means - self.means
+        here = pull - information @ off
+        score = off @ pull - 0.5 * off @ information @ off + 0.5 * here @ covariance @ here
+        score -= 0.5 * np.linalg.slogdet(np.eye(3) + faded @ information)[1]
+        means: Float = np.asarray(before.means + covariance @ here, np.float64)
+        return _Filter(means, covariance, MEMORY * before.score + float(score))
