@@ -83,6 +83,27 @@ def test_all_readings_at_a_rail_are_flagged(method: str, ratio: float) -> None:
     assert "readings of most cells disagree" in found.message
 
 
+@pytest.mark.parametrize("method", ["ohm", "matrix", "joint", "touch"])
+@pytest.mark.parametrize("what", ["all", "nothing"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_line_stuck_at_half_is_flagged(method: str, what: str, axis: int) -> None:
+    """All its ports look shorted: as touches, to `ohm`."""
+    knowledge = knowledge_of((8, 8), what)
+    ratio = np.moveaxis(readings(touch(rest_of((8, 8)), 2, np.random.default_rng(2))), axis, 0)
+    ratio[3] = 0.5
+    found = make_estimator(method, knowledge).estimate(np.moveaxis(ratio, 0, axis))
+    assert "less resistance than any touch leaves" in found.message
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 4), (8, 8)])
+def test_readings_that_no_cells_give_are_flagged(shape: tuple[int, int]) -> None:
+    """Every port reads twice the current of a short. Nothing else contradicts it: no rest."""
+    ratio = np.broadcast_to([0.0, 1.0, 0.0, 1.0], (*shape, 4))
+    found = make_estimator("matrix", knowledge_of(shape, "nothing")).estimate(ratio)
+    assert found.chi2 > 1e6
+    assert "no cells give these readings: they miss 50 % of Vdd" in found.message
+
+
 @pytest.mark.parametrize("method", ["joint", "touch"])
 def test_after_nonsense_a_good_frame_is_answered_as_if_nothing_had_been(method: str) -> None:
     random = np.random.default_rng(3)

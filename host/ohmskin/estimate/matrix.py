@@ -46,6 +46,7 @@ from ohmskin.circuit.skin import impedance_of, port_difference
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.ohm import conductance_from_current, port_current
+from ohmskin.estimate.port_faults import MOST_CELLS_RATIO
 from ohmskin.estimate.port_readings import PortReadings
 
 # Most steps in a frame. Chosen: twice what the hardest frame of the reference takes; a frame that
@@ -98,7 +99,8 @@ def voltage_squared(impedance: Float, rows: int) -> Float:
 class MatrixEstimator(Estimator):
     """No wires, all cells at once. Starts from the previous frame, or from `ohm` if that is nearer.
 
-    It has converged if, within 40 iterations, no step lowers the chi-square by `CHI2_TOLERANCE`.
+    It has converged if, within 40 iterations, no step lowers the chi-square by `CHI2_TOLERANCE`,
+    and the cells give the readings to `MOST_CELLS_RATIO`: neglected wires make a tenth of it.
     Standard deviations are the roots of the diagonal of (J^T J)^-1 at the solution, also for a
     cell that ends on a bound. They are wider by the root of |r|^2 / RC where that exceeds 1.
     """
@@ -117,14 +119,18 @@ class MatrixEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         fit = CellFit(ports, self.knowledge.ref_ohm, self._previous)
         # A frame that did not converge is a poor start for the next one.
-        cell = fit.best.cell
-        self._previous = None if fit.message else cell
+        cell, message = fit.best.cell, fit.message
+        self._previous = None if message else cell
+        chi2 = self._chi2(ports, fit.best.current.reshape(cell.shape))
+        misfit_ratio = chi2**0.5 * self.knowledge.ratio_std
+        if not message and misfit_ratio > MOST_CELLS_RATIO:
+            message = f"no cells give these readings: they miss {100 * misfit_ratio:.0f} % of Vdd"
         return Solution(
             cell_siemens=cell,
             cell_siemens_std=fit.cell_std(),
-            chi2=self._chi2(ports, fit.best.current.reshape(cell.shape)),
+            chi2=chi2,
             iterations=fit.iterations,
-            message=fit.message,
+            message=message,
         )
 
 

@@ -19,7 +19,6 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
-from ohmskin.estimate.port_faults import FAULT_STDS, cell_of
 from ohmskin.estimate.port_readings import PortReadings
 
 
@@ -39,8 +38,7 @@ class OhmEstimator(Estimator):
     """Each cell by Ohm's law.
 
     A port may read more current than a short of its cell allows. Then the cell has the bound of
-    1 S, and the large standard deviation that belongs there. If the current is more than noise
-    explains, the frame has not converged.
+    1 S, and the large standard deviation that belongs there.
     """
 
     name = "ohm"
@@ -48,16 +46,10 @@ class OhmEstimator(Estimator):
     def _solve(self, ports: PortReadings) -> Solution:
         ref_ohm = self.knowledge.ref_ohm
         cell = conductance_from_current(ports.current, ref_ohm)
-        allowed = port_current(MAX_CELL_SIEMENS, ref_ohm) + FAULT_STDS * self.knowledge.current_std
-        excess = ports.current - allowed
-        message = ""
-        if (excess > 0).any():
-            message = f"{cell_of(excess.argmax(), excess)} has more current than a short allows"
         return Solution(
             cell_siemens=cell,
             cell_siemens_std=(1.0 + cell * ref_ohm) ** 2 * ports.current_std,
             chi2=self._chi2(ports, cell / (1.0 + cell * ref_ohm)),
-            message=message,
         )
 
 

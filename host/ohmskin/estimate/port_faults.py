@@ -8,7 +8,7 @@ A frame is at fault, and its answer not to be relied on, where
 - a current is below that at rest. Touches lower resistances, and that lowers the resistance between
   any two electrodes (Rayleigh's monotonicity law). So touches cannot do this, but open lines do;
 - a port has less resistance than it had if every cell were pressed as hard as can be, by the same
-  law: a row is shorted to a column;
+  law: a row is shorted to a column. Where nobody has told the wires, the limit is one such cell;
 - two lines that differed at rest draw the same current from every other line, and all of it more
   than at rest: their electrodes are shorted. Or they did so at rest already, and more than the
   other lines. A finger between two lines makes them alike for a moment. So lines that a frame has
@@ -257,7 +257,7 @@ class SkinFaults:
         worst = excess.argmax()
         if excess.flat[worst] <= 0:
             return ""
-        return f"{cell_of(worst, excess)}: less resistance than wires have: row and column shorted?"
+        return f"{cell_of(worst, excess)}: less resistance than any touch leaves: is it a short?"
 
     def _loss(self, now: PortCurrents, rest: PortCurrents) -> str:
         """A current that is below that at rest, by more than drift and noise."""
@@ -286,10 +286,15 @@ def far_line_fault(drop: Float, drop_std: Float) -> str:
 
 
 def _highest_current(knowledge: SkinKnowledge) -> Float:
-    """What ports draw if every cell is pressed as hard as can be, (R, C) [S]; inf if not known."""
+    """What ports draw if every cell is pressed as hard as can be, (R, C) [S].
+
+    Without wires, that could not be told from a short. There, it is what one such cell draws: hard
+    presses that add up to more are seldom, and wires that nobody told make all answers to them
+    wrong.
+    """
     shape = knowledge.rows, knowledge.columns
     if knowledge.nominal_wire_ohm.both is None:
-        return np.full(shape, np.inf)
+        return np.full(shape, 1.0 / (1.0 / HIGHEST_TOUCH_SIEMENS + knowledge.ref_ohm))
     top, bottom = (WIRE_SHARE * ohm for ohm in knowledge.nominal_wire_ohm.both)
     pressed = PortCircuit(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
     return np.asarray(1.0 / (pressed.port_ohm.reshape(shape) + knowledge.ref_ohm))
