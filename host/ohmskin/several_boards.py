@@ -76,7 +76,7 @@ def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[B
     """The scans of a device with their times by the host's clock, as its scans tell it."""
     clock, unit_id = BoardClock(), device.info.unit_id
     for scan in scans:
-        board = device.info
+        board = scan.board or device.info
         took_us = 1e6 * scan_s(board)
         clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
         yield BoardScan(unit_id, scan, clock.host_s(scan.time_us + took_us / 2))

@@ -116,6 +116,24 @@ def test_all_that_a_stepped_skin_gave_is_on_one_clock(path: Path, run: Run) -> N
     assert max(times_ns) - min(times_ns) == pytest.approx(3e9, abs=0.1e9)
 
 
+def test_a_scan_that_waited_is_recorded_behind_its_own_hello(path: Path) -> None:
+    """The newest one was recorded before all scans that still waited when somebody configured."""
+    bench = stepped("emulator://3x4?rate=50")
+    with Recorder(path, bench.info) as recorder:
+        scans = iter(bench)
+        bench.step(0.2)
+        before, after = bench.info, bench.configure(rate_hz=100)
+        bench.step(0.2)
+        record(bench, recorder, islice(scans, 20))
+    found = [each for each in messages(path) if isinstance(each, Hello | Scan)]
+    waited = found.index(after) - 1
+    assert 9 <= waited <= 10
+    assert [each for each in found if isinstance(each, Hello)] == [before, after]
+    numbers = [each.number for each in found if isinstance(each, Scan)]
+    assert numbers == [*range(waited), *range(20 - waited)]  # they begin anew with the board
+    assert [each.board for each in replayed(path)] == waited * [before] + (20 - waited) * [after]
+
+
 def test_size_on_disk(path: Path, hello: Hello) -> None:
     """At most 40 kB/s for 8x8 at 90 Hz, half a second in each chunk."""
     board, _, _ = emulated("emulator://8x8?scene=moving&noise=1")

@@ -150,6 +150,7 @@ class Scan:
         were damaged on the way.
     mode: which readings these are, a name of the enum `mode`.
     rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
+    board: what the board had last said of itself when a `Device` got the scan; else None.
     """
 
     codes: NDArray[np.uint16]
@@ -159,6 +160,7 @@ class Scan:
     missed: int
     mode: str = field(default="near", kw_only=True)
     rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
+    board: Hello | None = field(default=None, kw_only=True)
 
     @property
     def ratio(self) -> NDArray[np.float64]:

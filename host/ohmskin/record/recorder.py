@@ -228,8 +228,9 @@ def record(
     """
 
     def keep(scan: Scan) -> None:
-        if skin.info is not recorder.board:
-            recorder.add(skin.info)
+        board = scan.board or skin.info
+        if board is not recorder.board:
+            recorder.add(board)
         recorder.add(scan)
         for sample in sensor.take() if sensor is not None else ():
             recorder.add(sample)
