@@ -3,6 +3,7 @@
 
 import sys
 import time
+from contextlib import suppress
 
 import ohmskin
 
@@ -25,4 +26,5 @@ def main(port: str, seconds: float = float("inf")) -> None:
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(__doc__)
-    main(sys.argv[1])
+    with suppress(KeyboardInterrupt):  # Ctrl-C ends it
+        main(sys.argv[1])

@@ -2,13 +2,14 @@
 """Print one reading of every scan: python every_scan.py PORT [SCANS]"""
 
 import sys
+from contextlib import suppress
 
 import ohmskin
 
 if len(sys.argv) < 2:
     sys.exit(__doc__)
 port, scans = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 0
-with ohmskin.open(port) as skin:
+with suppress(KeyboardInterrupt), ohmskin.open(port) as skin:  # Ctrl-C ends it
     for count, scan in enumerate(skin, start=1):
         print(scan.number, scan.missed, scan.ratio[0, 0])
         if count == scans:

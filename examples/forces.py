@@ -11,12 +11,14 @@ Without hardware, with a calibration from presses that are made up:
 """
 
 import sys
+from contextlib import suppress
 
 import ohmskin
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)
-with ohmskin.open(sys.argv[1], calibration=sys.argv[2]) as skin:
+port, calibration = sys.argv[1:]
+with suppress(KeyboardInterrupt), ohmskin.open(port, calibration=calibration) as skin:
     for scan in skin:
         for each in scan.contacts:
             print(f"{each.force_text} at ({each.row:.1f}, {each.column:.1f})", flush=True)

@@ -88,4 +88,7 @@ def main(recording: str, calibration: str, out: str) -> None:
 if __name__ == "__main__":
     if len(sys.argv) != 4:
         sys.exit(__doc__)
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except KeyboardInterrupt:
+        sys.exit(f"{sys.argv[3]} is not whole")

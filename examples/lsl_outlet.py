@@ -10,6 +10,7 @@ has no force. Needs `pip install pylsl`. Without hardware, with made-up presses:
 
 import sys
 import time
+from contextlib import suppress
 
 import pylsl
 
@@ -46,4 +47,5 @@ def main(port: str, calibration: str, seconds: float = float("inf")) -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit(__doc__)
-    main(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))
+    with suppress(KeyboardInterrupt):  # Ctrl-C ends it
+        main(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))

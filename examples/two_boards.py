@@ -11,10 +11,11 @@ Without hardware:
 """
 
 import sys
+from contextlib import suppress
 
 import ohmskin
 
-with ohmskin.open_all(sys.argv[1:] or None) as skins:
+with suppress(KeyboardInterrupt), ohmskin.open_all(sys.argv[1:] or None) as skins:
     print(f"units {', '.join(map(str, skins))}", flush=True)
     for unit_id, scan, time_s in skins.scans():
         text = f"{time_s:.4f} s: unit {unit_id}, scan {scan.number}, missed {scan.missed}, "

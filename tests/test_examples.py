@@ -4,6 +4,7 @@
 import base64
 import json
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -37,13 +38,15 @@ def output_of(*command: str) -> str:
 
 
 def first_lines(count: int, *command: str) -> list[str]:
-    """Of a program that goes on for ever."""
-    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True)
+    """Of a program that goes on until Ctrl-C, which ends it well."""
+    pipe = subprocess.PIPE
+    process = subprocess.Popen([sys.executable, *command], stdout=pipe, stderr=pipe, text=True)
     try:
         return [process.stdout.readline() for _ in range(count)]
     finally:
-        process.terminate()
-        process.communicate(timeout=20)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+        assert (process.returncode, said) == (0, "")
 
 
 def example(name: str) -> SimpleNamespace:
@@ -61,6 +64,12 @@ def test_every_scan_prints_consecutive_scans() -> None:
     lines = output_of(str(EXAMPLES / "every_scan.py"), "emulator://2x2", "5").splitlines()
     numbers = [int(line.split()[0]) for line in lines]
     assert numbers == list(range(numbers[0], numbers[0] + 5))
+
+
+@pytest.mark.parametrize("name", ["every_scan", "estimate"])
+def test_ctrl_c_ends_an_example(name: str) -> None:
+    [line] = first_lines(1, "-u", str(EXAMPLES / f"{name}.py"), "emulator://2x2?scene=multi")
+    assert line
 
 
 @pytest.mark.parametrize(("mode", "error"), [("near", 0.1), ("far", 0.02)])
