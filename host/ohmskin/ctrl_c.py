@@ -9,20 +9,26 @@ what runs                           what Ctrl-C does                            
 anything else                       raises KeyboardInterrupt up to `cli.main.run`   130
 ==================================  ==============================================  ============
 
+In ``stream`` and ``estimate``, which write no file meanwhile, `ends_in_time` ends the process if
+that takes too long.
+
 Commands of the first two rows have no end of their own, so Ctrl-C is their usual end, and no error.
 Those of the second row write what they read, and Ctrl-C must not come amid a write. 130 is what
 shells say of a program that Ctrl-C has ended.
 """
 
+import os
 import signal
 import threading
 from collections import namedtuple
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TypeVar
+from typing import Final, TypeVar
 
 _T = TypeVar("_T")
+# So long after Ctrl-C, `ends_in_time` ends the process [s]. Chosen: a person waits a second.
+PATIENCE_S: Final = 0.7
 
 
 @contextmanager
@@ -54,6 +60,34 @@ def ends_by_ctrl_c() -> Iterator[None]:
     """Ctrl-C ends the body at once, wherever it is, and the program goes on after it."""
     with suppress(KeyboardInterrupt), ctrl_c_kept():
         yield
+
+
+@contextmanager
+def ends_in_time(leave: Callable[[], object]) -> Iterator[None]:
+    """End the process, after `leave`, if Ctrl-C has not ended the body within `PATIENCE_S`.
+
+    Python raises nothing before a call of CasADi returns, which may take half a minute. So the body
+    must write nothing.
+    """
+    has_ended, (reads, writes) = threading.Event(), os.pipe()
+
+    def watch() -> None:
+        if os.read(reads, 1) and not has_ended.wait(PATIENCE_S):
+            leave()
+            os._exit(130)
+
+    os.set_blocking(writes, False)
+    before = signal.set_wakeup_fd(writes)
+    watcher = threading.Thread(target=watch, name="ctrl-c", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        has_ended.set()
+        signal.set_wakeup_fd(before)
+        os.close(writes)  # ends the watcher
+        watcher.join()
+        os.close(reads)
 
 
 def until_ctrl_c(scans: Iterable[_T]) -> Iterator[_T]:

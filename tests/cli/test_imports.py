@@ -122,6 +122,26 @@ def test_ctrl_c_amid_imports_shows_no_traceback(at: str) -> None:
     assert done.err == ""
 
 
+# A call in which Python sees no signal, as in CasADi. It would take days.
+DEAF = """
+import hashlib, os
+from ohmskin.ctrl_c import ends_in_time
+with ends_in_time(lambda: os.write(1, b"left")):
+    os.kill(os.getpid(), 2) if {early} else None
+    os.posix_spawn("/bin/kill", ["kill", "-2", str(os.getpid())], {{}})
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1, 2**20)
+"""
+
+
+def test_ctrl_c_ends_what_does_not_see_it() -> None:
+    """`lsq` needed 11 s for that."""
+    done = python("-c", DEAF.format(early=False))
+    assert (done.code, done.out, done.err) == (130, "left", "")
+    done = python("-c", DEAF.format(early=True))
+    assert done.code == -signal.SIGINT
+    assert "KeyboardInterrupt" in done.err  # the body has ended in time, as without it
+
+
 def test_ctrl_c_that_was_ignored_stays_so() -> None:
     done = python("-c", f"import signal; signal.signal(2, signal.SIG_IGN)\n{INTERRUPTED}", "typer")
     assert (done.code, done.err) == (2, "")

@@ -8,14 +8,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
 from rich.console import Group
 from rich.live import Live
-from rich.progress import track
+from rich.progress import Progress, TimeElapsedColumn
 from rich.text import Text
 from typer import Argument, Option
 
@@ -25,7 +24,7 @@ from ohmskin.calibrate.guide import OnSkin, pressed_cells
 from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.cli.terminal import Terminal
-from ohmskin.ctrl_c import until_ctrl_c
+from ohmskin.ctrl_c import ends_in_time, until_ctrl_c
 from ohmskin.errors import DeviceLost, OhmskinError
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
@@ -57,6 +56,7 @@ ForceScale = Annotated[
 ForceUnit = Annotated[str, Option(help=f"{' | '.join(NEWTONS)}: where its lines state none")]
 ForceColumn = Annotated[str, Option(help="which field of its lines: a name, or a number from 1")]
 
+_errors = Terminal(stderr=True)
 _T = TypeVar("_T")
 
 
@@ -143,10 +143,16 @@ def _with_truth(
 
 
 def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
-    """Passes things on; in a terminal, a bar says how many have been."""
-    console = Terminal(stderr=True)
-    hidden = not console.is_terminal
-    return partial(track, description=what, console=console, transient=True, disable=hidden)
+    """Passes things on; in a terminal, a bar says how many have been, and for how long."""
+
+    def watched(things: Iterable[_T]) -> Iterator[_T]:
+        columns, shown = Progress.get_default_columns(), _errors.is_terminal
+        with Progress(
+            *columns, TimeElapsedColumn(), console=_errors, transient=True, disable=not shown
+        ) as bar:
+            yield from bar.track(things, description=what)
+
+    return watched
 
 
 class PressDisplay:
@@ -221,9 +227,13 @@ def estimate(
     out: Annotated[Path, Option(help="file to write (.npz)")],
     cold: Annotated[bool, Option(help="start every frame afresh")] = False,
 ) -> None:
-    """Estimate every cell of every frame of a readings file."""
+    """Estimate every cell of every frame of a readings file.
+
+    `lsq` and `regularized` are for 64 cells at most, which take 1.9 GB and some minutes a frame.
+    """
     check_place(out, readings)
-    answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))
+    with ends_in_time(_errors.show_cursor):
+        answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))
     save_arrays(out, answers)
     frames = len(answers["converged"])
     TERMINAL.print(

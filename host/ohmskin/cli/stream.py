@@ -22,7 +22,7 @@ import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.cli.board import Port, Scans, Seconds, asked_for
 from ohmskin.cli.terminal import Terminal
-from ohmskin.ctrl_c import ends_by_ctrl_c
+from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.contacts import ContactTracker
@@ -79,7 +79,7 @@ def stream(
             if tare_s:
                 # Without a calibration the rest is unknown, and cells may seem touched.
                 reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
-        with ends_by_ctrl_c():
+        with ends_by_ctrl_c(), ends_in_time(_out.show_cursor):
             given = asked_for(skin, scans, seconds)
             if as_json:
                 _print_scans(skin, reader, given)

@@ -239,10 +239,9 @@ def estimate_file(
     frame: then each frame is a skin of its own. watch: a progress bar that passes the frames on.
     Raises ValueError for an unknown method.
     """
-    estimator = make_estimator(method, readings.knowledge(0))
     out: dict[str, NDArray[Any]] = {}
     for frame, ratio in enumerate(watch(readings.ratio)):
-        if frame and readings.one_skin_per_frame:
+        if not frame or readings.one_skin_per_frame:
             estimator = make_estimator(method, readings.knowledge(frame))
         elif cold:
             estimator.reset()
