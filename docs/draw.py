@@ -107,6 +107,7 @@ def numbers() -> dict[str, Any]:
     }
     return {
         "reference-resistor": precision,
+        "kneading": None,
         "circuit": None,
         "far-ends": None,
         "slot": slot(),
@@ -346,7 +347,73 @@ def _draw_far_ends(axes: Any) -> None:
     axes.axis("off")
 
 
+def _draw_kneading(axes: Any) -> None:
+    """From the side: skin, plate, load cell, table; where the force goes, and where it must not."""
+    from matplotlib.patches import Ellipse, FancyBboxPatch, Rectangle
+
+    force, metal = "#b03a2e", "#c8ccd0"
+
+    def box(x: float, y: float, width: float, height: float, colour: str) -> None:
+        size = {"facecolor": colour, "edgecolor": "black", "linewidth": 1, "zorder": 2}
+        axes.add_patch(Rectangle((x, y), width, height, **size))
+
+    def say(text: str, at: tuple[float, float], words: tuple[float, float], side: str) -> None:
+        line = {"arrowstyle": "-", "color": "#777777", "linewidth": 0.8}
+        axes.annotate(text, at, words, ha=side, va="center", fontsize=8, arrowprops=line, zorder=6)
+
+    def arrow(x: float, y: float, to_x: float, to_y: float) -> None:
+        style = {"arrowstyle": "-|>", "color": force, "linewidth": 2}
+        axes.annotate("", (to_x, to_y), (x, y), arrowprops=style, zorder=5)
+
+    box(-5.5, -1.2, 12.5, 0.5, "#d9c7a8")  # table
+    box(-2.2, -0.7, 1.0, 0.35, metal)  # what the load cell is screwed to
+    box(-2.2, -0.35, 4.4, 0.7, "#e8ebee")  # load cell
+    for x in (-0.32, 0.32):
+        axes.add_patch(Ellipse((x, 0.0), 0.5, 0.5, facecolor="white", edgecolor="black", zorder=3))
+    box(1.2, 0.35, 1.0, 0.35, metal)  # spacer
+    box(-3.2, 0.7, 6.4, 0.3, metal)  # plate
+    # The skin: two layers of stripes.
+    skin = FancyBboxPatch((-2.7, 1.0), 5.4, 0.34, boxstyle="round,pad=0,rounding_size=0.12")
+    skin.set(facecolor="#7fb3d5", edgecolor="black", zorder=2)
+    axes.add_patch(skin)
+    for n in range(8):
+        axes.add_patch(Rectangle((-2.45 + 0.65 * n, 1.19), 0.36, 0.08, color="#24506e", zorder=3))
+    axes.plot([-2.6, 2.6], [1.09, 1.09], color="#24506e", linewidth=2, zorder=3)
+    for width, colour in ((28, "black"), (26, "#efc9a9")):  # a finger
+        ends = [-1.0, -0.4], [1.75, 3.0]
+        axes.plot(*ends, color=colour, linewidth=width, solid_capstyle="round", zorder=4)
+    arrow(-1.0, 2.6, -1.0, 1.45)
+    arrow(1.7, 0.95, 1.7, 0.1)
+    arrow(-1.7, -0.1, -1.7, -0.9)
+    axes.plot([2.7, 3.4, 3.9, 4.2], [1.15, 1.0, 0.2, -0.7], color="#24506e", linewidth=1.5)
+    axes.plot([2.2, 2.9, 3.1], [-0.1, -0.35, -0.7], color="black", linewidth=1.2)
+    box(4.0, -0.7, 1.3, 0.45, "#2f7d5b")
+    box(2.7, -0.7, 0.8, 0.3, "#b5482f")
+    say(
+        "load cell: one end on the table,\nthe other under the plate",
+        (-2.0, 0.1),
+        (-3.6, -0.1),
+        "right",
+    )
+    say("plate, stiff", (-3.1, 0.85), (-3.6, 1.05), "right")
+    say("skin, all of it on the plate", (-2.5, 1.2), (-3.6, 1.75), "right")
+    say("press anywhere, softly and hard", (-1.15, 2.4), (-3.6, 2.6), "right")
+    say(
+        "cables lie loose: a tight one\ncarries force past the load cell",
+        (3.6, 0.7),
+        (4.4, 1.3),
+        "left",
+    )
+    say("the skin's board, to USB", (4.9, -0.5), (5.5, 0.3), "left")
+    say("HX711 and its board, to USB", (3.1, -0.65), (3.6, -1.6), "left")
+    axes.plot([], [], color=force, linewidth=2, label="all of the force goes this way")
+    axes.legend(loc="upper right", frameon=False, fontsize=8)
+    axes.set(xlim=(-7.6, 9.3), ylim=(-1.9, 3.5), aspect="equal")
+    axes.axis("off")
+
+
 PICTURES = {
+    "kneading": (_draw_kneading, (8.0, 2.9)),
     "reference-resistor": (_draw_precision, (7.0, 3.4)),
     "circuit": (_draw_circuit, (8.0, 4.3)),
     "far-ends": (_draw_far_ends, (8.0, 5.1)),

@@ -42,6 +42,15 @@ def test_a_weight_lies_on_one_cell_until_it_is_taken_off() -> None:
         assert (scene.ratio(1.0) == untouched).all() == (weight is None)
 
 
+def test_a_weight_between_cells_presses_several() -> None:
+    scene = Scene("weights", 4, 4)
+    scene.put(((1.5, 2.0), 3.0))
+    force_n = scene.force_n(1.0)
+    assert force_n.sum() == pytest.approx(3.0)
+    assert force_n[1, 2] == pytest.approx(force_n[2, 2])
+    assert np.argwhere(force_n).tolist() == [[1, 1], [1, 2], [1, 3], [2, 1], [2, 2], [2, 3]]
+
+
 def test_the_robot_presses_each_cell_as_often_as_a_curve_needs() -> None:
     assert ROBOT_PRESSES == MIN_PRESSES
     scene = Scene("presses", 2, 3, seed=4)

@@ -19,7 +19,6 @@ from rich.text import Text
 from typer import Argument, Option
 
 import ohmskin
-from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
 from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
@@ -31,6 +30,7 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import check_place
 from ohmskin.force.reader import DEFAULT_METHOD
+from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
 from ohmskin.record.export import FORMATS
@@ -86,13 +86,11 @@ def record(
     if tare_s is None:
         tare_s = FORCE_TARE_S if force_port else 0.0
     with ExitStack() as stack:
-        skin, sensor = stack.enter_context(ohmskin.open(port, start=False)), None
-        truth = skin.true_force_n if force_port == TRUTH else None
-        if force_port == TRUTH and truth is None:
-            raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
-        if force_port and truth is None:
-            says = force_baud, force_scale, force_unit, force_column
-            sensor = stack.enter_context(ForceSensor(force_port, *says))
+        skin = stack.enter_context(ohmskin.open(port, start=False))
+        sensor = None
+        if force_port and not is_truth(force_port, skin):
+            said = force_baud, force_scale, force_unit, force_column
+            sensor = stack.enter_context(ForceSensor(force_port, *said))
             sensor.wait()
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
@@ -112,8 +110,8 @@ def record(
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
             given = asked_for(until_ctrl_c(skin), scans, seconds)
-            if truth is not None:
-                given = _with_truth(given, truth, recorder)
+            if force_port == TRUTH:
+                given = with_truth(given, skin, recorder)
             recording.record(skin, recorder, given, tare_s=tare_s, sensor=sensor, beside=look)
         except DeviceLost as exc:
             raise DeviceLost(f"{exc} (what came before is in {file})") from exc
@@ -125,19 +123,25 @@ def record(
     TERMINAL.print(f"{file}: {done}")
 
 
-def _with_truth(
-    scans: Iterable[Scan], true_force_n: Callable[[Scan], Float], recorder: Recorder
-) -> Iterator[Scan]:
+def is_truth(force_port: str, skin: Device) -> bool:
+    """Whether the port is `TRUTH`. Raises ValueError where the skin knows none."""
+    if force_port == TRUTH and skin.true_force_n is None:
+        raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
+    return force_port == TRUTH
+
+
+def with_truth(scans: Iterable[Scan], skin: Device, recorder: Recorder) -> Iterator[Scan]:
     """Pass scans on, and record the whole force on the simulated skin beside each.
 
     Both have the board's clock, because a scan may arrive late, and the board of a simulator may be
     slower than the host's clock.
     """
     begin_s: float | None = None  # of the board's clock, by the host's
+    assert skin.true_force_n is not None
     for scan in scans:
         board_s = 1e-6 * scan.time_us
         begin_s = scan.host_time_s - board_s if begin_s is None else begin_s
-        force_n = float(true_force_n(scan).sum())
+        force_n = float(skin.true_force_n(scan).sum())
         recorder.add(ForceSample(force_n, begin_s + board_s, source=TRUTH))
         yield replace(scan, host_time_s=begin_s + board_s)
 

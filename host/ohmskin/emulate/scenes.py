@@ -79,10 +79,9 @@ _ROBOT_PAUSE_S: Final = (0.15, 0.45)
 # The fingertips of the scene "knead" press, all cells together, with these forces [N], least and
 # largest. Chosen: those of people who knead.
 _TIP_N: Final = (1.0, 12.0)
-# A fingertip's pressure falls to 1/e so far from its middle [cells]. Chosen: it covers some five.
-_TIP_WIDTH_CELLS: Final = 0.9
-# Less than this share of its highest pressure is none. Chosen: the skin does not show it.
-_TIP_LEAST_SHARE: Final = 0.01
+# A fingertip presses the cells within this distance of its middle [cells], as a ball does (Hertz,
+# 1882). Chosen: it covers some five.
+_TIP_RADIUS_CELLS: Final = 1.3
 # While it presses, its middle moves so far [cells]. Chosen: as a hand that kneads.
 _TIP_MOVES_CELLS: Final = 1.5
 # After so many fingertips for each cell, they come again. Chosen: four minutes on 8x8.
@@ -189,11 +188,18 @@ class Scene:
         """The true force on each cell at a time, (rows, columns) [N]: (touch / k)^(1 / b)."""
         return np.asarray((self._touch(time_s) / self._siemens_at_1n) ** (1 / _EXPONENT))
 
-    def put(self, weight: tuple[tuple[int, int], float] | None) -> None:
-        """Press a cell by a force [N], and no other; None: none. For the scene "weights"."""
+    def put(self, weight: tuple[tuple[float, float], float] | None) -> None:
+        """Press a cell by a force [N], and no other; None: none. For the scene "weights".
+
+        A place between cells is pressed as by a fingertip, which covers several.
+        """
         force_n = np.zeros((self.rows, self.columns))
         if weight is not None:
-            force_n[weight[0]] = weight[1]
+            (row, column), total_n = weight
+            if row % 1 or column % 1:
+                force_n = total_n * self._pressure(row, column)
+            else:
+                force_n[int(row), int(column)] = total_n
         self._touches = self._by_force(force_n)
 
     def _by_force(self, force_n: Float) -> Float:
@@ -262,9 +268,12 @@ class Scene:
         moved, way = _TIP_MOVES_CELLS * (share - 0.5), self._tip_ways[number]
         row = np.clip(row + moved * np.sin(way), 0, self.rows - 1)
         column = np.clip(column + moved * np.cos(way), 0, self.columns - 1)
-        pressure = np.exp(-self._away(row, column) / _TIP_WIDTH_CELLS**2)
-        pressure[pressure < _TIP_LEAST_SHARE * pressure.max()] = 0.0
-        return np.asarray(force_n * pressure / pressure.sum())
+        return force_n * self._pressure(row, column)
+
+    def _pressure(self, row: float, column: float) -> Float:
+        """The share of each cell (rows, columns) in the force of a fingertip at a place."""
+        pressure = np.sqrt(np.maximum(1 - self._away(row, column) / _TIP_RADIUS_CELLS**2, 0.0))
+        return np.asarray(pressure / pressure.sum())
 
     def _away(self, row: float, column: float) -> Float:
         """Square distances of the cells from a place, (rows, columns) [cells^2]."""

@@ -52,7 +52,7 @@ class Device(Closing):
         """The port's name."""
         self.true_force_n: Callable[[Scan], Float] | None = None
         """Gives the force on each cell (R, C) [N] at a scan, where a simulation knows it."""
-        self.put: Callable[[tuple[tuple[int, int], float] | None], None] | None = None
+        self.put: Callable[[tuple[tuple[float, float], float] | None], None] | None = None
         """Presses a cell by a force [N], or none, where a simulated skin lets a program do so."""
         self.only_unit: int | None = None
         """The unit that is meant: another that says hello ends the device. None: any may come."""

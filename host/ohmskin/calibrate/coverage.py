@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well each cell is known while a skin is kneaded over a scale, before anything is fitted.
+
+The scale shows the sum of the cells' forces, so a number of it tells of each cell by its share.
+
+======== ====== ===================================================================== ======
+symbol   shape  meaning                                                               unit
+======== ====== ===================================================================== ======
+x        (N,)   rise of each cell above rest; 0 where it is not touched               S
+s        (N,)   share of each cell in the force, by the usual curve: x^`USUAL_EXPONENT`  1
+t        (N,)   log of what each cell's force is over that of the usual curve          1
+F, v            force; variance of its log                                             N, 1
+A        (N, N) information on t                                                        1
+======== ====== ===================================================================== ======
+
+    d log F / d t = s ,   A = A_0 + sum over numbers of s s^T / v ,   v = v_contact + (d_F / F)^2 ,
+
+    A_0 = (I - 1 1^T / N) / `GAIN_STD`^2 + 1 1^T / (N `LEVEL_STD`)^2 :
+
+cells scatter about a level that nobody knows. The deviation of t is the root of diag(A^-1). Of what
+the scale shows, its size alone is needed: this is the theory of the design of experiments.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from ohmskin.arrays import Bool, Float
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.force.reader import DEFAULT_METHOD
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.record.recording import ForceSample, Recording, Tare
+
+# A cell is known when what its force is multiplied by is known within this. Chosen: as well as
+# presses of contacts of textile repeat.
+KNOWN_LOG: Final = 0.15
+# Cells differ by this, before anything is known: the deviation of a logarithm. Chosen: as cells of
+# textile scatter, and some more.
+GAIN_STD: Final = 0.25
+# The level of all cells is known to this, before anything is: the deviation of a logarithm.
+# Chosen: a factor of e.
+LEVEL_STD: Final = 1.0
+# Force grows with this power of the rise. Chosen: that of rough contacts (docs/force.md).
+USUAL_EXPONENT: Final = 0.6
+# Deviation of a number of the scale from what all cells' curves let expect. Chosen: noise and
+# hysteresis of a contact, less by the few cells of a fingertip.
+CONTACT_STD: Final = 0.08
+# The same, of the scale [N]. Chosen: a few grams, and what its filter leaves.
+SCALE_STD_N: Final = 0.05
+# Numbers that come sooner after the last are no news [s]. Chosen: the noise of a contact lasts as
+# long, and most scales show ten numbers a second.
+NEWS_S: Final = 0.1
+# Less force is not counted [N]. Chosen: there, a scale's zero is a share of it.
+LEAST_N: Final = 0.3
+
+
+class Coverage:
+    """What a skin of N cells has been kneaded to show so far. See the module."""
+
+    def __init__(self, cells: int) -> None:
+        ones = np.ones((cells, cells)) / cells
+        self._information = (np.eye(cells) - ones) / GAIN_STD**2 + ones / (cells * LEVEL_STD**2)
+        self._last_s = -np.inf
+
+    def is_news(self, time_s: float, force_n: float) -> bool:
+        """Whether a number of the scale, shown then [s], tells something if the skin is touched."""
+        return force_n > LEAST_N and not 0 <= time_s - self._last_s < NEWS_S
+
+    def add(self, time_s: float, rise: Float, force_n: float) -> None:
+        """One number of the scale: when [s], the rise of touched cells (N,) [S], the force [N]."""
+        self._last_s = time_s
+        share = np.maximum(rise, 0.0) ** USUAL_EXPONENT
+        share /= share.sum()
+        variance = CONTACT_STD**2 + (SCALE_STD_N / force_n) ** 2
+        self._information += np.outer(share, share) / variance
+
+    def log_std(self) -> Float:
+        """Deviation of t of each cell, (N,)."""
+        return np.asarray(np.sqrt(np.linalg.inv(self._information).diagonal()))
+
+
+class LiveCoverage:
+    """Follows recordings of a skin that is kneaded: how well each of its cells is known.
+
+    board: the one that scans it.
+    log_std: deviation of t of each cell, (R, C).
+    """
+
+    def __init__(self, board: Hello) -> None:
+        self._board = board
+        self._coverage = Coverage(board.rows * board.columns)
+        self.log_std = self._coverage.log_std().reshape(board.rows, board.columns)
+        self.begin()
+
+    def begin(self) -> None:
+        """Another recording begins: its rest and the zero of its scale are its own."""
+        self._zeros_n: list[float] = []
+        self._estimator: Estimator | None = None
+
+    def look(self, scan: Scan, tare: Tare | None, sample: ForceSample | None) -> bool:
+        """A scan, the recording's tare if it is taken, the newest force. Returns if they tell."""
+        if sample is None or tare is None or not tare.is_of(scan):
+            self._zeros_n += [] if sample is None else [sample.force_n]
+            return False
+        if self._estimator is None:
+            knowledge = SkinKnowledge.of(self._board, tare.rest_ratio)
+            self._estimator = make_estimator(DEFAULT_METHOD, replace(knowledge, may_be_bent=False))
+        force_n = sample.force_n - float(np.median(self._zeros_n or [0.0]))
+        if not self._coverage.is_news(sample.host_time_s, force_n):
+            return False
+        frame = self._estimator.estimate(scan.ratio)
+        rise = np.where(frame.touched, frame.level - self._estimator.rest_level(), 0.0)
+        if not (rise > 0).any():
+            return False
+        self._coverage.add(sample.host_time_s, rise.ravel(), force_n)
+        self.log_std = self._coverage.log_std().reshape(self.log_std.shape)
+        return True
+
+    def look_at(self, recording: Recording) -> None:
+        """All of a recording."""
+        self.begin()
+        if not (recording.scans and recording.tares):
+            return
+        tare, times_s = recording.tares[0], [scan.host_time_s for scan in recording.scans]
+        for sample in recording.forces:
+            near = min(int(np.searchsorted(times_s, sample.host_time_s)), len(times_s) - 1)
+            is_later = sample.host_time_s > tare.host_time_s
+            self.look(recording.scans[near], tare if is_later else None, sample)
+
+    @property
+    def known(self) -> Bool:
+        """Which cells are known, (R, C)."""
+        return np.asarray(self.log_std <= KNOWN_LOG)
+
+    @property
+    def next_cell(self) -> tuple[int, int]:
+        """The cell that is known least: where to press next."""
+        row, column = np.unravel_index(np.argmax(self.log_std), self.log_std.shape)
+        return int(row), int(column)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of one skin that were made one after another, and are learned from together.
+
+A recording cannot be written on, so whoever goes on writes a new one: ``skin.knead-1.mcap``,
+``skin.knead-2.mcap`` and so on, beside the calibration ``skin.json``.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ohmskin.record.recording import ForceSample, Recording
+
+# Between two of them, time is taken to pass so long [s]. Chosen: longer than any gap that forces or
+# clocks are interpolated across.
+PAUSE_S: Final = 100.0
+
+
+def session_paths(out: Path, what: str) -> tuple[list[Path], Path]:
+    """The recordings beside a calibration that are there, in order; and the name of the next."""
+    paths: list[Path] = []
+    while (path := out.with_suffix(f".{what}-{len(paths) + 1}.mcap")).exists():
+        paths.append(path)
+    return paths, path
+
+
+def joined(recordings: list[Recording]) -> Recording:
+    """One recording of all, on one clock. The rest is the newest one's.
+
+    What the force sensor shows while nothing touches the skin, up to the tare, is taken off the
+    forces of each. Raises ValueError if they are not of one skin in one mode.
+    """
+    last = recordings[-1]
+    board = last.hellos[-1]
+    whole = Recording([board], [], last.tares[:1], [], [], last.cut_off)
+    end_s, end_us = 0.0, 0
+    for given in recordings:
+        of = given.hellos[-1]
+        if (of.rows, of.columns, of.mode, of.unit_id) != (
+            *(board.rows, board.columns, board.mode, board.unit_id),
+        ):
+            raise ValueError("recordings of several skins: move those of the other one away")
+        if not (given.scans and given.tares):
+            continue
+        later_s = end_s + PAUSE_S - given.scans[0].host_time_s
+        later_us = end_us + round(1e6 * PAUSE_S) - given.scans[0].time_us
+        whole.scans += [
+            replace(s, host_time_s=s.host_time_s + later_s, time_us=s.time_us + later_us)
+            for s in given.scans
+        ]
+        zero_n = _zero_n(given.forces, given.tares[0].host_time_s)
+        whole.forces += [
+            replace(f, force_n=f.force_n - zero_n, host_time_s=f.host_time_s + later_s)
+            for f in given.forces
+        ]
+        end_s, end_us = whole.scans[-1].host_time_s, whole.scans[-1].time_us
+    return whole
+
+
+def _zero_n(forces: list[ForceSample], until_s: float) -> float:
+    """What the sensor shows until then [N]; 0 where it shows nothing."""
+    shown = [sample.force_n for sample in forces if sample.host_time_s <= until_s]
+    return float(np.median(shown)) if shown else 0.0

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What kneading shows of each cell, against fits of many simulated skins."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import ohmskin
+from ohmskin.calibrate.coverage import CONTACT_STD, GAIN_STD, Coverage, LiveCoverage
+from ohmskin.calibrate.sessions import joined, session_paths
+from ohmskin.link.device import scans_for
+from ohmskin.record.recorder import Recorder, record
+from ohmskin.record.recording import ForceSample, Recording, load_recording
+
+CELLS = 12
+
+
+def presses(random: np.random.Generator) -> np.ndarray:
+    """Rises (n, CELLS) [S]: neighbours along a line, the last cell never."""
+    places = random.uniform(0, CELLS - 2, 90)[:, None]
+    near = np.exp(-((np.arange(CELLS) - places) ** 2)) * random.uniform(1e-5, 3e-4, (90, 1))
+    near[:, -1] = 0.0
+    return np.where(near > 1e-6, near, 0.0)
+
+
+def test_deviations_are_those_of_errors_of_fits() -> None:
+    """Independent skins, whose gains are fitted by another optimiser to noisy totals."""
+    random = np.random.default_rng(1)
+    rises, errors = presses(random), []
+    for _ in range(150):
+        gains = GAIN_STD * random.standard_normal(CELLS)
+        gains += -gains.mean() + 0.5 * random.standard_normal()
+        shares = 1e3 * rises**0.6
+        force_n = (shares @ np.exp(gains)) * np.exp(CONTACT_STD * random.standard_normal(90))
+
+        def off(trial: np.ndarray, shares: np.ndarray = shares, force_n: np.ndarray = force_n):
+            by_noise = np.log(shares @ np.exp(trial) / force_n) / CONTACT_STD
+            return np.concatenate([by_noise, (trial - trial.mean()) / GAIN_STD])
+
+        errors.append(least_squares(off, np.zeros(CELLS)).x - gains)
+    coverage = Coverage(CELLS)
+    for number, rise in enumerate(rises):
+        coverage.add(float(number), rise, 1e9)
+    stated = coverage.log_std()
+    np.testing.assert_allclose(stated, np.std(errors, axis=0), rtol=0.25)
+    assert stated[-1] > 0.9 * GAIN_STD  # nobody has pressed it
+    assert stated[:-1].max() < 0.7 * GAIN_STD
+
+
+def test_a_number_that_comes_at_once_or_is_small_is_no_news() -> None:
+    coverage = Coverage(2)
+    assert coverage.is_news(5.0, 1.0)
+    assert not coverage.is_news(5.0, 0.1)
+    coverage.add(5.0, np.array([1e-5, 0.0]), 1.0)
+    assert not coverage.is_news(5.05, 1.0)
+    assert coverage.is_news(5.2, 1.0)
+    assert coverage.is_news(3.0, 1.0)  # another recording, by another clock
+
+
+def record_kneading(path: Path, seconds: float, seed: int) -> Recording:
+    """A skin of 2x3 that is kneaded over a sensor whose zero is at 3 N."""
+    url = f"emulator://2x3?scene=knead&begin=1.5&speed=0&seed={seed}&rate=40"
+    with ohmskin.open(url) as skin, Recorder(path, skin.info, lambda: skin.now_s) as recorder:
+
+        def beside(scan: ohmskin.Scan) -> None:
+            force_n = 3.0 + float(skin.true_force_n(scan).sum())
+            recorder.add(ForceSample(force_n, scan.host_time_s))
+
+        record(skin, recorder, scans_for(skin, seconds), tare_s=1.0, beside=beside)
+    return load_recording(path)
+
+
+def test_a_recording_is_looked_at_as_it_was_live(tmp_path: Path) -> None:
+    given = record_kneading(tmp_path / "a.mcap", 8.0, 1)
+    live, later = LiveCoverage(given.hellos[0]), LiveCoverage(given.hellos[0])
+    news = [
+        live.look(scan, given.tares[0] if scan.host_time_s > 1.2 else None, force)
+        for scan, force in zip(given.scans, given.forces, strict=True)
+    ]
+    assert 20 < sum(news) < 80
+    later.look_at(given)
+    np.testing.assert_allclose(later.log_std, live.log_std, rtol=0.1)
+    before = later.log_std.copy()
+    later.look_at(record_kneading(tmp_path / "b.mcap", 8.0, 2))
+    assert (later.log_std < before).all()
+    assert later.next_cell == np.unravel_index(later.log_std.argmax(), (2, 3))
+    assert (later.known == (later.log_std <= 0.15)).all()
+
+
+def test_recordings_are_joined_on_one_clock_and_zero(tmp_path: Path) -> None:
+    out = tmp_path / "skin.json"
+    assert session_paths(out, "knead") == ([], tmp_path / "skin.knead-1.mcap")
+    both = [record_kneading(tmp_path / f"skin.knead-{n}.mcap", 4.0, n) for n in (1, 2)]
+    paths, following = session_paths(out, "knead")
+    assert [path.name for path in paths] == ["skin.knead-1.mcap", "skin.knead-2.mcap"]
+    assert following.name == "skin.knead-3.mcap"
+    whole = joined(both)
+    assert len(whole.scans) == sum(len(given.scans) for given in both)
+    for name in ("host_time_s", "time_us"):
+        assert (np.diff([getattr(scan, name) for scan in whole.scans]) > 0).all()
+    first = len(both[0].scans)
+    assert whole.scans[first].host_time_s - whole.scans[first - 1].host_time_s == 100.0
+    shown = np.array([sample.force_n for sample in whole.forces])
+    assert np.abs(shown[[0, first]]).max() < 1e-9
+    assert shown.max() == pytest.approx(
+        max(sample.force_n for given in both for sample in given.forces) - 3.0
+    )
+    assert whole.tares[0] is both[1].tares[0]
+
+
+def test_recordings_of_two_skins_are_not_joined(tmp_path: Path) -> None:
+    one = record_kneading(tmp_path / "a.mcap", 2.0, 1)
+    with ohmskin.open("emulator://2x2?speed=0") as skin:
+        other = Recording([skin.info], [], [], [], [], cut_off=False)
+    with pytest.raises(ValueError, match="several skins"):
+        joined([one, other])
