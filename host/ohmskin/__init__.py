@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ohmskin.link.device import Device
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
     from ohmskin.opening import open
+    from ohmskin.record.recording import load_recording
     from ohmskin.several_boards import Boards, BoardScan, open_all
 
 __all__ = [
@@ -73,6 +74,7 @@ __all__ = [
     "TareRefused",
     "WireOhm",
     "load_calibration",
+    "load_recording",
     "make_estimator",
     "open",
     "open_all",
@@ -93,6 +95,7 @@ _MODULES = {
     "link.device": ("Device",),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
     "opening": ("open",),
+    "record.recording": ("load_recording",),
     "several_boards": ("BoardScan", "Boards", "open_all"),
 }
 

@@ -7,20 +7,23 @@ import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
 from ohmskin import opening
 from ohmskin.errors import DeviceSilent, PortError
 from ohmskin.files import Closing, naming
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.reader import CalibratedSkin
+from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import serial_ports
 
+_Skin = TypeVar("_Skin", bound=Device | CalibratedSkin)
+_Scan = TypeVar("_Scan", bound=Scan)
 
-class BoardScan(NamedTuple):
+
+class BoardScan(NamedTuple, Generic[_Scan]):
     """A scan of one of several boards.
 
     unit_id: of the board.
@@ -30,11 +33,11 @@ class BoardScan(NamedTuple):
     """
 
     unit_id: int
-    scan: Any
+    scan: _Scan
     time_s: float
 
 
-class Boards(Closing, dict[int, Any]):
+class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
     """Open boards by unit id: each a `Device`, or a `CalibratedSkin` if calibrations were given.
 
     Made by `open_all`. ``with`` closes all, and so does `close`.
@@ -42,7 +45,7 @@ class Boards(Closing, dict[int, Any]):
     :raises PortError: two have the same unit id.
     """
 
-    def __init__(self, devices: Sequence[Device | CalibratedSkin]) -> None:
+    def __init__(self, devices: Sequence[_Skin]) -> None:
         for device in devices:
             unit_id = device.info.unit_id
             first = self.setdefault(unit_id, device)
@@ -52,7 +55,7 @@ class Boards(Closing, dict[int, Any]):
                     f"ohmskin configure {device.name} --unit-id NUMBER --save"
                 )
 
-    def scans(self) -> Iterator[BoardScan]:
+    def scans(self) -> Iterator[BoardScan[_Scan]]:
         """Every scan of every board from now on, in order of their times.
 
         A scan is given when every other board has sent a later one: late by about a period of the
@@ -61,7 +64,7 @@ class Boards(Closing, dict[int, Any]):
         :raises DeviceLost: one of the boards went away; its text names the port.
         """
         # All boards begin now. The merge would begin each of them when it first takes a scan of it.
-        begun = [(device, iter(device)) for device in self.values()]
+        begun = [(device, cast("Iterator[_Scan]", iter(device))) for device in self.values()]
         of_boards = [_timed(device, scans) for device, scans in begun]
         return heapq.merge(*of_boards, key=lambda board_scan: board_scan.time_s)
 
@@ -72,7 +75,7 @@ class Boards(Closing, dict[int, Any]):
                 closing.push(device)
 
 
-def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[BoardScan]:
+def _timed(device: Device | CalibratedSkin, scans: Iterator[_Scan]) -> Iterator[BoardScan[_Scan]]:
     """The scans of a device with their times by the host's clock, as its scans tell it."""
     clock, unit_id = BoardClock(), device.info.unit_id
     for scan in scans:
@@ -82,12 +85,25 @@ def _timed(device: Device | CalibratedSkin, scans: Iterator[Scan]) -> Iterator[B
         yield BoardScan(unit_id, scan, clock.host_s(scan.time_us + took_us / 2))
 
 
+@overload
+def open_all(urls: Iterable[str] | None = None, *, start: bool = True) -> Boards[Device, Scan]: ...
+
+
+@overload
+def open_all(
+    urls: Iterable[str] | None = None,
+    *,
+    calibrations: Iterable[opening.CalibrationLike],
+    start: bool = True,
+) -> Boards[CalibratedSkin, ForceScan]: ...
+
+
 def open_all(
     urls: Iterable[str] | None = None,
     *,
     calibrations: Iterable[opening.CalibrationLike] | None = None,
     start: bool = True,
-) -> Boards:
+) -> Any:
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
 
     urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a
@@ -125,7 +141,7 @@ def open_all(
             devices = [device for device in pool.map(connect, ports) if device is not None]
         if not devices:
             raise PortError(f"no skin board answers at {', '.join(ports)}: are they flashed?")
-        boards = Boards(devices)
+        boards: Boards[Any, Any] = Boards(devices)
         if start:
             for device in devices:
                 device.start()

@@ -9,9 +9,9 @@ import numpy as np
 from rich.columns import Columns
 
 import ohmskin
-from ohmskin.arrays import Bool, Float
+from ohmskin.arrays import FULL_SCALE_USIEMENS, Bool, Float
 from ohmskin.cli.record import progress
-from ohmskin.cli.stream import FULL_SCALE_USIEMENS, WIDE, coloured
+from ohmskin.cli.stream import WIDE, coloured
 from ohmskin.cli.terminal import Terminal
 from ohmskin.emulate.urls import emulated
 from ohmskin.estimate.knowledge import SkinKnowledge

@@ -19,7 +19,7 @@ from rich.text import Text
 from typer import Option
 
 import ohmskin
-from ohmskin.arrays import Float
+from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, shades
 from ohmskin.cli.board import Port, Scans, Seconds, asked_for
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
@@ -33,10 +33,6 @@ from ohmskin.link.messages import Scan
 _out = Terminal()
 # For tables in a file or pipe, which have no width: 16 columns, or three tables of 8 side by side.
 WIDE: Final = Terminal(width=160)
-# Conductance at which a table's colours end [microsiemens]. Chosen: a firm press makes 5 kOhm.
-FULL_SCALE_USIEMENS: Final = 200.0
-# Force at which a table's colours end [N]. Chosen: more than a fingertip usually presses.
-FULL_SCALE_N: Final = 10.0
 # An untouched cell shows its force, and no "?", if its standard deviation is at most this [N].
 # Chosen: the page's scale of forces begins there.
 KNOWN_N: Final = 0.1
@@ -183,15 +179,13 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
 
 def coloured(values: Float, full_scale: float, title: str = "") -> Table:
     """Values, shape (rows, columns), as a table, coloured on a scale that ends at `full_scale`."""
-    texts = [[Text(_short(value), _colour(value / full_scale)) for value in row] for row in values]
+    last = len(_COLOURS) - 1
+    colours = np.minimum((last + 1) * shades(values, full_scale), last).astype(int)
+    texts = [
+        [Text(_short(value), _COLOURS[colour]) for value, colour in zip(*row, strict=True)]
+        for row in zip(values, colours, strict=True)
+    ]
     return cell_table(texts, title)
-
-
-def _colour(share: float) -> str:
-    """The colour of a share of the full scale, on a logarithmic scale that begins at 0.01."""
-    if not share > 0.01:
-        return _COLOURS[0]
-    return _COLOURS[min(int((1 + np.log10(share) / 2) * len(_COLOURS)), len(_COLOURS) - 1)]
 
 
 def _short(value: float) -> str:

@@ -13,7 +13,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ohmskin.arrays import Bool, Float
+from ohmskin.arrays import FULL_SCALE_USIEMENS, Bool, Float, heat_map
 from ohmskin.circuit.skin import NEAR, ratio_from_current
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
@@ -65,6 +65,16 @@ class Estimate:
     converged: bool
     message: str
     seconds: float
+
+    def __repr__(self) -> str:
+        rows, columns = self.touched.shape
+        how = self.message or f"converged, chi-square {self.chi2:.2f}"
+        return f"<Estimate of {rows}x{columns} cells: {self.touched.sum()} touched, {how}>"
+
+    def _repr_html_(self) -> str:
+        """A heat map of the conductances, in a notebook."""
+        text = f"{self!r} [microsiemens]"
+        return heat_map(1e6 * self.cell_siemens, FULL_SCALE_USIEMENS, text)
 
     @property
     def cell_ohm(self) -> Float:

@@ -31,6 +31,9 @@ METHODS: Final = tuple(name for name in LEVEL_METHODS if name != VOLTAGE)
 
 def make_estimator(method: str, knowledge: SkinKnowledge) -> Estimator:
     """The estimator called `method`. Raises ValueError as `kind_of`, and for what it refuses."""
+    if not isinstance(knowledge, SkinKnowledge):
+        given = f"a SkinKnowledge, such as SkinKnowledge.of(skin.info), not {knowledge!r:.40}"
+        raise TypeError(f"'{method}' is made of {given}")
     return kind_of(method)(knowledge)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ohmskin.arrays import Bool, Float
+from ohmskin.arrays import FULL_SCALE_N, Bool, Float, heat_map
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge
@@ -28,7 +28,7 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
-from ohmskin.link.device import Device
+from ohmskin.link.device import Device, in_threads
 from ohmskin.link.messages import BoardStats, Hello, Scan
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ TARE_S: Final = 1.0
 _NAMED_CELLS: Final = 4
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ForceScan(Scan):
     """A scan, and what it shows.
 
@@ -60,6 +60,12 @@ class ForceScan(Scan):
     force_n_std: Float
     contacts: tuple[Contact, ...]
     estimate: Estimate
+
+    def _repr_html_(self) -> str:
+        """A heat map of the forces, in a notebook; of the conductances where there are none."""
+        if np.isnan(self.force_n).all():
+            return self.estimate._repr_html_()
+        return heat_map(self.force_n, FULL_SCALE_N, f"{self!r} [newtons]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,6 +320,9 @@ class CalibratedSkin(Closing):
         assert calibration is not None  # the reader was made with one
         return calibration
 
+    def __repr__(self) -> str:
+        return f"{repr(self.device)[:-1]}, forces by '{self.calibration.method}'>"
+
     def start(self) -> None:
         """See `Device.start`."""
         self.device.start()
@@ -321,6 +330,10 @@ class CalibratedSkin(Closing):
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, with its forces."""
         return map(self._reader.another().read, self.device)
+
+    def __aiter__(self) -> AsyncIterator[ForceScan]:
+        """The same for ``async for``."""
+        return in_threads(self)
 
     def latest(self, timeout_s: float | None = None) -> ForceScan:
         """The newest scan, with its forces."""

@@ -6,10 +6,10 @@ import threading
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -34,6 +34,7 @@ QUEUE_SCANS: Final = 1024
 # A command is sent so often before the board counts as lost. Chosen: a line that damages one frame
 # in a hundred loses three in a row once in a million.
 COMMAND_TRIES: Final = 3
+_S = TypeVar("_S", bound=Scan)
 
 
 class Device(Closing):
@@ -89,6 +90,17 @@ class Device(Closing):
     def now_s(self) -> float:
         """The time by the clock of `Scan.host_time_s` [s]: `time.monotonic()`, unless stepped."""
         return time.monotonic()
+
+    def __repr__(self) -> str:
+        board = self._hello
+        if board is None:
+            return f"<{type(self).__name__} {self.name}>"
+        size = f"{board.rows}x{board.columns} cells at {board.rate_hz:.1f} Hz"
+        return f"<{type(self).__name__} {self.name}: unit {board.unit_id}, {size}>"
+
+    def __aiter__(self) -> AsyncIterator[Scan]:
+        """The same as iterating, for ``async for``."""
+        return in_threads(self)
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan from now on; ``missed`` of each counts what was lost before it.
@@ -346,6 +358,15 @@ def configuration(board: Hello) -> dict[str, protocol.Value]:
     asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
     same = ("rows", "columns", "adc_prescaler", "mode")
     return asked | {name: getattr(board, name) for name in same}
+
+
+async def in_threads(skin: Iterable[_S]) -> AsyncIterator[_S]:
+    """The scans of a skin for ``async for``: threads wait for them, and the event loop goes on."""
+    from asyncio import to_thread  # only these programs need it
+
+    scans = await to_thread(iter, skin)
+    while (scan := await to_thread(next, scans, None)) is not None:
+        yield scan
 
 
 def scans_for(scans: Iterable[Scan], seconds: float) -> Iterator[Scan]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ohmskin.arrays import FULL_SCALE_USIEMENS, heat_map
 from ohmskin.link import protocol
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.framing import Decoder, DecoderStats, RawFrame
@@ -161,6 +162,16 @@ class Scan:
     mode: str = field(default="near", kw_only=True)
     rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
     board: Hello | None = field(default=None, kw_only=True)
+
+    def __repr__(self) -> str:
+        size = f"{self.rows}x{self.columns} cells, mode {self.mode}"
+        return f"<{type(self).__name__} {self.number}: {size}, missed {self.missed} before it>"
+
+    def _repr_html_(self) -> str:
+        """A heat map, in a notebook: of the readings B, which small conductances are like."""
+        thousandths = 1e3 * self.ratio[:, :, self.reading_names.index("b")]
+        text = f"{self!r} [reading B, thousandths of Vdd]"
+        return heat_map(thousandths, FULL_SCALE_USIEMENS, text)
 
     @property
     def ratio(self) -> NDArray[np.float64]:
