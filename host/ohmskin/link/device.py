@@ -312,7 +312,7 @@ class Device(Closing):
         if scan.missed:
             LOG.info("%s: missed %d scans before scan %d", self.name, scan.missed, scan.number)
         with self._changed:
-            scan = replace(scan, board=self.info)  # `info` may change before the scan is taken
+            scan = replace(scan, board=self._hello)  # it may change before the scan is taken
             self._newest = scan
             for queue in self._queues.values():
                 queue.append(scan)
