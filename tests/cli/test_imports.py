@@ -128,7 +128,7 @@ import hashlib, os
 from ohmskin.ctrl_c import ends_in_time
 with ends_in_time(lambda: os.write(1, b"left")):
     os.kill(os.getpid(), 2) if {early} else None
-    os.posix_spawn("/bin/kill", ["kill", "-2", str(os.getpid())], {{}})
+    os.posix_spawn("/bin/sh", ["sh", "-c", f"sleep 2; kill -2 {{os.getpid()}}"], {{}})
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1, 2**20)
 """
 
