@@ -43,10 +43,7 @@ N the noise of the readings, * by elements, and [...] 1 where it is so, else 0. 
 (y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits the variances v are made those
 of most likelihood. Two leads and r add to one series resistance, so presses tell their sum alone,
 and the prior of r decides: what a lead adds to the usual r is taken for the lead.
-
-The covariance of p is that of least squares. It is one of small changes in ohm: wires of 30 +- 12
-ohm are rarely 6 ohm, but often in a log-normal. So the deviation of the log is stated by the lower
-limit of `REACH_STDS` deviations, as in `prior.siemens_std`.
+The covariance of p is that of least squares.
 """
 
 from dataclasses import dataclass
@@ -419,9 +416,7 @@ class _PressFit:
 
     def wires(self, p: Float, std: Float) -> WireOhm:
         """The wires of this p and its deviations (7,), with those that are stated."""
-        lowest = np.maximum(1 - REACH_STDS * std[:2], np.exp(-REACH_STDS * self._std[:2]))
-        log_stds = np.maximum(std[:2], -np.log(lowest) / REACH_STDS)
-        top_log_std, bottom_log_std = log_stds.tolist()
+        top_log_std, bottom_log_std = std[:2].tolist()
         lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
         top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
         return WireOhm(top_ohm, bottom_ohm, lead_ohm, top_log_std, bottom_log_std, lead_std_ohm)
