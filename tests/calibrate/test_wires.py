@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wires found from presses, against readings of the node Laplacian and two models of presses."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import ohmskin
 from network import SkinCircuit
+from ohmskin.calibrate.presses import Calibrator
+from ohmskin.calibrate.tables import PRESS
 from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
 from ohmskin.circuit.skin import Skin, current_from_ratio
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
@@ -101,6 +105,28 @@ def test_told_wires_are_one_more_piece_of_evidence(factor: float, disagrees: boo
     # Where presses tell nothing, what was told stays.
     found = found_by(skin((5, 4), 300.0, 600.0), told, [0, 1], 0.2)
     assert found.wires.bottom == pytest.approx(factor * 600.0, rel=0.35)
+
+
+def test_readings_under_weights_tell_the_wires() -> None:
+    """Three weights twice on every cell: conductances that were read without knowing the wires."""
+    of, law, random = skin((5, 4), 300.0, 600.0), [], np.random.default_rng(4)
+    circuit, rest = SkinCircuit(of), of.cell_siemens
+    true, ratios = [], []
+    for cell, force_n in product(range(20), np.tile([0.5, 1.0, 2.0], 2)):
+        contact = 100e-6 * force_n**1.5 * np.exp(0.03 * random.standard_normal())
+        true.append(contact / (1 + 250.0 * contact))
+        pressed = rest.copy()
+        pressed.flat[cell] += true[-1]
+        ratios.append(circuit.readings(pressed)[..., :4])
+        law.append((*divmod(cell, 4), force_n, 0.8 * true[-1], 0.01 * true[-1]))
+    rest_ratio = circuit.readings(rest)[..., :4]
+    with ohmskin.open("emulator://5x4", start=False) as board:
+        calibrator = Calibrator(board.info, rest_ratio, "joint", 8e-5)
+    presses = calibrator.presses_in_readings(np.array(law, PRESS), np.array(ratios))
+    assert calibrator.found is not None
+    assert calibrator.found.wires.both == pytest.approx((300.0, 600.0), rel=0.1)
+    np.testing.assert_allclose(presses.rise, true, rtol=0.05)
+    np.testing.assert_allclose(presses.rise_std / presses.rise, 0.0125, rtol=0.05)
 
 
 def test_what_shows_no_press_is_refused() -> None:

@@ -305,16 +305,18 @@ class Calibrator:
         self._refuse(-rise > np.fmax(LOST_SHARE * rest, TOUCH_STDS * std))
         return history
 
-    def learn_wires(self, ratios: Iterable[Float], presses: Presses) -> None:
+    def learn_wires(
+        self, ratios: Iterable[Float], presses: Presses, *, in_order: bool = True
+    ) -> None:
         """Find the wires by presses, and tell them the estimator.
 
-        ratios: readings (R, C, 4) of each row of `presses`. Raises ValueError where no press is
-        clear.
+        ratios: readings (R, C, 4) of each row of `presses`. in_order: they are scans, not means of
+        scans. Raises ValueError where no press is clear.
         """
         reader, cells = PortReader(self._knowledge), presses.cells
         current = np.empty((2, cells.size))
         for row, ratio in enumerate(ratios):
-            ports = reader.read(ratio, in_order=True)
+            ports = reader.read(ratio, in_order=in_order)
             current[:, row] = ports.current.flat[cells[row]], ports.current_std.flat[cells[row]]
         readings = PressReadings(cells, presses.press, presses.force_n, *current)
         self.found = find_wires(self._knowledge, readings)
@@ -339,6 +341,22 @@ class Calibrator:
             scan=np.arange(cells.size),
             shape=(rows, columns),
         )
+
+    def presses_in_readings(self, table: PressTable, ratios: Float) -> Presses:
+        """The presses of a table, seen with the wires that their readings tell.
+
+        ratios: mean readings under each press, (n, R, C, 4). Raises ValueError as
+        `presses_in_table`, and where no press is clear.
+        """
+        presses = self.presses_in_table(table)
+        if not self.shows_wires:
+            self.learn_wires(ratios, presses, in_order=False)
+        levels = (self.estimator.estimate(ratio).level for ratio in ratios)
+        seen = zip(levels, presses.cells, strict=True)
+        rise = np.array([level.flat[cell] for level, cell in seen])
+        rise -= self.rest_level.flat[presses.cells]
+        # What scattered while a weight lay on the cell scatters as much in shares.
+        return replace(presses, rise=rise, rise_std=presses.rise_std * np.abs(rise / presses.rise))
 
     def calibration(self, presses: Presses) -> tuple[Calibration, str]:
         """The calibration, and which cells have no curve of their own.

@@ -15,7 +15,7 @@ from typer import Argument, Option
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
-from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step, still_wanted
+from ohmskin.calibrate.guide import READING_S, Cells, Guide, Press, State, Step, still_wanted
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cell, check_cells_differ, check_enough
 from ohmskin.calibrate.tables import (
@@ -36,8 +36,9 @@ from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
-from ohmskin.link.messages import Hello
+from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.force_sensor import NEWTONS
+from ohmskin.record.readings import load_readings, save_arrays
 from ohmskin.record.recording import Recording, load_recording
 
 # Rest is measured so long [s] after somebody is asked to let go. Chosen: long enough to let go.
@@ -75,7 +76,8 @@ def weights(
 ) -> None:
     """With weights: says which to put on which cell of the skin at PORT, and when it has read it.
 
-    Every press is kept at once, in OUT with .presses.csv: after Ctrl-C the same command goes on.
+    Every press is kept at once, in OUT with .presses.csv and its readings with .presses.npz: after
+    Ctrl-C the same command goes on.
     """
     calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table=True)
     forces_n = [mass_g * NEWTONS["g"] for mass_g in grams_of(grams)]
@@ -102,7 +104,7 @@ def weights(
         with naming(kept.path):
             calibrator.presses_in_table(kept.table)  # raises ValueError for another skin's
         if again:
-            kept.keep(kept.table[[press.cell not in again for press in kept.presses]])
+            kept.keep_those([press.cell not in again for press in kept.presses])
         rest_us = 1e6 * calibrator.rest_level
         TERMINAL.print(f"rest: {rest_us.min():.2f} to {rest_us.max():.2f} microsiemens")
         left = _guided(skin, calibrator, kept, missing, len(wanted)) if missing else 0
@@ -111,7 +113,9 @@ def weights(
         done = f"{len(wanted) - left} of {len(wanted)} presses are in {kept.path}"
         TERMINAL.print(f"{done}: {command} goes on", markup=False)
         raise typer.Exit(130)  # what a shell says of Ctrl-C
-    _from_table(calibrator, kept.table, kept.path, out)
+    with naming(kept.path):
+        presses = kept.seen_by(calibrator)
+    _finish(calibrator, presses, kept.path, out)
 
 
 @calibrate.command()
@@ -294,8 +298,10 @@ def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
     """What the calibration keeps of the wires, and what has shown them."""
     found = calibrator.found
     if wires.both is None:
-        why = "presses in a table do not tell them"
-        return f"wires are not told (--wires), and {why}: forces' standard deviations are wide"
+        why = (
+            "a table without readings does not show them: say --wires, or calibrate by a recording"
+        )
+        return f"wires are not known, and {why}: forces' standard deviations are wide"
     line = f"wires: {wires.top:.0f} and {wires.bottom:.0f} ohm a segment"
     if wires.top_log_std is None or wires.bottom_log_std is None:
         return f"{line}, as told"
@@ -320,30 +326,64 @@ def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
 
 
 class _KeptPresses:
-    """A table of presses and its file, which is written anew, and whole, at each change."""
+    """A table of presses, and the readings under each of them, with their files.
+
+    Both files are written anew, and whole, at each change: the readings first. Where a kill comes
+    between, they have one press more than the table, which counts.
+
+    ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
+        table that somebody else has made.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self._readings_path = path, path.with_suffix(".npz")
         self.table: PressTable = load_press_table(path) if path.exists() else np.empty(0, PRESS)
+        self.ratios: Float | None = None
+        if self._readings_path.exists() and self.table.size:
+            ratios = load_readings(self._readings_path).ratio
+            if len(ratios) >= self.table.size:
+                self.ratios = ratios[: self.table.size]
 
     @property
     def presses(self) -> list[Press]:
         """Cell and force of each."""
         return [Press((row, column), force_n) for row, column, force_n, *_ in self.table.tolist()]
 
-    def add(self, press: Press, conductance: float, std: float) -> None:
-        """Keep one more press, under which the cell had this conductance [S]."""
+    def seen_by(self, calibrator: Calibrator) -> Presses:
+        """The presses, with the wires that their readings tell. Raises ValueError, of bad rows."""
+        if self.ratios is None:
+            return calibrator.presses_in_table(self.table)
+        return calibrator.presses_in_readings(self.table, self.ratios)
+
+    def add(self, press: Press, conductance: float, std: float, ratio: Float) -> None:
+        """Keep one more press, under which the cell had this conductance [S].
+
+        ratio: mean readings meanwhile, (R, C, 4).
+        """
         # The table has no conductance below 0.
         one = np.array([(*press.cell, press.force_n, max(conductance, 0.0), std)], PRESS)
-        self.keep(np.concatenate([self.table, one]))
+        if not self.table.size:
+            self.ratios = ratio[None]
+        elif self.ratios is not None:
+            self.ratios = np.concatenate([self.ratios, ratio[None]])
+        self.table = np.concatenate([self.table, one])
+        self._save()
 
-    def keep(self, table: PressTable) -> None:
-        """Keep this table in place of the one before."""
-        if table.size:
-            save_press_table(self.path, table)
-        else:
+    def keep_those(self, wanted: list[bool]) -> None:
+        """Keep these presses alone."""
+        self.table = self.table[wanted]
+        if self.ratios is not None:
+            self.ratios = self.ratios[wanted]
+        self._save()
+
+    def _save(self) -> None:
+        if not self.table.size:
             self.path.unlink(missing_ok=True)
-        self.table = table
+            self._readings_path.unlink(missing_ok=True)
+            return
+        if self.ratios is not None:
+            save_arrays(self._readings_path, {"ratio": self.ratios})
+        save_press_table(self.path, self.table)
 
 
 def _guided(
@@ -354,6 +394,7 @@ def _guided(
     Lines say what to do next. A terminal also gets a bar, and a bell for each press.
     """
     guide, rest = Guide(missing), calibrator.rest_level
+    window: deque[Scan] = deque()  # the scans that a press is read from
     done, last_line = total - len(missing), ""
     columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
     bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
@@ -364,8 +405,12 @@ def _guided(
             step = guide.feed(1e-6 * scan.time_us, frame.level - rest, frame.touched)
             if skin.put is not None:  # a simulated skin: nobody else puts a weight on it
                 skin.put(None if step.state is State.TAKE_OFF else step.wanted)
+            window.append(scan)
+            while 1e-6 * (scan.time_us - window[0].time_us) > READING_S:
+                window.popleft()
             if step.wanted is not None and step.rise is not None:
-                kept.add(step.wanted, step.rise + rest[step.wanted.cell], step.rise_std)
+                level = step.rise + rest[step.wanted.cell]
+                kept.add(step.wanted, level, step.rise_std, mean_ratio(window))
                 done += 1
                 TERMINAL.bell()
             line, now = _step_in_words(step)
