@@ -28,9 +28,10 @@ class Writer:
         self.name, self._noted, self._script = name, place / "noted", place / name
         self.fail_at("nothing")
 
-    def fail_at(self, pattern: str) -> None:
+    def fail_at(self, pattern: str, said: str = "it is broken") -> None:
         note = f'echo "$*" >> {self._noted}'
-        self._script.write_text(f'#!/bin/sh\n{note}\ncase "$*" in {pattern}) exit 1; esac\n')
+        fails = f'{pattern}) echo "{said}" >&2; exit 1'
+        self._script.write_text(f'#!/bin/sh\n{note}\ncase "$*" in {fails}; esac\n')
         self._script.chmod(0o755)
 
     @property
@@ -173,13 +174,36 @@ def failed(run: Run) -> str:
     assert done.code == 2
     assert done.err.count("\n") == 1
     assert "answers" not in done.out
-    return done.err
+    return done.out + done.err
 
 
 def test_a_failed_upload_is_said(run: Run, writer: Writer, attach: Attach) -> None:
     attach(("/dev/ttyACM0", "uno"))
     writer.fail_at("*")
-    assert "flashing uno at /dev/ttyACM0 failed" in failed(run)
+    said = failed(run)
+    assert "it is broken" in said
+    assert "flashing uno at /dev/ttyACM0 failed: the lines above" in said
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "avrdude warning: attempt 2 of 2: not in sync: resp=0x00",
+        "avrdude error: timeout communicating with programmer",
+    ],
+)
+def test_a_dead_port_is_a_line(run: Run, writer: Writer, attach: Attach, said: str) -> None:
+    """avrdude alone says 23."""
+    attach(("/dev/ttyACM0", "uno"))
+    writer.fail_at("*", f"{said}\navrdude done.  Thank you.")
+    done = run("flash")
+    assert (done.code, done.out) == (2, "flashing uno at /dev/ttyACM0, 115200 baud\n")
+    assert done.err.startswith("ohmskin: no boot loader answers at /dev/ttyACM0: is it a uno")
+    assert done.err.count("\n") == 1
+
+
+def test_a_url_is_no_port(run: Run) -> None:
+    assert_one_line(run("flash", "uno", "--port", "emulator://8x8"), "flash takes no URL")
 
 
 def test_a_board_that_stays_silent_is_said(

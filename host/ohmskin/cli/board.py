@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -35,6 +36,8 @@ _BOARDS: Final = {
     "nano": ("-p atmega328p -c arduino -x attempts=2", {"nano": 115200, "nano_old": 57600}),
     "megaatmega2560": ("-p atmega2560 -c wiring", {"megaatmega2560": 115200}),
 }
+# What avrdude says, of all that it and PlatformIO do, where no boot loader answers.
+_NO_ANSWER: Final = ("not in sync", "not respond", "unable to open programmer", "timeout communi")
 _ROOT: Final = Path(__file__).parents[3]
 _FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # there is none but in a wheel
 # Time between two tries to open a board that was flashed [s]. Chosen: short beside the 3 s that it
@@ -185,9 +188,15 @@ def flash(
     environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
     for baud, command in _uploads(board, port).items():
         TERMINAL.print(f"flashing {board} at {port}, {baud} baud")
-        if not subprocess.run(command, env=environment | os.environ).returncode:
+        call = partial(subprocess.run, command, env=environment | os.environ, text=True)
+        done = call(stdout=subprocess.PIPE, stderr=subprocess.STDOUT, errors="replace")
+        if not done.returncode:
             break
     else:
+        if any(words in done.stdout for words in _NO_ANSWER):
+            hint = f"is it a {board}, does no other program have its port, is its cable whole?"
+            raise OhmskinError(f"no boot loader answers at {port}: {hint}")
+        TERMINAL.print(done.stdout)
         raise OhmskinError(f"flashing {board} at {port} failed: the lines above say why")
     hello = _answer(port)
     if hello.board != ("uno" if board == "nano" else board):  # the same chip, and the same wiring
@@ -222,6 +231,8 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
 
     :raises PortError: it is not clear which board or which port is meant.
     """
+    if "://" in port:
+        raise PortError(f"flash takes no URL, but the port of a board: not {port}")
     if board and board not in _BOARDS:
         raise PortError(f"no board '{board}': there are {', '.join(_BOARDS)}")
     real = os.path.realpath(port)  # a link of udev's has no USB id of its own
