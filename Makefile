@@ -22,6 +22,7 @@ endif
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEX := host/ohmskin/firmware
+PINS := tools/pins
 NPM_LOCKS := firmware/second_sim/package-lock.json tools/page_lint/package-lock.json
 BIOME = $(firstword $(shell ls tools/page_lint/node_modules/@biomejs/cli-*/biome 2>/dev/null) false)
 PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
@@ -32,7 +33,7 @@ BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers 
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-host demo test check docs format firmware wheel test-firmware test-arduino-gcc check-firmware sim \
+.PHONY: help setup setup-host pins demo test check docs format firmware wheel test-firmware test-arduino-gcc check-firmware sim \
         test-host fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
 
 help: ## list the targets
@@ -47,11 +48,19 @@ setup: $(STAMP) $(PIO_STAMP) ## install what development needs (apt packages, .v
 
 setup-host: $(HOST_STAMP) ## install what the host alone needs (.venv)
 
-$(HOST_STAMP): pyproject.toml tools/setup.sh tools/constraints.txt
+$(HOST_STAMP): pyproject.toml tools/setup.sh $(PINS)/host.txt
 	tools/setup.sh host
 
-$(STAMP): pyproject.toml tools/setup.sh tools/constraints.txt $(NPM_LOCKS)
+$(STAMP): pyproject.toml tools/setup.sh $(PINS)/all.txt $(NPM_LOCKS)
 	tools/setup.sh all
+
+# Versions stay as they are, with UPGRADE=--upgrade they are the newest.
+PIN := uv pip compile --quiet --generate-hashes --no-annotate --custom-compile-command 'make pins' $(UPGRADE)
+pins: ## write what `make setup` installs, with hashes, anew (needs uv): tools/pins
+	$(PIN) --universal --python-version 3.11 --extra dev pyproject.toml $(PINS)/build.in -o $(PINS)/all.txt
+	$(PIN) --universal --python-version 3.11 --extra plot --extra view --constraint $(PINS)/all.txt \
+		pyproject.toml $(PINS)/build.in -o $(PINS)/host.txt
+	$(PIN) --no-deps $(PINS)/avr-gcc.in -o $(PINS)/avr-gcc.txt
 
 check: setup ## formatting, lint, types, generated files, docs
 	$(BIN)/ruff check

@@ -180,3 +180,20 @@ def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Pat
     assert "no ghost" in out
     assert "0 missed, 0 damaged" in out
     run(binaries / "python", "-c", IMPORT_ALL, place=elsewhere)
+
+
+def test_make_setup_installs_files_that_are_known() -> None:
+    """Each by version and hash; what the host needs is among what development needs."""
+    pins = {}
+    for name in ("host", "all", "avr-gcc"):
+        text = (ROOT / f"tools/pins/{name}.txt").read_text().replace("\\\n", "")
+        lines = [line for line in text.splitlines() if not line.startswith("#")]
+        assert all(re.match(r"\S+==[^\s*]+ .*--hash=sha256:[0-9a-f]{64}", line) for line in lines)
+        pins[name] = {line.split("==")[0]: line for line in lines}
+    assert pins["host"].items() <= pins["all"].items()
+    for text in distribution("ohmskin").requires or []:
+        requirement = Requirement(text)
+        if requirement.name != "ohmskin":
+            pinned = pins["all"][requirement.name].split("==")[1].split()[0]
+            assert requirement.specifier.contains(pinned)
+    assert not re.findall(r"platform = .*[\^~>*]", (ROOT / "platformio.ini").read_text())

@@ -6,8 +6,8 @@
 # host: .venv with the ohmskin package.
 # all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second
 # simulator, for tests) and biome (for the page's JavaScript) from npm, and the development tools.
-# Installs only what is missing, and says what. Python packages are of the versions that were tested:
-# tools/constraints.txt.
+# Installs only what is missing, and says what. Python packages are those files that were tested, by their
+# hashes, and no package is built but this one: tools/pins.
 set -euo pipefail
 
 APT_PACKAGES=(gcc-avr binutils-avr avr-libc arduino-core-avr avrdude cppcheck
@@ -74,10 +74,13 @@ make_venv() {
     "$python" -m venv --clear .venv
 }
 
-pip_install() { # requirement
-    echo "setup: installing $1 and its dependencies into .venv"
+pip_install() { # pins
+    echo "setup: installing $1 and this package into .venv"
+    # To build a package would take the newest of what its build asks for, without hashes.
+    PIP_ONLY_BINARY=${PIP_ONLY_BINARY-:all:} .venv/bin/python -m pip install --quiet \
+        --disable-pip-version-check --require-hashes --requirement "$1"
     .venv/bin/python -m pip install --quiet --disable-pip-version-check \
-        --constraint tools/constraints.txt --editable "$1"
+        --no-deps --no-build-isolation --editable .
 }
 
 npm_install() { # folder, what it is, what is skipped without it
@@ -93,7 +96,7 @@ npm_install() { # folder, what it is, what is skipped without it
 case ${1:-} in
 host)
     make_venv
-    pip_install '.[plot,view]'
+    pip_install tools/pins/host.txt
     touch .venv/.stamp-host
     ;;
 all)
@@ -106,7 +109,7 @@ all)
     npm_install firmware/second_sim avr8js "tests in the second simulator are skipped"
     npm_install tools/page_lint biome "the page's JavaScript is not linted"
     make_venv
-    pip_install '.[dev]'
+    pip_install tools/pins/all.txt
     touch .venv/.stamp-host .venv/.stamp
     ;;
 *)

