@@ -85,3 +85,10 @@ def test_far_ends_measure_leads_and_are_not_misled(ohm: float) -> None:
     assert lead_ohm == pytest.approx(behind.rest.lead_ohm.mean(), rel=0.1)
     assert np.median(off) < 1.5 * np.median(usual)
     assert np.mean(stds_off < 4) > 0.97
+
+
+def test_fingertips_alone_show_the_lead_at_far_ends() -> None:
+    """Every frame measures it, even one that is too crowded to be a lesson."""
+    behind = with_leads(finger_trial(8, 8, 6, seed=3), 600.0)
+    _, lead_ohm = estimates(behind, "joint", None, "far")
+    assert lead_ohm == pytest.approx(behind.rest.lead_ohm.mean(), rel=0.1)

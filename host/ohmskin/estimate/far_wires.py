@@ -65,6 +65,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import PortCircuit
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     LAYER_STD,
@@ -94,6 +95,10 @@ class MeasuredWires(WireBelief):
             (np.zeros((lines, 1 + n, 1 + n)), np.zeros((lines, 1 + n)))
             for lines, n in (self.shape, self.shape[::-1])
         ]
+
+    def learned(self) -> WireOhm | None:
+        """The means as the last frame has shown them: one under a fingertip, too."""
+        return None if self._known[0] is self._nominal else self._as_known()
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Take the means from this frame, weighed against the frames before.

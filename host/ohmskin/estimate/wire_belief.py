@@ -256,8 +256,9 @@ class WireBelief(ABC):
 
     def learned(self) -> WireOhm | None:
         """The means, and their deviations. None before any lesson."""
-        if self._lesson_cells is None:
-            return None
+        return None if self._lesson_cells is None else self._as_known()
+
+    def _as_known(self) -> WireOhm:
         means, covariance = self._known
         top, bottom = np.exp(means[:2]).tolist()
         lead = max(float(means[2]), 0.0)
