@@ -27,6 +27,7 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
+from ohmskin.force.curve import ForceModel
 from ohmskin.force.reader import DEFAULT_METHOD, now, touched_cells
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
@@ -138,7 +139,7 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     # but they are of no press, and so are left out below.
     every = np.arange(scans)
     pressed_rise = rise[every, pressed]
-    press = _numbered(pressed, pressed_rise)
+    press = number_presses(pressed, pressed_rise)
     others = rise.copy()
     others[every, pressed] = -np.inf
     shared = (press != _NOTHING) & (others.max(axis=1) > SECOND_SHARE * pressed_rise)
@@ -180,7 +181,7 @@ def _pressed(rise: Float, touched: Bool) -> NDArray[np.intp]:
     return pressed
 
 
-def _numbered(pressed: NDArray[np.intp], pressed_rise: Float) -> NDArray[np.intp]:
+def number_presses(pressed: NDArray[np.intp], pressed_rise: Float) -> NDArray[np.intp]:
     """Number of the press that each scan is of, or `_NOTHING`.
 
     pressed: index of the cell that is pressed in each scan, or `_NOTHING`, (n,).
@@ -220,12 +221,13 @@ class Calibrator:
     board: the one that scans it.
     rest_ratio: readings (R, C, 4) of the untouched skin.
     method: the one by which forces will be read.
-    indenter_area_m2: area that the skin is pressed with [m^2].
+    indenter_area_m2: area that the skin is pressed with [m^2]; None: any, by `kneading`.
     nominal_wire_ohm: what is known of its wires.
     force: calibrate even if cells seem touched at rest.
 
     Made from these:
 
+    knowledge: what is known of the skin.
     estimator: of this method, for this skin.
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
     found: the wires by presses; None before `learn_wires`.
@@ -240,14 +242,14 @@ class Calibrator:
     board: Hello
     rest_ratio: Float
     method: str
-    indenter_area_m2: float
+    indenter_area_m2: float | None
     nominal_wire_ohm: WireOhm = NO_WIRES
     force: bool = False
 
     def __post_init__(self) -> None:
         self.found: FoundWires | None = None
         self._tell(self.nominal_wire_ohm)
-        at_rest = make_estimator(DEFAULT_METHOD, self._knowledge).rest()
+        at_rest = make_estimator(DEFAULT_METHOD, self.knowledge).rest()
         assert at_rest is not None  # the readings are known
         siemens = at_rest.cell_siemens
         untouched = float(np.quantile(siemens, UNTOUCHED_SHARE, method="lower"))
@@ -259,8 +261,8 @@ class Calibrator:
         While it is pressed, the skin is as its presses show it: not bent since.
         """
         knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires)
-        self._knowledge = replace(knowledge, may_be_bent=False)
-        self.estimator = make_estimator(self.method, self._knowledge)
+        self.knowledge = replace(knowledge, may_be_bent=False)
+        self.estimator = make_estimator(self.method, self.knowledge)
         self.rest_level = self.estimator.rest_level()
 
     def _refuse(self, touched: Bool) -> None:
@@ -282,7 +284,7 @@ class Calibrator:
         """
         if self.shows_wires:
             return self.measure(scans, progress)
-        estimator = make_estimator(WIRELESS, self._knowledge)
+        estimator = make_estimator(WIRELESS, self.knowledge)
         return self._history(estimator, estimator.rest_level(), progress(scans))
 
     def measure(self, scans: list[Scan], progress: Progress = iter) -> LevelHistory:
@@ -313,14 +315,18 @@ class Calibrator:
         ratios: readings (R, C, 4) of each row of `presses`. in_order: they are scans, not means of
         scans. Raises ValueError where no press is clear.
         """
-        reader, cells = PortReader(self._knowledge), presses.cells
+        reader, cells = PortReader(self.knowledge), presses.cells
         current = np.empty((2, cells.size))
         for row, ratio in enumerate(ratios):
             ports = reader.read(ratio, in_order=in_order)
             current[:, row] = ports.current.flat[cells[row]], ports.current_std.flat[cells[row]]
         readings = PressReadings(cells, presses.press, presses.force_n, *current)
-        self.found = find_wires(self._knowledge, readings)
-        self._tell(self.found.wires)
+        self.take_wires(find_wires(self.knowledge, readings))
+
+    def take_wires(self, found: FoundWires) -> None:
+        """Tell the estimator the wires that presses have shown."""
+        self.found = found
+        self._tell(found.wires)
 
     def presses_in_table(self, table: PressTable) -> Presses:
         """The presses of a table, each of its rows one.
@@ -374,16 +380,19 @@ class Calibrator:
         )
         pressed = np.argwhere(presses.counts).tolist()
         check_cells_differ({(row, column) for row, column in pressed}, presses.shape)
-        date, told = now(), self._knowledge.nominal_wire_ohm
-        calibration = Calibration(
+        return self.calibration_of(regression.model_), regression.message_
+
+    def calibration_of(self, model: ForceModel) -> Calibration:
+        """The calibration with these curves."""
+        date, told = now(), self.knowledge.nominal_wire_ohm
+        return Calibration(
             unit_id=self.board.unit_id,
             date=date,
             method=self.method,
-            rest=Rest.of(self.method, self._knowledge, date),
-            model=regression.model_,
+            rest=Rest.of(self.method, self.knowledge, date),
+            model=model,
             indenter_area_m2=self.indenter_area_m2,
             # Single presses teach `joint` nothing that the fit of all presses does not know.
             nominal_wire_ohm=self.estimator.wires() if self.shows_wires else told,
             mode=self.board.mode,
         )
-        return calibration, regression.message_

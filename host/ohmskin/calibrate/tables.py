@@ -83,6 +83,7 @@ class ForceLog:
     time_s: of each sample, (n,) [s], increasing.
     force_n: (n,) [N]. Noise about zero may be negative: see `NEGATIVE_N`.
     rows: where in a file each sample stands, (n,), for the texts of errors; None: not in a file.
+    any_zero: whether its zero is found later, so that it may be anything.
 
     Raises ValueError for fewer than `MIN_SAMPLES`, for times that do not increase, for a force that
     never changes, and for presses that are negative.
@@ -91,8 +92,9 @@ class ForceLog:
     time_s: Float
     force_n: Float
     rows: InitVar[NDArray[np.int64] | None] = None
+    any_zero: InitVar[bool] = False
 
-    def __post_init__(self, rows: NDArray[np.int64] | None) -> None:
+    def __post_init__(self, rows: NDArray[np.int64] | None, any_zero: bool) -> None:
         time_s, force_n = self.time_s, self.force_n
         if time_s.size < MIN_SAMPLES:
             raise ValueError(f"too few samples: {time_s.size}, {MIN_SAMPLES} are needed")
@@ -100,6 +102,8 @@ class ForceLog:
         require_rows("time_s", time_s, later, "later than the one before", rows)
         if np.ptp(force_n) == 0:
             raise ValueError(f"force_n is {force_n[0]:g} throughout: does the sensor measure?")
+        if any_zero:
+            return
         limit = max(NEGATIVE_N, NEGATIVE_SHARE * float(force_n.max()))
         # A sensor mounted upside down has more samples below zero than above it.
         if np.count_nonzero(force_n < -limit) > np.count_nonzero(force_n > limit):
@@ -130,11 +134,11 @@ def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
     return np.where(inside & is_gap[after - 1], np.nan, interpolated)
 
 
-def load_force_log(path: PathName) -> ForceLog:
-    """Read a force log. Raises ValueError: see the module."""
+def load_force_log(path: PathName, *, any_zero: bool = False) -> ForceLog:
+    """Read a force log. any_zero: as for it. Raises ValueError: see the module."""
     with naming(path):
         columns, rows = _read(path, ("time_s", "force_n"), None)
-        return ForceLog(**columns, rows=rows)
+        return ForceLog(**columns, rows=rows, any_zero=any_zero)
 
 
 def load_press_table(path: PathName) -> PressTable:

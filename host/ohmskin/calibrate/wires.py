@@ -228,6 +228,20 @@ def _rows(readings: PressReadings, rest_current: Float) -> _Rows:
     return _Rows(cells[first], press[first], *means)
 
 
+def wire_prior(told: WireOhm) -> tuple[Float, Float]:
+    """Centre and deviation of p[:3], by what was told of the wires."""
+    centre, std = [], []
+    for ohm, log_std in zip(told[:2], told[3:5], strict=True):
+        centre.append(np.log(UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3)))
+        std.append(UNTOLD_STD if ohm is None else np.hypot(LAYER_STD, log_std or 0.0))
+    lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNTOLD_LEAD_STD_OHM
+    if told.lead is not None:
+        lead_ohm, lead_std_ohm = told.lead, told.lead_std_ohm or LEAD_STD * told.lead
+    centre.append(lead_ohm / UNKNOWN_LEAD_OHM)
+    std.append(max(lead_std_ohm, 1e-3) / UNKNOWN_LEAD_OHM)
+    return np.array(centre), np.array(std)
+
+
 class _PressFit:
     """Fits wires and law to the rows of presses."""
 
@@ -246,15 +260,7 @@ class _PressFit:
 
     def _set_priors(self, told: WireOhm) -> None:
         """Centre and deviation of p, by what was told."""
-        centre, std = [], []
-        for ohm, log_std in zip(told[:2], told[3:5], strict=True):
-            centre.append(np.log(UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3)))
-            std.append(UNTOLD_STD if ohm is None else np.hypot(LAYER_STD, log_std or 0.0))
-        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNTOLD_LEAD_STD_OHM
-        if told.lead is not None:
-            lead_ohm, lead_std_ohm = told.lead, told.lead_std_ohm or LEAD_STD * told.lead
-        centre.append(lead_ohm / UNKNOWN_LEAD_OHM)
-        std.append(max(lead_std_ohm, 1e-3) / UNKNOWN_LEAD_OHM)
+        centre, std = wire_prior(told)
         # The level k of the law is free: -10 is 45 microsiemens.
         self._centre = np.array([*centre, -10.0, EXPONENT, 0.0, np.log(SERIES_OHM)])
         self._std = np.array([*std, 10.0, EXPONENT_STD, BEND_STD, SERIES_STD])

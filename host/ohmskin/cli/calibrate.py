@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin calibrate``: with weights, from a recording, from a table of presses; ``tare``."""
 
+import json
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -16,6 +18,7 @@ import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
 from ohmskin.calibrate.guide import READING_S, Cells, Guide, Press, State, Step, still_wanted
+from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cell, check_cells_differ, check_enough
 from ohmskin.calibrate.tables import (
@@ -122,7 +125,12 @@ def weights(
 def recording(
     recording: Annotated[Path, Argument(help="recording (.mcap) of presses of single cells")],
     out: Out,
-    indenter_mm2: Indenter,
+    indenter_mm2: Annotated[
+        float | None, Option("--indenter-mm2", help="as elsewhere; none with --total")
+    ] = None,
+    total: Annotated[
+        bool, Option("--total", help="forces are those on the whole skin, pressed anywhere")
+    ] = False,
     forces: Annotated[
         Path | None,
         Option(help="force sensor's log (.csv: time_s, force_n); default: the forces in it"),
@@ -134,14 +142,18 @@ def recording(
     wires: Wires = "",
     leads: Leads = None,
     force: Force = False,
+    as_json: Annotated[bool, Option("--json", help="with --total: one JSON object")] = False,
 ) -> None:
     """From a recording of presses, with the forces in it or a force sensor's log of the same time.
 
-    The two clocks may differ: they are aligned by what both saw.
+    The two clocks may differ: they are aligned by what both saw. With --total, a scale under the
+    skin measured the force on all of it, and presses may be anywhere, of many cells at once.
     """
+    if total == (indenter_mm2 is not None):
+        raise ValueError("say either --indenter-mm2, of presses of single cells, or --total")
     calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), recording, forces)
     given = load_recording(recording)
-    log = None if forces is None else load_force_log(forces)
+    log = None if forces is None else load_force_log(forces, any_zero=total)
     with naming(recording):
         if not given.scans:
             raise ValueError("no scan in it")
@@ -149,10 +161,11 @@ def recording(
             raise ValueError("no force in it: say --forces LOG.csv")
         if any(scan.mode != given.hellos[-1].mode for scan in given.scans):
             raise ValueError("modes near and far are mixed in it: record the presses in one mode")
-        if log is None:  # the scans have the same clock
-            samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
-            log = ForceLog(*samples.T)
         calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s), force)
+        if total:
+            _knead(calibrator, given, log, out, as_json)
+            return
+        log = log or _log_in(given)
         history = calibrator.look(given.scans, progress("presses"))
         alignment = align(history.time_s, history.of_skin, log)
         presses = find_presses(history, log, alignment.offset_s)
@@ -168,6 +181,47 @@ def recording(
     if presses.shared:
         note += f"\n{presses.shared} scans left out: two cells were pressed"
     _finish(calibrator, presses, recording, out, note)
+
+
+def _log_in(given: Recording, *, any_zero: bool = False) -> ForceLog:
+    """The forces in a recording; the scans have the same clock."""
+    samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
+    time_s, force_n = samples.T
+    return ForceLog(time_s, force_n, any_zero=any_zero)
+
+
+def _knead(
+    calibrator: Calibrator, given: Recording, log: ForceLog | None, out: Path, as_json: bool
+) -> None:
+    """Learn from the total force, write the calibration, and say what came of it.
+
+    log: by another clock; None: the forces in the recording.
+    """
+    kneading, offset_s = Kneading(calibrator, given.scans), 0.0
+    if log is None:
+        log = _log_in(given, any_zero=True)
+    else:
+        above = replace(log, force_n=np.maximum(log.force_n - np.quantile(log.force_n, 0.02), 0.0))
+        offset_s = align(kneading.time_s, kneading.of_skin, above).offset_s
+        log = replace(log, time_s=log.time_s + offset_s, any_zero=True)
+    fit = kneading.learn(log, progress("scans"))
+    calibration = calibrator.calibration_of(fit.model(kneading.shape))
+    calibration.save(out)
+    first_s, stds = kneading.time_s[0], fit.gain_std()
+    left_out = [[begin - first_s, end - first_s] for begin, end in fit.left_out]
+    known = int(np.count_nonzero(~calibration.model.pooled))
+    if as_json:
+        said = {"left_out": left_out, "lag_s": fit.scale_.lag_s, "offset_s": offset_s}
+        said |= {"presses": fit.presses, "gain_std": stds.reshape(kneading.shape).tolist()}
+        print(json.dumps(said | calibration.nominal_wire_ohm._asdict()))  # noqa: T201
+        return
+    lag = f"the scale lags by {1000 * fit.scale_.lag_s:.0f} ms"
+    TERMINAL.print(f"{fit.presses} presses; {lag}; {len(left_out)} presses left out")
+    for begin_s, end_s in left_out:
+        TERMINAL.print(f"left out: {begin_s:.1f} to {end_s:.1f} s, force beside the skin?")
+    TERMINAL.print(f"{known} of {stds.size} cells have a gain of their own")
+    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator), markup=False)
+    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
 
 
 @calibrate.command()
@@ -224,7 +278,7 @@ def tare(
 def _options(
     out: Path,
     method: str,
-    indenter_mm2: float,
+    indenter_mm2: float | None,
     wires: WireOhm,
     *inputs: Path | None,
     table: bool = False,
@@ -239,10 +293,10 @@ def _options(
         raise ValueError(f"no method '{method}': there are {', '.join(LEVEL_METHODS)}")
     if table and method == VOLTAGE:
         raise ValueError(f"a table has conductances, which '{VOLTAGE}' knows nothing of")
-    if not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
+    if indenter_mm2 is not None and not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     check_place(out, *inputs)
-    area_m2 = 1e-6 * indenter_mm2
+    area_m2 = None if indenter_mm2 is None else 1e-6 * indenter_mm2
     return lambda board, rest, force: Calibrator(board, rest, method, area_m2, wires, force)
 
 

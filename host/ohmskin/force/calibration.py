@@ -18,7 +18,8 @@ nominal_lead_ohm                           from a multiplexer's common pin to th
 top_wire_log_std                           standard deviations of the logarithms of both segments;
 bottom_wire_log_std                        null: not measured
 lead_std_ohm                               standard deviation of the lead [ohm]; null: not measured
-indenter_area_m2                           what the skin was pressed with [m^2]
+indenter_area_m2                           what the skin was pressed with [m^2]; null: anything, by
+                                           the total force on the skin, so there is no pressure
 rest.date                                  ISO 8601
 rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
 rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
@@ -71,7 +72,7 @@ MAX_NUMBER: Final = 1e60
 UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
 # The fields of the file, by where their values are kept: in the calibration itself, with their
 # types; in its rests; in its `WireOhm`; in its model, of which some may be null.
-_OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str, "indenter_area_m2": float}
+_OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str}
 _RESTS: Final = ("rest", "tare")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
 _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
@@ -118,7 +119,8 @@ class Calibration:
     method: the one that gave the levels, one of `LEVEL_METHODS`.
     rest: the untouched skin before the presses.
     model: the curve of every cell.
-    indenter_area_m2: what the skin was pressed with [m^2].
+    indenter_area_m2: what the skin was pressed with [m^2]; None: anything, since the total force
+        was measured.
     nominal_wire_ohm: a wire segment of each layer.
     tare: the untouched skin of a later date, which is used in place of `rest`; None: there is none.
     mode: which readings the scans hold, a name of the enum `mode`.
@@ -129,7 +131,7 @@ class Calibration:
     method: str
     rest: Rest
     model: ForceModel
-    indenter_area_m2: float
+    indenter_area_m2: float | None
     nominal_wire_ohm: WireOhm = NO_WIRES
     tare: Rest | None = None
     mode: str = "near"
@@ -148,8 +150,9 @@ class Calibration:
             if rest is not None and rest.level.shape != shape:
                 raise ValueError(f"{name} has shape {rest.level.shape}, the model {shape}")
         check_size(self.rows, self.columns)
-        if not (np.isfinite(self.indenter_area_m2) and self.indenter_area_m2 > 0):
-            raise ValueError(f"indenter_area_m2 is {self.indenter_area_m2}, it must be above 0")
+        area_m2 = self.indenter_area_m2
+        if area_m2 is not None and not (np.isfinite(area_m2) and area_m2 > 0):
+            raise ValueError(f"indenter_area_m2 is {area_m2}, it must be above 0")
         self.nominal_wire_ohm.check()
 
     @property
@@ -183,7 +186,7 @@ class Calibration:
     def save(self, path: PathName) -> None:
         """Write the file whole or not at all. Raises ValueError if it cannot be written."""
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
-        for name in (*_OWN, "rows", "columns"):
+        for name in (*_OWN, "indenter_area_m2", "rows", "columns"):
             content[name] = getattr(self, name)
         content |= dict(zip(WIRE_FIELDS, self.nominal_wire_ohm, strict=True))
         for name in _RESTS:
@@ -238,19 +241,20 @@ def _from_content(content: Any) -> Calibration:
     of_both = content.pop("wire_log_std", None)
     absent = dict.fromkeys(WIRE_FIELDS[2:]) | dict.fromkeys(WIRE_FIELDS[3:5], of_both)
     content = {"mode": "near", **absent, **content}
-    names = {"format", "schema", "rows", "columns", *_OWN, *WIRE_FIELDS, *_RESTS, *_MODEL_FIELDS}
+    numbers = ("indenter_area_m2", *WIRE_FIELDS)  # each may be null
+    names = {"format", "schema", "rows", "columns", *_OWN, *numbers, *_RESTS, *_MODEL_FIELDS}
     _require_fields(content, names)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
-    wires = (
-        None if content[name] is None else _value(name, content[name], float)
-        for name in WIRE_FIELDS
+    area_m2, *wires = (
+        None if content[name] is None else _value(name, content[name], float) for name in numbers
     )
     return Calibration(
         **{name: _value(name, content[name], wanted) for name, wanted in _OWN.items()},
         rest=_rest("rest", content["rest"], shape),
         tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
         model=model,
+        indenter_area_m2=area_m2,
         nominal_wire_ohm=WireOhm(*wires),
     )
 

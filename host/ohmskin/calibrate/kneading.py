@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From scans of a skin that is pressed anywhere, and the total force meanwhile, to its calibration.
+
+What the presses show of the forces, `totals` learns. Before that, the wires are learned from the
+same presses: with wrong wires, cells far from the electrodes, and those under much force, come out
+too soft or too hard, and no one curve with gains fits the sums.
+
+Symbols
+
+====== ======= ========================================================================= =======
+symbol shape   meaning                                                                   unit
+====== ======= ========================================================================= =======
+x      (n, C)  rise of each cell above rest, by an estimator that is told the wires      S
+g      (n, C)  conductance of each cell                                                  S
+w      (3,)    logs of a top and of a bottom segment; a lead over `UNKNOWN_LEAD_OHM`     1
+A, B           slopes of the ports' currents, over their noise, by log g of the pressed
+               cells, and by w
+====== ======= ========================================================================= =======
+
+The currents of the ports do not depend on what anybody believes of the wires. So if these change by
+dw, the pressed cells follow by
+
+    d log g = -(A^T A + 1 / 3^2)^-1 A^T B dw ,    d log x = (g / x) d log g .
+
+`TotalFit` takes these slopes and finds dw together with curve and gains. That is repeated with the
+wires found, until they hardly change.
+"""
+
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ohmskin.arrays import Bool, Float
+from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
+from ohmskin.calibrate.tables import ForceLog
+from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.calibrate.wires import FoundWires, wire_prior
+from ohmskin.circuit.skin import PortCircuit
+from ohmskin.circuit.small import one_blas_thread, solve_positive
+from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
+from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, WireOhm
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_readings import PortReader
+from ohmskin.estimate.prior import UNKNOWN_LEAD_OHM, UNLIMITED_STD
+from ohmskin.force.reader import DEFAULT_METHOD
+from ohmskin.link.clock import scan_times_s
+from ohmskin.link.messages import Scan
+
+# At most so many scans of presses are estimated, for the curves and for each trial of the wires.
+# Chosen: a fit of the wires takes no longer than that of the curves.
+MOST_SCANS, TRIAL_SCANS = 8000, 2800
+# Presses are chosen in stretches of so many. Chosen: what a slow scale still shows of a press that
+# was not chosen is in one of so many.
+STRETCH: Final = 12
+# So many scans of pauses show what cells show of nothing. Chosen: enough for a median.
+PAUSE_SCANS: Final = 200
+# Rises below this many times what cells show of nothing tell no force.
+PAUSE_TIMES: Final = 2.0
+# Trials of the wires, their longest step, and the one that is the last.
+TRIALS, LONGEST_STEP, LAST_STEP = 8, 1.0, 0.05
+# Deviation of leads that nobody has told, over `UNKNOWN_LEAD_OHM`. Chosen: totals tell leads badly,
+# as hysteresis looks like them; a multiplexer has 70 to 160 ohm.
+USUAL_LEAD_STD: Final = 0.5
+# How well a trial's wires are told: so well that no scan teaches others. Chosen.
+TRIAL_LOG_STD, TRIAL_LEAD_STD_OHM = 1e-3, 1.0
+
+
+class _Levels(NamedTuple):
+    """x (n, C), 0 where nothing is pressed; at rest, (R, C); which scans were used, (n,)."""
+
+    rise: Float
+    rest: Float
+    used: Bool
+
+
+class Kneading:
+    """Scans of presses anywhere, by which a calibrator learns.
+
+    time_s: of the scans, (n,) [s]. of_skin: what all ports rise by together, (n,) [S]. shape:
+    (R, C).
+    """
+
+    def __init__(self, calibrator: Calibrator, scans: list[Scan]) -> None:
+        self._calibrator, self._scans = calibrator, scans
+        self.shape = calibrator.knowledge.rows, calibrator.knowledge.columns
+        knowledge = calibrator.knowledge
+        assert knowledge.rest_ratio is not None
+        self._reader = PortReader(knowledge)
+        rest = self._reader.read(knowledge.rest_ratio).current
+        currents = [self._reader.read(scan.ratio, in_order=True).current for scan in scans]
+        rise = (np.array(currents) - rest).reshape(len(scans), -1)
+        rises = rise > TOUCH_SIEMENS
+        self.time_s = scan_times_s(scans)
+        self.of_skin: Float = np.sum(rise, axis=1, where=rises)
+        self._press = number_presses(np.where(rises.any(axis=1), 0, -1), self.of_skin)
+
+    def learn(self, log: ForceLog, progress: Progress = iter) -> TotalFit:
+        """Find the wires, unless the estimator shows them, and fit the curves.
+
+        log: of the scale, by the clock of the scans, but for its lag.
+        """
+        calibrator = self._calibrator
+        if not calibrator.shows_wires:
+            calibrator.take_wires(self._found_wires(log))
+        counts = np.cumsum(self._press >= 0)
+        every = int(counts[-1] // MOST_SCANS) + 1
+        used = (self._press < 0) | (counts % every == 0)
+        levels = self._levels(calibrator.estimator, used, progress)
+        return TotalFit(self._totals(levels, log)).fit()
+
+    def _found_wires(self, log: ForceLog) -> FoundWires:
+        """The wires with which one curve and gains fit the totals best."""
+        knowledge = self._calibrator.knowledge
+        told = knowledge.nominal_wire_ohm
+        centre, std = wire_prior(told)
+        if told.lead is None:
+            std[2] = USUAL_LEAD_STD
+        every = int(np.count_nonzero(self._press >= 0) // TRIAL_SCANS) + 1
+        used = np.maximum.accumulate(self._press) // STRETCH % every == 0
+        w, scale = centre, None
+        for _ in range(TRIALS):
+            ohm = _in_ohm(w)
+            stds = TRIAL_LOG_STD, TRIAL_LOG_STD, TRIAL_LEAD_STD_OHM
+            trial = replace(knowledge, nominal_wire_ohm=WireOhm(*ohm, *stds))
+            levels = self._levels(make_estimator(DEFAULT_METHOD, trial), used)
+            totals, slopes = self._totals(levels, log), self._slopes(ohm, levels)
+            prior = WireSlopes(slopes, centre - w, std)
+            fit = TotalFit(totals, prior, scale).fit()
+            scale = fit.scale_
+            step, of_w = fit.w
+            w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
+            w[2] = max(w[2], 0.0)
+            if np.abs(step).max() < LAST_STEP:
+                break
+        top_std, bottom_std, lead_std = of_w.tolist()
+        wires = WireOhm(*_in_ohm(w), top_std, bottom_std, lead_std * UNKNOWN_LEAD_OHM)
+        return FoundWires(wires, told, fit.presses, ())
+
+    def _levels(self, estimator: Estimator, used: Bool, progress: Progress = iter) -> _Levels:
+        """What an estimator shows of the scans that are used, (n,), but for those it doubts."""
+        pressed = self._press >= 0
+        pauses = np.flatnonzero(used & ~pressed)
+        wanted = used & pressed
+        wanted[pauses[:: pauses.size // PAUSE_SCANS + 1]] = True
+        rest = estimator.rest_level()
+        rise, good = np.zeros((used.size, rest.size)), used.copy()
+        numbers = np.flatnonzero(wanted)
+        for n, scan in zip(numbers, progress([self._scans[n] for n in numbers]), strict=True):
+            answer = estimator.estimate(scan.ratio)
+            good[n], rise[n] = answer.converged, (answer.level - rest).ravel()
+        of_nothing = rise[good & wanted & ~pressed].max(axis=1, initial=0.0)
+        least = PAUSE_TIMES * float(np.median(of_nothing)) if of_nothing.size else 0.0
+        rise[(rise < min(least, TOUCH_SIEMENS)) | ~pressed[:, None]] = 0.0
+        return _Levels(rise, rest, good)
+
+    def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
+        """What skin and scale have shown, of the scans that were used: no more rows than scans."""
+        time_s, used = self.time_s, levels.used
+        inside = (log.time_s >= time_s[0]) & (log.time_s <= time_s[-1])
+        at_s = log.time_s[inside]
+        if at_s.size > time_s.size:
+            at_s = time_s
+        shown_n = log.at(at_s)
+        scan = np.searchsorted(time_s, at_s).clip(0, time_s.size - 1)
+        known = np.isfinite(shown_n) & used[scan]
+        if not known.any():
+            raise ValueError("skin and scale were not read at the same time")
+        of_scans = time_s[used], levels.rise[used], self._press[used]
+        return Totals(*of_scans, at_s[known], shown_n[known])
+
+    @one_blas_thread
+    def _slopes(self, wires: tuple[float, float, float], levels: _Levels) -> Float:
+        """d log x / dw of the module's equations, (3, n, C), of the scans that were used."""
+        knowledge = self._calibrator.knowledge
+        top_ohm, bottom_ohm, lead_ohm = wires
+        series_ohm = knowledge.ref_ohm + 2 * lead_ohm
+        rises = levels.rise[levels.used]
+        slopes = np.zeros((3, *rises.shape))
+        for n in np.flatnonzero(rises.any(axis=1)):
+            siemens = np.maximum(rises[n] + levels.rest.ravel(), MIN_CELL_SIEMENS)
+            circuit = PortCircuit(siemens.reshape(self.shape), top_ohm, bottom_ohm)
+            weight = (circuit.port_ohm + series_ohm)[:, None] ** -2.0 / knowledge.current_std
+            pressed = rises[n] > 0
+            by_cells = weight * circuit.by_cell()[:, pressed]
+            by_leads = np.full((siemens.size, 1), 2 * UNKNOWN_LEAD_OHM)
+            by_wires = weight * np.hstack([circuit.by_layers(), by_leads])
+            system = by_cells.T @ by_cells + np.eye(by_cells.shape[1]) / UNLIMITED_STD**2
+            log_ohm = solve_positive(system, by_cells.T @ by_wires)  # of the cells: -log g
+            slopes[:, n, pressed] = log_ohm.T * (siemens / rises[n].clip(1e-12))[pressed]
+        return slopes
+
+
+def _in_ohm(w: Float) -> tuple[float, float, float]:
+    """Segments and lead of w."""
+    top_ohm, bottom_ohm = np.exp(w[:2]).tolist()
+    return top_ohm, bottom_ohm, float(w[2]) * UNKNOWN_LEAD_OHM

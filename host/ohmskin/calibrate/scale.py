@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scale shows of the force on it: later, and smoothed by its filter.
+
+Symbols
+
+====== ======= ==================================================== ====
+symbol shape   meaning                                              unit
+====== ======= ==================================================== ====
+F(t)   (n,)    force on the scale, straight between its times       N
+y      (m,)    what the scale shows                                 N
+d              delay, by its electronics and its line               s
+w              time constant of the pole, or length of the average  s
+====== ======= ==================================================== ====
+
+    pole     T dG/dt = F - G  with T = w,             y(s) = G(s - d)
+    average  G(t) = 1/w (integral of F from t - w to t),  y(s) = G(s - d)
+
+Whoever only shifts forces by a lag has them wrong wherever they change faster than w.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ohmskin.arrays import Float
+
+# Filters begin the search from all pairs of these [s]. Chosen: from a fast load cell to a kitchen
+# scale.
+DELAYS_S: Final = (0.0, 0.1, 0.2, 0.4)
+LENGTHS_S: Final = (0.02, 0.1, 0.3)
+# A scale shows a force this much earlier than the scan that it is in, at most [s]. Chosen: a scan
+# takes no longer.
+EARLIEST_S: Final = -0.1
+# Filters are computed on a grid of half a scan, or of this, the longer [s].
+LEAST_STEP_S: Final = 0.01
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One scale's filter: d, w, and whether it averages (else it has one pole)."""
+
+    delay_s: float = 0.0
+    length_s: float = 0.0
+    averages: bool = False
+
+    @property
+    def lag_s(self) -> float:
+        """By how much it is late on the whole: where its answer to an impulse has its mean."""
+        return self.delay_s + (0.5 if self.averages else 1.0) * self.length_s
+
+    def shown(self, time_s: Float, force_n: Float, at_s: Float) -> Float:
+        """y at some times (m,), of forces (n, k) at increasing times (n,): (m, k)."""
+        from scipy.signal import lfilter
+
+        step_s = max(LEAST_STEP_S, 0.5 * float(np.median(np.diff(time_s))))
+        grid_s = np.arange(time_s[0], time_s[-1] + step_s, step_s)
+        force = between(time_s, force_n, grid_s)
+        if self.length_s < 1e-3:
+            return between(grid_s, force, at_s - self.delay_s)
+        if self.averages:
+            steps = 0.5 * step_s * (force[1:] + force[:-1])
+            area = np.concatenate([np.zeros_like(force[:1]), np.cumsum(steps, axis=0)])
+            ends = (between(grid_s, area, at_s - self.delay_s - w) for w in (0.0, self.length_s))
+            return np.asarray((next(ends) - next(ends)) / self.length_s)
+        stays = np.exp(-step_s / self.length_s)
+        smooth = lfilter([0.5 * (1 - stays)] * 2, [1, -stays], force, axis=0)
+        return between(grid_s, smooth, at_s - self.delay_s)
+
+
+def between(time_s: Float, values: Float, at_s: Float) -> Float:
+    """Values (n, k) of times (n,), interpolated at others (m,): (m, k). At both ends they stay."""
+    after = np.searchsorted(time_s, at_s).clip(1, time_s.size - 1)
+    before = after - 1
+    share = ((at_s - time_s[before]) / (time_s[after] - time_s[before])).clip(0.0, 1.0)
+    return np.asarray(values[before] + share[:, None] * (values[after] - values[before]))
+
+
+def fit_scale(
+    time_s: Float, force_n: Float, shown_s: Float, shown_n: Float, weight: Float
+) -> Scale:
+    """The filter that makes `shown_n` (m,) of forces (n,), but for a factor and a zero.
+
+    weight: of each that is shown, (m,).
+    """
+    from scipy.optimize import minimize
+
+    forces = force_n[:, None]
+
+    def misfit(delay_s: float, length_s: float, averages: bool) -> float:
+        if delay_s < EARLIEST_S or length_s < 0:
+            return np.inf
+        shown = Scale(delay_s, length_s, averages).shown(time_s, forces, shown_s)[:, 0]
+        terms = np.column_stack([shown, np.ones_like(shown)])
+        weighted = terms * weight[:, None]
+        normal = weighted.T @ terms + 1e-12 * np.eye(2)
+        off = shown_n - terms @ np.linalg.solve(normal, weighted.T @ shown_n)
+        return float(weight @ off**2)
+
+    found = []
+    for averages in (False, True):
+        pairs = [(delay_s, length_s) for delay_s in DELAYS_S for length_s in LENGTHS_S]
+        delay_s, length_s = min(pairs, key=lambda pair: misfit(pair[0], pair[1], averages))
+        corners = [(delay_s, length_s), (delay_s + 0.03, length_s), (delay_s, 1.5 * length_s)]
+        options = {"initial_simplex": corners, "xatol": 1e-3, "fatol": 1e-9, "maxfev": 50}
+        best = minimize(
+            lambda pair, averages=averages: misfit(pair[0], pair[1], averages),
+            corners[0],
+            method="Nelder-Mead",
+            options=options,
+        )
+        found.append((best.fun, Scale(float(best.x[0]), float(best.x[1]), averages)))
+    return min(found, key=lambda one: one[0])[1]

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``calibrate recording --total``: curves of all cells from the force on the whole skin."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from command_line import Run, assert_one_line, well
+from kneaded_skin import KneadedSkin
+from ohmskin.arrays import Float
+from ohmskin.calibrate.scale import Scale, fit_scale
+from ohmskin.calibrate.totals import TotalFit, Totals
+from ohmskin.force.calibration import load_calibration
+from pressed_skin import Plan
+
+STEP_S = 0.02
+
+
+def presses(seed: int, count: int = 150, cells: int = 12) -> tuple[Float, Float, Float]:
+    """Times (n,), which press each scan is of (n,), shares of each cell in the forces (n, cells).
+
+    Presses last 0.4 s, every 0.6 s, on three cells each; none is on the last cell.
+    """
+    random = np.random.default_rng(seed)
+    time_s = np.arange(0.0, 0.6 * count, STEP_S)
+    number, phase = np.divmod(time_s, 0.6)
+    press = np.where(phase < 0.4, number, -1).astype(np.intp)
+    force_n = np.zeros((time_s.size, cells))
+    for n in range(count):
+        peaks_n = np.zeros(cells)
+        peaks_n[random.choice(cells - 1, 3, replace=False)] = random.uniform(0.3, 4.0, 3)
+        force_n[press == n] = np.outer(np.sin(np.pi * phase[press == n] / 0.4), peaks_n)
+    return time_s, press, force_n
+
+
+def rises(force_n: Float, gains: Float, exponent: float = 0.7) -> Float:
+    """Rises of cells whose force is 3 gain (x / 1e-4)^exponent."""
+    return np.asarray(1e-4 * (force_n / (3.0 * gains)) ** (1 / exponent))
+
+
+def test_a_pole_is_that_of_its_differential_equation() -> None:
+    time_s = np.arange(0.0, 3.0, STEP_S)
+    force_n = np.interp(time_s, [0.2, 0.5, 1.0, 1.2], [0.0, 4.0, 4.0, 0.0])
+
+    def slope(now_s: float, shown: Float) -> Float:
+        return np.asarray((np.interp(now_s, time_s, force_n) - shown) / 0.15)
+
+    exact = solve_ivp(slope, (0, 3), [0.0], t_eval=time_s, max_step=0.01, rtol=1e-6).y[0]
+    shown = Scale(0.1, 0.15).shown(time_s, force_n[:, None], time_s + 0.1)[:, 0]
+    assert shown == pytest.approx(exact, abs=0.01)
+
+
+def test_an_average_is_the_mean_of_its_window() -> None:
+    time_s = np.arange(0.0, 3.0, STEP_S)
+    force_n = np.sin(5 * time_s) ** 2
+    shown = Scale(0.2, 0.4, averages=True).shown(time_s, force_n[:, None], np.array([1.6, 2.2]))
+    for got, end_s in zip(shown[:, 0], (1.4, 2.0), strict=True):
+        window = np.linspace(end_s - 0.4, end_s, 1001)
+        assert got == pytest.approx(np.mean(np.interp(window, time_s, force_n)), abs=2e-3)
+
+
+@pytest.mark.parametrize("scale", [Scale(0.2, 0.1), Scale(0.05, 0.3, averages=True)])
+def test_the_filter_of_a_scale_is_found(scale: Scale) -> None:
+    time_s, _, force_n = presses(1, 60)
+    total_n = force_n.sum(axis=1)
+    at_s = np.arange(1.0, time_s[-1], 0.1)
+    shown_n = 1.3 * scale.shown(time_s, total_n[:, None], at_s)[:, 0] - 0.7
+    found = fit_scale(time_s, total_n, at_s, shown_n, np.ones_like(at_s))
+    assert found.lag_s == pytest.approx(scale.lag_s, abs=0.01)
+    assert found.length_s == pytest.approx(scale.length_s, abs=0.04)
+
+
+@pytest.fixture(scope="module")
+def fit() -> tuple[TotalFit, Float, list[int]]:
+    """Of a slow scale with a zero; every twelfth press is beside the skin, too."""
+    time_s, press, force_n = presses(2)
+    random = np.random.default_rng(3)
+    gains = np.exp(0.2 * random.standard_normal(force_n.shape[1]))
+    beside = list(range(5, 150, 12))
+    total_n = force_n.sum(axis=1)
+    total_n = total_n + np.where(np.isin(press, beside), 0.6 * total_n + 1.0 * (total_n > 0.1), 0.0)
+    at_s = np.arange(0.5, time_s[-1], 0.1)
+    shown_n = Scale(0.1, 0.1).shown(time_s, total_n[:, None], at_s)[:, 0] + 0.8
+    shown_n += 0.02 * random.standard_normal(at_s.size)
+    totals = Totals(time_s, rises(force_n, gains), press, at_s, shown_n)
+    return TotalFit(totals).fit(), gains, beside
+
+
+def test_curves_are_found_from_sums(fit: tuple[TotalFit, Float, list[int]]) -> None:
+    found, gains, _ = fit
+    model = found.model((3, 4))
+    for force_n in (1.0, 3.0):
+        rise = rises(np.full(12, force_n), gains).reshape(3, 4)
+        read_n = model.predict(rise, np.zeros_like(rise))[0]
+        assert read_n.ravel()[:-1] == pytest.approx(force_n, rel=0.1)
+
+
+def test_a_cell_that_nobody_pressed_says_so(fit: tuple[TotalFit, Float, list[int]]) -> None:
+    found, gains, _ = fit
+    stds = found.gain_std()
+    assert stds[:-1].max() < 0.5 * stds[-1]
+    assert stds[-1] == pytest.approx(np.std(np.log(gains)), rel=0.3)
+    model = found.model((3, 4))
+    assert model.pooled.ravel().tolist() == [False] * 11 + [True]
+    rise = rises(np.full(12, 2.0), gains).reshape(3, 4)
+    force_n, std_n = model.predict(rise, np.zeros_like(rise))
+    assert abs(force_n[-1, -1] - 2.0) < 4 * std_n[-1, -1]
+
+
+def test_presses_beside_the_skin_are_left_out(fit: tuple[TotalFit, Float, list[int]]) -> None:
+    found, _, beside = fit
+    middles_s = [0.6 * n + 0.2 for n in beside]
+    spans = found.left_out
+    assert all(any(begin <= at_s <= end for begin, end in spans) for at_s in middles_s)
+    others = [n for n in range(150) if n not in beside]
+    wrong = [n for n in others if any(b <= 0.6 * n + 0.2 <= e for b, e in spans)]
+    assert len(wrong) <= 1
+
+
+def test_a_skin_that_was_kneaded_reads_forces(run: Run, tmp_path: Path) -> None:
+    skin = KneadedSkin(Plan((100.0, 200.0), "series", 1, shape=(4, 4), touches=40), scans=2500)
+    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
+    skin.record_kneading(recording)
+    done = well(run("calibrate", "recording", str(recording), str(out), "--total", "--json"))
+    said = json.loads(done.out)
+    assert said["left_out"] == []
+    assert abs(said["lag_s"]) < 0.03
+    calibration = load_calibration(out)
+    assert calibration.indenter_area_m2 is None  # so there is no pressure
+    assert calibration.nominal_wire_ohm.top_log_std is not None
+    forces = skin.read(out)
+    assert forces.rmse_n() < 0.6
+    assert forces.within_percent() > 97
+
+
+def test_total_and_an_indenter_exclude_each_other(run: Run, tmp_path: Path) -> None:
+    both = ("--total", "--indenter-mm2", "80")
+    paths = str(tmp_path / "a.mcap"), str(tmp_path / "b.json")
+    for options in ((), both):
+        done = run("calibrate", "recording", *paths, *options)
+        assert_one_line(done)
