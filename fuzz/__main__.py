@@ -16,6 +16,8 @@ from pathlib import Path
 CORPUS = Path(__file__).parent / "corpus"
 FOUND = Path("build/fuzz")
 MOST_MB = 500
+# What is guided: ours, and what reads what strangers say to the page.
+GUIDED = ["ohmskin", "h11", "uvicorn.protocols", "wsproto"]
 # Not guided by these: what atheris 3.0 puts into code loses some 40 bytes whenever an array is
 # compared, and each emulated board compares several: 36 MB in a million inputs of `urls`.
 ARITHMETIC = ["ohmskin.circuit.skin"]
@@ -28,7 +30,7 @@ def fuzz(target: str, seconds: int) -> None:
     """Fuzz in this process, which libFuzzer ends."""
     import atheris
 
-    with atheris.instrument_imports(include=["ohmskin"], exclude=ARITHMETIC):
+    with atheris.instrument_imports(include=GUIDED, exclude=ARITHMETIC):
         from fuzz.targets import TARGETS, seeds
 
         given = seeds()[target]  # it imports what the package imports late

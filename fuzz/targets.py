@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
@@ -22,16 +23,22 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from calibrations import calibration
+from fuzz.page import Strangers
 from ohmskin.calibrate.tables import load_force_log, load_press_table
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.driver import SteppedLink, SteppedSkin
+from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.urls import emulated
-from ohmskin.errors import PortError, RecordingError
+from ohmskin.errors import OhmskinError, PortError, RecordingError
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.force.calibration import load_calibration
+from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.reader import CalibratedSkin
 from ohmskin.link import framing, protocol
 from ohmskin.link.clock import BoardClock, line_delay_s, scan_s, scan_times_s
 from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.link.serial_port import READ_TIMEOUT_S
 from ohmskin.record.export import export
 from ohmskin.record.force_sensor import ForceLineDecoder
 from ohmskin.record.readings import load_readings
@@ -77,6 +84,15 @@ def _stretches(octets: bytes) -> Iterator[bytes]:
         yield content
 
 
+def _cut(octets: bytes) -> Iterator[bytes]:
+    """The same, each with its kind before it, and none framed."""
+    at = 0
+    while at + 3 <= len(octets):
+        kind, size = struct.unpack_from("<BH", octets, at)
+        yield bytes([kind]) + octets[at + 3 : at + 3 + size]
+        at += 3 + size
+
+
 def _stretch(kind: int, content: bytes) -> bytes:
     return struct.pack("<BH", kind, len(content)) + content
 
@@ -103,6 +119,74 @@ def frames(octets: bytes) -> None:
                     except ValueError as error:
                         one_line(error)
                         assert board.mode != "near"  # the only one that `ohm` takes
+
+
+class _Line(SteppedLink):
+    """A line behind which boards change. `more` comes after what the board sends."""
+
+    more = b""
+
+    def read(self, limit_s: float = READ_TIMEOUT_S) -> bytes:
+        octets, self.more = super().read(limit_s) + self.more, b""
+        return octets
+
+
+# Those that come: the one that was calibrated, another unit, and the same set otherwise.
+_BOARDS = (
+    BoardSettings(2, 3),
+    BoardSettings(2, 3, unit_id=1),
+    BoardSettings(3, 2),
+    BoardSettings(2, 3, mode="far"),
+    BoardSettings(2, 3, rate_hz=20.0),
+)
+
+
+@lru_cache
+def _scene(number: int) -> Scene:
+    return Scene("rest", _BOARDS[number].rows, _BOARDS[number].columns)
+
+
+def _board(number: int) -> EmulatedBoard:
+    return EmulatedBoard(_scene(number).ratio, _BOARDS[number])
+
+
+@lru_cache
+def _calibration() -> Calibration:
+    """Of the first board."""
+    return calibration(_scene(0).rest_ratio, "ohm")
+
+
+def boards(octets: bytes) -> None:
+    """Boards that change behind one line, and what they send besides, before a calibrated skin.
+
+    A stretch of a kind below their number brings that board, any other comes as it is.
+    """
+    line = _Line(_board(0))
+    try:
+        with CalibratedSkin(SteppedSkin(line), _calibration()) as skin:
+            for stretch in [b"", *_cut(octets)]:
+                if stretch[:1] and stretch[0] < len(_BOARDS):
+                    line.board = _board(stretch[0])
+                else:
+                    line.more = stretch[1:]
+                for _ in range(3):
+                    found = skin.latest()
+                    assert found.force_n.shape == (2, 3)
+                    told = skin.info
+                    of = (told.unit_id, told.rows, told.columns, told.mode)
+                    assert of == (0, 2, 3, "near"), f"forces of another board: {of}"
+    except (OhmskinError, ValueError) as error:
+        one_line(error)
+
+
+def strangers(octets: bytes) -> None:
+    """What those say to the page who have not its token."""
+    server().meet([(each[0], each[1:]) for each in _cut(octets)])
+
+
+@lru_cache
+def server() -> Strangers:
+    return Strangers()
 
 
 def forces(octets: bytes) -> None:
@@ -198,7 +282,10 @@ def urls(octets: bytes) -> None:
 
 TARGETS: dict[str, Target] = {
     each.__name__: each
-    for each in (frames, forces, recordings, readings, calibrations, tables, urls)
+    for each in (
+        *(frames, boards, strangers, forces),
+        *(recordings, readings, calibrations, tables, urls),
+    )
 }
 
 
@@ -239,8 +326,25 @@ def seeds() -> dict[str, Sequence[bytes]]:
     recorded, out = (_FOLDER / f"input{suffix}" for suffix in (".mcap", ".npz"))
     presses = "row,column,force_n,conductance\n" + "0,1,1.5,2e-5\n" * 3
     log = "time_s,force_n\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(12))
+    host, key = b"Host: 127.0.0.1\r\n", b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    upgrade = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    asks = (
+        *(b"GET / HTTP/1.1\r\n" + host + b"\r\n", b"GET /draw.js HTTP/1.1\r\n" + host + b"\r\n"),
+        b"POST /boards?token=x HTTP/1.1\r\n" + host + b"Content-Length: 9\r\n\r\nx",
+        b"GET /boards/0 HTTP/1.1\r\n" + host + upgrade + key + b"\r\n",
+        *(b"GET", b"\x16\x03\x01\r\n\r\n", b""),
+    )
+    again = framing.encode(sent[0].type, 9, sent[0].payload)
     return {
         "frames": [stream, _stretch(255, board.advance(0.2))],
+        "boards": [
+            _stretch(8, b"\0") + _stretch(255, again),
+            *(_stretch(kind, b"") + _stretch(9, b"\0") for kind in range(len(_BOARDS))),
+        ],
+        "strangers": [
+            b"".join(_stretch(kind, said) for kind, said in enumerate(asks)),
+            *(_stretch(0, said) + _stretch(24, b"") + _stretch(16, b"") for said in asks),
+        ],
         "forces": [b"1.5\r\n-2 N\n\n3e-1N\nabc\n", b"2\nt,Fz\n1,2 g\n", b"0\nST,GS,+  1 kg\n9,5\n"],
         "recordings": [
             *(bytes([how]) + lines for how in range(len(_PACKED))),

@@ -17,7 +17,7 @@ from fuzz.targets import TARGETS, seeds
 from places import ROOT
 
 # Mutations of each target: about a second.
-COUNTS = {"frames": 800, "recordings": 500, "readings": 500, "urls": 500}
+COUNTS = {"frames": 800, "boards": 100, "recordings": 500, "readings": 500, "urls": 500}
 SEEDS = seeds()
 
 
