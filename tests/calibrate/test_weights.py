@@ -70,6 +70,7 @@ def weigh(monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path) -> Run:
         skin = ScriptedSkin(lambda time_s: on_skin(script, time_s), 10.0, happens)
 
         def rest_measured(seconds: float) -> Float:
+            assert skin.only_unit == skin.info.unit_id
             ratio = ScriptedSkin.mean_ratio(skin, seconds)
             skin.begin()
             return ratio

@@ -15,13 +15,14 @@ from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.circuit import examine_circuit
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Place, Severity, merged
-from ohmskin.doctor.gather import gather
+from ohmskin.doctor.gather import Step, gather
 from ohmskin.doctor.signal import Look, Rest, examine_signal, find_hum, second_look
+from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
-from stepped import evidence, stepped
+from stepped import evidence, stepped, stepped_link
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
 
@@ -389,3 +390,16 @@ def test_places_are_named() -> None:
     assert named(Place(rows=(1,), columns=(2, 3))) == "row 1, columns 2, 3"
     assert named(Place(cells=cells)).endswith("(0, 4), (0, 5) and 3 more")
     assert named(Place()) == "whole skin"
+
+
+def test_findings_are_of_one_unit() -> None:
+    """Another one that comes meanwhile, behind an adapter, is said, and its scans do not count."""
+    link = stepped_link("emulator://4x4?unit=3")
+
+    def report(step: Step, _: object) -> None:
+        if step is Step.SKIN:
+            link.board = stepped_link("emulator://4x4?unit=8").board
+
+    found = gather(SteppedSkin(link), report)
+    assert "unit 8 has come in place of unit 3" in found.lost
+    assert "lost" in {finding.kind.id for finding in examine(found).findings}

@@ -86,6 +86,7 @@ def weights(
     forces_n = [mass_g * NEWTONS["g"] for mass_g in grams_of(grams)]
     kept = _KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
+        skin.only_unit = skin.info.unit_id  # no other may come while nobody looks
         shape = skin.info.rows, skin.info.columns
         only, again = _cells(cells, shape), _cells(" ".join(redo or ()), shape)
         wanted = [

@@ -66,6 +66,7 @@ def gather(
     :raises ValueError: somebody would be asked to press a skin of one row or column.
     """
     board, path = device.info, device.name.partition("?")[0]
+    device.only_unit = board.unit_id  # findings are of one board
     evidence = Evidence(board)
     # Wires without resistance cannot have changed: there is nothing to compare with.
     is_nominal = told.both is not None and all(told.both)
