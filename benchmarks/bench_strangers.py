@@ -9,6 +9,7 @@ descriptors. A page looks at it and records. Then strangers connect, keep their 
 nothing, begin a request, send a request and no body, send what is no request, or ask for a file.
 
 strangers              how many.
+flood_ratio            the same while FLOOD_HZ others a second connect and say that; 500 stay.
 left_open              connections of theirs that are open 10 s after the first.
 new_page_s             until another page with the token has its first scan, meanwhile.
 scans_ratio            scans/s of the page that looks, among strangers, over those before.
@@ -26,12 +27,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 from wsproto import ConnectionType, WSConnection
-from wsproto.events import AcceptConnection, BytesMessage, Request, TextMessage
+from wsproto.events import AcceptConnection, BytesMessage, Ping, Request, TextMessage
 
 from bars import Part, at_least, at_most, run  # beside this file
 from ohmskin.record.recording import load_recording
@@ -40,6 +42,7 @@ STRANGERS = 2000
 DESCRIPTORS = 1024
 SECONDS = 5.0  # scans are counted for so long, before and after. Chosen.
 CLOSED_AFTER_S = 10.0
+FLOOD_HZ = 2000
 SAID = (
     b"",
     b"GET / HTTP/1.1\r\n",
@@ -70,7 +73,11 @@ class Page:
         while count < most and time.monotonic() < end_s:
             self._line.receive_data(self._socket.recv(65536))
             for event in self._line.events():
-                assert isinstance(event, AcceptConnection | TextMessage | BytesMessage), event
+                assert isinstance(event, AcceptConnection | TextMessage | BytesMessage | Ping), (
+                    event
+                )
+                if isinstance(event, Ping):
+                    self._socket.sendall(self._line.send(event.response()))
                 if isinstance(event, BytesMessage):
                     self._scan += event.data
                     if event.message_finished:
@@ -105,6 +112,19 @@ def connect(port: int, said: bytes) -> socket.socket:
     with suppress(OSError):  # it is cut off already
         connection.sendall(said)
     return connection
+
+
+def flood(port: int, seconds: float) -> None:
+    """Strangers who come and go. The last line says how many."""
+    begin_s, count, there = time.monotonic(), 0, deque[socket.socket](maxlen=500)
+    while (passed_s := time.monotonic() - begin_s) < seconds:
+        if count > FLOOD_HZ * passed_s:
+            time.sleep(0.001)
+            continue
+        with suppress(OSError):
+            there.append(connect(port, SAID[count % len(SAID)]))
+        count += 1
+    print(round(count / seconds))
 
 
 def measure(part: Part) -> dict[str, Any]:
@@ -145,6 +165,13 @@ def measure(part: Part) -> dict[str, Any]:
         among = page.scans(seconds) / seconds
         page.scans(max(0.0, begin_s + CLOSED_AFTER_S - time.monotonic()))
         left_open = sum(map(is_open, strangers))
+        for each in strangers:
+            each.close()
+        flooding = [sys.executable, __file__, "flood", str(port), str(seconds + 1)]
+        with subprocess.Popen(flooding, stdout=subprocess.PIPE, text=True) as others:
+            page.scans(1.0)
+            in_flood = page.scans(seconds) / seconds
+            flood_hz = int(others.communicate()[0])
         page.say(do="stop")
         page.scans(1.0)
         recording = load_recording(next(folder.glob("*.mcap")))
@@ -153,6 +180,8 @@ def measure(part: Part) -> dict[str, Any]:
             "left_open": left_open,
             "new_page_s": round(new_page_s, 2),
             "scans_ratio": round(among / before, 2),
+            "flood_hz": flood_hz,
+            "flood_ratio": round(in_flood / before, 2),
             "missed": sum(scan.missed for scan in recording.scans[1:]),
             "stderr_bytes": (folder / "stderr").stat().st_size,
         }
@@ -162,10 +191,14 @@ BARS = (
     at_most("left_open", 0),
     at_most("new_page_s", 5),
     at_least("scans_ratio", 0.8),
+    at_least("flood_ratio", 0.8),
     at_most("missed", 0),
     at_most("stderr_bytes", 1000),
 )
 
 
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["flood"]:
+        flood(int(sys.argv[2]), float(sys.argv[3]))
+        sys.exit()
     sys.exit(run(__doc__, measure, BARS))
