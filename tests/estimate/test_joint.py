@@ -28,7 +28,7 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.wire_belief import LearnedWires
 from skins import reference, ten_bits, told
-from studies.trials import skin_at_rest, touch
+from studies.trials import random_trial, skin_at_rest, touch
 
 
 def estimates(name: str, bits: int | None) -> list[tuple[Estimate, dict[str, Float]]]:
@@ -182,3 +182,15 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
             moved = best.copy()
             moved[resistor] += step * (500.0 if resistor >= 36 else 1.0)
             assert cost(moved) > lowest - 0.05
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_an_estimate_says_how_its_wires_are_known(method: str) -> None:
+    """They are assumed until frames of several touches have taught them."""
+    given = random_trial(8, 8, 8, 40, seed=5).rounded(10, wires_told=False)
+    estimator = make_estimator(method, given.knowledge(0))
+    said = [estimator.estimate(ratio).wires for ratio in given.ratio]
+    assert (said[0], said[-1]) == ("assumed", "learned")
+    told = replace(given.knowledge(0), nominal_wire_ohm=WireOhm(100.0, 200.0))
+    assert make_estimator(method, told).estimate(given.ratio[0]).wires == "known"
+    assert make_estimator("matrix", told).estimate(given.ratio[0]).wires == ""

@@ -289,6 +289,19 @@ def test_wires_that_touch_reports_are_those_that_it_has_learned() -> None:
     assert few > 3
 
 
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_wires_far_from_what_is_expected_are_learned(method: str) -> None:
+    """Cells at rest that were fitted with 150 ohm pulled wires of 1 kOhm to 300."""
+    for seed in range(3):
+        trial = random_trial(8, 8, 6, 20, seed=seed, wire_ohm=(1000.0, 1000.0))
+        knowledge = trial.rounded(10).knowledge(0)
+        untold = replace(knowledge, nominal_wire_ohm=WireOhm(lead=0.0))
+        estimator = make_estimator(method, untold)
+        for ratio in trial.rounded(10).ratio:
+            estimator.estimate(ratio)
+        assert estimator.wires().both == pytest.approx((1000.0, 1000.0), rel=0.2)
+
+
 def test_the_belief_of_wires_is_of_two_kalman_filters() -> None:
     """Against the textbook's covariance form and likelihood: two lessons, each after a fade."""
     random = np.random.default_rng(8)
@@ -307,8 +320,7 @@ def test_the_belief_of_wires_is_of_two_kalman_filters() -> None:
         belief.take(Lesson(belief.per_mean_std(by_mean), at_mean, factor))
         for which, fade in enumerate((STEADY_FADE, AGILE_FADE)):
             residual = at_mean - by_mean @ (means[which] - mean)
-            widest = prior.copy()
-            widest[2, 2] = covariances[which][2, 2]
+            widest = np.diag(np.maximum(np.diag(covariances[which]), [LAYER_STD**2] * 2 + [0.0]))
             faded = (1 - fade) * covariances[which] + fade * widest
             expected = by_mean @ faded @ by_mean.T + noise
             likelihood = scipy.stats.multivariate_normal(np.zeros(4), expected).logpdf(residual)

@@ -22,7 +22,7 @@ SIEMENS = ("cell_siemens", "cell_siemens_std")
 OUT_SHAPES = {
     **dict.fromkeys(("cell_ohm", *SIEMENS, "touched", "top_wire_ohm", "bottom_wire_ohm"), 3),
     **dict.fromkeys(("top_wire_ohm_std", "bottom_wire_ohm_std"), 3),
-    **dict.fromkeys(("converged", "message", "chi2", "iterations", "seconds"), 1),
+    **dict.fromkeys(("converged", "message", "wires", "chi2", "iterations", "seconds"), 1),
 }
 
 

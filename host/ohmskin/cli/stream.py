@@ -23,6 +23,7 @@ from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, shades
 from ohmskin.cli.board import Port, Scans, Seconds, asked_for
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
+from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.contacts import ContactTracker
@@ -105,6 +106,7 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
             line["cell_siemens_std"] = numbers(shown.estimate.cell_siemens_std)
             line["converged"] = shown.estimate.converged
             line["message"] = shown.estimate.message
+            line["wires"] = shown.estimate.wires
             if reader.has_forces:
                 line["force_n"] = numbers(shown.force_n)
                 line["force_n_std"] = numbers(shown.force_n_std)
@@ -155,6 +157,8 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     shown = reader.read(scan)
     if not shown.estimate.converged:
         caption += f"  not converged: {shown.estimate.message}"
+    if shown.estimate.wires == ASSUMED:
+        caption += f"\n{ASSUMED_WIRES}"
     if reader.has_forces:
         title = f"{skin.name}: force by '{reader.method}' [N], ?: uncertain"
         least_n = np.where(shown.estimate.touched, 0.0, KNOWN_N)

@@ -26,6 +26,11 @@ TOUCH_SIEMENS: Final = 0.5e-6
 # The conductance of a touched cell has also risen by more than so many standard deviations. Chosen:
 # by chance, one normal error of 32,000 is larger.
 TOUCH_STDS: Final = 4.0
+# What `Estimate.wires` says of wires that nobody told, and what people read of that.
+ASSUMED: Final = "assumed"
+ASSUMED_WIRES: Final = (
+    "wires not known: forces and hard touches may be larger; calibrate, or press corners"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +53,8 @@ class Estimate:
     iterations: steps of the method, 1 where it has none.
     converged: whether the method converged and the readings can be trusted: message is empty.
     message: why not, in words.
+    wires: "known", they are told or measured; "learned", by frames of several touches; "assumed",
+        usual ones (`ASSUMED_WIRES`); empty where the method takes none into account.
     seconds: wall time of this frame [s].
     """
 
@@ -64,6 +71,7 @@ class Estimate:
     iterations: int
     converged: bool
     message: str
+    wires: str
     seconds: float
 
     def __repr__(self) -> str:
@@ -138,6 +146,10 @@ class Estimator(ABC):
         """What is known of the wires: what was told, and what a method has learned since."""
         return self.knowledge.nominal_wire_ohm
 
+    def wires_are(self) -> str:
+        """`Estimate.wires` of the last frame."""
+        return ""
+
     def reset(self) -> None:
         """Forget the previous frame: the next one starts afresh. What is known of rest stays."""
         self._reader.reset()
@@ -205,6 +217,7 @@ class Estimator(ABC):
             iterations=solution.iterations,
             converged=not message,
             message=message,
+            wires=self.wires_are(),
             seconds=time.perf_counter() - started,
         )
 

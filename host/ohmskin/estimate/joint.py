@@ -23,7 +23,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import Estimator, Solution
+from ohmskin.estimate.base import ASSUMED, Estimator, Solution
 from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge, WireOhm
@@ -45,7 +45,7 @@ from ohmskin.estimate.prior import (
     siemens_std,
 )
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
-from ohmskin.estimate.wire_belief import MOST_FITS, LearnedWires, WireBelief
+from ohmskin.estimate.wire_belief import FAR_LOG, MOST_FITS, LearnedWires, WireBelief
 
 # Both numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
 # table "What each number earns" of docs/estimate.md says what came of it.
@@ -81,6 +81,12 @@ class JointEstimator(Estimator):
         """As told, until a frame has taught more."""
         learned = self._belief.learned()
         return super().wires() if learned is None else learned
+
+    def wires_are(self) -> str:
+        """By what was told, and by how well the belief knows both layers since."""
+        if self.knowledge.nominal_wire_ohm.both is not None or all(self._belief.far):
+            return "known"
+        return "learned" if self._belief.stds().layer_std < LAYER_STD else ASSUMED
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
@@ -207,7 +213,8 @@ class JointEstimator(Estimator):
         if rest_ratio is None:
             prior = self._prior_by_level(ports)
         elif before is None:
-            prior = self._prior_by_rest(self._reader.read(rest_ratio))
+            self._rest_ports = self._reader.read(rest_ratio)
+            prior = self._prior_by_rest(self._rest_ports)
         else:
             prior = self._prior_followed(before)
         if prior is not before:
@@ -227,6 +234,10 @@ class JointEstimator(Estimator):
         be larger before it matters.
         """
         means = self._belief.means
+        # Cells at rest follow the layers by slopes, which hold for small moves only. (Readings at
+        # far ends hardly have these wires in them.)
+        if not any(self._belief.far) and np.abs(means - self._rest_means)[:2].max() > FAR_LOG:
+            return self._prior_by_rest(self._rest_ports)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
         if (np.abs(means - prior.means) > [least_log, least_log, LEAST_LEAD_OHM]).any():
             return prior.about(means)
@@ -263,7 +274,7 @@ class JointEstimator(Estimator):
             alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
             fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)
             log_cells = fit.log_cells
-        means = self._belief.means
+        self._rest_means = means = self._belief.means
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
         # Where wires hide even cells at rest, these follow them too far for slopes to say how.
@@ -280,7 +291,10 @@ class TouchEstimator(JointEstimator):
 
     def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer of these few touches; None if they leave something open, or one uncertain."""
-        touched = None if self.knowledge.rest_ratio is None else touches.explain()
+        # Where wires are assumed, the fit of all resistances learns them sooner.
+        if self.knowledge.rest_ratio is None or self.wires_are() == ASSUMED:
+            return None
+        touched = touches.explain()
         if touched is None:
             return None
         if touched.log_cells_std[touched.cells].max(initial=0.0) > CLEAR_LOG:

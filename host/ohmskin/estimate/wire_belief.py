@@ -52,10 +52,10 @@ A touch alone reveals nothing, as its own resistance is in the same reading: N h
 cells as noise without limit. What single wires have of their own is not learned: frames of near
 ends say too little of it.
 
-A skin bends, so before a lesson V grows back towards V0 by a share f, but for the lead. Most skins
-are still, and are known best where little fades; some have just been bent. So there are two
-filters, steady and agile, each with its own f, m and V. How well a filter has expected a lesson is
-its log likelihood, less what is the same for both. With g_0 = L J^T N^-1 z at the mean that the
+A skin bends, so before a lesson V grows by a share f towards that of told layers; leads stay.
+Most skins are still, and are known best where little fades; some have just been bent. So there are
+two filters, steady and agile, each with its own f, m and V. How well a filter has expected a lesson
+is its log likelihood, less what is the same for both. With g_0 = L J^T N^-1 z at the mean that the
 fit had, n = m - that mean, V before and V' after the lesson, and g = g_0 - A n,
 
     score = n . g_0 - n . A n / 2 + (g . V' g - log det(1 + V A)) / 2 .
@@ -442,8 +442,9 @@ class LearnedWires(WireBelief):
 
     def _stepped(self, before: _Filter, fade: float, information: Float, pull: Float) -> _Filter:
         """One filter after a lesson. information: A, (3, 3). pull: g_0 at `self.means`, (3,)."""
-        widest = self._prior_covariance.copy()
-        widest[2, 2] = before.covariance[2, 2]  # a bend does not change leads
+        # A bend changes no leads, and layers by no more than told ones may be off.
+        bent = np.minimum(np.diagonal(self._prior_covariance), [LAYER_STD**2, LAYER_STD**2, 0.0])
+        widest = np.diag(np.maximum(np.diagonal(before.covariance), bent))
         faded = before.covariance + fade * (widest - before.covariance)
         covariance = np.asarray(np.linalg.inv(np.linalg.inv(faded) + information), np.float64)
         off = before.means - self.means

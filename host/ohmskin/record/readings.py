@@ -28,6 +28,7 @@ top_wire_ohm, top_wire_ohm_std                F, R, C each segment of the rows' 
 bottom_wire_ohm, bottom_wire_ohm_std          F, R, C each segment of the columns' wires
 converged                                     F       whether the method came to an end
 message                                       F, text why it did not, or what is wrong with readings
+wires                                         F, text how they are known: as in `Estimate`
 chi2                                          F       misfit per reading
 iterations, seconds                           F       how long it took
 ============================================= ======= ============================================
@@ -79,7 +80,8 @@ _RATIOS: Final = ("ratio", "rest_ratio")
 # The arrays that go out, in this order.
 _OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
 _OF_WIRES: Final = ("top_wire_ohm", "bottom_wire_ohm", "top_wire_ohm_std", "bottom_wire_ohm_std")
-_OF_FRAMES: Final = ("converged", "message", "chi2", "iterations", "seconds")
+_OF_FRAMES: Final = ("converged", "message", "wires", "chi2", "iterations", "seconds")
+_TEXTS: Final = ("message", "wires")
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +251,11 @@ def estimate_file(
         for name in (*_OF_CELLS, *_OF_WIRES, *_OF_FRAMES):
             value = getattr(estimate, name)
             if not frame:
-                like = np.asarray(value, dtype=object if name == "message" else None)
+                like = np.asarray(value, dtype=object if name in _TEXTS else None)
                 out[name] = np.empty((len(readings.ratio), *like.shape), like.dtype)
             out[name][frame] = value
-    out["message"] = out["message"].astype(str)
+    for name in _TEXTS:
+        out[name] = out[name].astype(str)
     return out
 
 

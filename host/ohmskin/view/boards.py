@@ -24,7 +24,7 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import as_near
 from ohmskin.emulate.urls import is_stepped
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
-from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES, Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, kind_of, make_estimator
 from ohmskin.files import Closing
@@ -103,6 +103,7 @@ def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any
         "chi2": _number(estimate.chi2),
         "estimate_s": estimate.seconds,
         "text": estimate.message,
+        "wires": ASSUMED_WIRES if estimate.wires == ASSUMED else "",
         "contacts": [list(map(_number, _numbers_of(contact))) for contact in scan.contacts],
     }
     header = json.dumps(content, allow_nan=False).encode()

@@ -409,7 +409,8 @@ export class Panel {
   health(scan) {
     const missed = scan.missed ? `${scan.missed} scans missed` : "nothing missed";
     const late = this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–";
-    return `${scan.rate_hz.toFixed(0)} Hz, ${missed}, ${late}`;
+    const line = `${scan.rate_hz.toFixed(0)} Hz, ${missed}, ${late}`;
+    return scan.wires ? `${line} · ${scan.wires}` : line;
   }
 
   write(scan, nowMs) {
