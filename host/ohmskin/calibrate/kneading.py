@@ -12,7 +12,7 @@ symbol shape   meaning                                                          
 ====== ======= ========================================================================= =======
 x      (n, C)  rise of each cell above rest, by an estimator that is told the wires      S
 g      (n, C)  conductance of each cell                                                  S
-w      (3,)    logs of a top and of a bottom segment; a lead over `UNKNOWN_LEAD_OHM`     1
+w      (2,)    logs of a top and of a bottom segment                                     1
 A, B           slopes of the ports' currents, over their noise, by log g of the pressed
                cells, and by w
 ====== ======= ========================================================================= =======
@@ -23,7 +23,8 @@ dw, the pressed cells follow by
     d log g = -(A^T A + 1 / 3^2)^-1 A^T B dw ,    d log x = (g / x) d log g .
 
 `TotalFit` takes these slopes and finds dw together with curve and gains. That is repeated with the
-wires found, until they hardly change.
+wires found, until they hardly change. The estimator learns the leads meanwhile, by frames of
+several touches: in totals, a lead looks as hysteresis does.
 """
 
 from dataclasses import replace
@@ -42,7 +43,7 @@ from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import UNKNOWN_LEAD_OHM, UNLIMITED_STD
+from ohmskin.estimate.prior import UNKNOWN_LEAD_OHM, UNLIMITED_STD, USUAL_LEAD_STD_OHM
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Scan
@@ -59,11 +60,8 @@ PAUSE_SCANS: Final = 200
 PAUSE_TIMES: Final = 2.0
 # Trials of the wires, their longest step, and the one that is the last.
 TRIALS, LONGEST_STEP, LAST_STEP = 8, 1.0, 0.05
-# Deviation of leads that nobody has told, over `UNKNOWN_LEAD_OHM`. Chosen: totals tell leads badly,
-# as hysteresis looks like them; a multiplexer has 70 to 160 ohm.
-USUAL_LEAD_STD: Final = 0.5
-# How well a trial's wires are told: so well that no scan teaches others. Chosen.
-TRIAL_LOG_STD, TRIAL_LEAD_STD_OHM = 1e-3, 1.0
+# How well a trial's segments are told: so well that no scan teaches others. Chosen.
+TRIAL_LOG_STD: Final = 1e-3
 
 
 class _Levels(NamedTuple):
@@ -113,29 +111,33 @@ class Kneading:
         """The wires with which one curve and gains fit the totals best."""
         knowledge = self._calibrator.knowledge
         told = knowledge.nominal_wire_ohm
-        centre, std = wire_prior(told)
+        (*centre, lead), (*std, lead_std) = (each.tolist() for each in wire_prior(told))
+        lead_ohm, lead_std_ohm = lead * UNKNOWN_LEAD_OHM, lead_std * UNKNOWN_LEAD_OHM
         if told.lead is None:
-            std[2] = USUAL_LEAD_STD
+            lead_std_ohm = USUAL_LEAD_STD_OHM
         every = int(np.count_nonzero(self._press >= 0) // TRIAL_SCANS) + 1
         used = np.maximum.accumulate(self._press) // STRETCH % every == 0
-        w, scale = centre, None
+        w, scale = np.array(centre), None
         for _ in range(TRIALS):
-            ohm = _in_ohm(w)
-            stds = TRIAL_LOG_STD, TRIAL_LOG_STD, TRIAL_LEAD_STD_OHM
-            trial = replace(knowledge, nominal_wire_ohm=WireOhm(*ohm, *stds))
-            levels = self._levels(make_estimator(DEFAULT_METHOD, trial), used)
-            totals, slopes = self._totals(levels, log), self._slopes(ohm, levels)
-            prior = WireSlopes(slopes, centre - w, std)
-            fit = TotalFit(totals, prior, scale).fit()
+            top_ohm, bottom_ohm = np.exp(w).tolist()
+            wires = WireOhm(
+                top_ohm, bottom_ohm, lead_ohm, TRIAL_LOG_STD, TRIAL_LOG_STD, lead_std_ohm
+            )
+            estimator = make_estimator(DEFAULT_METHOD, replace(knowledge, nominal_wire_ohm=wires))
+            levels = self._levels(estimator, used)
+            wires = estimator.wires()
+            lead_ohm = wires.lead or 0.0
+            prior = WireSlopes(self._slopes(wires, levels), centre - w, np.array(std))
+            fit = TotalFit(self._totals(levels, log), prior, scale).fit()
             scale = fit.scale_
-            step, of_w = fit.w
+            step, stds = fit.w
             w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
-            w[2] = max(w[2], 0.0)
             if np.abs(step).max() < LAST_STEP:
                 break
-        top_std, bottom_std, lead_std = of_w.tolist()
-        wires = WireOhm(*_in_ohm(w), top_std, bottom_std, lead_std * UNKNOWN_LEAD_OHM)
-        return FoundWires(wires, told, fit.presses, ())
+        (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), stds.tolist()
+        lead_std = wires.lead_std_ohm
+        found = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std)
+        return FoundWires(found, told, fit.presses, ())
 
     def _levels(self, estimator: Estimator, used: Bool, progress: Progress = iter) -> _Levels:
         """What an estimator shows of the scans that are used, (n,), but for those it doubts."""
@@ -170,28 +172,21 @@ class Kneading:
         return Totals(*of_scans, at_s[known], shown_n[known])
 
     @one_blas_thread
-    def _slopes(self, wires: tuple[float, float, float], levels: _Levels) -> Float:
-        """d log x / dw of the module's equations, (3, n, C), of the scans that were used."""
+    def _slopes(self, wires: WireOhm, levels: _Levels) -> Float:
+        """d log x / dw of the module's equations, (2, n, C), of the scans that were used."""
         knowledge = self._calibrator.knowledge
-        top_ohm, bottom_ohm, lead_ohm = wires
-        series_ohm = knowledge.ref_ohm + 2 * lead_ohm
+        assert wires.both is not None
+        series_ohm = knowledge.ref_ohm + 2 * (wires.lead or 0.0)
         rises = levels.rise[levels.used]
-        slopes = np.zeros((3, *rises.shape))
+        slopes = np.zeros((2, *rises.shape))
         for n in np.flatnonzero(rises.any(axis=1)):
             siemens = np.maximum(rises[n] + levels.rest.ravel(), MIN_CELL_SIEMENS)
-            circuit = PortCircuit(siemens.reshape(self.shape), top_ohm, bottom_ohm)
+            circuit = PortCircuit(siemens.reshape(self.shape), *wires.both)
             weight = (circuit.port_ohm + series_ohm)[:, None] ** -2.0 / knowledge.current_std
             pressed = rises[n] > 0
             by_cells = weight * circuit.by_cell()[:, pressed]
-            by_leads = np.full((siemens.size, 1), 2 * UNKNOWN_LEAD_OHM)
-            by_wires = weight * np.hstack([circuit.by_layers(), by_leads])
             system = by_cells.T @ by_cells + np.eye(by_cells.shape[1]) / UNLIMITED_STD**2
-            log_ohm = solve_positive(system, by_cells.T @ by_wires)  # of the cells: -log g
-            slopes[:, n, pressed] = log_ohm.T * (siemens / rises[n].clip(1e-12))[pressed]
+            by_wires = by_cells.T @ (weight * circuit.by_layers())
+            log_siemens = solve_positive(system, by_wires)  # slopes of ports are those by log ohm
+            slopes[:, n, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
         return slopes
-
-
-def _in_ohm(w: Float) -> tuple[float, float, float]:
-    """Segments and lead of w."""
-    top_ohm, bottom_ohm = np.exp(w[:2]).tolist()
-    return top_ohm, bottom_ohm, float(w[2]) * UNKNOWN_LEAD_OHM

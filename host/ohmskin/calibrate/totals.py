@@ -14,8 +14,7 @@ c                 what lies in series with a contact, times a hard x1, the quant
                   `HARD_QUANTILE` of all x; x' is the contact alone                     S, or 1
 g        (C,)     log of each cell's gain about that
 P        (n, C)   force on each cell                                                    N
-w        (3,)     logs of a top and of a bottom segment, and the lead over              1
-                  `UNKNOWN_LEAD_OHM`; all less those that x is of
+w        (2,)     logs of a top and of a bottom segment, less those that x is of        1
 S                 the scale's filter (`scale`): (n,) to (m,)
 z        (q,)     zero of the scale at times `KNOT_S` apart; B (m, q) is straight       N
                   between them
@@ -29,17 +28,15 @@ s0, s1            scatter of y at no force; its share of the force              
 F0 is large, because what is wrong at little force, such as cells that have not come back yet, is as
 large in newtons at any force. The fit is least squares (Gauss-Newton) with priors: gains have the
 deviation `GAIN_STD` about one curve, which the fit corrects by what cells show; b is about
-`EXPONENT`, c about `SERIES`; the zero wanders by `ZERO_STEP_N` from knot to knot; w is what was
-told of the wires.
+`EXPONENT`; the zero wanders by `ZERO_STEP_N` from knot to knot; w is what was told of the wires.
 
-Contacts conduct more while a press goes than while it comes, so only the rows near the top of each
-press count: those above `PEAK_SHARE` of it. Their errors have one cause, so they count as one row
-together, and a press is kept or left out as a whole: at first each weighs less the more it is off
-(Cauchy), then those off by more than `OUTLIER_STDS` robust deviations are left out. Such a press is
-one whose force does not go through the skin: a finger beside it, a hand on the plate.
+Errors of one press have few causes, so its rows count as `PRESS_ROWS` together, and it is kept or
+left out as a whole: at first each press weighs less the more it is off (Cauchy), then those off by
+more than `OUTLIER_STDS` robust deviations are left out. Such a press is one whose force does not go
+through the skin: a finger beside it, a hand on the plate.
 
-The model that is kept is a power law without c: the one that is nearest to the curve where touches
-are.
+c is 0 but while the wires are looked for: what no force lowers bends the curve as wires do, and so
+does hysteresis. Wires are learned with a row a press, because errors of presses look like them.
 
 A cell's force is wrong by more than the sum, where errors average out. With r of the sum from s1 of
 each cell, r^2 = s1^2 sum(P^2): this s1 is the `residual_share` of the model.
@@ -63,9 +60,8 @@ GAIN_STD: Final = 0.25
 GAIN_CELLS: Final = 4.0
 # Exponent of F by x: contacts conduct by F^1 to F^2.
 EXPONENT, EXPONENT_STD = 0.67, 0.3
-# c: its prior, the deviation of that, and the most. Chosen: 250 ohm at 120 microsiemens. Presses
-# show twice as much, as hysteresis looks like it.
-SERIES, SERIES_STD, MOST_SERIES = 0.03, 0.03, 0.8
+# c: its prior, the deviation of that, and the most. Chosen: 350 ohm at 280 microsiemens.
+SERIES, SERIES_STD, MOST_SERIES = 0.1, 0.1, 0.8
 # x1 is this quantile of all rises.
 HARD_QUANTILE: Final = 0.99
 # A contact seems worse by its series by at most this factor.
@@ -73,8 +69,9 @@ LEAST_OF_SERIES: Final = 0.1
 # The zero is known at times so far apart [s], and wanders by so much from one to the next [N].
 # Chosen: a load cell that warms up drifts by a gram in seconds.
 KNOT_S, ZERO_STEP_N = 15.0, 0.05
-# Rows above this share of the highest of their press count. Chosen: enough to find one in a press.
-PEAK_SHARE: Final = 0.8
+# The rows of a press count as so many; and while the wires are looked for. Chosen: from no force to
+# its highest and back; see the module.
+PRESS_ROWS, WIRE_PRESS_ROWS = 4.0, 1.0
 # F0 as a share of the largest total. Chosen: see the module.
 FLOOR_SHARE: Final = 0.5
 # A press that is off by more robust standard deviations is left out. Chosen: by chance, one normal
@@ -92,11 +89,6 @@ POOLED_SHARE: Final = 0.7
 MOST_SHARE: Final = 0.7
 # A median of |r| is so much of a normal standard deviation.
 _MEDIAN_STD: Final = 0.6745
-
-
-# The power law is that of forces from and to so much of the largest on a cell. Chosen: later
-# touches are of single cells, and so harder.
-LAW_FROM, LAW_TO = 0.1, 1.5
 
 
 class Totals(NamedTuple):
@@ -117,7 +109,7 @@ class Totals(NamedTuple):
 
 
 class WireSlopes(NamedTuple):
-    """How the rises follow the wires: d log x / dw, (3, n, C); prior of w, centre and std (3,)."""
+    """How the rises follow the wires: d log x / dw, (2, n, C); prior of w, centre and std (2,)."""
 
     slopes: Float
     centre: Float
@@ -127,7 +119,8 @@ class WireSlopes(NamedTuple):
 class TotalFit:
     """The fit of the module's equations.
 
-    After `fit`: `scale_`; `covariance_` of k, b, w, g, z; `score_`, -2 log likelihood.
+    scale: the scale's filter; None: it is found. After `fit`: `scale_`; `covariance_` of k, b, c,
+    w, g, z.
     """
 
     def __init__(
@@ -149,7 +142,7 @@ class TotalFit:
         self._of_wires = slice(3, 3 + offsets)
         self._of_gains, self._of_zero = slice(3 + offsets, size), slice(size, None)
         self._p = np.zeros(size + self._basis.shape[1])
-        self._p[1:3] = EXPONENT, SERIES
+        self._p[1:3] = self._law = EXPONENT, SERIES if wires else 0.0
         self._gain_std = GAIN_STD
         self._group()
         self._weight = np.ones(self._groups)  # of groups
@@ -233,7 +226,7 @@ class TotalFit:
         jacobian = np.hstack([self._shown(np.column_stack([*columns, parts])), self._basis])
         self.total_n_ = jacobian[:, 0].copy()
         self.off_n_ = self._totals.shown_n - self.total_n_ - self._basis @ self._p[self._of_zero]
-        variance, weight = self._weights()
+        weight = self._weights()
         precision, pull = self._prior()
         weighted = jacobian * weight[:, None]
         precision = precision + weighted.T @ jacobian
@@ -243,11 +236,9 @@ class TotalFit:
         self._p[1] = np.clip(self._p[1], MIN_EXPONENT, MAX_EXPONENT)
         self._p[2] = np.clip(self._p[2], 0.0, MOST_SERIES)
         self.covariance_ = np.linalg.inv(precision)
-        share = weight * variance
-        self.score_ = float(weight @ self.off_n_**2 + share @ np.log(variance))
 
-    def _weights(self) -> tuple[Float, Float]:
-        """Variance of each row, and what it weighs, (m,), by what they are off now."""
+    def _weights(self) -> Float:
+        """What each row weighs, (m,) [1/N^2], by how far rows are off now."""
         off_n, total_n, kept = np.abs(self.off_n_), self.total_n_, ~self._out[self._of_row]
         self._floor_n = FLOOR_SHARE * float(total_n.max())
         size_n = np.hypot(total_n, self._floor_n)
@@ -256,19 +247,20 @@ class TotalFit:
         s0 = _robust_std(off_n[still], 0.005) if still.sum() > 10 else 0.005
         moves = self._pressed | (total_n > s0)
         variance = s0**2 + np.where(moves, (s1 * size_n) ** 2, 0.0)
-        peak = np.zeros(self._groups)
-        np.maximum.at(peak, self._of_row, total_n)
-        top = total_n > PEAK_SHARE * peak[self._of_row]
-        rows = np.bincount(self._of_row, top, self._groups)[self._of_row] + 1e-9
-        share = np.where(self._pressed, top / rows, 1.0)
+        rows = np.bincount(self._of_row, minlength=self._groups)[self._of_row]
+        press_rows = PRESS_ROWS if self._wires is None else WIRE_PRESS_ROWS
+        share = np.where(self._pressed, np.minimum(1.0, press_rows / rows), 1.0)
         share *= kept * self._weight[self._of_row]
-        return variance, share / variance
+        return np.asarray(share / variance)
 
     def _prior(self) -> tuple[Float, Float]:
         """Precision of p, and its pull."""
         p = self._p
         centre, std = np.zeros(p.size), np.full(p.size, self._gain_std)
-        centre[:3], std[:3] = (p[0], EXPONENT, SERIES), (10.0, EXPONENT_STD, SERIES_STD)
+        centre[:3], std[:3] = (
+            (p[0], *self._law),
+            (10.0, EXPONENT_STD, SERIES_STD if self._wires else 1e-9),
+        )
         if self._wires is not None:
             centre[self._of_wires], std[self._of_wires] = self._wires.centre, self._wires.std
         precision = np.diag(std**-2.0)
@@ -303,7 +295,7 @@ class TotalFit:
 
     @property
     def w(self) -> tuple[Float, Float]:
-        """w and its standard deviations, (3,)."""
+        """w and its standard deviations, (2,)."""
         of_wires = self._of_wires
         return self._p[of_wires], np.sqrt(self.covariance_.diagonal()[of_wires])
 
@@ -327,32 +319,12 @@ class TotalFit:
         """Standard deviation of the log of each cell's gain, (C,)."""
         return np.asarray(np.sqrt(self.covariance_.diagonal()[self._of_gains]))
 
-    def _power_law(self) -> tuple[Float, Float]:
-        """k and b of the power law that is nearest to the curve, (2,); slopes by k, b, c, (2, 3).
-
-        Nearest in logs, from `LAW_FROM` to `LAW_TO` of the largest force on a cell.
-        """
-        p = self._p[:3]
-        log_n = np.log(self._largest_n) + np.linspace(np.log(LAW_FROM), np.log(LAW_TO), 20)
-
-        def law(k: float, b: float, c: float) -> Float:
-            contact = np.exp((log_n - k) / b)  # x' / x0
-            log_x = np.log(contact / (1 + c * contact * self._unit / self._hard))
-            terms = np.column_stack([np.ones_like(log_x), log_x])
-            return np.asarray(np.linalg.lstsq(terms, log_n)[0])
-
-        here, step = law(*p), 1e-4
-        return here, np.column_stack([law(*(p + d)) - here for d in step * np.eye(3)]) / step
-
     def model(self, shape: tuple[int, int]) -> ForceModel:
         """The curves of all cells."""
-        law, to_law = self._power_law()
-        k, b = law
-        of_law = to_law @ self.covariance_[:3, :3] @ to_law.T
-        gains = self.covariance_.diagonal()[self._of_gains]
-        with_gains = to_law @ self.covariance_[:3, self._of_gains]
-        variance = of_law[0, 0] + gains + 2 * with_gains[0]
-        with_b, b_std = of_law[0, 1] + with_gains[1], float(np.sqrt(of_law[1, 1]))
+        k, b = self._p[:2]
+        covariance, gains = self.covariance_, self._of_gains
+        variance = covariance[0, 0] + covariance.diagonal()[gains] + 2 * covariance[0, gains]
+        with_b, b_std = covariance[0, 1] + covariance[1, gains], float(np.sqrt(covariance[1, 1]))
         if abs(b - 1) < b_std:  # a line will do
             kind, b, b_std, with_b = LINEAR, 1.0, 0.0, 0 * with_b
         else:
@@ -360,7 +332,7 @@ class TotalFit:
         # a = exp(k + g) x0^-b, so d log(a) = d(k + g) - log(x0) db.
         log_unit = np.log(self._unit)
         slope = np.exp(k + self._p[self._of_gains] - b * log_unit)
-        variance += -2 * log_unit * with_b + (log_unit * b_std) ** 2
+        variance = variance - 2 * log_unit * with_b + (log_unit * b_std) ** 2
         slope_log_std = np.sqrt(np.maximum(variance, 1e-12))
         correlation = np.zeros_like(slope)
         if b_std:
