@@ -28,7 +28,7 @@ BIOME = $(firstword $(shell ls tools/page_lint/node_modules/@biomejs/cli-*/biome
 PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
-BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons far orders desk force \
+BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far orders desk force \
                 view strangers boards quick)
 
 .DEFAULT_GOAL := help
@@ -160,6 +160,9 @@ bench-fingers: setup-host ## measure fingertips where nobody knows the wires, an
 
 bench-newtons: setup-host ## measure forces under many touches where nobody has told the wires
 	$(BENCH)/bench_newtons.py
+
+bench-knead: setup-host ## measure forces of skins that were kneaded over a scale
+	$(BENCH)/bench_knead.py
 
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
 	$(BENCH)/bench_far.py

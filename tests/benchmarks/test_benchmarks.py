@@ -17,7 +17,14 @@ from places import ROOT
 
 BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
 SHORT = (
-    *("bench_estimators", "bench_far", "bench_fingers", "bench_host", "bench_newtons"),
+    *(
+        "bench_estimators",
+        "bench_far",
+        "bench_fingers",
+        "bench_host",
+        "bench_knead",
+        "bench_newtons",
+    ),
     "bench_tables",
     pytest.param("bench_desk", marks=pytest.mark.simavr),
 )

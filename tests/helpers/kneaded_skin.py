@@ -27,6 +27,8 @@ SCAN_HZ = 50.0
 TIP_WIDTH, TIP_N = (0.7, 1.2), (1.0, 12.0)  # in cells, and forces: least and most
 # A fingertip comes, holds and goes [s]; then another one comes after 0 to `PAUSE_S`.
 TIP_S, PAUSE_S = np.array([0.0, 0.15, 0.25, 0.4]), 0.2
+WEIGHT_S = np.array([0.0, 0.3, 1.0, 1.3])  # the same of a weight
+WEIGHTS_N = (1.0, 2.0, 5.0)
 LEAST_SHARE = 0.01  # of a fingertip's highest pressure: less counts as none
 TIPS_READ, NEXT_TIP_S = 100, 3.0  # held-out fingertips; when the next one comes
 BESIDE_N, BESIDE_SHARE = 1.0, 0.3  # least force beside the skin, and as a share of the touch
@@ -59,11 +61,21 @@ class KneadedSkin(PressedSkin):
     """One skin, its presses, kneading and touches.
 
     scans: of the kneading. beside: this share of the fingertips presses beside the skin, too.
-    spared: so many cells are touched by no fingertip of the kneading.
+    spared: so many cells are touched by no fingertip of the kneading. weights: so many weights are
+    laid somewhere in place of fingertips.
     """
 
-    def __init__(self, plan: Plan, scans: int = 6000, beside: float = 0.0, spared: int = 0) -> None:
-        self._span_s, self._beside = scans / SCAN_HZ, beside
+    def __init__(
+        self,
+        plan: Plan,
+        scans: int = 6000,
+        beside: float = 0.0,
+        spared: int = 0,
+        weights: int = 0,
+    ) -> None:
+        self._span_s, self._beside, self._weights = scans / SCAN_HZ, beside, weights
+        if weights:
+            self._span_s = weights * (WEIGHT_S[-1] + 0.5 * PAUSE_S) + 4.0
         self.presses: list[Press] = []
         cells = plan.shape[0] * plan.shape[1]
         own = np.random.default_rng([plan.seed, 77])
@@ -82,6 +94,8 @@ class KneadedSkin(PressedSkin):
         own, (rows, columns) = self._own, self._shape
         row, column = own.uniform(0, rows - 1), own.uniform(0, columns - 1)
         width, force_n = own.uniform(*TIP_WIDTH), own.uniform(*TIP_N)
+        if self._weights and times_s is WEIGHT_S:
+            force_n = float(own.choice(WEIGHTS_N))
         i, j = np.divmod(np.arange(rows * columns), columns)
         pressure = np.exp(-((i - row) ** 2 + (j - column) ** 2) / width**2)
         pressure[(pressure < LEAST_SHARE * pressure.max()) | spared] = 0.0
@@ -94,16 +108,17 @@ class KneadedSkin(PressedSkin):
 
     def _touch(self, now_s: float, count: int) -> Float:
         """The kneading, then what is read later. Returns when: touches, fingertips, kneading."""
-        own, self._shape = self._own, self._plan_shape()
+        own, self._shape = self._own, self.rest.shape
+        tip_s = WEIGHT_S if self._weights else TIP_S
         begin_s = now_s
         now_s += 2.0
         while now_s < begin_s + self._span_s - 1.0:
-            force_n = self._tip(now_s, TIP_S, np.array([0.0, 1.0, 1.0, 0.0]), self.spared)
+            force_n = self._tip(now_s, tip_s, np.array([0.0, 1.0, 1.0, 0.0]), self.spared)
             off = own.random() < self._beside
             least_n = max(BESIDE_N, BESIDE_SHARE * force_n)
             beside_n = own.uniform(1, 2) * least_n if off else 0.0
-            self.presses.append(Press(now_s - begin_s, now_s + TIP_S[-1] - begin_s, beside_n))
-            now_s += TIP_S[-1] + own.uniform(0, PAUSE_S)
+            self.presses.append(Press(now_s - begin_s, now_s + tip_s[-1] - begin_s, beside_n))
+            now_s += tip_s[-1] + own.uniform(0, PAUSE_S)
         self._knead_s = np.arange(begin_s, begin_s + self._span_s, 1 / SCAN_HZ)
         self._begin_s = begin_s
         now_s = begin_s + self._span_s + 1.0
@@ -116,17 +131,14 @@ class KneadedSkin(PressedSkin):
         read_s = super()._touch(float(tips_s[-1]) + NEXT_TIP_S, count)
         return np.concatenate([read_s, tips_s + 1.6, self._knead_s])
 
-    def _plan_shape(self) -> tuple[int, int]:
-        return self.rest.shape
-
     # ------------------------------------------------------------------------ what is recorded
 
-    def total(self, scale: Scale) -> tuple[Float, Float]:
+    def total(self, scale: Scale, *, beside: bool) -> tuple[Float, Float]:
         """What the scale shows while the skin is kneaded: times [s], forces [N]."""
         time_s = self._knead_s - self._begin_s
         fine_s = np.arange(0.0, time_s[-1], 0.001)
         force_n = np.interp(fine_s, time_s, self.knead_n.sum(axis=(1, 2)))
-        for press in self.presses:
+        for press in self.presses if beside else ():
             shape = np.interp(fine_s - press.from_s, TIP_S, [0, 1, 1, 0])
             force_n += press.beside_n * shape
         if scale.pole_s:
@@ -142,15 +154,17 @@ class KneadedSkin(PressedSkin):
         shown_n += scale.drift_n * (shown_s / time_s[-1] + 0.3 * np.sin(shown_s / 15 + phase))
         return shown_s, shown_n
 
-    def record_kneading(self, path: Path, scale: Scale = Scale(), mode: str = "near") -> None:
-        """Write the recording of the kneading (.mcap)."""
+    def record_kneading(
+        self, path: Path, scale: Scale = Scale(), mode: str = "near", *, beside: bool = True
+    ) -> None:
+        """Write the recording of the kneading (.mcap). beside: with what passes beside the skin."""
         rest = self._codes(np.zeros((REST_SCANS, *self.rest.shape)), mode)
         with Recorder(path, replace(self._hello, mode=mode)) as recorder:
             recorder.add(Tare(ratio_from_codes(rest, ADC_BITS).mean(axis=0), 0.0, mode))
             for number, codes in enumerate(self._codes(self.knead_rise, mode)):
                 now_s = number / SCAN_HZ
                 recorder.add(Scan(codes, number, round(1e6 * now_s), now_s, 0, mode=mode))
-            for now_s, force_n in np.transpose(self.total(scale)).tolist():
+            for now_s, force_n in np.transpose(self.total(scale, beside=beside)).tolist():
                 recorder.add(ForceSample(force_n, now_s))
 
     def read_tips(self, calibration: Path) -> Forces:
