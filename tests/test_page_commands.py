@@ -77,6 +77,12 @@ NOT_RUN = {
     "ohmskin flash uno --port /dev/ttyACM0": "needs a boot loader; tests/cli/test_flash.py has one",
     "ohmskin calibrate scale /dev/ttyUSB0 --grams 200,500": "asks for weights; "
     "tests/record/test_force_sensor.py puts them on",
+    "ohmskin calibrate knead /dev/ttyACM0 skin.json --force-port /dev/ttyUSB0": "ends when a skin "
+    "is kneaded; tests/cli/test_knead.py has one",
+    "ohmskin calibrate weights /dev/ttyACM0 skin.json --anywhere --grams 100,200,500": "waits for "
+    "weights; tests/cli/test_knead.py puts them on",
+    "ohmskin calibrate recording knead.mcap skin.json --total": "tests/calibrate has such "
+    "recordings",
     "python examples/lsl_outlet.py emulator://8x8?scene=moving skin.json": "needs liblsl; "
     "tests/test_examples.py runs it with a stand-in",
     "python examples/ros2_node.py --ros-args -p calibration:=skin.json -p "
@@ -130,6 +136,7 @@ def steps() -> dict[str, list[Shown]]:
 
 
 STEPS = steps()
+KNEADED = [line for line in STEPS if re.search(r"\bkneaded\.json|scene=knead\"?$", line)]
 IN_ORDER = [line for line in STEPS if re.search(r"\b(?:robot|weights)\.(?:mcap|json)", line)]
 
 
@@ -267,7 +274,9 @@ def printed_by(
 
 
 @pytest.mark.usefixtures("place")
-@pytest.mark.parametrize("line", [line for line in STEPS if line not in (*NOT_RUN, *IN_ORDER)])
+@pytest.mark.parametrize(
+    "line", [line for line in STEPS if line not in (*NOT_RUN, *IN_ORDER, *KNEADED)]
+)
 def test_a_command_prints_what_its_pages_show(
     line: str,
     run: Run,
@@ -309,6 +318,24 @@ def test_an_emulated_skin_is_calibrated_as_a_page_says(
         stop = ("--seconds", "1") if words[1] == "stream" else ()
         done = well(run(*words[1:], *stop))
         assert missing(lines, done.out) is None, (page, done.out)
+
+
+def test_an_emulated_skin_is_kneaded_as_a_page_says(
+    run: Run, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    [(_, names, words)], *others = (STEPS[line] for line in KNEADED)
+    assert words[1] == "emulate"
+    process = command(*words[1:])
+    try:
+        places = {name: process.stdout.readline().strip() for name in names}
+        for [(page, lines, words)] in others:
+            stop = ("--seconds", "1") if words[1] == "stream" else ()
+            done = well(run(*(places.get(word, word) for word in words[1:]), *stop))
+            assert missing(lines, done.out) is None, (page, done.out)
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_what_is_not_run_is_on_a_page() -> None:

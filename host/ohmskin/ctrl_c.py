@@ -5,15 +5,16 @@
 what runs                           what Ctrl-C does                                exit code
 ==================================  ==============================================  ============
 ``stream``, ``view``, ``emulate``   ends the body of `ends_by_ctrl_c` at once       0
-``record``, ``calibrate weights``   ends `until_ctrl_c` between two scans           0, weights 130
+``record``, ``calibrate knead``     ends `until_ctrl_c` between two scans           0
+``calibrate weights``               the same                                        130
 anything else                       raises KeyboardInterrupt up to `cli.main.run`   130
 ==================================  ==============================================  ============
 
 In ``stream`` and ``estimate``, which write no file meanwhile, `ends_in_time` ends the process if
 that takes too long.
 
-Commands of the first two rows have no end of their own, so Ctrl-C is their usual end, and no error.
-Those of the second row write what they read, and Ctrl-C must not come amid a write. 130 is what
+Commands of the first two rows need not end by themselves: Ctrl-C is no error. Those of the second
+and third write what they read, and Ctrl-C must not come amid a write. 130 is what
 shells say of a program that Ctrl-C has ended.
 """
 

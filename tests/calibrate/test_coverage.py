@@ -87,6 +87,7 @@ def test_a_recording_is_looked_at_as_it_was_live(tmp_path: Path) -> None:
     assert (later.log_std < before).all()
     assert later.next_cell == np.unravel_index(later.log_std.argmax(), (2, 3))
     assert (later.known == (later.log_std <= 0.15)).all()
+    assert not live.known.any()  # it has seen some presses alone
 
 
 def test_recordings_are_joined_on_one_clock_and_zero(tmp_path: Path) -> None:

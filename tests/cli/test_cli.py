@@ -435,7 +435,7 @@ TAKES = {
     "export": "RECORDING OUT --begin --end",
     "emulate": "URL --seconds",
     "demo": "--seconds --port --picture",
-    "calibrate": "recording scale table weights",
+    "calibrate": "knead recording scale table weights",
 }
 NAMES = {"stream": METHODS, "estimate": METHODS, "export": (".npz", ".csv")}
 

@@ -53,6 +53,9 @@ SCALE_STD_N: Final = 0.05
 # Numbers that come sooner after the last are no news [s]. Chosen: the noise of a contact lasts as
 # long, and most scales show ten numbers a second.
 NEWS_S: Final = 0.1
+# No cell counts as known before so many numbers of the scale. Chosen: some ten presses, because the
+# curve of all cells and the wires have to be known, too.
+LEAST_NUMBERS: Final = 60
 # Less force is not counted [N]. Chosen: there, a scale's zero is a share of it.
 LEAST_N: Final = 0.3
 
@@ -64,6 +67,8 @@ class Coverage:
         ones = np.ones((cells, cells)) / cells
         self._information = (np.eye(cells) - ones) / GAIN_STD**2 + ones / (cells * LEVEL_STD**2)
         self._last_s = -np.inf
+        self.numbers = 0
+        """How many were added."""
 
     def is_news(self, time_s: float, force_n: float) -> bool:
         """Whether a number of the scale, shown then [s], tells something if the skin is touched."""
@@ -72,6 +77,7 @@ class Coverage:
     def add(self, time_s: float, rise: Float, force_n: float) -> None:
         """One number of the scale: when [s], the rise of touched cells (N,) [S], the force [N]."""
         self._last_s = time_s
+        self.numbers += 1
         share = np.maximum(rise, 0.0) ** USUAL_EXPONENT
         share /= share.sum()
         variance = CONTACT_STD**2 + (SCALE_STD_N / force_n) ** 2
@@ -133,7 +139,7 @@ class LiveCoverage:
     @property
     def known(self) -> Bool:
         """Which cells are known, (R, C)."""
-        return np.asarray(self.log_std <= KNOWN_LOG)
+        return (self.log_std <= KNOWN_LOG) & (self._coverage.numbers >= LEAST_NUMBERS)
 
     @property
     def next_cell(self) -> tuple[int, int]:

@@ -90,15 +90,19 @@ class Kneading:
         rise = (np.array(currents) - rest).reshape(len(scans), -1)
         rises = rise > TOUCH_SIEMENS
         self.time_s = scan_times_s(scans)
+        self._weighed: Bool | None = None  # scans whose force is known, if the scale does not lag
         self.of_skin: Float = np.sum(rise, axis=1, where=rises)
         self._press = number_presses(np.where(rises.any(axis=1), 0, -1), self.of_skin)
 
-    def learn(self, log: ForceLog, progress: Progress = iter) -> TotalFit:
+    def learn(self, log: ForceLog, progress: Progress = iter, *, lags: bool = True) -> TotalFit:
         """Find the wires, unless the estimator shows them, and fit the curves.
 
-        log: of the scale, by the clock of the scans, but for its lag.
+        log: of the scale, by the clock of the scans, but for its lag. lags: as for `Totals`; where
+        it does not, scans are used whose force is known.
         """
         calibrator = self._calibrator
+        if not lags:
+            self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         if not calibrator.shows_wires:
             calibrator.take_wires(self._found_wires(log))
         counts = np.cumsum(self._press >= 0)
@@ -154,11 +158,14 @@ class Kneading:
         of_nothing = rise[good & wanted & ~pressed].max(axis=1, initial=0.0)
         least = PAUSE_TIMES * float(np.median(of_nothing)) if of_nothing.size else 0.0
         rise[(rise < min(least, TOUCH_SIEMENS)) | ~pressed[:, None]] = 0.0
-        return _Levels(rise, rest, good)
+        return _Levels(rise, rest, good if self._weighed is None else good & self._weighed)
 
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
         """What skin and scale have shown, of the scans that were used: no more rows than scans."""
         time_s, used = self.time_s, levels.used
+        if self._weighed is not None:
+            of_scans = time_s[used], levels.rise[used], self._press[used]
+            return Totals(*of_scans, time_s[used], log.at(time_s[used]), lags=False)
         inside = (log.time_s >= time_s[0]) & (log.time_s <= time_s[-1])
         at_s = log.time_s[inside]
         if at_s.size > time_s.size:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``ohmskin calibrate``: with weights, from a recording, from a table of presses; ``tare``."""
+"""``ohmskin calibrate``: over a scale, with weights, from recordings, from a table; ``tare``."""
 
 import json
 import math
@@ -11,38 +11,52 @@ from typing import Annotated, Final
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from typer import Argument, Option
 
 import ohmskin
 from ohmskin.arrays import Float
 from ohmskin.calibrate.alignment import align
-from ohmskin.calibrate.guide import READING_S, Cells, Guide, Press, State, Step, still_wanted
+from ohmskin.calibrate.guide import Press, still_wanted
 from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
-from ohmskin.calibrate.rules import check_cell, check_cells_differ, check_enough
+from ohmskin.calibrate.rules import check_cells_differ, check_enough
+from ohmskin.calibrate.sessions import joined, session_paths
 from ohmskin.calibrate.tables import (
-    PRESS,
     ForceLog,
     PressTable,
     load_force_log,
     load_press_table,
-    save_press_table,
 )
-from ohmskin.cli.board import TERMINAL, Leads, Port, Wires, wires_of
-from ohmskin.cli.record import progress
+from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
+from ohmskin.cli.knead import kneaded
+from ohmskin.cli.record import (
+    ForceBaud,
+    ForceColumn,
+    ForceScale,
+    ForceUnit,
+    is_truth,
+    progress,
+)
 from ohmskin.cli.scale import grams_of, scale
 from ohmskin.cli.stream import cell_table
-from ohmskin.ctrl_c import until_ctrl_c
+from ohmskin.cli.weights import (
+    ANYWHERE,
+    WEIGHTS,
+    KeptAnywhere,
+    KeptPresses,
+    cells_of,
+    guided,
+    put_anywhere,
+)
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
-from ohmskin.link.messages import Hello, Scan
-from ohmskin.record.force_sensor import NEWTONS
-from ohmskin.record.readings import load_readings, save_arrays
-from ohmskin.record.recording import Recording, load_recording
+from ohmskin.link.messages import Hello
+from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Recording, Tare, load_recording
 
 # Rest is measured so long [s] after somebody is asked to let go. Chosen: long enough to let go.
 COUNT_DOWN_S: Final = 3
@@ -51,6 +65,9 @@ Out = Annotated[Path, Argument(help="calibration file to write (.json)")]
 Method = Annotated[str, Option(help=" | ".join(LEVEL_METHODS))]
 Indenter = Annotated[
     float, Option("--indenter-mm2", help="area that the skin is pressed with, in mm2")
+]
+AnyIndenter = Annotated[
+    float | None, Option("--indenter-mm2", help="the same, where single cells are pressed")
 ]
 Force = Annotated[bool, Option("--force", help="even if cells seem to be touched at rest")]
 calibrate = typer.Typer(
@@ -68,8 +85,13 @@ def weights(
     port: Port,
     out: Out,
     grams: Annotated[str, Option(help="the weights you have, in gram, such as 50,100")],
-    indenter_mm2: Indenter,
-    repeats: Annotated[int, Option(min=1, help="times each weight is put on each cell")] = 2,
+    indenter_mm2: AnyIndenter = None,
+    anywhere: Annotated[
+        bool, Option("--anywhere", help="put each weight at some places, not on single cells")
+    ] = False,
+    repeats: Annotated[
+        int | None, Option(min=1, help="times each weight is put on each cell: 2, anywhere 20")
+    ] = None,
     cells: Annotated[str, Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
     redo: Annotated[list[str] | None, Option(help="row,column: drop its presses first")] = None,
     method: Method = DEFAULT_METHOD,
@@ -80,19 +102,26 @@ def weights(
     """With weights: says which to put on which cell of the skin at PORT, and when it has read it.
 
     Every press is kept at once, in OUT with .presses.csv and its readings with .presses.npz: after
-    Ctrl-C the same command goes on.
+    Ctrl-C the same command goes on. With --anywhere, where you put a weight is your choice.
     """
-    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table=True)
+    if anywhere == (indenter_mm2 is not None) or (anywhere and (cells or redo)):
+        raise ValueError(
+            "say --indenter-mm2, or --anywhere without --indenter-mm2, --cells, --redo"
+        )
+    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table=not anywhere)
     forces_n = [mass_g * NEWTONS["g"] for mass_g in grams_of(grams)]
-    kept = _KeptPresses(out.with_suffix(".presses.csv"))
+    if anywhere:
+        _weigh_anywhere(port, out, np.repeat(forces_n, repeats or 20), calibrator_of, force)
+        return
+    kept = KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
         skin.only_unit = skin.info.unit_id  # no other may come while nobody looks
         shape = skin.info.rows, skin.info.columns
-        only, again = _cells(cells, shape), _cells(" ".join(redo or ()), shape)
+        only, again = cells_of(cells, shape), cells_of(" ".join(redo or ()), shape)
         wanted = [
             Press(cell, force_n)
             for cell in only or np.ndindex(shape)
-            for _ in range(repeats)
+            for _ in range(repeats or 2)
             for force_n in forces_n
         ]
         read = [press for press in kept.presses if press.cell not in again]
@@ -101,17 +130,14 @@ def weights(
             every = [*read, *missing]
             check_enough(len(every), [press.force_n for press in every])
             check_cells_differ({press.cell for press in every}, shape)
-        for left_s in range(COUNT_DOWN_S, 0, -1):
-            TERMINAL.print(f"take everything off the skin: its rest is measured in {left_s} s")
-            deque(scans_for(skin, 1.0), maxlen=0)  # so time passes by the board's clock
-        calibrator = calibrator_of(skin.info, skin.mean_ratio(TARE_S), force)
+        calibrator = calibrator_of(skin.info, _rest_of(skin), force)
         with naming(kept.path):
             calibrator.presses_in_table(kept.table)  # raises ValueError for another skin's
         if again:
             kept.keep_those([press.cell not in again for press in kept.presses])
         rest_us = 1e6 * calibrator.rest_level
         TERMINAL.print(f"rest: {rest_us.min():.2f} to {rest_us.max():.2f} microsiemens")
-        left = _guided(skin, calibrator, kept, missing, len(wanted)) if missing else 0
+        left = guided(skin, calibrator, kept, missing, len(wanted)) if missing else 0
     if left:
         command = "the same command without --redo" if again else "the same command"
         done = f"{len(wanted) - left} of {len(wanted)} presses are in {kept.path}"
@@ -122,13 +148,47 @@ def weights(
     _finish(calibrator, presses, kept.path, out)
 
 
+def _rest_of(skin: Device) -> Float:
+    """Readings (R, C, 4) of the untouched skin, after a count-down."""
+    for left_s in range(COUNT_DOWN_S, 0, -1):
+        TERMINAL.print(f"take everything off the skin: its rest is measured in {left_s} s")
+        deque(scans_for(skin, 1.0), maxlen=0)  # so time passes by the board's clock
+    return skin.mean_ratio(TARE_S)
+
+
+def _weigh_anywhere(
+    port: str,
+    out: Path,
+    forces_n: Float,
+    calibrator_of: Callable[[Hello, Float, bool], Calibrator],
+    force: bool,
+) -> None:
+    """Learn from weights at places of the user's choice, each of these forces (n,) [N]."""
+    before, path = session_paths(out, "weights")
+    recordings = [load_recording(each) for each in before]
+    wanted = [Press(ANYWHERE, force_n) for force_n in forces_n.tolist()]
+    missing = still_wanted(wanted, put_anywhere(recordings))
+    if missing:
+        with ohmskin.open(port) as skin:
+            skin.only_unit = skin.info.unit_id
+            rest_ratio = _rest_of(skin)
+            calibrator = calibrator_of(skin.info, rest_ratio, force)
+            with Recorder(path, skin.info, lambda: skin.now_s) as recorder:
+                recorder.add(Tare(rest_ratio, skin.now_s, skin.info.mode))
+                left = guided(skin, calibrator, KeptAnywhere(recorder), missing, len(wanted))
+        if left:
+            done = f"{len(wanted) - left} of {len(wanted)} weights have been read"
+            TERMINAL.print(f"{done}: the same command goes on", markup=False)
+            raise typer.Exit(130)
+        recordings.append(load_recording(path))
+    _learn_totals(calibrator_of, joined(recordings), out, force)
+
+
 @calibrate.command()
 def recording(
     recording: Annotated[Path, Argument(help="recording (.mcap) of presses of single cells")],
     out: Out,
-    indenter_mm2: Annotated[
-        float | None, Option("--indenter-mm2", help="as elsewhere; none with --total")
-    ] = None,
+    indenter_mm2: AnyIndenter = None,
     total: Annotated[
         bool, Option("--total", help="forces are those on the whole skin, pressed anywhere")
     ] = False,
@@ -184,6 +244,51 @@ def recording(
     _finish(calibrator, presses, recording, out, note)
 
 
+@calibrate.command()
+def knead(
+    port: Port,
+    out: Out,
+    force_port: Annotated[
+        str, Option(help="serial port of the scale under the skin; of a simulated skin: truth")
+    ],
+    force_baud: ForceBaud = DEFAULT_BAUD,
+    force_scale: ForceScale = 1.0,
+    force_unit: ForceUnit = "",
+    force_column: ForceColumn = "",
+    seconds: Seconds = 0.0,
+    method: Method = DEFAULT_METHOD,
+    wires: Wires = "",
+    leads: Leads = None,
+    force: Force = False,
+) -> None:
+    """By pressing the skin at PORT anywhere, over a scale: shows where to press until all is known.
+
+    Ctrl-C ends it with what there is. The same command goes on: all recordings beside OUT count.
+    """
+    calibrator_of = _options(out, method, None, wires_of(wires, leads))
+
+    def sensor_of(skin: Device) -> ForceSensor | None:
+        if is_truth(force_port, skin):
+            return None
+        return ForceSensor(force_port, force_baud, force_scale, force_unit, force_column)
+
+    given, known = kneaded(port, out, sensor_of, seconds)
+    _learn_totals(calibrator_of, given, out, force)
+    if not known:
+        TERMINAL.print("not all cells are known yet: the same command goes on")
+
+
+def _learn_totals(
+    calibrator_of: Callable[[Hello, Float, bool], Calibrator],
+    given: Recording,
+    out: Path,
+    force: bool,
+) -> None:
+    """Write the calibration that the forces on the whole skin teach."""
+    calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, 0.0), force)
+    _knead(calibrator, given, None, out, as_json=False)
+
+
 def _log_in(given: Recording, *, any_zero: bool = False) -> ForceLog:
     """The forces in a recording; the scans have the same clock."""
     samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
@@ -205,7 +310,8 @@ def _knead(
         above = replace(log, force_n=np.maximum(log.force_n - np.quantile(log.force_n, 0.02), 0.0))
         offset_s = align(kneading.time_s, kneading.of_skin, above).offset_s
         log = replace(log, time_s=log.time_s + offset_s, any_zero=True)
-    fit = kneading.learn(log, progress("scans"))
+    lags = any(sample.source != WEIGHTS for sample in given.forces)
+    fit = kneading.learn(log, progress("scans"), lags=lags)
     calibration = calibrator.calibration_of(fit.model(kneading.shape))
     calibration.save(out)
     first_s, stds = kneading.time_s[0], fit.gain_std()
@@ -375,137 +481,3 @@ def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
             "electrodes and cells far from them"
         )
     return line
-
-
-# -------------------------------------------------------------------------------- with weights
-
-
-class _KeptPresses:
-    """A table of presses, and the readings under each of them, with their files.
-
-    Both files are written anew, and whole, at each change: the readings first. Where a kill comes
-    between, they have one press more than the table, which counts.
-
-    ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
-        table that somebody else has made.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path, self._readings_path = path, path.with_suffix(".npz")
-        self.table: PressTable = load_press_table(path) if path.exists() else np.empty(0, PRESS)
-        self.ratios: Float | None = None
-        if self._readings_path.exists() and self.table.size:
-            ratios = load_readings(self._readings_path).ratio
-            if len(ratios) >= self.table.size:
-                self.ratios = ratios[: self.table.size]
-
-    @property
-    def presses(self) -> list[Press]:
-        """Cell and force of each."""
-        return [Press((row, column), force_n) for row, column, force_n, *_ in self.table.tolist()]
-
-    def seen_by(self, calibrator: Calibrator) -> Presses:
-        """The presses, with the wires that their readings tell. Raises ValueError, of bad rows."""
-        if self.ratios is None:
-            return calibrator.presses_in_table(self.table)
-        return calibrator.presses_in_readings(self.table, self.ratios)
-
-    def add(self, press: Press, conductance: float, std: float, ratio: Float) -> None:
-        """Keep one more press, under which the cell had this conductance [S].
-
-        ratio: mean readings meanwhile, (R, C, 4).
-        """
-        # The table has no conductance below 0.
-        one = np.array([(*press.cell, press.force_n, max(conductance, 0.0), std)], PRESS)
-        if not self.table.size:
-            self.ratios = ratio[None]
-        elif self.ratios is not None:
-            self.ratios = np.concatenate([self.ratios, ratio[None]])
-        self.table = np.concatenate([self.table, one])
-        self._save()
-
-    def keep_those(self, wanted: list[bool]) -> None:
-        """Keep these presses alone."""
-        self.table = self.table[wanted]
-        if self.ratios is not None:
-            self.ratios = self.ratios[wanted]
-        self._save()
-
-    def _save(self) -> None:
-        if not self.table.size:
-            self.path.unlink(missing_ok=True)
-            self._readings_path.unlink(missing_ok=True)
-            return
-        if self.ratios is not None:
-            save_arrays(self._readings_path, {"ratio": self.ratios})
-        save_press_table(self.path, self.table)
-
-
-def _guided(
-    skin: Device, calibrator: Calibrator, kept: _KeptPresses, missing: list[Press], total: int
-) -> int:
-    """Ask for the missing presses. Returns how many still are, after an interruption.
-
-    Lines say what to do next. A terminal also gets a bar, and a bell for each press.
-    """
-    guide, rest = Guide(missing), calibrator.rest_level
-    window: deque[Scan] = deque()  # the scans that a press is read from
-    done, last_line = total - len(missing), ""
-    columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
-    bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
-    task = bar.add_task("", total=total)
-    with bar:
-        for scan in until_ctrl_c(iter(skin.latest, None)):
-            frame = calibrator.estimator.estimate(scan.ratio)
-            step = guide.feed(1e-6 * scan.time_us, frame.level - rest, frame.touched)
-            if skin.put is not None:  # a simulated skin: nobody else puts a weight on it
-                skin.put(None if step.state is State.TAKE_OFF else step.wanted)
-            window.append(scan)
-            while 1e-6 * (scan.time_us - window[0].time_us) > READING_S:
-                window.popleft()
-            if step.wanted is not None and step.rise is not None:
-                level = step.rise + rest[step.wanted.cell]
-                kept.add(step.wanted, level, step.rise_std, mean_ratio(window))
-                done += 1
-                TERMINAL.bell()
-            line, now = _step_in_words(step)
-            if line and line != last_line:
-                counted = f"{done} of {total}: " if step.rise is not None else ""
-                TERMINAL.print(counted + line, markup=False, highlight=False)
-                last_line = line
-            bar.update(task, completed=done, description=now)
-            if step.state is State.DONE:
-                break
-    return total - done
-
-
-def _step_in_words(step: Step) -> tuple[str, str]:
-    """What the person has to do next, empty where nothing changes, and what goes on meanwhile."""
-    press, line, now = step.wanted, "", step.state.value
-    if press is None:
-        return "", ""
-    if step.rise is not None:
-        rise = f"{1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} microsiemens above rest"
-        line = f"{rise}: take it off"
-    elif step.state is State.PUT:
-        weight = f"{press.force_n / NEWTONS['g']:.6g} g ({press.force_n:.3f} N)"
-        row, column = press.cell
-        line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
-    elif step.state is State.WRONG:
-        cells = ", ".join(map(str, step.cells))
-        pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"
-        line = f"{pressed} pressed: put the weight on {press.cell} alone"
-    elif step.change is not None:
-        now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
-    return line, now
-
-
-def _cells(text: str, shape: tuple[int, int]) -> Cells:
-    """The cells that a text names, each once, in its order."""
-    cells = []
-    for part in text.split():
-        row, comma, column = part.partition(",")
-        if not (comma and row.isdecimal() and column.isdecimal()):
-            raise ValueError(f"'{part:.40}' is no cell: write row,column, such as 0,1")
-        cells.append(check_cell(int(row), int(column), shape))
-    return tuple(dict.fromkeys(cells))

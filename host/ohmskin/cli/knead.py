@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin calibrate knead``: press a skin anywhere, over a scale, until all cells are known."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import takewhile
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.console import Group
+from rich.live import Live
+from rich.text import Text
+
+import ohmskin
+from ohmskin.calibrate.coverage import KNOWN_LOG, LiveCoverage
+from ohmskin.calibrate.sessions import joined, session_paths
+from ohmskin.cli.board import TERMINAL, asked_for
+from ohmskin.cli.record import FORCE_TARE_S, with_truth
+from ohmskin.cli.stream import cell_table
+from ohmskin.ctrl_c import until_ctrl_c
+from ohmskin.errors import DeviceLost
+from ohmskin.link.device import Device
+from ohmskin.link.messages import Scan
+from ohmskin.record import recorder as recording
+from ohmskin.record.force_sensor import ForceSensor
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Recording, load_recording
+
+# Where nobody sees the map, a line says so often how far it is [s]. Chosen: some a minute.
+_SAY_EVERY_S: Final = 10.0
+
+
+class KneadMap:
+    """How well each cell is known, in the terminal, while it is recorded."""
+
+    def __init__(self, recorder: Recorder, coverage: LiveCoverage) -> None:
+        self._recorder, self._coverage = recorder, coverage
+        self._said_s = self._began_s = recorder.now_s()
+
+    def look(self, scan: Scan) -> None:
+        """At a scan that was recorded."""
+        self._coverage.look(scan, self._recorder.tare, self._recorder.force)
+        if not TERMINAL.is_terminal and scan.host_time_s - self._said_s >= _SAY_EVERY_S:
+            self._said_s = scan.host_time_s
+            TERMINAL.print(f"{scan.host_time_s - self._began_s:.0f} s: {self.words()}")
+
+    def words(self) -> str:
+        """How far it is, and where to press next."""
+        known = self._coverage.known
+        row, column = self._coverage.next_cell
+        text = f"{known.sum()} of {known.size} cells are known to {100 * KNOWN_LOG:.0f} %"
+        return text if known.all() else f"{text}, press at row {row}, column {column}"
+
+    def picture(self) -> Group:
+        """All of it."""
+        force, tare = self._recorder.force, self._recorder.tare
+        shown = "" if force is None else f"   force {force.force_n:.2f} N"
+        doing = "touch nothing yet" if tare is None else self.words()
+        percent, known = 100 * self._coverage.log_std, self._coverage.known
+        cells = [[Text(f"{each:.0f}") for each in row] for row in percent.tolist()]
+        for at in np.ndindex(known.shape):
+            cells[at[0]][at[1]].stylize("green" if known[at] else "red")
+        row, column = self._coverage.next_cell
+        cells[row][column].stylize("reverse")
+        return Group(Text(doing + shown), cell_table(cells, "how well each cell is known [%]"))
+
+
+def kneaded(
+    port: str, out: Path, sensor_of: Callable[[Device], ForceSensor | None], seconds: float
+) -> tuple[Recording, bool]:
+    """What was kneaded before, and now, until all cells are known or Ctrl-C comes.
+
+    sensor_of: opens the force sensor; None: the skin knows the truth. Returns all recordings as
+    one, and whether all cells are known.
+    """
+    before, path = session_paths(out, "knead")
+    recordings = [load_recording(each) for each in before]
+    with ohmskin.open(port, start=False) as skin:
+        skin.only_unit = skin.info.unit_id
+        coverage = LiveCoverage(skin.info)
+        for given in recordings:
+            coverage.look_at(given)
+        if not coverage.known.all():
+            try:
+                _knead(skin, path, sensor_of(skin), coverage, seconds)
+            except DeviceLost as exc:
+                raise DeviceLost(f"{exc} (the same command goes on from {path})") from exc
+            recordings.append(load_recording(path))
+    return joined(recordings), bool(coverage.known.all())
+
+
+def _knead(
+    skin: Device, path: Path, sensor: ForceSensor | None, coverage: LiveCoverage, seconds: float
+) -> None:
+    """Record while somebody kneads."""
+    coverage.begin()
+    with ExitStack() as stack:
+        if sensor is not None:
+            stack.enter_context(sensor).wait()
+        recorder = stack.enter_context(Recorder(path, skin.info, lambda: skin.now_s))
+        TERMINAL.print(
+            f"touch nothing for {FORCE_TARE_S:g} s, then press everywhere, softly and hard, with a "
+            "finger or several; Ctrl-C ends it, and the same command goes on"
+        )
+        shown = KneadMap(recorder, coverage)
+        if TERMINAL.is_terminal:
+            live = Live(get_renderable=shown.picture, console=TERMINAL, transient=True)
+            stack.enter_context(live)
+        scans = asked_for(until_ctrl_c(skin), 0, seconds)
+        if sensor is None:
+            scans = with_truth(scans, skin, recorder)
+        unknown = takewhile(lambda _: not coverage.known.all(), scans)
+        recording.record(
+            skin, recorder, unknown, tare_s=FORCE_TARE_S, sensor=sensor, beside=shown.look
+        )
+    TERMINAL.print(f"{path}: {recorder.scans} scans, {recorder.forces} forces: {shown.words()}")

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Leads a person who puts known weights on a skin, on cell after cell or anywhere."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from ohmskin.arrays import Float
+from ohmskin.calibrate.guide import READING_S, Cells, Guide, Press, State, Step
+from ohmskin.calibrate.presses import Calibrator, Presses
+from ohmskin.calibrate.rules import check_cell
+from ohmskin.calibrate.tables import PRESS, PressTable, load_press_table, save_press_table
+from ohmskin.cli.board import TERMINAL
+from ohmskin.ctrl_c import until_ctrl_c
+from ohmskin.link.device import Device, mean_ratio
+from ohmskin.link.messages import Scan
+from ohmskin.record.force_sensor import NEWTONS
+from ohmskin.record.readings import load_readings, save_arrays
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import ForceSample, Mark, Recording
+
+# The source of forces in a recording that are known weights.
+WEIGHTS: Final = "weights"
+# The cell of a press that may be anywhere: the skin is taken for one cell.
+ANYWHERE: Final = (0, 0)
+
+
+class KeptPresses:
+    """A table of presses, and the readings under each of them, with their files.
+
+    Both files are written anew, and whole, at each change: the readings first. Where a kill comes
+    between, they have one press more than the table, which counts.
+
+    ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
+        table that somebody else has made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._readings_path = path, path.with_suffix(".npz")
+        self.table: PressTable = load_press_table(path) if path.exists() else np.empty(0, PRESS)
+        self.ratios: Float | None = None
+        if self._readings_path.exists() and self.table.size:
+            ratios = load_readings(self._readings_path).ratio
+            if len(ratios) >= self.table.size:
+                self.ratios = ratios[: self.table.size]
+
+    @property
+    def presses(self) -> list[Press]:
+        """Cell and force of each."""
+        return [Press((row, column), force_n) for row, column, force_n, *_ in self.table.tolist()]
+
+    def seen_by(self, calibrator: Calibrator) -> Presses:
+        """The presses, with the wires that their readings tell. Raises ValueError, of bad rows."""
+        if self.ratios is None:
+            return calibrator.presses_in_table(self.table)
+        return calibrator.presses_in_readings(self.table, self.ratios)
+
+    def add(self, step: Step, rest: Float, window: Iterable[Scan]) -> None:
+        """Keep one more press, that of a step which has read it from these scans.
+
+        rest: of the cells, (R, C) [S].
+        """
+        press = step.wanted
+        assert press is not None
+        assert step.rise is not None
+        # The table has no conductance below 0.
+        siemens = max(step.rise + rest[press.cell], 0.0)
+        one = np.array([(*press.cell, press.force_n, siemens, step.rise_std)], PRESS)
+        ratio = mean_ratio(list(window))
+        if not self.table.size:
+            self.ratios = ratio[None]
+        elif self.ratios is not None:
+            self.ratios = np.concatenate([self.ratios, ratio[None]])
+        self.table = np.concatenate([self.table, one])
+        self._save()
+
+    def keep_those(self, wanted: list[bool]) -> None:
+        """Keep these presses alone."""
+        self.table = self.table[wanted]
+        if self.ratios is not None:
+            self.ratios = self.ratios[wanted]
+        self._save()
+
+    def recorded(self, scans: Iterable[Scan]) -> Iterable[Scan]:
+        """The scans: but for those of presses, none is kept."""
+        return scans
+
+    def _save(self) -> None:
+        if not self.table.size:
+            self.path.unlink(missing_ok=True)
+            self._readings_path.unlink(missing_ok=True)
+            return
+        if self.ratios is not None:
+            save_arrays(self._readings_path, {"ratio": self.ratios})
+        save_press_table(self.path, self.table)
+
+
+class KeptAnywhere:
+    """Records all scans while weights are put anywhere, and the force of each that was read.
+
+    Every weight that was read is a mark: its force.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+
+    def add(self, step: Step, _: Float, window: Iterable[Scan]) -> None:
+        """Keep the press of a step which has read it from these scans."""
+        assert step.wanted is not None
+        force_n = step.wanted.force_n
+        for scan in window:
+            self._recorder.add(ForceSample(force_n, scan.host_time_s, source=WEIGHTS))
+        self._recorder.add(Mark(repr(force_n), self._recorder.now_s()))
+
+    def recorded(self, scans: Iterable[Scan]) -> Iterator[Scan]:
+        """Pass scans on that are recorded."""
+        for scan in scans:
+            self._recorder.add(scan)
+            yield scan
+
+
+def put_anywhere(recordings: Iterable[Recording]) -> list[Press]:
+    """What `KeptAnywhere` has kept in recordings."""
+    return [Press(ANYWHERE, float(mark.text)) for given in recordings for mark in given.marks]
+
+
+def guided(
+    skin: Device,
+    calibrator: Calibrator,
+    kept: KeptPresses | KeptAnywhere,
+    missing: list[Press],
+    total: int,
+) -> int:
+    """Ask for the missing presses. Returns how many still are, after an interruption.
+
+    Lines say what to do next. A terminal also gets a bar, and a bell for each press.
+    """
+    guide, rest = Guide(missing), calibrator.rest_level
+    anywhere = isinstance(kept, KeptAnywhere)
+    places = np.random.default_rng(0).uniform(0, np.array(rest.shape) - 1, (total + 1, 2)).tolist()
+    window: deque[Scan] = deque()  # the scans that a press is read from
+    done, last_line = total - len(missing), ""
+    columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
+    bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
+    task = bar.add_task("", total=total)
+    with bar:
+        for scan in until_ctrl_c(kept.recorded(iter(skin.latest, None))):
+            frame = calibrator.estimator.estimate(scan.ratio)
+            rise, touched = frame.level - rest, frame.touched
+            if anywhere:
+                rise = np.sum(rise, where=touched, keepdims=True)
+                touched = np.array([[touched.any()]])
+            step = guide.feed(1e-6 * scan.time_us, rise, touched)
+            if skin.put is not None:  # a simulated skin: nobody else puts a weight on it
+                put = None if step.state is State.TAKE_OFF else step.wanted
+                skin.put(put if put is None or not anywhere else (places[done], put.force_n))
+            window.append(scan)
+            while 1e-6 * (scan.time_us - window[0].time_us) > READING_S:
+                window.popleft()
+            if step.wanted is not None and step.rise is not None:
+                kept.add(step, rest, window)
+                done += 1
+                TERMINAL.bell()
+            line, now = _step_in_words(step, anywhere)
+            if line and line != last_line:
+                counted = f"{done} of {total}: " if step.rise is not None else ""
+                TERMINAL.print(counted + line, markup=False, highlight=False)
+                last_line = line
+            bar.update(task, completed=done, description=now)
+            if step.state is State.DONE:
+                break
+    return total - done
+
+
+def _step_in_words(step: Step, anywhere: bool) -> tuple[str, str]:
+    """What the person has to do next, empty where nothing changes, and what goes on meanwhile."""
+    press, line, now = step.wanted, "", step.state.value
+    if press is None:
+        return "", ""
+    if step.rise is not None:
+        rise = f"{1e6 * step.rise:.2f} +- {1e6 * step.rise_std:.2f} microsiemens above rest"
+        line = f"{rise}: take it off"
+    elif step.state is State.PUT:
+        weight = f"{press.force_n / NEWTONS['g']:.6g} g ({press.force_n:.3f} N)"
+        row, column = press.cell
+        line = f"put {weight} on cell {press.cell}, row {row}, column {column}"
+        if anywhere:
+            line = f"put {weight} where none has been yet"
+    elif step.state is State.WRONG:
+        cells = ", ".join(map(str, step.cells))
+        pressed = f"cells {cells} are" if len(step.cells) > 1 else f"cell {cells} is"
+        line = f"{pressed} pressed: put the weight on {press.cell} alone"
+    elif step.change is not None:
+        now = f"not steady yet: changes by {100 * step.change:.0f} % in half a second"
+    return line, now
+
+
+def cells_of(text: str, shape: tuple[int, int]) -> Cells:
+    """The cells that a text names, each once, in its order."""
+    cells = []
+    for part in text.split():
+        row, comma, column = part.partition(",")
+        if not (comma and row.isdecimal() and column.isdecimal()):
+            raise ValueError(f"'{part:.40}' is no cell: write row,column, such as 0,1")
+        cells.append(check_cell(int(row), int(column), shape))
+    return tuple(dict.fromkeys(cells))

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``calibrate knead`` and ``weights --anywhere``: emulated skins, and how near to the truth."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from test_first_hour import streamed
+
+import ohmskin
+from command_line import Command, Run, assert_one_line, well
+from ohmskin.calibrate.coverage import LiveCoverage
+from ohmskin.cli.knead import KneadMap
+from ohmskin.emulate.scenes import Scene
+from ohmskin.force.calibration import load_calibration
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Tare, load_recording
+
+SKIN = "emulator://2x3?speed=0&rate=20"
+TRUTH = ("--force-port", "truth")
+
+
+def errors(path: Path, force_n: float = 3.0, seed: int = 0) -> np.ndarray:
+    """By what share the cells' forces are off, were their conductances known (R, C)."""
+    model = load_calibration(path).model
+    scene = Scene("weights", *model.kind.shape, seed=seed)
+    rises = np.empty(model.kind.shape)
+    for cell in np.ndindex(rises.shape):
+        scene.put((cell, force_n))
+        rises[cell] = (scene.skin(0.0).cell_siemens - scene.rest.cell_siemens)[cell]
+    return model.predict(rises, np.zeros_like(rises))[0] / force_n - 1
+
+
+def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "skin.json"
+    done = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
+    lines = done.out.splitlines()
+    assert lines[0].startswith("touch nothing for 2 s, then press everywhere")
+    assert re.fullmatch(r"10 s: \d of 6 cells are known to 15 %, press at row .*", lines[1])
+    assert "6 of 6 cells are known to 15 %" in done.out
+    assert f"{out}: calibration of unit 0" in lines[-1]
+    recording = load_recording(tmp_path / "skin.knead-1.mcap")
+    assert recording.scans[-1].host_time_s < 40.0
+    off = errors(out)
+    assert np.abs(off).max() < 0.3
+    assert np.sqrt(np.mean(off**2)) < 0.15
+    assert load_calibration(out).indenter_area_m2 is None
+    force_n, true_n = streamed(run, "emulator://2x3?scene=ghost&begin=0&speed=0", out)
+    np.testing.assert_allclose(force_n[true_n > 0], true_n[true_n > 0], rtol=0.3)
+    # Once more: all is known, and nothing is recorded.
+    again = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
+    assert "touch nothing" not in again.out
+    assert not (tmp_path / "skin.knead-2.mcap").exists()
+
+
+def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "skin.json"
+    command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
+    done = well(run(*command, "--seconds", "11"))
+    assert "not all cells are known yet: the same command goes on" in done.out
+    known = [int(n) for n in re.findall(r"(\d+) of 6 cells are known", done.out)]
+    first = load_calibration(out)
+    done = well(run(*command, "--seconds", "11"))
+    now = [int(n) for n in re.findall(r"(\d+) of 6 cells are known", done.out)]
+    assert known[-1] < now[-1]
+    assert len(list(tmp_path.glob("skin.knead-*.mcap"))) == 2
+    assert load_calibration(out).model.slope_std.max() < first.model.slope_std.max()
+
+
+def test_wrong_uses_of_knead(run: Run, tmp_path: Path) -> None:
+    out = str(tmp_path / "skin.json")
+    knead = ("calibrate", "knead", SKIN, out, "--force-port")
+    assert_one_line(run(*knead, "/dev/ttyNONE"), "no port /dev/ttyNONE")
+    assert_one_line(run(*knead, "truth", "--method", "rsq"), "no method 'rsq'")
+    assert list(tmp_path.iterdir()) == []
+    done = run(*knead, "truth", "--seconds", "3")
+    assert_one_line(done._replace(out=""), "force_n is 0 throughout: does the sensor")
+
+
+def test_the_map_shows_each_cell_and_where_to_press_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    console = Console(width=80, color_system=None)
+    with ohmskin.open("emulator://2x3?speed=0") as skin:
+        board = skin.info
+    coverage = LiveCoverage(board)
+    monkeypatch.setattr("ohmskin.calibrate.coverage.LEAST_NUMBERS", 0)
+    coverage.log_std[:] = [[0.12, 0.5, 0.1], [0.14, 0.9, 0.2]]
+    with Recorder(tmp_path / "a.mcap", board, lambda: 5.0) as recorder, console.capture() as got:
+        shown = KneadMap(recorder, coverage)
+        console.print(shown.picture())
+        recorder.add(Tare(np.full((2, 3, 4), 0.5), 1.0))
+        console.print(shown.picture())
+    lines = [line.split() for line in got.get().splitlines()]
+    assert ["touch", "nothing", "yet"] in lines
+    assert "3 of 6 cells are known to 15 %, press at row 1, column 1" in got.get()
+    assert lines.count(["0", "12", "50", "10"]) == lines.count(["1", "14", "90", "20"]) == 2
+
+
+def test_weights_are_put_anywhere(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "skin.json"
+    grams = ("--anywhere", "--grams", "100,300,700", "--repeats", "3")
+    done = well(run("calibrate", "weights", f"{SKIN}&scene=weights", str(out), *grams))
+    asked = [line for line in done.out.splitlines() if line.startswith("put ")]
+    assert len(asked) == 9
+    assert asked[0] == "put 100 g (0.981 N) where none has been yet"
+    assert f"{out}: calibration of unit 0" in done.out
+    recording = load_recording(tmp_path / "skin.weights-1.mcap")
+    forces_n = {round(sample.force_n, 3) for sample in recording.forces}
+    assert forces_n == {0.981, 2.942, 6.865}
+    assert [mark.text for mark in recording.marks].count(repr(0.980665)) == 3
+    assert np.abs(np.median(errors(out))) < 0.15
+    # Nothing is missing: it is learned from at once.
+    slope = load_calibration(out).model.slope.tolist()
+    done = well(run("calibrate", "weights", f"{SKIN}&scene=weights", str(out), *grams))
+    assert "put 100" not in done.out
+    assert load_calibration(out).model.slope.tolist() == slope
+    for words in (("--indenter-mm2", "80"), ("--cells", "0,0"), ("--redo", "0,0")):
+        done = run("calibrate", "weights", SKIN, str(out), *grams, *words)
+        assert_one_line(done, "--anywhere without --indenter-mm2, --cells, --redo")
+
+
+def test_a_board_and_a_scale_at_ports_are_enough(
+    run: Run, command: Command, tmp_path: Path
+) -> None:
+    """As users have them; both are emulated, by another process."""
+    process = command("emulate", "emulator://2x2?scene=knead&scale_rate=20&begin=3")
+    board, scale = process.stdout.readline().strip(), process.stdout.readline().strip()
+    out = tmp_path / "skin.json"
+    try:
+        ports = ("calibrate", "knead", board, str(out), "--force-port", scale)
+        done = well(run(*ports, "--seconds", "20"))
+    finally:
+        process.kill()
+        process.communicate()
+    assert f"{out}: calibration of unit 0" in done.out
+    assert np.abs(errors(out)).max() < 0.5
+    sources = {sample.source for sample in load_recording(tmp_path / "skin.knead-1.mcap").forces}
+    assert sources == {scale}
