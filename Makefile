@@ -164,6 +164,9 @@ bench-newtons: setup-host ## measure forces under many touches where nobody has 
 bench-knead: setup-host ## measure forces of skins that were kneaded over a scale
 	$(BENCH)/bench_knead.py
 
+bench-honest: setup-host ## measure whether answers say so where a skin is not as the model supposes
+	$(BENCH)/bench_honest.py
+
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
 	$(BENCH)/bench_far.py
 

@@ -17,15 +17,8 @@ from places import ROOT
 
 BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
 SHORT = (
-    *(
-        "bench_estimators",
-        "bench_far",
-        "bench_fingers",
-        "bench_host",
-        "bench_knead",
-        "bench_newtons",
-    ),
-    "bench_tables",
+    *("bench_estimators", "bench_far", "bench_fingers", "bench_honest", "bench_host"),
+    *("bench_knead", "bench_newtons", "bench_tables"),
     pytest.param("bench_desk", marks=pytest.mark.simavr),
 )
 

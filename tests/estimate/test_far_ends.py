@@ -239,7 +239,7 @@ def test_a_far_end_that_floats_is_named() -> None:
     ratio = ten_bits(seen(touch(rest, 3, random)))
     ratio[3, :, 1] = 0.95  # the far end of row 3, above its near end
     found = make_estimator("joint", knowledge(ten_bits(seen(rest)))).estimate(ratio)
-    assert found.message.startswith("row 3: its far end does not follow it, is it open?")
+    assert found.message.startswith("far row 3 does not follow its line: is it open?")
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])
@@ -288,3 +288,50 @@ def test_a_bent_skin_is_read_as_the_same_at_once(method: str) -> None:
     assert np.median(np.concatenate(off)) < 0.005
     assert np.median(found.top_wire_ohm) == pytest.approx(135, rel=0.07)
     assert np.median(found.bottom_wire_ohm) == pytest.approx(270, rel=0.07)
+
+
+@pytest.mark.parametrize("at_near_end", [False, True])
+@pytest.mark.parametrize(
+    ("lines", "near_far", "name"),
+    [
+        (np.s_[:], (0, 1), "far rows"),
+        (np.s_[:], (2, 3), "far columns"),
+        (np.s_[3], (0, 1), "far row 3"),
+    ],
+)
+def test_far_ends_that_show_nothing_of_their_lines_are_named(
+    lines: slice | int, near_far: tuple[int, int], name: str, at_near_end: bool
+) -> None:
+    """From the middle of a run on; not before, and an untouched skin is as bad as a touched one."""
+    random = np.random.default_rng(20)
+    rest = skin_at_rest(8, 8, random)
+    estimator = make_estimator("joint", knowledge(ten_bits(seen(rest))))
+    near, far = near_far
+    for frame in range(20):
+        ratio = ten_bits(seen(rest if frame == 19 else touch(rest, 6, random)))
+        if frame >= 10:
+            ratio[lines, :, far] = ratio[lines, :, near] if at_near_end else 0.5
+        found = estimator.estimate(ratio)
+        assert (frame >= 10) or found.converged
+    assert name in found.message
+
+
+def test_other_cells_may_carry_more_to_far_ends_than_the_ports_own() -> None:
+    """Behind wires of 41 kOhm, the voltage between far ends may be below 0."""
+    random = np.random.default_rng(21)
+    rest = skin_at_rest(4, 4, random, wire_ohm=(41e3, 41e3), spread=0.3)
+    touched = touch(rest, 4, random)
+    expected = sensed_ohm(touched, (True, True))
+    assert expected.min() < 0
+    ports = PortReader(knowledge(seen(rest), bits=None)).read(seen(touched))
+    np.testing.assert_allclose(1 / ports.current - 60e3, expected, rtol=1e-6)
+
+
+def test_an_open_near_line_does_not_spoil_what_others_lose() -> None:
+    random = np.random.default_rng(22)
+    rest = skin_at_rest(6, 6, random)
+    ratio = ten_bits(seen(touch(rest, 4, random)))
+    ratio[2] = [1.0, 0.6, 0.0, 0.6]
+    ports = PortReader(knowledge(ten_bits(seen(rest)))).read(ratio)
+    assert ports.drop_std[2].min() > 1e6 > ports.drop_std[[0, 1, 3, 4, 5]].max()
+    assert "far" not in ports.fault

@@ -77,6 +77,13 @@ from ohmskin.estimate.wire_belief import Fit, WireBelief
 # Share of what is known of the layers that fades after each lesson, because skins bend. Chosen: as
 # each frame measures the layers, little depends on it.
 FADE_SHARE: Final = 0.1
+# A line whose far end shows less than this share of what the usual line loses is at fault, by so
+# many deviations. Chosen: lines differ by less, and one of 2,000 errors is as large.
+OFF_SHARE: Final = 0.5
+OFF_STDS: Final = 3.5
+# A layer whose mean segment is known by less than this has been measured. Chosen: between what a
+# bend may change and what is supposed of wires that nobody has told.
+KNOWN_LOG: Final = 0.5
 
 
 class MeasuredWires(WireBelief):
@@ -90,6 +97,9 @@ class MeasuredWires(WireBelief):
         self._log_reference = self._nominal[:2]  # log m of both layers
         self._segment_ohm: Float | None = None  # (2, R, C) as learned, None before any lesson
         self._own_std = np.full((2, *self.shape), SEGMENT_STD)  # of z, (2, R, C)
+        self._off = [np.zeros(lines, dtype=bool) for lines in self.shape]
+        self._is_layer_off = [False, False]
+        self._judged: PortReadings | None = None  # the last frame whose lines have been looked at
         # L and l of the lines of each layer, which all lessons add to.
         self._information = [
             (np.zeros((lines, 1 + n, 1 + n)), np.zeros((lines, 1 + n)))
@@ -151,6 +161,8 @@ class MeasuredWires(WireBelief):
             lines = np.moveaxis(np.array([*columns, weight]), 1 + layer, 1)
             x, of_ports = lines[:-1], lines[-1]
             products = np.einsum("alp,blp,lp->lab", x, x, of_ports)
+            if ports is not self._judged:
+                self._notice(layer, products)
             shared = products[:, [0, 2]] * own[:, None]
             system = np.eye(2) + shared[:, :, [0, 2]] * own
             products -= shared.transpose(0, 2, 1) @ np.linalg.solve(system, shared)
@@ -159,13 +171,55 @@ class MeasuredWires(WireBelief):
             at = [layer, 2, 3]
             normal[np.ix_(at, at)] += summed[:3, :3]
             right[at] += summed[:3, 3]
+        self._judged = ports
         covariance = np.asarray(np.linalg.inv(normal), np.float64)
         return covariance @ right, covariance
+
+    def _notice(self, layer: int, products: Float) -> None:
+        """Notice lines that lose much less than the usual one, and a layer than was believed.
+
+        The loss of a line over that of the believed wires, and lead, is that of least squares. What
+        has been noticed of a line stays until a frame shows that it loses as it should.
+
+        products (lines, 4, 4): ab of q, h, ones and p.
+        """
+        lead_ohm = max(float(self._means_before[0][2]), 0.0)
+        of_loss = products[:, 0] + lead_ohm * products[:, 2]
+        per_offset = of_loss[:, 1] / (products[:, 1, 1] + 1.0)
+        precision = of_loss[:, 0] + lead_ohm * of_loss[:, 2] - per_offset * of_loss[:, 1]
+        precision = np.maximum(precision, 1e-9)
+        share = (of_loss[:, 3] - per_offset * products[:, 1, 3]) / precision
+        reach = OFF_STDS * np.sqrt(1.0 / precision + SEGMENT_STD**2)
+        usual = OFF_SHARE * np.sort(share)[share.size // 2]  # faster than median
+        off = self._off[layer]
+        off[share + reach < usual] = True
+        off[share - reach > usual] = False
+        # Once its wires are known, a layer may have been bent, but not so that it loses nothing.
+        sound = np.where(off, 0.0, precision)
+        total = max(float(sound.sum()), 1e-9)
+        loss, nothing = float(share @ sound) / total, OFF_STDS * total**-0.5
+        log_std = self._means_before[1][layer] ** 0.5
+        least = np.exp(-OFF_STDS * log_std)
+        if log_std < KNOWN_LOG and loss < min(nothing, least - nothing):
+            self._is_layer_off[layer] = True
+        elif loss > nothing:
+            self._is_layer_off[layer] = False
+
+    @property
+    def fault(self) -> str:
+        """Far ends that show none of what their lines lose, in words, or empty."""
+        for line, off, whole in zip(("row", "column"), self._off, self._is_layer_off, strict=True):
+            if whole or np.count_nonzero(off) > 0.5 * off.size:
+                return f"far {line}s lose too little: do they read as near ends?"
+            if off.any():
+                return f"far {line} {off.argmax()} loses too little: does it read as its near end?"
+        return ""
 
     def fix_rest_wires(self) -> None:
         """Later frames are expected about the wires at rest, but for a bend."""
         prior = np.diagonal(self._prior_covariance)
-        bend = np.array([*np.where(self.far, LAYER_STD**2, prior[:2]), self._root[2, 2] ** 2])
+        found = np.diagonal(self._root) ** 2
+        bend = np.array([*np.where(self.far, LAYER_STD**2 + found[:2], prior[:2]), found[2]])
         self._nominal, self._prior_covariance = self.means, np.diag(bend)
         self._means_before = self._nominal, bend
 
@@ -176,6 +230,8 @@ class MeasuredWires(WireBelief):
         self._lesson_cells = fit.log_cells
         circuit = self.circuit(fit.log_cells, self.means)
         offset = self._measure(circuit, ports)
+        if self.fault:
+            return False
         variance = np.diagonal(self._root) ** 2
         most = np.diagonal(self._prior_covariance)
         fades = np.array([FADE_SHARE, FADE_SHARE, 0.0])  # a bend does not change leads

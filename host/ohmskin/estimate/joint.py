@@ -57,6 +57,9 @@ LOSS_STDS: Final = 10.0
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
 # by less than their rounding.
 LEAST_LEAD_OHM: Final = 20.0
+# [ohm] Longer lines are not neglected to find a start. Chosen: 8 segments of 3 kOhm; from there on
+# a fit takes fewer steps from rest.
+LONG_LINE_OHM: Final = 24e3
 
 
 class JointEstimator(Estimator):
@@ -130,7 +133,7 @@ class JointEstimator(Estimator):
             touches = self._finder.find(ports)
         if touches is not None and (touched := self._explained_by(touches)):
             again = not ports.fault and self._belief.after_fit(touched, ports, again=again)
-            return self._solution(ports, touched), again
+            return self._solution(ports, touched, self._belief.fault), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
         expected = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
@@ -173,8 +176,8 @@ class JointEstimator(Estimator):
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:
         """Why this fit cannot be the answer; empty if it can."""
-        if fit.message:
-            return fit.message
+        if message := self._belief.fault or fit.message:
+            return message
         if self._rest_wires_log_std > REST_STD:
             return "wires resist too much: even cells at rest are uncertain"
         if fit.misfit > MAX_CHI2:
@@ -195,10 +198,14 @@ class JointEstimator(Estimator):
         They are those of the touches that `find` found, even if `explain` rejected them. Where it
         found none, they are what `matrix` finds. That neglects wires, so its cells come out a
         little too soft. This is wanted: from softer cells, the fit does not fall into the wrong
-        minimum of one hard touch behind long wires.
+        minimum of one hard touch behind long wires. Where far ends show that wires resist so much
+        that they must not be neglected, the cells start at rest.
         """
         if touches is not None:
             return touches.log_cells
+        lines_ohm = np.exp(self._belief.means[:2]) * self._shape[::-1]
+        if all(self._belief.far) and lines_ohm.max() > LONG_LINE_OHM:
+            return prior.expected
         # To start from, cells that miss each reading by one deviation are near enough.
         tolerance = float(ports.current.size)
         fit = CellFit(ports, self.knowledge.ref_ohm, self._cells_before, tolerance)

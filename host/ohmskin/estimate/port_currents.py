@@ -56,7 +56,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import (
     EXCHANGED,
     NEAR,
@@ -77,6 +77,11 @@ MOST_OFFSET_RATIO: Final = 0.008
 # Sign of each reading's residual in c: c is half of the current into the row, which readings of the
 # top node show, less the current out of the column, which readings of the bottom node show.
 _INTO_ROW: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
+# A port without a current of so many deviations is dead. Chosen: as faults are told from noise.
+DEAD_STDS: Final = 5.0
+# The least voltage between the far ends of a port, over what its references lose. Chosen: currents
+# are divided by 1 more than it.
+LEAST_APART: Final = -0.9
 
 
 class PortCurrents(NamedTuple):
@@ -165,12 +170,20 @@ class FarReadings(NamedTuple):
 
     ports: u and its standard deviation.
     near_current: I, but at least one standard deviation: others are divided by it (R, C) [S].
+    is_dead: ports whose near ends show no current, as of an open line: far ends show nothing of
+        their wires (R, C).
     drop: what the wires of row and of column lose, p_r I and p_c I, (2, R, C) [V/Vdd].
+    read_drop: the same by both ends as they are read: the references do not matter, but lines that
+        charge do.
+    ends: e and f, or a and b where no far end is sensed, (2, R, C) [V/Vdd].
     """
 
     ports: PortCurrents
     near_current: Float
     drop: Float
+    read_drop: Float
+    ends: Float
+    is_dead: Bool
 
 
 class FarEnds:
@@ -195,9 +208,15 @@ class FarEnds:
             node_ratio(ratio, self._names, node) if is_sensed else potential
             for node, is_sensed, potential in zip("ef", self.sensed, near_end, strict=True)
         )
-        apart = np.maximum(row_end - column_end, 0.0)  # U
+        # Behind long wires, other cells may carry more to the far ends than the port's own: U < 0.
+        apart = np.maximum(row_end - column_end, LEAST_APART * sum(self._ref_ohm) * current)  # U
         whole = apart + sum(self._ref_ohm) * current
         # By d u / d I = U / (U + R_s I)^2 and d u / d U = - I / (U + R_s I)^2.
         std = np.sqrt(apart**2 * near.std**2 + variance * current**2) / whole**2
         drop = np.stack([near_end[0] - row_end, column_end - near_end[1]])
-        return FarReadings(PortCurrents(current / whole, std), current, drop)
+        ends = np.stack([row_end, column_end])
+        is_dead = near.current < DEAD_STDS * near.std
+        a, b = (node_ratio(ratio, self._names, node) for node in "ab")
+        read_drop = np.stack([a - row_end, column_end - b])
+        ports = PortCurrents(current / whole, std)
+        return FarReadings(ports, current, drop, read_drop, ends, is_dead)

@@ -14,8 +14,9 @@ A frame is at fault, and its answer not to be relied on, where
   other lines. A finger between two lines makes them alike for a moment. So lines that a frame has
   shown apart must be alike in `ALIKE_FRAMES` of the frames that are compared after it;
 - a line showed no current at rest, though others did;
-- the far end of a line has a potential that is not between those of the near ends: it is open, or
-  it belongs to another line.
+- the far end of a line has a potential that is not between those of the near ends, or stays while
+  that of the near end moves: it is open, or it belongs to another line;
+- all far ends of a layer show what the near ends show: they are not connected.
 
 A check answers with words, and with no words where nothing is wrong. What frames have shown of
 pairs of lines is the only state here; only `LinePairs.compare` and `reset` change it.
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import PortCircuit
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.port_currents import NearEnds, NearReadings, PortCurrents
+from ohmskin.estimate.port_currents import FarReadings, NearEnds, NearReadings, PortCurrents
 from ohmskin.estimate.port_noise import Spread
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
 
@@ -63,7 +64,22 @@ ALIKE_FRAMES: Final = 270
 PAIR_TIMES: Final = 1.15
 # Share of its nominal wires that a skin has at least. Chosen: no bend or wrong number halves them.
 WIRE_SHARE: Final = 0.5
+# A far end is constant if its range is within noise and is so many times less than that of the near
+# end, once this is clear: so many deviations of the difference. Chosen: far ends move by more than
+# near ones, and the range of eight equal readings is up to four deviations.
+CONSTANT_TIMES: Final = 3.0
+CLEAR_STDS: Final = 8.0
+# [ohm] What lines lose at the least up to their far ends. Chosen: a switch of a CD74HC4067 alone
+# has 70 ohm, typically (data sheet).
+LEAST_LOSS_OHM: Final = 60.0
+# Far ends are at their near ends if they lose less by so many deviations, and not clearly anything.
+# Chosen: one frame of a sound skin in 4,000 is off by as much.
+NO_LOSS_STDS: Final = 3.5
+# Share of what frames have shown of that, which is left after each frame. Chosen: thirty frames.
+FAR_MEMORY: Final = 0.97
 
+# Near ends of rows are above their far ends, those of columns below.
+_TO_NEAR: Final = np.array([1.0, -1.0]).reshape(2, 1, 1)
 _LINES: Final = ("row", "column")  # By axis: rows are counted by axis 0 of an array of ports.
 
 
@@ -271,18 +287,96 @@ class SkinFaults:
         return f"{cell_of(worst, loss)}: conducts less than at rest, is a line open?"
 
 
-def far_line_fault(drop: Float, drop_std: Float) -> str:
-    """A line whose far end is not between the near ends, by all its ports together, or empty.
+class FarFaults:
+    """Finds far ends that do not show their lines, frame after frame.
 
-    The far end of such a line is beyond its near end: its wires seem to lose less than nothing.
-
-    drop (2, R, C): what the wires of row and of column lose up to the far ends; drop_std (R, C).
+    What has been seen of a far end stays until a frame shows another thing: an untouched skin shows
+    little of it.
     """
-    for axis, line in enumerate(_LINES):
-        most = (drop[axis] + FAULT_STDS * drop_std).sum(axis=1 - axis)
-        if most.min() < 0:
-            return f"{line} {most.argmin()}: its far end does not follow it, is it open?"
-    return ""
+
+    def __init__(self, knowledge: SkinKnowledge, sensed: tuple[bool, bool]) -> None:
+        """sensed: whether rows, and whether columns, have far ends that are read."""
+        wires = knowledge.nominal_wire_ohm
+        told_ohm = [sum(filter(None, (wires.lead, ohm)), start=0.0) for ohm in wires[:2]]
+        # What a line is told to lose at least, up to its first crossing, may be less.
+        self._least_ohm = [
+            LEAST_LOSS_OHM if ohm is None else min(LEAST_LOSS_OHM, 0.5 * told)
+            for ohm, told in zip(wires[:2], told_ohm, strict=True)
+        ]
+        self._sensed = sensed
+        self._lines = knowledge.rows, knowledge.columns
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames before."""
+        self._is_constant = [np.zeros(lines, dtype=bool) for lines in self._lines]
+        self._sums = [np.zeros((4, 4)) for _ in self._lines]
+        self._is_near = [False, False]
+
+    def find(self, far: FarReadings, std: Float, shift: float) -> str:
+        """The lines at fault, in words: `far rows`, `far columns`, or `far row 3`; or empty.
+
+        std: of the difference between both ends (R, C); shift: of the offset of far ends [V/Vdd].
+        """
+        # Lines that charge spoil what is read, and references that differ what is modelled: a fault
+        # is in both.
+        drops = np.array([far.drop, far.read_drop])
+        near = far.ends + drops * _TO_NEAR
+        alive = ~far.is_dead  # else the near end is at fault
+        most = alive * (drops.max(axis=0) + FAULT_STDS * std)
+        weight = alive / (std * std)
+        for axis, line in enumerate(_LINES):
+            if not self._sensed[axis]:
+                continue
+            is_off = self._constant(axis, near[:, axis], far.ends[axis], std)
+            is_off = is_off | (most[axis].sum(axis=1 - axis) < 0)
+            if count := np.count_nonzero(is_off):
+                if count > 0.5 * is_off.size:
+                    return f"far {line}s do not follow their lines: is a connector off?"
+                return f"far {line} {is_off.argmax()} does not follow its line: is it open?"
+            if self._loses_nothing(axis, drops[:, axis], far.near_current, weight, shift):
+                return f"far {line}s read as their near ends: is a connector off?"
+        return ""
+
+    def _constant(self, axis: int, near: Float, far: Float, std: Float) -> Bool:
+        """Lines whose far end is the same for all ports, though the near end is not, (lines,).
+
+        near (2, R, C), far (R, C): potentials of the ends [V/Vdd], near ones as they may be.
+        """
+        across = 1 - axis
+        of_near = (near.max(axis=1 + across) - near.min(axis=1 + across)).min(axis=0)
+        of_far, noise = far.max(axis=across) - far.min(axis=across), std.max(axis=across)
+        is_constant = (of_far < 4.0 * noise) & (of_far < of_near / CONSTANT_TIMES)
+        state = self._is_constant[axis]
+        np.copyto(state, is_constant, where=of_near > CLEAR_STDS * noise)
+        return state
+
+    def _loses_nothing(
+        self, axis: int, drops: Float, current: Float, weight: Float, shift: float
+    ) -> bool:
+        """Whether a layer's ends show what its near ends show, as where the connector is off.
+
+        All that its lines lose is taken for the same resistance, and an offset of all far ends.
+        This frame is judged alone, and with those before.
+
+        drops (2, R, C): what they lose, in two ways [V/Vdd].
+        """
+        terms = np.array([current, np.full(current.shape, shift), *drops]).reshape(4, -1)
+        alone = (terms * weight.ravel()) @ terms.T
+        self._sums[axis] = FAR_MEMORY * self._sums[axis] + alone
+        for square in (alone, self._sums[axis]):
+            # Least squares, with the offset within one deviation.
+            (own, both, *pulls), (_, offset, *offset_pulls) = square[:2].tolist()
+            per_offset = both / (offset + 1.0)
+            precision = max(own - per_offset * both, 1e-9)
+            pairs = zip(pulls, offset_pulls, strict=True)
+            ohm = max(pull - per_offset * of_offset for pull, of_offset in pairs) / precision
+            reach_ohm = NO_LOSS_STDS * precision**-0.5
+            if ohm < min(reach_ohm, self._least_ohm[axis] - reach_ohm):
+                self._is_near[axis] = True
+            elif ohm > 2.0 * reach_ohm:
+                self._is_near[axis] = False
+        return self._is_near[axis]
 
 
 def _highest_current(knowledge: SkinKnowledge) -> Float:

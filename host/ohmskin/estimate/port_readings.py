@@ -17,7 +17,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import FarEnds, NearEnds, PortCurrents
-from ohmskin.estimate.port_faults import Contradictions, SkinFaults, far_line_fault
+from ohmskin.estimate.port_faults import Contradictions, FarFaults, SkinFaults
 from ohmskin.estimate.port_noise import ReadingNoise, Spread, Variances
 
 
@@ -82,13 +82,14 @@ class PortReader:
         rest = None
         if knowledge.rest_ratio is not None:
             rest = self._read_near(knowledge.rest_ratio, in_order=False).ports
-        self._faults = SkinFaults(knowledge, rest)
+        self._faults, self._far_faults = SkinFaults(knowledge, rest), FarFaults(knowledge, self.far)
         self._rest_fault = self._faults.at_rest()
 
     def reset(self) -> None:
         """Forget the frames before: the last one, and which lines they have shown apart."""
         self._noise.reset()
         self._faults.reset()
+        self._far_faults.reset()
 
     def read(self, ratio: Float, *, in_order: bool = False) -> PortReadings:
         """Currents of checked readings (R, C, m), m for each cell, and what is wrong with them.
@@ -110,10 +111,13 @@ class PortReader:
         return PortReadings(
             ratio,
             *far.ports,
-            fault or far_line_fault(far.drop, drop_ratio_std),
+            "; ".join(
+                filter(None, (fault, self._far_faults.find(far, drop_ratio_std, shift_ratio)))
+            ),
             self.far,
             drop_ohm=far.drop / far.near_current,
-            drop_std=drop_ratio_std / far.near_current,
+            # Chosen: as good as nothing is known, and its square is still a number.
+            drop_std=np.where(far.is_dead, 1e9, drop_ratio_std / far.near_current),
             drop_shift=shift_ratio / far.near_current,
         )
 

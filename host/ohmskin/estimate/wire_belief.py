@@ -254,6 +254,11 @@ class WireBelief(ABC):
         before = self._lesson_cells
         return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
 
+    @property
+    def fault(self) -> str:
+        """What frames have shown to be wrong with the wires, in words, or empty."""
+        return ""
+
     def learned(self) -> WireOhm | None:
         """The means, and their deviations. None before any lesson."""
         return None if self._lesson_cells is None else self._as_known()
