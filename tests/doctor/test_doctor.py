@@ -403,3 +403,11 @@ def test_findings_are_of_one_unit() -> None:
     found = gather(SteppedSkin(link), report)
     assert "unit 8 has come in place of unit 3" in found.lost
     assert "lost" in {finding.kind.id for finding in examine(found).findings}
+
+
+def test_scans_of_another_size_are_not_sound() -> None:
+    """A recording can have them: nothing of them was examined."""
+    given = evidence("emulator://4x4")
+    other = replace(given, board=replace(given.board, rows=2))
+    assert [each.kind.id for each in examine(other).findings] == ["lost"]
+    assert not examine(other).sound

@@ -133,6 +133,9 @@ def examine(
     if usual is not None:
         with one_blas_thread:
             of_scans(evidence, usual, diagnosis)
+    elif len(evidence.scans) > 1 and not (evidence.lost or stats.restarts):
+        size = f"{board.rows}x{board.columns}"
+        diagnosis.add(Kind.LOST, problem=f"it says {size} cells, and its scans have others")
     diagnosis.findings = merged(diagnosis.findings)
     return diagnosis
 
