@@ -65,6 +65,9 @@ EXCHANGED: Final = {"a": "d", "b": "c", "e": "h", "f": "g"}
 
 # A reference resistor, if nothing else is told: that of the wiring in README.md.
 DEFAULT_REF_OHM: Final = 30_000.0
+# No reference, wire or lead has more. Chosen: a gigohm, which no converter sees; squares of what
+# follows from it stay finite.
+MAX_OHM: Final = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +120,10 @@ class Skin:
 
 
 def check_references(ref_top_ohm: float, ref_bottom_ohm: float) -> None:
-    """Raise ValueError unless both reference resistors are positive and finite."""
+    """Raise ValueError unless both reference resistors are within 1..`MAX_OHM`."""
     for name, ohm in (("ref_top_ohm", ref_top_ohm), ("ref_bottom_ohm", ref_bottom_ohm)):
-        if not (np.isfinite(ohm) and ohm > 0):
-            raise ValueError(f"{name} must be positive and finite, not {ohm}")
+        if not 1 <= ohm <= MAX_OHM:
+            raise ValueError(f"{name} must be from 1 to {MAX_OHM:g}, not {ohm:g}")
 
 
 @lru_cache(maxsize=8)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR, check_references, current_std
+from ohmskin.circuit.skin import DEFAULT_REF_OHM, MAX_OHM, NEAR, check_references, current_std
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
@@ -42,10 +42,10 @@ class WireOhm(NamedTuple):
     lead_std_ohm: float | None = None
 
     def check(self) -> Self:
-        """Itself. Raises ValueError, naming the field, for what is not finite or below 0."""
+        """Itself. Raises ValueError, naming the field, for what is not within 0..`MAX_OHM`."""
         for name, number in zip(WIRE_FIELDS, self, strict=True):
-            if number is not None and not (np.isfinite(number) and number >= 0):
-                raise ValueError(f"{name} is {number}, it must be finite and >= 0")
+            if number is not None and not 0 <= number <= MAX_OHM:
+                raise ValueError(f"{name} is {number:g}, it must be from 0 to {MAX_OHM:g}")
         return self
 
     @property
