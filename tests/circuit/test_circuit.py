@@ -117,7 +117,7 @@ def test_current_is_the_combination_of_least_variance() -> None:
         ({"bottom_wire_ohm": np.full((2, 2), -1.0)}, "bottom_wire_ohm must be finite"),
         ({"cell_siemens": np.full((2, 2), np.nan)}, "cell_siemens must be finite"),
         ({"ref_top_ohm": 0.0}, "ref_top_ohm must be from 1"),
-        ({"ref_bottom_ohm": np.inf}, "ref_bottom_ohm must be positive"),
+        ({"ref_bottom_ohm": np.inf}, "ref_bottom_ohm must be from 1"),
         ({"lead_ohm": np.ones(3)}, "lead_ohm has shape"),
         ({"lead_ohm": np.array(-1.0)}, "lead_ohm must be finite"),
     ],

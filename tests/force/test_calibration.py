@@ -173,7 +173,7 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
         (put("kind", 1, 2, 1), "kind holds int, not str"),
         (put("pooled", 1, 2, 1), "pooled holds int, not bool"),
         (put("indenter_area_m2", 0), "indenter_area_m2 is 0.0, it must be above 0"),
-        (put("nominal_top_wire_ohm", -1), "nominal_top_wire_ohm is -1.0, it must be finite"),
+        (put("nominal_top_wire_ohm", -1), "nominal_top_wire_ohm is -1, it must be from 0"),
         (put("nominal_bottom_wire_ohm", []), "nominal_bottom_wire_ohm holds list, not float"),
     ],
 )

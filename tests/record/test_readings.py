@@ -137,6 +137,10 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD[..., :3]}, "ratio has shape"),
         ({"ratio": GOOD[:0]}, "ratio has 0 frames"),
         ({"ratio": GOOD[:, :0]}, "0x4 cells"),
+        (
+            {"ratio": GOOD, "nominal_lead_ohm": 1e300},
+            "nominal_lead_ohm is 1e.300, it must be from 0",
+        ),
         ({"ratio": np.zeros((1, 33, 32, 4))}, "33x32 cells: at most 1024 cells in 64 rows"),
         ({"ratio": np.zeros((1, 1, 65, 4))}, "no skin has 1x65 cells"),
         (
@@ -158,7 +162,7 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD, "reading_names": list("abcdefgha")}, "9 names of 4 bytes, not some"),
         ({"ratio": GOOD[..., :0], "reading_names": np.array([], "U1")}, "reading_names are ,"),
         ({"ratio": np.zeros((200_001, 1, 1, 4))}, "200001 frames, not 1 to 200000"),
-        ({"ratio": GOOD, "ref_bottom_ohm": 0.0}, "ref_bottom_ohm must be positive"),
+        ({"ratio": GOOD, "ref_bottom_ohm": 0.0}, "ref_bottom_ohm must be from 1"),
         ({"ratio": GOOD, "adc_bits": 10.5}, "adc bits must be"),
         ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),
         ({"ratio": GOOD, "nominal_top_wire_ohm": np.ones(3)}, "nominal_top_wire_ohm has shape"),
