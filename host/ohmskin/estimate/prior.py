@@ -64,9 +64,9 @@ LEAD_STD: Final = 0.05
 # Share of what is known of the layers that fades before each lesson, because skins bend: where the
 # skin is still, and where it has just been bent.
 STEADY_FADE: Final = 0.01
-AGILE_FADE: Final = 0.3
+AGILE_FADE: Final = 0.6
 # How likely it is before any lesson that a skin bends.
-AGILE_SHARE: Final = 0.3
+AGILE_SHARE: Final = 0.5
 # Share of what lessons have said of that, which is left after each lesson.
 MEMORY: Final = 0.8
 
