@@ -48,9 +48,9 @@ from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Scan
 
-# At most so many scans of presses are estimated, for the curves and for each trial of the wires.
-# Chosen: a fit of the wires takes no longer than that of the curves.
-MOST_SCANS, TRIAL_SCANS = 8000, 2800
+# At most so many scans of presses are estimated for the curves; and for each trial of the wires, so
+# many cells of them. Chosen: 16x16 then takes some minutes.
+MOST_SCANS, TRIAL_CELLS = 8000, 400_000
 # Presses are chosen in stretches of so many. Chosen: what a slow scale still shows of a press that
 # was not chosen is in one of so many.
 STRETCH: Final = 12
@@ -59,7 +59,7 @@ PAUSE_SCANS: Final = 200
 # Rises below this many times what cells show of nothing tell no force.
 PAUSE_TIMES: Final = 2.0
 # Trials of the wires, their longest step, and the one that is the last.
-TRIALS, LONGEST_STEP, LAST_STEP = 8, 1.0, 0.05
+TRIALS, LONGEST_STEP, LAST_STEP = 6, 1.0, 0.1
 # How well a trial's segments are told: so well that no scan teaches others. Chosen.
 TRIAL_LOG_STD: Final = 1e-3
 
@@ -119,7 +119,8 @@ class Kneading:
         lead_ohm, lead_std_ohm = lead * UNKNOWN_LEAD_OHM, lead_std * UNKNOWN_LEAD_OHM
         if told.lead is None:
             lead_std_ohm = USUAL_LEAD_STD_OHM
-        every = int(np.count_nonzero(self._press >= 0) // TRIAL_SCANS) + 1
+        cells = int(np.count_nonzero(self._press >= 0)) * knowledge.rows * knowledge.columns
+        every = cells // TRIAL_CELLS + 1
         used = np.maximum.accumulate(self._press) // STRETCH % every == 0
         w, scale = np.array(centre), None
         for _ in range(TRIALS):

@@ -31,9 +31,9 @@ deviation `GAIN_STD` about one curve, which the fit corrects by what cells show;
 `EXPONENT`; the zero wanders by `ZERO_STEP_N` from knot to knot; w is what was told of the wires.
 
 Errors of one press have few causes, so its rows count as `PRESS_ROWS` together, and it is kept or
-left out as a whole: at first each press weighs less the more it is off (Cauchy), then those off by
-more than `OUTLIER_STDS` robust deviations are left out. Such a press is one whose force does not go
-through the skin: a finger beside it, a hand on the plate.
+left out as a whole: at first only those count that fit best, and cells hardly differ; then all but
+those that are off by more than `OUTLIER_STDS` robust deviations. Such a press is one whose force
+does not go through the skin: a finger beside it, a hand on the plate.
 
 c is 0 but while the wires are looked for: what no force lowers bends the curve as wires do, and so
 does hysteresis. Wires are learned with a row a press, because errors of presses look like them.
@@ -56,6 +56,9 @@ from ohmskin.force.curve import LINEAR, MAX_EXPONENT, MIN_EXPONENT, POWER, Force
 # Prior deviation of log gains. Chosen: cells of one skin scatter by some ten percent, and knitted
 # by hand by more.
 GAIN_STD: Final = 0.25
+# That while it is not known yet which presses are beside the skin. Chosen: so the gains of cells
+# that few presses reach do not follow these.
+FIRST_GAIN_STD: Final = 0.05
 # That deviation counts as much as so many cells that show it.
 GAIN_CELLS: Final = 4.0
 # Exponent of F by x: contacts conduct by F^1 to F^2.
@@ -77,12 +80,14 @@ FLOOR_SHARE: Final = 0.5
 # A press that is off by more robust standard deviations is left out. Chosen: by chance, one normal
 # error of 16,000 is larger, and presses are not quite normal.
 OUTLIER_STDS: Final = 4.0
+# At first only this share of the presses counts: those that fit best.
+SURE_SHARE: Final = 0.7
 # A press is never left out that is off by less than this share, or by less than this force [N].
 LEAST_OFF: Final = 0.15
 LEAST_OFF_N: Final = 0.15
 # Rounds of the fit: robust ones, then ones with outliers left out; the filter is fitted after some.
 ROBUST_ROUNDS, TRIMMED_ROUNDS = 5, 5
-SCALE_ROUNDS: Final = (0, 4)
+SCALE_ROUNDS: Final = (0, 4, 7)
 # A gain whose deviation is still so much of the prior's is not the cell's own.
 POOLED_SHARE: Final = 0.7
 # Cells whose forces scatter by more than this share follow no curve.
@@ -143,9 +148,8 @@ class TotalFit:
         self._of_gains, self._of_zero = slice(3 + offsets, size), slice(size, None)
         self._p = np.zeros(size + self._basis.shape[1])
         self._p[1:3] = self._law = EXPONENT, SERIES if wires else 0.0
-        self._gain_std = GAIN_STD
+        self._gain_std = FIRST_GAIN_STD
         self._group()
-        self._weight = np.ones(self._groups)  # of groups
         self._out: Bool = np.zeros(self._groups, dtype=bool)
 
     def _set_zero(self) -> None:
@@ -209,7 +213,7 @@ class TotalFit:
 
     def _fit_scale(self) -> None:
         totals = self._totals
-        weight = (self._weight * ~self._out)[self._of_row]
+        weight = 1.0 * ~self._out[self._of_row]
         force_n = self._parts(self._contact()[0]).sum(axis=1)
         shown_n = totals.shown_n - self._basis @ self._p[self._of_zero]
         self.scale_ = fit_scale(totals.time_s, force_n, totals.shown_s, shown_n, weight)
@@ -250,8 +254,7 @@ class TotalFit:
         rows = np.bincount(self._of_row, minlength=self._groups)[self._of_row]
         press_rows = PRESS_ROWS if self._wires is None else WIRE_PRESS_ROWS
         share = np.where(self._pressed, np.minimum(1.0, press_rows / rows), 1.0)
-        share *= kept * self._weight[self._of_row]
-        return np.asarray(share / variance)
+        return np.asarray(kept * share / variance)
 
     def _prior(self) -> tuple[Float, Float]:
         """Precision of p, and its pull."""
@@ -268,21 +271,21 @@ class TotalFit:
         return precision, precision @ (centre - p)
 
     def _judge(self, *, trims: bool) -> None:
-        """Weigh the groups, or leave some out, by how far each is off; then the gains' scatter."""
+        """Leave out groups by how far each is off. trims: outliers alone; cells may differ then."""
         size_n = self.total_n_ + self._floor_n
         weight = np.bincount(self._of_row, size_n, self._groups) + 1e-12
         off_n = np.bincount(self._of_row, size_n * self.off_n_, self._groups) / weight
         force_n = np.bincount(self._of_row, size_n * self.total_n_, self._groups) / weight
         scale_n = np.hypot(force_n, np.where(self._is_press, self._floor_n, 0.0))
-        kept, off = ~self._out & (weight > 1e-9), np.abs(off_n)
-        presses, pauses = kept & self._is_press, kept & ~self._is_press
+        seen, off = weight > 1e-9, np.abs(off_n)
+        presses, pauses = seen & self._is_press, seen & ~self._is_press
         s1 = _robust_std(off[presses] / scale_n[presses], 0.01)
         s0 = _robust_std(off[pauses], 0.01) if pauses.sum() > 5 else 0.01
         stds = off / np.hypot(s0, np.where(self._is_press, s1 * scale_n, 0.0))
         if not trims:
-            self._weight = 1 / (1 + (stds / 2) ** 2)
+            most = np.quantile(stds[presses], SURE_SHARE)
+            self._out = stds > np.where(self._is_press, most, OUTLIER_STDS)
             return
-        self._weight = np.ones(self._groups)
         least_n = np.maximum(LEAST_OFF_N, LEAST_OFF * force_n)
         self._out = (stds > OUTLIER_STDS) & (off > least_n)
         self._largest_n = float(self._parts(self._contact()[0]).max())
