@@ -29,7 +29,7 @@ PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far orders desk force \
-                view strangers boards quick)
+                view strangers boards honest quick)
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:

@@ -276,6 +276,19 @@ def test_all_far_ends_are_open_where_there_is_no_second_pair() -> None:
     assert rows.place.rows == columns.place.columns == tuple(range(8))
 
 
+@pytest.mark.parametrize("code", [None, 300, 900])
+@pytest.mark.parametrize("lines", [(3,), tuple(range(8))])
+def test_far_ends_that_show_nothing_are_open(lines: tuple[int, ...], code: int | None) -> None:
+    """They show what the near ends show (None), or the same code whatever is read."""
+    read = evidence(FAR)
+    assert read.settled is not None
+    for codes in (*(scan.codes for scan in read.scans), *read.settled.codes):
+        codes[lines, :, 1] = codes[lines, :, 0] if code is None else code
+    assert [(each.kind, each.place.rows) for each in examine(read).findings] == [
+        (Kind.OPEN_FAR, lines)
+    ]
+
+
 # ------------------------------------------------------------------------------- the command
 
 

@@ -44,10 +44,11 @@ The readings alone do not determine n segments. They are taken to scatter about 
 With m free, this gives the segments of a sound line. With the usual m of the layer, and one segment
 that may have any resistance, it finds a bad segment.
 
-A far end is at fault if no r fits, or if u = k w fits clearly better, with k from 0 to 1. That is
-what a node shows that is not connected: it keeps the voltage of the cell before (k = 1), unless the
-converter's sample capacitor brings along that of the near end, which is read before (down to
-k = 0). Two ends are swapped if what the circuit says of the other line's end fits.
+A far end is at fault if it stays while the near end moves, if it shows what the near end shows, if
+no r fits, or if u = k w fits clearly better, with k from 0 to 1. That is what a node shows that is
+not connected: it keeps the voltage of the cell before (k = 1), unless the converter's sample
+capacitor brings along that of the near end, which is read before (down to k = 0). Two ends are
+swapped if what the circuit says of the other line's end fits.
 """
 
 from collections.abc import Iterable, Sequence
@@ -71,6 +72,7 @@ from ohmskin.doctor.limits import (
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_faults import CONSTANT_TIMES, LEAST_LOSS_OHM
 from ohmskin.estimate.prior import SEGMENT_STD
 from ohmskin.link.protocol import ADC_BITS, LARGEST_CODE
 
@@ -96,6 +98,8 @@ class FarReadings:
 
     shape: number of rows and columns that are kept.
     loss_std_floating: u, s and w of rows (3, R, C), and of columns (3, C, R) [ohm].
+    silent: which rows, and which columns, have a far end that stays while the near end moves, or
+        shows what the near end shows.
     cell_siemens: the cells, (R, C) [S]; first as if wires had no resistance, later as
         `current_shares` corrects them.
     """
@@ -116,6 +120,17 @@ class FarReadings:
         loss = np.stack([a - e, f - b])
         # A loss is the difference of two readings, and the A r that explains it is not exact.
         std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * loss)
+        silent = []
+        for axis, (near_end, far_end) in enumerate(((a, e), (b, f))):
+            moves, follows = (np.ptp(each, axis=1 - axis) for each in (near_end, far_end))
+            stays = (follows < moves / CONSTANT_TIMES) & (follows < 2.0**-ADC_BITS)
+            ohm = np.abs((loss[axis] / self._current).mean(axis=1 - axis))
+            std_ohm = (std[axis] / self._current).mean(axis=1 - axis) / loss.shape[2 - axis] ** 0.5
+            most_ohm = LEAST_LOSS_OHM - FEW_STDS * std_ohm
+            whole = ohm.mean() < LEAST_LOSS_OHM - FEW_STDS * std_ohm.mean() / ohm.size**0.5
+            # In single lines, what wires lose may undo what cells make of the current.
+            silent.append(stays.all() | (ohm < most_ohm) | whole)
+        self.silent = silent[0], silent[1]
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
         rows, columns = np.stack([loss, std, floating], axis=1) / self._current
         self.loss_std_floating = rows, columns.swapaxes(1, 2)
@@ -203,10 +218,12 @@ class _Layer:
         shorts: list[list[int]],
         loss_std_floating: Float,
         lead_ohm: tuple[float, float],
+        silent: Bool,
     ) -> None:
         self.axis, self.numbers, self.across = axis, kept[axis], kept[1 - axis]
         self.loss_ohm, self.std_ohm, self.floating_ohm = loss_std_floating
         self.shorts, (self.lead_ohm, self.lead_std_ohm) = shorts, lead_ohm
+        self._silent = silent
         # A shorted line has currents of others in its wire, so that u = l + A r does not hold.
         self._alone = ~np.isin(self.numbers, [n for group in self.shorts for n in group])
 
@@ -231,7 +248,7 @@ class _Layer:
         most_of_any = MANY_STDS**2 * max(len(self.across) - 1, 1)
         most_cost = np.minimum(most_of_any, MANY_STDS**2 + self._floating_cost())
         too_much = np.abs(self.fit.ohm.sum(axis=1)) > MOST_LINE_OHM
-        self.lost = self._alone & ((least_cost > most_cost) | too_much)
+        self.lost = self._alone & ((least_cost > most_cost) | too_much | self._silent)
         self.measured = self._alone & ~self.lost
         self.usual_ohm = self._median_ohm(self.measured)
 
@@ -353,7 +370,7 @@ class _Layer:
         off = (self.beyond_ohm - ends_ohm) / self.std_ohm
         chi2 = np.mean(off**2, axis=2)  # axes: the line whose end may be read, the line
         np.fill_diagonal(chi2, np.inf)  # its own end has been judged
-        swapped = self.lost & (chi2.min(axis=0) < MANY_STDS**2)
+        swapped = self.lost & ~self._silent & (chi2.min(axis=0) < MANY_STDS**2)
         for kind, lines in ((Kind.SWAPPED_FAR, swapped), (Kind.OPEN_FAR, self.lost & ~swapped)):
             if lines.any():
                 diagnosis.add(kind, self.place(lines_of(lines)))
@@ -511,8 +528,10 @@ def examine_far(
         kept.append([n for n in range(len(is_open)) if n not in left_out])
     readings, expected_lead = FarReadings(rest, kept), rest.lead_ohm(USUAL_LEAD_STD_OHM)
     layers = [
-        _Layer(axis, kept, near.shorts[axis], loss_std_floating, expected_lead)
-        for axis, loss_std_floating in enumerate(readings.loss_std_floating)
+        _Layer(axis, kept, near.shorts[axis], loss_std_floating, expected_lead, silent)
+        for axis, (loss_std_floating, silent) in enumerate(
+            zip(readings.loss_std_floating, readings.silent, strict=True)
+        )
     ]
     wire_ohm: Float = np.zeros((2, *readings.shape))
     for _ in range(ROUNDS):

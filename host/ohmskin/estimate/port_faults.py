@@ -69,6 +69,8 @@ WIRE_SHARE: Final = 0.5
 # near ones, and the range of eight equal readings is up to four deviations.
 CONSTANT_TIMES: Final = 3.0
 CLEAR_STDS: Final = 8.0
+# Lines of fewer ports are not said to be constant. Chosen: one of four ports has been, by chance.
+LEAST_PORTS: Final = 6
 # [ohm] What lines lose at the least up to their far ends. Chosen: a switch of a CD74HC4067 alone
 # has 70 ohm, typically (data sheet).
 LEAST_LOSS_OHM: Final = 60.0
@@ -348,7 +350,9 @@ class FarFaults:
         of_far, noise = far.max(axis=across) - far.min(axis=across), std.max(axis=across)
         is_constant = (of_far < 4.0 * noise) & (of_far < of_near / CONSTANT_TIMES)
         state = self._is_constant[axis]
-        np.copyto(state, is_constant, where=of_near > CLEAR_STDS * noise)
+        # In a few ports, what wires lose may undo what cells make of the current.
+        if far.shape[across] >= LEAST_PORTS:
+            np.copyto(state, is_constant, where=of_near > CLEAR_STDS * noise)
         return state
 
     def _loses_nothing(
