@@ -53,6 +53,11 @@ def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -
     again = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
     assert "touch nothing" not in again.out
     assert not (tmp_path / "skin.knead-2.mcap").exists()
+    # Where that has failed to teach a calibration, more is recorded.
+    out.unlink()
+    again = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
+    assert "skin.knead-2.mcap: " in again.out
+    assert out.exists()
 
 
 def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
@@ -86,7 +91,8 @@ def test_the_map_shows_each_cell_and_where_to_press_next(
     with ohmskin.open("emulator://2x3?speed=0") as skin:
         board = skin.info
     coverage = LiveCoverage(board)
-    monkeypatch.setattr("ohmskin.calibrate.coverage.LEAST_NUMBERS", 0)
+    monkeypatch.setattr("ohmskin.calibrate.coverage.NUMBERS_A_CELL", 0)
+    coverage.ask_more()
     coverage.log_std[:] = [[0.12, 0.5, 0.1], [0.14, 0.9, 0.2]]
     with Recorder(tmp_path / "a.mcap", board, lambda: 5.0) as recorder, console.capture() as got:
         shown = KneadMap(recorder, coverage)

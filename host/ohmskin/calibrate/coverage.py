@@ -53,9 +53,9 @@ SCALE_STD_N: Final = 0.05
 # Numbers that come sooner after the last are no news [s]. Chosen: the noise of a contact lasts as
 # long, and most scales show ten numbers a second.
 NEWS_S: Final = 0.1
-# No cell counts as known before so many numbers of the scale. Chosen: some ten presses, because the
-# curve of all cells and the wires have to be known, too.
-LEAST_NUMBERS: Final = 60
+# No cell counts as known before so many numbers of the scale for each cell. Chosen: one or two
+# presses a cell, because the curve of all cells and the wires have to be known, too.
+NUMBERS_A_CELL: Final = 10
 # Less force is not counted [N]. Chosen: there, a scale's zero is a share of it.
 LEAST_N: Final = 0.3
 
@@ -99,7 +99,13 @@ class LiveCoverage:
         self._board = board
         self._coverage = Coverage(board.rows * board.columns)
         self.log_std = self._coverage.log_std().reshape(board.rows, board.columns)
+        self._least = 0  # numbers before which nothing counts as known
+        self.ask_more()
         self.begin()
+
+    def ask_more(self) -> None:
+        """As many numbers are wanted from now on as for a new skin."""
+        self._least = self._coverage.numbers + NUMBERS_A_CELL * self.log_std.size
 
     def begin(self) -> None:
         """Another recording begins: its rest and the zero of its scale are its own."""
@@ -139,7 +145,7 @@ class LiveCoverage:
     @property
     def known(self) -> Bool:
         """Which cells are known, (R, C)."""
-        return (self.log_std <= KNOWN_LOG) & (self._coverage.numbers >= LEAST_NUMBERS)
+        return (self.log_std <= KNOWN_LOG) & (self._coverage.numbers >= self._least)
 
     @property
     def next_cell(self) -> tuple[int, int]:

@@ -81,6 +81,8 @@ def kneaded(
         coverage = LiveCoverage(skin.info)
         for given in recordings:
             coverage.look_at(given)
+        if coverage.known.all() and not out.exists():  # the fit has failed
+            coverage.ask_more()
         if not coverage.known.all():
             try:
                 _knead(skin, path, sensor_of(skin), coverage, seconds)
