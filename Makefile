@@ -29,7 +29,11 @@ PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far orders desk force \
+<<<<<<< HEAD
                 view strangers boards honest quick)
+=======
+                view strangers largest boards quick)
+>>>>>>> e240666 (benchmarks: what the largest skins of files cost, as SECURITY.md states)
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
@@ -184,6 +188,9 @@ bench-view: setup ## measure the page: latency to the screen, frames, load
 
 bench-strangers: setup-host ## measure what those without the token can do to the page
 	$(BENCH)/bench_strangers.py
+
+bench-largest: setup-host ## measure what the largest skins that files may have cost: SECURITY.md
+	$(BENCH)/bench_largest.py
 
 bench-boards: setup-host ## measure one process that reads eight boards at once: five minutes
 	$(BENCH)/bench_boards.py
