@@ -29,11 +29,7 @@ PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far orders desk force \
-<<<<<<< HEAD
-                view strangers boards honest quick)
-=======
-                view strangers largest boards quick)
->>>>>>> e240666 (benchmarks: what the largest skins of files cost, as SECURITY.md states)
+                view strangers largest boards honest quick)
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
