@@ -93,14 +93,16 @@ def measure(minutes: float) -> dict[str, Any]:
         served(__file__, BOARDS) as emulated,
         ohmskin.open_all(emulated.ports, calibrations=calibrations) as skins,
     ):
-        load = Load()
+        load, epoch_ns = Load(), time.time_ns() - time.monotonic_ns()
         for timed in skins.scans():
             counts[timed.unit_id] += 1
             missed += timed.scan.missed
             pressed += bool(timed.scan.contacts)
             ages_s.append(time.monotonic() - timed.scan.host_time_s)
             if load.seconds() > SETTLED_S:
-                times_s.append((timed.unit_id, timed.scan.time_us, timed.time_s))
+                times_s.append(
+                    (timed.unit_id, timed.scan.time_us, 1e-9 * (timed.scan.time_ns - epoch_ns))
+                )
             if load.seconds() >= 60 * minutes:
                 break
         took_s, cpu_percent = load.seconds(), load.percent()

@@ -13,11 +13,9 @@ import json
 import sys
 
 import numpy as np
-from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import ohmskin
-from ohmskin.record.recording import load_recording
 
 PITCH_M = 0.01
 # Foxglove knows this schema by its name; of its text it needs what is base64.
@@ -50,10 +48,6 @@ def grid(force_n: np.ndarray, time_ns: int) -> dict:
 
 
 def main(recording: str, calibration: str, out: str) -> None:
-    with open(recording, "rb") as file:
-        _, _, first = next(make_reader(file).iter_messages("/skin/scan"))
-    since_1970_ns = first.log_time - round(1e9 * json.loads(first.data)["host_time_s"])
-    recorded = load_recording(recording).scans
     with (
         ohmskin.open(f"replay://{recording}?speed=0", calibration=calibration) as skin,
         open(out, "xb") as file,
@@ -69,8 +63,7 @@ def main(recording: str, calibration: str, out: str) -> None:
                 ("/skin/cells", "ohmskin.cells", CELLS),
             )
         ]
-        for told, scan in zip(recorded, skin, strict=True):
-            time_ns = since_1970_ns + round(1e9 * told.host_time_s)
+        for scan in skin:
             force_n = np.nan_to_num(scan.force_n)
             cells = {"force_n": force_n, "force_n_std": scan.force_n_std}
             # JSON has no NaN: what the method does not tell is left out.
@@ -79,9 +72,10 @@ def main(recording: str, calibration: str, out: str) -> None:
                 for name, values in cells.items()
                 if not np.isnan(values).any()
             }
-            messages = (grid(force_n, time_ns), content)
+            messages = (grid(force_n, scan.time_ns), content)
             for channel, message in zip(channels, messages, strict=True):
-                writer.add_message(channel, time_ns, json.dumps(message).encode(), time_ns)
+                octets = json.dumps(message).encode()
+                writer.add_message(channel, scan.time_ns, octets, scan.time_ns)
         writer.finish()
 
 

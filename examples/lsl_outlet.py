@@ -32,14 +32,13 @@ def stream_info(board: ohmskin.Hello) -> pylsl.StreamInfo:
 
 
 def main(port: str, calibration: str, seconds: float = float("inf")) -> None:
-    with ohmskin.open_all([port], calibrations=[calibration]) as skins:
-        (skin,) = skins.values()
+    with ohmskin.open(port, calibration=calibration) as skin:
         outlet = pylsl.StreamOutlet(stream_info(skin.info))
-        # On Linux both are CLOCK_MONOTONIC; elsewhere they differ by this.
-        offset_s = pylsl.local_clock() - time.monotonic()
+        offset_s = pylsl.local_clock() - time.time()
         end_s = time.monotonic() + seconds
-        for each in skins.scans():
-            outlet.push_sample(each.scan.force_n.flatten().tolist(), each.time_s + offset_s)
+        for scan in skin:
+            time_s = 1e-9 * scan.time_ns + offset_s
+            outlet.push_sample(scan.force_n.flatten().tolist(), time_s)
             if time.monotonic() > end_s:
                 break
 

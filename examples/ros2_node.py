@@ -13,7 +13,6 @@ emulated skin and made-up presses:
         -p "port:='emulator://8x8?scene=moving'"
 """
 
-import time
 from array import array
 from contextlib import suppress
 
@@ -39,14 +38,9 @@ class SkinNode(Node):
         self.frame_id = self.declare_parameter("frame_id", "skin").value
         self.forces = self.create_publisher(Float32MultiArray, "~/forces", 10)
         self.taxels = self.create_publisher(PointCloud2, "~/taxels", 10)
-        # ROS's clock less time.monotonic(). An interruption between them only makes it larger.
-        self.offset_ns = min(
-            -time.monotonic_ns() + self.get_clock().now().nanoseconds for _ in range(5)
-        )
 
-    def publish(self, scan: ohmskin.ForceScan, time_s: float) -> None:
-        """time_s: of the scan's middle, on time.monotonic() [s]."""
-        stamp = Time(nanoseconds=round(1e9 * time_s) + self.offset_ns)
+    def publish(self, scan: ohmskin.ForceScan) -> None:
+        stamp = Time(nanoseconds=scan.time_ns)
         self.forces.publish(multi_array(scan.force_n))
         header = Header(stamp=stamp.to_msg(), frame_id=self.frame_id)
         self.taxels.publish(point_cloud(scan, self.pitch_m, header))
@@ -90,12 +84,12 @@ def main() -> None:
     node = SkinNode()
     with (
         suppress(KeyboardInterrupt, ExternalShutdownException),
-        ohmskin.open_all([node.port], calibrations=[node.calibration]) as skins,
+        ohmskin.open(node.port, calibration=node.calibration) as skin,
     ):
-        for each in skins.scans():
+        for scan in skin:
             if not rclpy.ok():
                 break
-            node.publish(each.scan, each.time_s)
+            node.publish(scan)
             rclpy.spin_once(node, timeout_sec=0)
     node.destroy_node()
     rclpy.try_shutdown()

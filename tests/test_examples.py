@@ -117,7 +117,7 @@ def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> Non
 
 def test_two_boards_have_one_clock() -> None:
     urls = ("emulator://8x8?unit=1", "emulator://8x8?unit=2&mode=far")
-    begin_s = time.monotonic()
+    begin_s = time.time()
     head, *lines = first_lines(40, str(EXAMPLES / "two_boards.py"), *urls)
     assert head == "units 1, 2\n"
     scans = [
@@ -127,7 +127,7 @@ def test_two_boards_have_one_clock() -> None:
     assert len(times_s) == 39
     assert all(b - a > -0.002 for a, b in pairwise(times_s))
     # A clock that is still learning may be ahead by 50 ms.
-    assert begin_s < times_s[0] < times_s[-1] < time.monotonic() + 0.1
+    assert begin_s < times_s[0] < times_s[-1] < time.time() + 0.1
     assert {each[2] for each in scans if each} == {"1", "2"}
 
 
@@ -274,7 +274,7 @@ def test_foxglove_forces_writes_a_grid(recorded: Path, skin_json: str, tmp_path:
     for (_, name, text, log_ns, grid), (*_, scan_ns, _) in zip(grids, scans, strict=True):
         assert name == "foxglove.Grid"
         assert text["properties"]["data"]["contentEncoding"] == "base64"
-        assert abs(log_ns - scan_ns) < 1000
+        assert 0 < 1e-9 * (scan_ns - log_ns) < 0.1  # it came after its middle
         assert grid["timestamp"] == {"sec": log_ns // 10**9, "nsec": log_ns % 10**9}
     force_n = np.frombuffer(base64.b64decode(grid["data"]), "<f4").reshape(8, 8)
     assert (grid["column_count"], grid["row_stride"], grid["cell_stride"]) == (8, 32, 4)

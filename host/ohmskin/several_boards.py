@@ -14,7 +14,6 @@ from ohmskin.errors import DeviceSilent, PortError
 from ohmskin.files import Closing, naming
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan
-from ohmskin.link.clock import BoardClock, line_delay_s, scan_s
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.link.serial_port import serial_ports
@@ -28,13 +27,10 @@ class BoardScan(NamedTuple, Generic[_Scan]):
 
     unit_id: of the board.
     scan: a `Scan`; a `ForceScan` if the boards were opened with calibrations.
-    time_s: when the middle of the scan was, on `time.monotonic()` [s]. It is late by the delay that
-        USB has for all scans alike, which no host can see.
     """
 
     unit_id: int
     scan: _Scan
-    time_s: float
 
 
 class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
@@ -56,7 +52,7 @@ class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
                 )
 
     def scans(self) -> Iterator[BoardScan[_Scan]]:
-        """Every scan of every board from now on, in order of their times.
+        """Every scan of every board from now on, in order of `Scan.time_ns`.
 
         A scan is given when every other board has sent a later one: late by about a period of the
         slowest board. A program for which that is too late reads each device's `latest`.
@@ -64,9 +60,9 @@ class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
         :raises DeviceLost: one of the boards went away; its text names the port.
         """
         # All boards begin now. The merge would begin each of them when it first takes a scan of it.
-        begun = [(device, cast("Iterator[_Scan]", iter(device))) for device in self.values()]
-        of_boards = [_timed(device, scans) for device, scans in begun]
-        return heapq.merge(*of_boards, key=lambda board_scan: board_scan.time_s)
+        begun = [cast("Iterator[_Scan]", iter(device)) for device in self.values()]
+        of_boards = map(_named, self, begun)
+        return heapq.merge(*of_boards, key=lambda board_scan: board_scan.scan.time_ns)
 
     def close(self) -> None:
         """Stop all boards and give their ports back. May be called again."""
@@ -75,14 +71,8 @@ class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
                 closing.push(device)
 
 
-def _timed(device: Device | CalibratedSkin, scans: Iterator[_Scan]) -> Iterator[BoardScan[_Scan]]:
-    """The scans of a device with their times by the host's clock, as its scans tell it."""
-    clock, unit_id = BoardClock(), device.info.unit_id
-    for scan in scans:
-        board = scan.board or device.info
-        took_us = 1e6 * scan_s(board)
-        clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
-        yield BoardScan(unit_id, scan, clock.host_s(scan.time_us + took_us / 2))
+def _named(unit_id: int, scans: Iterator[_Scan]) -> Iterator[BoardScan[_Scan]]:
+    return (BoardScan(unit_id, scan) for scan in scans)
 
 
 @overload

@@ -17,6 +17,7 @@ from ohmskin.emulate.board import CLOCK_HZ
 from ohmskin.errors import DeviceLost, DeviceSilent, PortError, ProtocolMismatch
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link import session
+from ohmskin.link.clock import ScanClock
 from ohmskin.link.messages import Scan
 from ohmskin.several_boards import Boards, BoardScan
 from ports import Attach, Serve
@@ -58,7 +59,7 @@ def test_every_scan_of_every_board_in_order_of_time() -> None:
         taken = [next(scans)]
         time.sleep(0.7)  # a slow reader loses nothing
         taken += itertools.islice(scans, 400)
-    assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(taken[100:]))
+    assert all(a.scan.time_ns <= b.scan.time_ns for a, b in itertools.pairwise(taken[100:]))
     for unit in range(1, 5):
         found = [each.scan for each in taken if each.unit_id == unit]
         numbers = [scan.number for scan in found]
@@ -67,6 +68,15 @@ def test_every_scan_of_every_board_in_order_of_time() -> None:
     rates = Counter(each.unit_id for each in taken[100:])
     assert rates[3] / rates[1] == pytest.approx(200 / 90, rel=0.05)
     assert rates[1] / rates[4] == pytest.approx(90 / 30, rel=0.1)
+
+
+# What `time.monotonic()` showed 0 at, since 1970 [ns].
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+def time_s(each: BoardScan) -> float:
+    """The middle of the scan by the clock of `Scan.host_time_s`."""
+    return 1e-9 * (each.scan.time_ns - EPOCH_NS)
 
 
 class Past:
@@ -78,12 +88,14 @@ class Past:
     def __init__(self, url: str, *begins_s: float) -> None:
         random = np.random.default_rng(1)
         self.scans: list[Scan] = []
+        clock = ScanClock(EPOCH_NS)
         for begin_s in begins_s:
             bench = stepped(url)
             self.info = bench.info
             for scan in itertools.takewhile(lambda scan: scan.host_time_s <= 2.0, bench):
                 arrived_s = begin_s + scan.host_time_s + random.exponential(2e-3)
-                self.scans.append(replace(scan, host_time_s=arrived_s))
+                arrived = replace(scan, host_time_s=arrived_s)
+                self.scans.append(replace(arrived, time_ns=clock.time_ns(arrived, bench.info)))
 
     def __iter__(self) -> Iterator[Scan]:
         return iter(self.scans)
@@ -98,10 +110,10 @@ def past_scans(*boards: Past) -> list[BoardScan]:
 
 def test_times_are_of_the_middle_of_scans_on_one_clock() -> None:
     taken = past_scans(Past(*units(1), 50.0), Past("emulator://8x8?unit=2&rate=45", 50.3))
-    assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(taken))
+    assert all(time_s(a) <= time_s(b) for a, b in itertools.pairwise(taken))
     for unit, begin_s, period_s in ((1, 50.0, 1 / 90), (2, 50.3, 1 / 45)):
         found = [each for each in taken if each.unit_id == unit][20:]
-        times_s = np.array([each.time_s for each in found])
+        times_s = np.array([time_s(each) for each in found])
         middles_s = [begin_s + 1e-6 * each.scan.time_us + period_s / 2 for each in found]
         assert times_s == pytest.approx(np.array(middles_s), abs=2e-3)
         assert np.diff(times_s) == pytest.approx(period_s, abs=1e-3)
@@ -112,7 +124,7 @@ def test_a_slow_board_has_the_time_of_its_readings() -> None:
     for each in past_scans(Past("emulator://4x4?rate=2", 50.0)):
         middle_s = 64 * 60_000 / CLOCK_HZ / 2  # 64 slots of 60,000 cycles at most
         begun_s = 50.0 + 1e-6 * each.scan.time_us
-        assert each.time_s - begun_s == pytest.approx(middle_s, abs=5e-3)
+        assert time_s(each) - begun_s == pytest.approx(middle_s, abs=5e-3)
 
 
 def test_a_board_that_is_reset_keeps_the_time() -> None:
@@ -122,7 +134,7 @@ def test_a_board_that_is_reset_keeps_the_time() -> None:
     resets = [b.scan.time_us < a.scan.time_us for a, b in itertools.pairwise(found)]
     assert sum(resets) == 2
     begun_s = np.array(begins_s)[np.cumsum([0, *resets])]
-    times_s = np.array([each.time_s for each in found])
+    times_s = np.array([time_s(each) for each in found])
     middles_s = begun_s + [1e-6 * each.scan.time_us + 0.5 / 90 for each in found]
     assert times_s == pytest.approx(middles_s, abs=10e-3)
     assert (np.diff(times_s) > 0).all()

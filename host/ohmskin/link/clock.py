@@ -222,6 +222,27 @@ class BoardClock:
         self._slew_from_u_s = u_s
 
 
+class ScanClock:
+    """Says of scan after scan of a board when its middle was, by a `BoardClock`.
+
+    epoch_ns: the time since 1970 [ns] at which the clock of `Scan.host_time_s` showed 0. It stays,
+    so that no clock of the day that is set anew makes times jump.
+    """
+
+    def __init__(self, epoch_ns: int) -> None:
+        self._epoch_ns = epoch_ns
+        self._clock = BoardClock()
+
+    def time_ns(self, scan: Scan, board: Hello) -> int:
+        """The middle of this scan, the newest so far, since 1970 [ns].
+
+        It is late by the delay that USB has for all scans alike, which no host can see.
+        """
+        took_us = 1e6 * scan_s(board)
+        self._clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
+        return self._epoch_ns + round(1e9 * self._clock.host_s(scan.time_us + took_us / 2))
+
+
 def scan_times_s(scans: list[Scan]) -> Float:
     """Times of recorded scans on the host's clock [s], (n,), without the jitter of their arrival.
 

@@ -150,6 +150,7 @@ class Scan:
     missed: scans made since the one before this that never came: the board dropped them, or they
         were damaged on the way.
     mode: which readings these are, a name of the enum `mode`.
+    time_ns: when the middle of the scan was, since 1970 [ns], by `ScanClock`; 0: nobody asked it.
     rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
     board: what the board had last said of itself when a `Device` got the scan; else None.
     """
@@ -160,6 +161,7 @@ class Scan:
     host_time_s: float
     missed: int
     mode: str = field(default="near", kw_only=True)
+    time_ns: int = field(default=0, kw_only=True)
     rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
     board: Hello | None = field(default=None, kw_only=True)
 

@@ -8,6 +8,7 @@ thread also looks after the board: one that was reset while it scanned is made t
 """
 
 import threading
+import time
 from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -21,6 +22,7 @@ from ohmskin.errors import (
     ProtocolMismatch,
 )
 from ohmskin.link import framing, protocol
+from ohmskin.link.clock import ScanClock
 from ohmskin.link.device import COMMAND_TRIES, LOG, Device, configuration
 from ohmskin.link.messages import (
     Ack,
@@ -96,6 +98,7 @@ class Session(Device):
         self._acks: dict[int, Ack] = {}  # by the sequence numbers of their commands
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0  # number of the last command
+        self._clock = ScanClock(time.time_ns() - round(1e9 * self.now_s))
         self._heard_s = self.now_s  # when a valid frame last came
         self._begin_thread(self._read, f"read {self.name}")
         try:
@@ -202,8 +205,9 @@ class Session(Device):
             case Scan() if self._want_scans and _size(message) != _size(self.info):
                 said = f"{_size(self.info)} cells, its scans have {_size(message)}"
                 raise ProtocolError(f"{self.name}: hello says {said}", _BROKEN)
-            case Scan():
-                self._publish(message)
+            case Scan() if self._hello is not None:
+                time_ns = self._clock.time_ns(message, self._hello)
+                self._publish(replace(message, time_ns=time_ns))
             case Ack():
                 self._acks[message.command_sequence] = message
             case SelfTestReport():

@@ -38,7 +38,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, BinaryIO, Final, TypeVar
 
 import lz4.frame
@@ -51,6 +51,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, require_file, stored_bytes
+from ohmskin.link.clock import ScanClock
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import LARGEST_CODE, MODES
 from ohmskin.record.readings import check_size
@@ -78,6 +79,8 @@ _HEAD: Final = struct.Struct("<BQ")
 _CHUNK: Final = struct.Struct("<16xQI")
 _CHANNEL_BYTES: Final = 4
 _MESSAGE_BYTES: Final = 22
+# Where in it the time is at which the message was logged [ns since 1970].
+_LOG_TIME: Final = slice(6, 14)
 _READ: Final = frozenset((Opcode.FOOTER, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK))
 # What damaged bytes raise in what unpacks them.
 _DAMAGE: Final = (struct.error, UnicodeDecodeError, zstandard.ZstdError, RuntimeError, MemoryError)
@@ -207,15 +210,17 @@ def load_recording(path: PathName) -> Recording:
     return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), cut_off)
 
 
-def messages(path: PathName) -> Generator[Recorded | None, None, None]:
+def messages(path: PathName, *, timed: bool = False) -> Generator[Recorded | None, None, None]:
     """The messages of a recording in order, hello first; None last of all if it ended properly.
 
-    Topics that are not ours are passed over, so that other programs may write into a recording.
+    timed: scans get their `time_ns`, which takes half as long again. Topics that are not ours are
+    passed over, so that other programs may write into a recording.
 
     :raises RecordingError: as `load_recording`.
     """
     topics: dict[int, str] = {}  # by the id of their channel
     has_hello = is_whole = False
+    clock: ScanClock | None = None
     try:
         require_file(path)
         with open(path, "rb") as file:
@@ -235,6 +240,13 @@ def messages(path: PathName) -> Generator[Recorded | None, None, None]:
                     if not has_hello and not isinstance(message, Hello):
                         raise ValueError("no board says hello in it before the first message")
                     has_hello = True
+                    if isinstance(message, Hello):
+                        board = message
+                    elif timed and isinstance(message, Scan):
+                        log_ns = int.from_bytes(content[_LOG_TIME], "little")
+                        epoch_ns = log_ns - round(1e9 * message.host_time_s)
+                        clock = clock or ScanClock(epoch_ns)
+                        message = replace(message, time_ns=clock.time_ns(message, board))
                     yield message
                 is_whole = opcode == Opcode.FOOTER
         if not has_hello:

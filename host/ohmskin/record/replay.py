@@ -11,8 +11,8 @@ shortened.
 At the recording's end iterators end, and `latest` raises `RecordingEnded`. Commands other than
 start and stop, which let the replay run and pause, raise `CommandRefused`.
 
-``host_time_s`` is the time of the replay. Marks and forces are not played:
-`ohmskin.record.recording.load_recording` has them.
+``host_time_s`` is the time of the replay, ``time_ns`` that of the recording. Marks and forces are
+not played: `ohmskin.record.recording.load_recording` has them.
 """
 
 import time
@@ -45,7 +45,7 @@ class Replay(Device):
             raise ValueError(f"speed must be 0 or more, not {speed}")
         super().__init__(name, BoardStats())
         self._speed = speed
-        self._messages = messages(path)
+        self._messages = messages(path, timed=True)
         hello = next(self._messages)
         assert isinstance(hello, Hello)
         self._hello = hello
