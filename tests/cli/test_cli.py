@@ -426,6 +426,7 @@ TAKES = {
     "stream": "PORT --method --calibration --force --tare --json --scans --seconds",
     "view": "PORT --calibration --force --host --http-port --no-browser",
     "tare": "PORT CALIBRATION --seconds --undo --force",
+    "skin": "FILE --pitch-mm --radius-mm --taxels --frame --picture",
     "doctor": "PORT --calibration --wires --leads --press --into --json",
     "verify": "PORT PLATE --wires --leads --seconds --picture --json --cell-percent "
     "--reference-percent --settling-lsb --loss",

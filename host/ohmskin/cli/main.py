@@ -27,6 +27,7 @@ _COMMANDS: Final = {
     "stream.stream": "Show the skin at PORT, live, or print every scan as JSON. Ctrl-C ends it.",
     "view.view": "Show skins live on a page in the browser: heat map, contacts, tare, recording.",
     "calibrate.tare": "Take what the skin at PORT reads now for no force: nothing may touch it.",
+    "skin.skin": "Show a calibration file; say where its cells are, and draw them.",
     "doctor.doctor": "Say what is wrong with the board at PORT, and what to do. Touch nothing.",
     "verify.verify": "Compare the board at PORT with a plate of known resistors.",
     "record.estimate": "Estimate every cell of every frame of a readings file.",

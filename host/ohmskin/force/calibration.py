@@ -25,6 +25,8 @@ rest.ratio               R, C, 4           readings of the untouched skin before
 rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
 tare                                       the same of a later date, used in place of rest; null:
                                            there is none
+geometry                                   where the cells are: kind, frame_id, and what `geometry`
+                                           says of this kind; absent or null: not known
 kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
@@ -55,6 +57,7 @@ from ohmskin.estimate.knowledge import (
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
+from ohmskin.force.geometry import KINDS, Geometry
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import FRAMES, MODES
 from ohmskin.record.readings import check_size
@@ -124,6 +127,7 @@ class Calibration:
     nominal_wire_ohm: a wire segment of each layer.
     tare: the untouched skin of a later date, which is used in place of `rest`; None: there is none.
     mode: which readings the scans hold, a name of the enum `mode`.
+    geometry: where the cells are; None: nobody has said so.
     """
 
     unit_id: int
@@ -135,6 +139,7 @@ class Calibration:
     nominal_wire_ohm: WireOhm = NO_WIRES
     tare: Rest | None = None
     mode: str = "near"
+    geometry: Geometry | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.unit_id < UNIT_IDS:
@@ -150,6 +155,9 @@ class Calibration:
             if rest is not None and rest.level.shape != shape:
                 raise ValueError(f"{name} has shape {rest.level.shape}, the model {shape}")
         check_size(self.rows, self.columns)
+        placed = self.geometry
+        if placed is not None and (placed.rows, placed.columns) != shape:
+            raise ValueError(f"geometry is of {placed.rows}x{placed.columns} cells, not {shape}")
         area_m2 = self.indenter_area_m2
         if area_m2 is not None and not (np.isfinite(area_m2) and area_m2 > 0):
             raise ValueError(f"indenter_area_m2 is {area_m2}, it must be above 0")
@@ -192,6 +200,9 @@ class Calibration:
         for name in _RESTS:
             rest = getattr(self, name)
             content[name] = None if rest is None else vars(rest)
+        if self.geometry is not None:
+            of_kind = {"kind": self.geometry.kind, "frame_id": self.geometry.frame_id}
+            content["geometry"] = of_kind | self.geometry.told
         for name in _MODEL_FIELDS:
             array = getattr(self.model, name)
             null = np.isnan(array) if name in _NULL_FIELDS else np.False_
@@ -240,9 +251,10 @@ def _from_content(content: Any) -> Calibration:
     # Older files have no mode, no leads, and one deviation for both layers.
     of_both = content.pop("wire_log_std", None)
     absent = dict.fromkeys(WIRE_FIELDS[2:]) | dict.fromkeys(WIRE_FIELDS[3:5], of_both)
-    content = {"mode": "near", **absent, **content}
+    content = {"mode": "near", "geometry": None, **absent, **content}
     numbers = ("indenter_area_m2", *WIRE_FIELDS)  # each may be null
-    names = {"format", "schema", "rows", "columns", *_OWN, *numbers, *_RESTS, *_MODEL_FIELDS}
+    names = {"format", "schema", "rows", "columns", "geometry"}
+    names |= {*_OWN, *numbers, *_RESTS, *_MODEL_FIELDS}
     _require_fields(content, names)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
@@ -256,6 +268,7 @@ def _from_content(content: Any) -> Calibration:
         model=model,
         indenter_area_m2=area_m2,
         nominal_wire_ohm=WireOhm(*wires),
+        geometry=None if content["geometry"] is None else _geometry(content["geometry"], *shape),
     )
 
 
@@ -274,6 +287,18 @@ def _rest(name: str, content: Any, shape: tuple[int, ...]) -> Rest:
     level = _array(f"{name}.level", content["level"], shape)
     with naming(name):
         return Rest(date, ratio, level)
+
+
+def _geometry(content: Any, rows: int, columns: int) -> Geometry:
+    said = _value("geometry", content, dict)
+    kind = _value("geometry.kind", said.get("kind"), str)
+    if kind not in KINDS:
+        raise ValueError(f"geometry.kind is {kind[:40]!r}, not one of {', '.join(KINDS)}")
+    _require_fields(said, {"kind", "frame_id", *KINDS[kind]}, "geometry.")
+    shapes = {"pitch_m": (2,), "radius_m": ()}
+    told = {n: _array(n, said[n], shapes.get(n, (rows, columns, 3))) for n in KINDS[kind]}
+    with naming("geometry"):
+        return Geometry(kind, _value("frame_id", said["frame_id"], str), rows, columns, told)
 
 
 def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -33,6 +33,8 @@ class Contact:
     force_n_std: sum of the cells' standard deviations [N]: they share wires, so that their errors
         may all have one sign.
     cells: which cells it covers, (R, C).
+    position_m: the same centre in the frame of the skin's `Geometry` (3,) [m]; None: not known.
+    normal: the mean of the cells' normals there (3,), of length 1; None: not known.
     """
 
     identity: int
@@ -41,6 +43,8 @@ class Contact:
     force_n: float
     force_n_std: float
     cells: Bool
+    position_m: Float | None = None
+    normal: Float | None = None
 
     @property
     def force_text(self) -> str:

@@ -28,6 +28,7 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
+from ohmskin.force.geometry import Geometry
 from ohmskin.link.device import Device, in_threads
 from ohmskin.link.messages import BoardStats, Hello, Scan
 
@@ -54,12 +55,26 @@ class ForceScan(Scan):
         conductance [S].
     estimate: what all of this was read from. Its ``message`` says why readings cannot be
         trusted.
+    geometry: where the cells are; None: the calibration does not say it.
     """
 
     force_n: Float
     force_n_std: Float
     contacts: tuple[Contact, ...]
     estimate: Estimate
+    geometry: Geometry | None = None
+
+    @property
+    def wrench(self) -> tuple[Float, Float]:
+        """Net force (3,) [N] and torque (3,) [N m] on the skin: `Geometry.wrench`.
+
+        :raises ValueError: there is no geometry.
+        """
+        if self.geometry is None:
+            raise ValueError(
+                "nobody has said where the cells are: 'ohmskin skin FILE --pitch-mm 10,10'"
+            )
+        return self.geometry.wrench(self.force_n)
 
     def _repr_html_(self) -> str:
         """A heat map of the forces, in a notebook; of the conductances where there are none."""
@@ -255,16 +270,20 @@ class SkinReader:
         force_n = force_n_std = np.full(rise.shape, np.nan)
         # Without newtons, contacts are summed and centred by what there is: the rise.
         of_contacts = np.maximum(rise, 0.0), frame.level_std
-        calibration = self._shared.calibration
+        calibration, geometry = self._shared.calibration, None
         if calibration is not None and self.has_forces:
+            geometry = calibration.geometry
             force_n, force_n_std = calibration.model.predict(rise, frame.level_std)
             of_contacts = force_n, force_n_std
         contacts = self._tracker.update(scan.time_us, frame.touched, *of_contacts)
+        if geometry is not None:
+            contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
         shown: dict[str, object] = {
             "force_n": force_n,
             "force_n_std": force_n_std,
             "contacts": contacts,
             "estimate": frame,
+            "geometry": geometry,
         }
         return ForceScan(**(vars(scan) | shown))
 

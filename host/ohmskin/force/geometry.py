@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the cells of a skin are in space: a flat grid, a cylinder, or a table of positions.
+
+Symbols
+
+====== ========= =============================================================== ======
+symbol shape     meaning                                                         unit
+====== ========= =============================================================== ======
+p      (R, C, 3) position of a cell's centre in the frame of the skin            m
+n      (R, C, 3) unit normal there, out of the skin                              1
+F      (R, C)    force normal to the skin; it pushes against n                   N
+====== ========= =============================================================== ======
+
+In the calibration file, `Geometry.told` says it by kind:
+
+``flat``      x = column * pitch_m[0], y = row * pitch_m[1], n along z
+``cylinder``  the same, bent: columns go round the axis y at radius_m, the first at (0, y, radius_m)
+``table``     position_m and normal of every cell
+"""
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import Final, Self
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.files import PathName, naming, read_bounded
+from ohmskin.force.contacts import Contact
+
+# What the file says of each kind. A pitch is two numbers, a table has (R, C, 3) of them.
+KINDS: Final = {
+    "flat": ("pitch_m",),
+    "cylinder": ("pitch_m", "radius_m"),
+    "table": ("position_m", "normal"),
+}
+# No cell is farther from the origin of its frame [m], and no pitch or radius is larger. Chosen:
+# robots are smaller.
+_FARTHEST_M: Final = 100.0
+# A frame's name has at most so many characters. Chosen: names of links in URDF files are shorter.
+_LONGEST_NAME: Final = 100
+# A file of taxels is not larger. Chosen: `MAX_CELLS` of them with their meshes' names.
+_MAX_FILE_BYTES: Final = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Where the cells of a rows x columns skin are, with the symbols of the module's table.
+
+    kind: one of `KINDS`.
+    frame_id: the name of the frame, as in ROS.
+    rows, columns: R and C.
+    told: what the file says, by name.
+
+    Raises ValueError, naming the field, for what no skin has.
+    """
+
+    kind: str
+    frame_id: str
+    rows: int
+    columns: int
+    told: dict[str, Float]
+    position_m: Float = field(init=False)
+    """p, (R, C, 3) [m]."""
+    normal: Float = field(init=False)
+    """n, (R, C, 3) [1]."""
+
+    def __post_init__(self) -> None:
+        if not (0 < len(self.frame_id) <= _LONGEST_NAME and self.frame_id.isprintable()):
+            raise ValueError(f"frame_id must be a name of 1 to {_LONGEST_NAME} characters")
+        for name, numbers in self.told.items():
+            if not (np.abs(numbers) <= _FARTHEST_M).all():  # so that NaN fails too
+                raise ValueError(f"{name} holds a number beyond {_FARTHEST_M:g}")
+        position_m, normal = self._cells()
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        if not (length > 0).all():
+            raise ValueError("normal has the length 0")
+        object.__setattr__(self, "position_m", position_m)
+        object.__setattr__(self, "normal", normal / length)
+
+    def _cells(self) -> tuple[Float, Float]:
+        """p and n; these not yet of length 1."""
+        if self.kind == "table":
+            return self.told["position_m"], self.told["normal"]
+        across_m, along_m = self.told["pitch_m"]
+        x, y = np.meshgrid(across_m * np.arange(self.columns), along_m * np.arange(self.rows))
+        zero = np.zeros_like(x)
+        if self.kind == "flat":
+            return np.stack([x, y, zero], -1), np.stack([zero, zero, zero + 1], -1)
+        radius_m = self.told["radius_m"]
+        if not radius_m > 0:
+            raise ValueError("radius_m is not above 0")
+        normal = np.stack([np.sin(x / radius_m), zero, np.cos(x / radius_m)], -1)
+        return radius_m * normal + np.stack([zero, y, zero], -1), normal
+
+    def placed(self, contact: Contact, force_n: Float) -> Contact:
+        """The contact with its position, sum F_e p_e / sum F_e, and its normal. force_n: (R, C)."""
+        share = np.where(contact.cells, np.nan_to_num(force_n), 0.0)
+        share = share if share.sum() > 0 else contact.cells.astype(float)
+        position_m, normal = (
+            np.tensordot(share / share.sum(), of_cells, 2)
+            for of_cells in (self.position_m, self.normal)
+        )
+        # Normals of a contact that reaches round a thin finger may cancel.
+        normal /= np.linalg.norm(normal) or 1.0
+        return replace(contact, position_m=position_m, normal=normal)
+
+    def wrench(self, force_n: Float) -> tuple[Float, Float]:
+        """Net force -sum F_e n_e [N] and torque -sum p_e x F_e n_e about the frame's origin [N m].
+
+        force_n: (R, C); cells without a force do not count, and where none has one, both are NaN.
+        """
+        known = np.nan_to_num(force_n) if np.isfinite(force_n).any() else force_n
+        on_cells = -known[..., None] * self.normal
+        return on_cells.sum((0, 1)), np.cross(self.position_m, on_cells).sum((0, 1))
+
+    @classmethod
+    def of_file(cls, path: PathName, rows: int, columns: int, frame_id: str) -> Self:
+        """The geometry that a file says in the order of rows, as other robots' tools write it.
+
+        Lines ``x y z nx ny nz`` [m], one a taxel, as for iCub's skin (other lines are passed over);
+        or URDF, whose ``<array>`` or ``<taxel idx= xyz= rpy=>`` are those of the package
+        urdf_tactile. Raises ValueError, naming the file, if it says no rows x columns cells.
+        """
+        with naming(path):
+            text = read_bounded(path, _MAX_FILE_BYTES).decode(errors="replace")
+            told = (_of_urdf if "<" in text else _of_lines)(text)
+            if "pitch_m" in told:
+                return cls("flat", frame_id, rows, columns, told)
+            count = len(told["normal"])
+            if count != rows * columns:
+                raise ValueError(f"{count} taxels, the skin has {rows}x{columns} cells")
+            told = {name: of_taxels.reshape(rows, columns, 3) for name, of_taxels in told.items()}
+            return cls("table", frame_id, rows, columns, told)
+
+
+def _table(taxels: Float) -> dict[str, Float]:
+    return {"position_m": taxels[:, :3], "normal": taxels[:, 3:]}
+
+
+def _of_lines(text: str) -> dict[str, Float]:
+    numbers = r"\s*[-+.\deE]+" * 6
+    lines = [line.split() for line in text.splitlines() if re.fullmatch(numbers + r"\s*", line)]
+    return _table(np.array(lines, dtype=np.float64).reshape(-1, 6))
+
+
+def _of_urdf(text: str) -> dict[str, Float]:
+    if "<!" in text.replace("<!--", ""):
+        raise ValueError("its XML declares types or entities, which no URDF needs")
+    try:
+        tree = ElementTree.fromstring(text)
+    except ElementTree.ParseError as exc:
+        raise ValueError(f"no XML: {exc}") from exc
+
+    def numbers(taxel: ElementTree.Element, name: str, count: int) -> Float:
+        found = np.array(taxel.get(name, "0 0 0").split(), dtype=np.float64)
+        if found.size != count:
+            raise ValueError(f"{name}='{taxel.get(name, '')[:40]}' is not {count} numbers")
+        return found
+
+    if (grid := tree.find(".//array")) is not None:
+        return {"pitch_m": numbers(grid, "spacing" if grid.get("spacing") else "size", 2)}
+    taxels = []
+    for taxel in sorted(tree.iter("taxel"), key=lambda taxel: int(taxel.get("idx", "0"))):
+        (sr, sp, sy), (cr, cp, cy) = (f(numbers(taxel, "rpy", 3)) for f in (np.sin, np.cos))
+        normal = cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp  # z, turned by rpy
+        taxels.append([*numbers(taxel, "xyz", 3), *normal])
+    return _table(np.array(taxels).reshape(-1, 6))

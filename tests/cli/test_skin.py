@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ohmskin skin``."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from calibrations import of_scene
+from command_line import Run, well
+from ohmskin.force.calibration import load_calibration
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    of_scene("rest").save(tmp_path / "skin.json")
+    return tmp_path / "skin.json"
+
+
+def test_it_says_and_changes_where_cells_are(file: Path, run: Run) -> None:
+    assert "nobody has said where the cells are" in well(run("skin", str(file))).out
+    said = well(run("skin", str(file), "--pitch-mm", "10,20")).out
+    assert "flat, in 'skin': from (0.0, 0.0, 0.0) to (70.0, 140.0, 0.0) mm" in said
+    assert said == well(run("skin", str(file))).out  # it is kept
+    well(run("skin", str(file), "--pitch-mm", "10,10", "--radius-mm", "40", "--frame", "arm"))
+    known = load_calibration(file).geometry
+    assert (known.kind, known.frame_id) == ("cylinder", "arm")
+    assert np.hypot(*known.position_m[..., [0, 2]].T) == pytest.approx(0.04)
+    well(run("skin", str(file), "--frame", "wrist"))
+    assert load_calibration(file).geometry.frame_id == "wrist"
+
+
+def test_it_draws_every_cell(file: Path, run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "skin.svg"
+    well(run("skin", str(file), "--pitch-mm", "10,10", "--picture", str(out)))
+    drawn = ElementTree.parse(out)
+    assert len(drawn.findall("{*}circle")) == len(drawn.findall("{*}line")) == 64
+    assert {text.text for text in drawn.findall("{*}text")} >= {"0,0", "7,7", "3,5"}
+
+
+def test_it_takes_a_file_of_taxels(file: Path, run: Run, tmp_path: Path) -> None:
+    taxels = tmp_path / "taxels.txt"
+    taxels.write_text("\n".join(f"{k / 100} 0 0 0 0 1" for k in range(64)))
+    well(run("skin", str(file), "--taxels", str(taxels)))
+    assert load_calibration(file).geometry.position_m[1, 0, 0] == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize("pitch", ["10", "a,b", "1,2,3"])
+def test_a_pitch_is_two_numbers(file: Path, run: Run, pitch: str) -> None:
+    done = run("skin", str(file), "--pitch-mm", pitch)
+    assert (done.code, done.out) == (2, "")
+    assert "--pitch-mm wants two numbers" in done.err

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where cells are, against positions and sums that are written by hand."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ohmskin
+from calibrations import of_scene
+from ohmskin.force.calibration import load_calibration
+from ohmskin.force.geometry import Geometry
+
+FLAT = {"kind": "flat", "frame_id": "skin", "pitch_m": [0.01, 0.02]}
+CYLINDER = {"kind": "cylinder", "frame_id": "arm", "pitch_m": [0.01, 0.02], "radius_m": 0.04}
+
+
+def saved(path: Path, geometry: object) -> Path:
+    of_scene("ghost").save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"geometry": geometry}))
+    return path
+
+
+def geometry(path: Path, content: dict[str, Any]) -> Geometry:
+    known = load_calibration(saved(path, content)).geometry
+    assert known is not None
+    return known
+
+
+def test_a_flat_skin(tmp_path: Path) -> None:
+    known = geometry(tmp_path / "skin.json", FLAT)
+    assert known.position_m[3, 5] == pytest.approx([0.05, 0.06, 0])
+    assert known.normal[3, 5] == pytest.approx([0, 0, 1])
+
+
+def test_a_cylinder_s_columns_go_round_y(tmp_path: Path) -> None:
+    known = geometry(tmp_path / "skin.json", CYLINDER)
+    angle = 0.05 / 0.04
+    expected = [0.04 * np.sin(angle), 0.06, 0.04 * np.cos(angle)]
+    assert known.position_m[3, 5] == pytest.approx(expected)
+    assert known.normal[3, 5] == pytest.approx([np.sin(angle), 0, np.cos(angle)])
+
+
+def test_it_is_kept(tmp_path: Path) -> None:
+    table = {
+        "kind": "table",
+        "frame_id": "pad",
+        "position_m": np.random.default_rng(1).uniform(-1, 1, (8, 8, 3)).tolist(),
+        "normal": np.random.default_rng(2).uniform(0.1, 1, (8, 8, 3)).tolist(),
+    }
+    for content in (FLAT, CYLINDER, table):
+        path = saved(tmp_path / "a.json", content)
+        load_calibration(path).save(tmp_path / "b.json")
+        assert json.loads((tmp_path / "b.json").read_text())["geometry"] == content
+        assert load_calibration(tmp_path / "b.json").geometry.frame_id == content["frame_id"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ({**FLAT, "kind": "round"}, "kind is 'round'"),
+        ({**FLAT, "radius_m": 1}, "unknown field 'geometry.radius_m'"),
+        ({**FLAT, "pitch_m": [0.01]}, "pitch_m has not the shape"),
+        ({**FLAT, "pitch_m": [0.01, "x"]}, "pitch_m holds str"),
+        ({**FLAT, "pitch_m": [0.01, 1e9]}, "beyond 100"),
+        ({**FLAT, "frame_id": "a\x1b[2J"}, "frame_id must be a name"),
+        ({**CYLINDER, "radius_m": 0}, "radius_m is not above 0"),
+        ({**FLAT, "kind": "table"}, "no field 'geometry.normal'"),
+        ([], "geometry holds list"),
+    ],
+)
+def test_what_no_skin_has_is_refused(tmp_path: Path, content: object, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        load_calibration(saved(tmp_path / "skin.json", content))
+
+
+def test_contacts_and_scans_have_places_and_sums(tmp_path: Path) -> None:
+    """Three touches of the scene ghost, at (2, 2), (2, 5) and (5, 2)."""
+    known = geometry(tmp_path / "skin.json", CYLINDER)
+    url = "emulator://8x8?scene=ghost&seed=1&begin=0&speed=0"
+    with ohmskin.open(url, calibration=replace(of_scene("ghost"), geometry=known)) as skin:
+        scan = next(iter(skin))
+    assert [(contact.row, contact.column) for contact in scan.contacts] == [(2, 2), (2, 5), (5, 2)]
+    for contact in scan.contacts:
+        cell = int(contact.row), int(contact.column)
+        assert contact.position_m == pytest.approx(known.position_m[cell])
+        assert contact.normal == pytest.approx(known.normal[cell])
+    force_n, torque_nm = scan.wrench
+    pushes = [(f, known.position_m[c], known.normal[c]) for c, f in np.ndenumerate(scan.force_n)]
+    assert force_n == pytest.approx(sum(-f * n for f, _, n in pushes))
+    assert torque_nm == pytest.approx(sum(np.cross(p, -f * n) for f, p, n in pushes))
+    assert force_n[2] < -1
+
+
+def test_without_geometry_a_wrench_says_what_to_do() -> None:
+    with ohmskin.open("emulator://8x8?speed=0", calibration=of_scene("rest")) as skin:
+        scan = next(iter(skin))
+    assert scan.geometry is None
+    with pytest.raises(ValueError, match="ohmskin skin FILE --pitch-mm"):
+        _ = scan.wrench
+
+
+def test_icub_s_files_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "palm.txt"
+    path.write_text("[calibration]\n" + "\n".join(f"0.0{k} 0.5 -1e-2 0 0 2" for k in range(4)))
+    known = Geometry.of_file(path, 2, 2, "palm")
+    assert known.position_m[1, 0] == pytest.approx([0.02, 0.5, -0.01])
+    assert known.normal[1, 0] == pytest.approx([0, 0, 1])
+    with pytest.raises(ValueError, match=r"palm.txt: 4 taxels, the skin has 2x3 cells"):
+        Geometry.of_file(path, 2, 3, "palm")
+
+
+def test_urdf_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    taxels = (
+        '<taxel idx="1" xyz="1 0 0" rpy="0 1.5707963 0"/><taxel idx="0" xyz="2 0 0" rpy="0 0 3"/>'
+    )
+    path.write_text(f"<robot><sensor><tactile><!-- two -->{taxels}</tactile></sensor></robot>")
+    known = Geometry.of_file(path, 1, 2, "tip")
+    assert known.position_m[0] == pytest.approx(np.array([[2, 0, 0], [1, 0, 0]]))
+    assert known.normal[0] == pytest.approx(np.array([[0, 0, 1], [1, 0, 0]]), abs=1e-6)
+    path.write_text('<robot><array rows="2" cols="3" size="0.005 0.006"/></robot>')
+    assert Geometry.of_file(path, 2, 3, "tip").position_m[1, 2] == pytest.approx([0.01, 0.006, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("<robot", "no XML"),
+        ('<!DOCTYPE r [<!ENTITY a "b">]><robot>&a;</robot>', "declares types or entities"),
+        ('<robot><taxel xyz="1 2"/></robot>', "is not 3 numbers"),
+        ("nothing", "0 taxels"),
+        ("1 2 3 4 5 6e", "could not convert"),
+    ],
+)
+def test_files_of_taxels_that_say_none(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "taxels"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=reason):
+        Geometry.of_file(path, 1, 1, "skin")
