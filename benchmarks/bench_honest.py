@@ -5,12 +5,13 @@
 
 Everything is simulated: skins of 8x8 by a node Laplacian (tests/helpers/network.py), 10 bits, noise
 of 0.3 LSB, rest readings and nothing else told; every other skin has leads of 100 ohm, the others
-none. `random`: up to 8 touches, anew in each frame. `fingers`: one or two fingertips that move.
+none. Mode near, unless said otherwise. `random`: up to 8 touches, anew in each frame. `fingers`:
+one or two fingertips that move.
 wrong: frames with a cell off by half, by 10 uS and by 4 deviations, though they converged.
 within_4: pressed cells within 4 stated deviations, or in a frame that is flagged. --only takes some
 of these groups:
 
-far     readings at far ends. Faults: all far rows, or all far columns, at a constant (rows,
+far     mode far. Faults: all far rows, or all far columns, at a constant (rows,
         columns); reading their near ends (rows_near, columns_near); one far line at a constant, or
         reading its near end (line, line_near); from the start, rest readings included, or in the
         middle of a run. named: scenes in which a message names it within a second.
@@ -18,22 +19,32 @@ far     readings at far ends. Faults: all far rows, or all far columns, at a con
         channel: 1 LSB of offset, up or down, of the far rows' channel.
         10000, 20000, 41000: ohm a segment; right_but_flagged: frames without a wrong cell.
         healthy: 100 and 200 ohm a segment.
+references  of each mode: both off by 5 %, of which estimators are told 1 % or 5 % as a deviation
+        (told_1%, told_5%); 5 % apart, told 1 % (apart).
+damp    of each mode: neighbouring stripes leak into each other by so many ohm at every crossing.
+palms   a palm over 60 % of the skin, with peaks of about 250 uS (firm); cells of 200 and 30 kOhm at
+        rest (rest_200000, rest_30000). error, p90: of pressed cells, median and 90th percentile.
+damages a segment of ten times its resistance (segment), 20 ohm between two rows (short).
+untold  wires of 150, 500, 1000 and 2000 ohm a segment.
 """
 
 from __future__ import annotations
 
 import sys
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bars import Bar, Figures, Part, at_least, at_most, finish, options  # beside this file
-from network import SkinCircuit  # tests/helpers
+from bars import Bar, Part, at_least, at_most, finish, options  # beside this file
+from network import SkinCircuit, leaks  # tests/helpers
 from ohmskin.arrays import Bool, Float
+from ohmskin.circuit.skin import Skin
+from ohmskin.emulate.scenes import REST_OHM
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -41,7 +52,14 @@ from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES
 from studies.judge import STATED_STDS, Verdict, verdict
 from studies.rows import Progress, in_processes
-from studies.trials import NOMINAL_WIRE_OHM, finger_trial, random_trial
+from studies.trials import (
+    NOMINAL_WIRE_OHM,
+    Trial,
+    finger_trial,
+    random_trial,
+    skin_at_rest,
+    trial_of,
+)
 
 SEED = 24000  # of the first skin
 SKINS, FRAMES = 4, 60  # of each condition
@@ -59,31 +77,45 @@ WHEN = ("start", "middle")
 LONG_OHM = (10_000, 20_000, 41_000)
 CONSTANTS = (0.0, 0.3, 0.5, 0.8, 1.0)  # over Vdd: one of these for each skin
 LINE = 3  # the one far line that is off
+SEGMENT_TIMES, SHORT_OHM = 10.0, 20.0  # a damaged yarn; two neighbouring rows that touch
+PALM_SHARE, PALM_SIEMENS = 0.6, 2.5e-4
+UNTOLD_OHM = (500, 1000)
+LEAKS_OHM = (3_000_000, 1_000_000, 300_000)
 
 
 class Scene(NamedTuple):
-    """A skin, touched in one way, read by a method; name: of the figures it belongs to."""
+    """A skin, touched in one way, read by a method; name: of the figures it belongs to.
+
+    fault: of `FAULTS` or `DAMAGES`. references: shares by which both are off.
+    """
 
     name: str
     seed: int
     kind: str
     method: str
     frames: int
+    mode: str = "far"
     fault: str = ""
     when: str = ""
     wire_ohm: tuple[float, float] = NOMINAL_WIRE_OHM
     channel_lsb: float = 0.0
-    references_apart: float = 0.0
+    references: tuple[float, float] = (0.0, 0.0)
+    ref_log_std: float = 0.0
+    leak_ohm: float = 0.0
+    rest_ohm: float = REST_OHM
 
 
 class Shown(NamedTuple):
-    """What the frames of a scene that count show, (F,), and pressed cells within 4, or flagged."""
+    """What the frames of a scene that count show, (F,), and of their pressed cells, (n,), whether
+    they are within 4, or flagged, and the error over the truth.
+    """
 
     wrong: Bool
     off: Bool
     flagged: Bool
     named: bool
     within: Bool
+    error: Float
 
 
 def broken(ratio: Float, fault: str, number: int) -> Float:
@@ -98,35 +130,77 @@ def broken(ratio: Float, fault: str, number: int) -> Float:
     return ratio
 
 
-def read_scene(scene: Scene) -> tuple[Scene, Shown]:
-    """Estimate all frames of a scene, and judge those with its fault."""
-    number, random = scene.seed - SEED, np.random.default_rng(scene.seed)
-    before = scene.frames // 2 if scene.when == "middle" else 0
-    frames, seed = scene.frames + before, scene.seed
+def palm_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
+    """A firm palm over 60 % of the cells that comes and goes; peaks of cells vary by 30 %."""
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(rows, columns, random)
+    i, j = np.mgrid[:rows, :columns]
+    middle = [random.uniform(0.35, 0.65) * (lines - 1) for lines in (rows, columns)]
+    away = ((i - middle[0]) / rows) ** 2 + ((j - middle[1]) / columns) ** 2
+    most = np.quantile(away, PALM_SHARE)
+    peak = PALM_SIEMENS * np.clip(3 * (most - away) / most, 0, 1)
+    peak = peak * np.exp(0.3 * random.standard_normal(rest.shape))
+    pressures = np.sin(np.pi * np.linspace(0.05, 0.95, frames))
+    skins = [replace(rest, cell_siemens=rest.cell_siemens + at * peak) for at in pressures]
+    return trial_of(rest, skins)
+
+
+def trial_of_scene(scene: Scene, frames: int) -> tuple[Skin, Float]:
+    """The untouched skin, and the cells of all frames, (F, R, C) [S]."""
     if scene.kind == "random":
-        trial = random_trial(*SHAPE, 8, frames, seed, wire_ohm=scene.wire_ohm)
+        trial = random_trial(*SHAPE, 8, frames, scene.seed, wire_ohm=scene.wire_ohm)
+    elif scene.kind == "palms":
+        trial = palm_trial(*SHAPE, frames, scene.seed)
     else:
         trial = finger_trial(
-            *(*SHAPE, frames, seed),
+            *(*SHAPE, frames, scene.seed),
             sigma_cells=(0.6, 1.0),
             peak_siemens=(3e-5, 3e-4),
             wire_ohm=scene.wire_ohm,
         )
-    sign = 1 - number // 2 % 2 * 2
-    apart = 0.5 * sign * scene.references_apart
+    cells = trial.rest.cell_siemens
+    at_rest = cells * REST_OHM / scene.rest_ohm
+    top, bottom = (1 + off for off in scene.references)
     rest = replace(
         trial.rest,
-        lead_ohm=np.array(LEAD_OHM * (number % 2)),
-        ref_top_ohm=(1 + apart) * trial.rest.ref_top_ohm,
-        ref_bottom_ohm=(1 - apart) * trial.rest.ref_bottom_ohm,
+        cell_siemens=at_rest,
+        lead_ohm=np.array(LEAD_OHM * (scene.seed % 2)),
+        ref_top_ohm=top * trial.rest.ref_top_ohm,
+        ref_bottom_ohm=bottom * trial.rest.ref_bottom_ohm,
     )
-    circuit, cells = SkinCircuit(rest), trial.cell_siemens
-    names = [ENUMS["reading"].values[name] for name in MODES["far"]]
+    return rest, at_rest + trial.cell_siemens - cells
+
+
+def circuits(scene: Scene, rest: Skin) -> tuple[SkinCircuit, SkinCircuit]:
+    """The circuit of the rest readings, and that of frames."""
+    more = leaks(SHAPE, scene.leak_ohm) if scene.leak_ohm else None
+    row, column = np.divmod(scene.seed * 7 % rest.cell_siemens.size, SHAPE[1])
+    if scene.fault == "segment":
+        top_ohm = rest.top_wire_ohm.copy()
+        top_ohm[row, column] *= SEGMENT_TIMES
+        rest = replace(rest, top_wire_ohm=top_ohm)
+    sound = SkinCircuit(rest, more)
+    if scene.fault != "short":
+        return sound, sound
+    first = row % (SHAPE[0] - 1)  # electrodes are the first nodes
+    return sound, SkinCircuit(rest, (np.array([[first], [first + 1]]), np.array([SHORT_OHM])))
+
+
+def read_scene(scene: Scene) -> tuple[Scene, Shown]:
+    """Estimate all frames of a scene, and judge those with its fault."""
+    number, random = scene.seed - SEED, np.random.default_rng(scene.seed)
+    before = scene.frames // 2 if scene.when == "middle" else 0
+    rest, cells = trial_of_scene(scene, scene.frames + before)
+    at_rest, in_frames = circuits(scene, rest)
+    names = [ENUMS["reading"].values[name] for name in MODES[scene.mode]]
     # Rest readings, frames before the fault, and frames with it.
-    exact = np.array([circuit.readings(one)[..., names] for one in (rest.cell_siemens, *cells)])
-    exact = np.concatenate([np.repeat(exact[:1], REST_FRAMES, axis=0), exact[1:]])
-    exact[..., MODES["far"].index("e")] += sign * scene.channel_lsb * LSB
-    if scene.fault:
+    of_rest = np.repeat([at_rest.readings(rest.cell_siemens)], REST_FRAMES, axis=0)
+    of_frames = np.array([in_frames.readings(one) for one in cells])
+    exact = np.concatenate([of_rest, of_frames])[..., names]
+    if scene.mode == "far":
+        sign = 1 - number // 2 % 2 * 2
+        exact[..., MODES["far"].index("e")] += sign * scene.channel_lsb * LSB
+    if scene.fault in FAULTS:
         faulty = REST_FRAMES + before if before else 0
         exact[faulty:] = broken(exact[faulty:], scene.fault, number)
     exact += NOISE_LSB * LSB * random.standard_normal(exact.shape)
@@ -135,7 +209,8 @@ def read_scene(scene: Scene) -> tuple[Scene, Shown]:
         *SHAPE,
         adc_bits=ADC_BITS,
         rest_ratio=ratio[:REST_FRAMES].mean(axis=0),
-        reading_names=MODES["far"],
+        reading_names=MODES[scene.mode],
+        ref_log_std=scene.ref_log_std,
     )
     with threadpool_limits(limits=1):
         estimator = make_estimator(scene.method, known)
@@ -161,57 +236,172 @@ def shown(scene: Scene, found: list[Estimate], cells: Float, rest_siemens: Float
     within = (off_siemens <= STATED_STDS * stds) | flagged[:, None, None]
     name = f"far row {LINE}" if "line" in scene.fault else f"far {scene.fault.split('_')[0]}"
     named = any(name in one.message for one in found)
-    return Shown(np.array(wrong), np.asarray(off), flagged, named, within[pressed])
+    error = (off_siemens / cells)[pressed]
+    return Shown(np.array(wrong), np.asarray(off), flagged, named, within[pressed], error)
 
 
-def of_far(part: Part, seed: int, jobs: int, progress: Progress) -> tuple[Figures, list[Bar]]:
-    """All figures of far ends, and their bars."""
-    skins = [
-        Scene("", seed + number, kind, method, part.of(FRAMES))
-        for kind, method in product(KINDS, METHODS)
+class Pooled(dict[str, float | None]):
+    """Figures of all scenes of a name, kind and method, and their bars."""
+
+    def __init__(self, scenes: list[Scene], jobs: int, progress: Progress) -> None:
+        super().__init__()
+        self.bars: list[Bar] = []
+        parts: defaultdict[tuple[str, str, str], list[Shown]] = defaultdict(list)
+        for scene, one in in_processes(read_scene, scenes, jobs, progress):
+            parts[scene.name, scene.kind, scene.method].append(one)
+        for (name, kind, method), shown_of in parts.items():
+            wrong, off, flagged, within, error = (
+                np.concatenate([getattr(one, of) for one in shown_of])
+                for of in ("wrong", "off", "flagged", "within", "error")
+            )
+            key = f"{name}_{kind}_{method}"
+            named = np.mean([one.named for one in shown_of])
+            for figure, share in (
+                ("wrong", wrong.mean()),
+                ("within_4", within.mean()),
+                ("flagged", flagged.mean()),
+                ("right_but_flagged", (flagged & ~off).mean()),
+                ("named", named),
+                ("error", np.median(error)),
+                ("error_p90", np.quantile(error, 0.9)),
+            ):
+                self[f"{key}_{figure}"] = round(100 * float(share), 2)
+
+    def only(self, *figures: str) -> Pooled:
+        """Without figures that are of no interest here."""
+        for key in [key for key in self if not key.endswith(figures)]:
+            del self[key]
+        return self
+
+    def bar(
+        self, make: Callable[[str, float], Bar], prefix: str, figure: str, limit: float
+    ) -> None:
+        """The same bar for this figure of all whose name begins so."""
+        ends = f"_{figure}"
+        for key in self:
+            if key.startswith(f"{prefix}_") and key.endswith(ends):
+                self.bars.append(make(key, limit))
+
+
+def skins_of(part: Part, seed: int, kinds: Sequence[str] = KINDS, **more: Any) -> list[Scene]:
+    """The skins of each condition, read by both methods."""
+    return [
+        Scene("", seed + number, kind, method, part.of(FRAMES), **more)
+        for kind, method in product(kinds, METHODS)
         for number in range(part.of(SKINS))
     ]
+
+
+def of_far(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """All figures of far ends, and their bars."""
+    skins = skins_of(part, seed)
     scenes = [
         one._replace(name=f"{fault}_{when}", fault=fault, when=when)
         for fault, when, one in product(FAULTS, WHEN, skins)
     ]
     for skin in skins:
+        apart = 0.025 * (1 - (skin.seed - SEED) // 2 % 2 * 2)
         scenes += [skin._replace(name=str(ohm), wire_ohm=(ohm, ohm)) for ohm in LONG_OHM]
-        scenes.append(skin._replace(name="references", references_apart=0.05))
+        scenes.append(skin._replace(name="references", references=(apart, -apart)))
         scenes += [skin._replace(name="channel", channel_lsb=1.0), skin._replace(name="healthy")]
-    found: defaultdict[tuple[str, str, str], list[Shown]] = defaultdict(list)
-    for scene, one in in_processes(read_scene, scenes, jobs, progress):
-        found[scene.name, scene.kind, scene.method].append(one)
-    figures: dict[str, float | None] = {}
-    bars = []
-    worst = dict(zip(map(str, LONG_OHM), (1, 2, 5), strict=True))
-    for (name, kind, method), parts in found.items():
-        wrong, off, flagged, within = (
-            np.concatenate([getattr(one, of) for one in parts])
-            for of in ("wrong", "off", "flagged", "within")
-        )
-        key = f"{name}_{kind}_{method}"
-        figures[f"{key}_wrong"] = 100 * float(wrong.mean())
-        bars.append(at_most(f"{key}_wrong", worst.get(name, 1)))
-        figures[f"{key}_within_4"] = 100 * float(within.mean())
-        if name.startswith(FAULTS):
-            figures[f"{key}_named"] = 100 * float(np.mean([one.named for one in parts]))
-            bars += [at_least(f"{key}_named", 100), at_least(f"{key}_within_4", 95)]
-        elif name == "channel":
-            bars.append(at_least(f"{key}_within_4", 95))
-        if name in worst:
-            figures[f"{key}_right_but_flagged"] = 100 * float((flagged & ~off).mean())
-            if kind == "fingers" and name != str(LONG_OHM[-1]):
-                bars.append(at_most(f"{key}_right_but_flagged", 10))
-        elif not name.startswith(FAULTS):
-            figures[f"{key}_flagged"] = 100 * float(flagged.mean())
-            if name != "channel":
-                bars.append(at_most(f"{key}_flagged", 1))
-    return {name: round(float(number or 0.0), 2) for name, number in figures.items()}, bars
+    found = Pooled(scenes, jobs, progress)
+    for name in (*FAULTS, "references", "channel", "healthy"):
+        found.bar(at_most, name, "wrong", 1)
+    for ohm, most in zip(LONG_OHM, (1, 2, 5), strict=True):
+        found.bar(at_most, str(ohm), "wrong", most)
+    for ohm in LONG_OHM[:-1]:
+        found.bar(at_most, f"{ohm}_fingers", "right_but_flagged", 10)
+    for fault, when in product(FAULTS, WHEN):
+        found.bar(at_least, f"{fault}_{when}", "named", 100)
+        found.bar(at_least, f"{fault}_{when}", "within_4", 95)
+    found.bar(at_least, "channel", "within_4", 95)
+    for name in ("references", "healthy"):
+        found.bar(at_most, name, "flagged", 1)
+    return found
+
+
+def of_references(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """References that are not as told: both 5 % off, and 5 % apart."""
+    scenes = []
+    for mode, skin in product(MODES, skins_of(part, seed)):
+        sign = 1 - (skin.seed - SEED) // 2 % 2 * 2
+        both = skin._replace(mode=mode, references=(0.05 * sign, 0.05 * sign))
+        scenes += [
+            both._replace(name=f"{mode}_told_{std:.0%}", ref_log_std=std) for std in (0.01, 0.05)
+        ]
+        apart = 0.025 * sign, -0.025 * sign
+        scenes.append(both._replace(name=f"{mode}_apart", references=apart, ref_log_std=0.01))
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged")
+    for mode in MODES:
+        found.bar(at_least, f"{mode}_told_5%", "within_4", 95)
+        found.bar(at_least, f"{mode}_apart", "within_4", 95)
+    return found
+
+
+def of_damp(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """Neighbouring stripes of each layer that leak into each other."""
+    scenes = [
+        skin._replace(name=f"{mode}_leaks_{ohm}", mode=mode, leak_ohm=ohm)
+        for mode, ohm, skin in product(MODES, LEAKS_OHM, skins_of(part, seed))
+    ]
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged", "error")
+    for mode, (ohm, within, wrong) in product(
+        MODES, zip(LEAKS_OHM, (95, 90, 80), (1, 1, 10), strict=True)
+    ):
+        found.bar(at_least, f"{mode}_leaks_{ohm}", "within_4", within)
+        found.bar(at_most, f"{mode}_leaks_{ohm}", "wrong", wrong)
+    return found
+
+
+def of_palms(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """Firm palms, and skins that conduct much at rest."""
+    scenes = [one._replace(name="firm") for one in skins_of(part, seed, ["palms"], mode="near")]
+    scenes += [
+        skin._replace(name=f"rest_{ohm}", rest_ohm=ohm)
+        for ohm, skin in product((200_000, 30_000), skins_of(part, seed, mode="near"))
+    ]
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged", "error", "p90")
+    found.bar(at_most, "rest_30000", "flagged", 5)
+    found.bar(at_most, "firm", "wrong", 1)
+    return found
+
+
+def of_damages(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """A segment of ten times its resistance, and a short of 20 ohm between two rows."""
+    scenes = [
+        skin._replace(name=fault, fault=fault)
+        for fault, skin in product(("segment", "short"), skins_of(part, seed, mode="near"))
+    ]
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged")
+    for fault in ("segment", "short"):
+        found.bar(at_most, fault, "wrong", 2)
+    return found
+
+
+def of_untold(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """Long wires at near ends that nobody told."""
+    scenes = [
+        skin._replace(name=str(ohm), wire_ohm=(ohm, ohm))
+        for ohm, skin in product((150, *UNTOLD_OHM, 2000), skins_of(part, seed, mode="near"))
+    ]
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged", "error")
+    for ohm, wrong in zip(UNTOLD_OHM, (1, 1), strict=True):
+        found.bar(at_most, f"{ohm}_fingers", "wrong", wrong)
+        found.bar(at_most, f"{ohm}_fingers", "right_but_flagged", 10)
+    for ohm, wrong in zip(UNTOLD_OHM, (3, 5), strict=True):
+        found.bar(at_most, f"{ohm}_random", "wrong", wrong)
+    return found
 
 
 # Figures of each group, and their bars.
-GROUPS = {"far": of_far}
+GROUPS: dict[str, Callable[[Part, int, int, Progress], Pooled]] = {
+    "far": of_far,
+    "references": of_references,
+    "damp": of_damp,
+    "palms": of_palms,
+    "damages": of_damages,
+    "untold": of_untold,
+}
 
 
 def main() -> int:
@@ -227,8 +417,8 @@ def main() -> int:
     figures: dict[str, float | None] = {}
     bars: list[Bar] = []
     for group in asked.only.split(","):
-        of_group, more = GROUPS[group](asked.part, asked.seed, asked.jobs, progress)
-        figures, bars = figures | dict(of_group), bars + more
+        found = GROUPS[group](asked.part, asked.seed, asked.jobs, progress)
+        figures, bars = figures | found, bars + found.bars
     return finish(asked.part, figures, bars)
 
 

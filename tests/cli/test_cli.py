@@ -423,14 +423,14 @@ TAKES = {
     "info": "PORT --json --self-test",
     "configure": "PORT --rows --columns --rate --settle --adc --mode --unit-id --defaults --save",
     "flash": "BOARD --port",
-    "stream": "PORT --method --calibration --force --tare --json --scans --seconds",
+    "stream": "PORT --method --calibration --force --tare --ref-std --json --scans --seconds",
     "view": "PORT --calibration --force --host --http-port --no-browser",
     "tare": "PORT CALIBRATION --seconds --undo --force",
     "skin": "FILE --pitch-mm --radius-mm --taxels --frame --picture",
     "doctor": "PORT --calibration --wires --leads --press --into --json",
     "verify": "PORT PLATE --wires --leads --seconds --picture --json --cell-percent "
     "--reference-percent --settling-lsb --loss",
-    "estimate": "READINGS --method --out --cold",
+    "estimate": "READINGS --method --out --cold --ref-std",
     "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale"
     " --force-unit --force-column",
     "export": "RECORDING OUT --begin --end",

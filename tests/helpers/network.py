@@ -134,17 +134,39 @@ def laplacian_readings(
     return ratio
 
 
+def leaks(shape: tuple[int, int], leak_ohm: float) -> tuple[NDArray[np.intp], Float]:
+    """Branches between nodes of `skin_network` (2, n), and their resistances (n,): a damp skin.
+
+    Neighbouring stripes of a layer leak into each other by `leak_ohm` at each crossing.
+    """
+    rows, columns = shape
+    lines = rows + columns
+    top, bottom = np.arange(lines, lines + 2 * rows * columns).reshape(2, rows, columns)
+    one = np.concatenate([top[:-1], bottom[:, :-1].T], axis=None)
+    other = np.concatenate([top[1:], bottom[:, 1:].T], axis=None)
+    return np.stack([one, other]), np.full(one.size, leak_ohm)
+
+
 class SkinCircuit:
     """The Laplacian of one untouched skin, inverted once: readings of many frames, fast.
 
     The point of row 0 is grounded: only differences are used. With Z = L^-1, D the branches of the
     cells and q the cells that conduct more than at rest by dg, Woodbury's identity gives
     Z - Z D_q^T (1/dg + D_q Z D_q^T)^-1 D_q Z. Cells at rest conduct, and no wire is a short.
+    more: branches that no skin should have, and their resistances: as `leaks` has them.
     """
 
-    def __init__(self, rest: Skin) -> None:
+    def __init__(self, rest: Skin, more: tuple[NDArray[np.intp], Float] | None = None) -> None:
         rows, columns = rest.shape
         network, cells, lines = skin_network(rest), rows * columns, rows + columns
+        if more is not None:
+            tail, head, ohm = network[1:]
+            network = Network(
+                network.nodes,
+                np.concatenate([tail, more[0][0]]),
+                np.concatenate([head, more[0][1]]),
+                np.concatenate([ohm, more[1]]),
+            )
         branch = np.arange(network.tail.size)
         incidence = np.zeros((branch.size, network.nodes))
         incidence[branch, network.tail], incidence[branch, network.head] = 1.0, -1.0

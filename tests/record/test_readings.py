@@ -165,6 +165,7 @@ def bad_ratio(index: tuple[int, ...], ratio: float) -> np.ndarray:
         ({"ratio": GOOD, "ref_bottom_ohm": 0.0}, "ref_bottom_ohm must be from 1"),
         ({"ratio": GOOD, "adc_bits": 10.5}, "adc bits must be"),
         ({"ratio": GOOD, "adc_bits": np.inf}, "adc bits must be"),
+        ({"ratio": GOOD, "ref_log_std": 1.5}, "ref_log_std is 1.5, it must be from 0 to 1"),
         ({"ratio": GOOD, "nominal_top_wire_ohm": np.ones(3)}, "nominal_top_wire_ohm has shape"),
         ({"ratio": GOOD, "nominal_bottom_wire_ohm": [1, -1]}, "nominal_bottom_wire_ohm is -1"),
         ({"ratio": GOOD, "nominal_lead_ohm": -1.0}, "nominal_lead_ohm is -1"),

@@ -53,6 +53,7 @@ Leads = Annotated[
     float | None,
     Option(help="nominal ohms from the multiplexer to a line's first crossing; 0: none"),
 ]
+REF_STD: Final = Option(min=0, max=1, help="how well the references are known: 0.05 is 5 %")
 
 Scans = Annotated[int, Option(min=0, help="stop after so many; 0: never")]
 Seconds = Annotated[float, Option(min=0, help="stop after so long; 0: never")]

@@ -20,7 +20,7 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli.board import TERMINAL, Port, Scans, Seconds, asked_for
+from ohmskin.cli.board import REF_STD, TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_in_time, until_ctrl_c
@@ -230,6 +230,7 @@ def estimate(
     method: Annotated[str, Option(help=" | ".join(METHODS))],
     out: Annotated[Path, Option(help="file to write (.npz)")],
     cold: Annotated[bool, Option(help="start every frame afresh")] = False,
+    ref_std: Annotated[float | None, REF_STD] = None,
 ) -> None:
     """Estimate every cell of every frame of a readings file.
 
@@ -237,7 +238,10 @@ def estimate(
     """
     check_place(out, readings)
     with ends_in_time(_errors.show_cursor):
-        answers = estimate_file(load_readings(readings), method, cold=cold, watch=progress(method))
+        loaded = load_readings(readings)
+        if ref_std is not None:
+            loaded = replace(loaded, ref_log_std=ref_std)
+        answers = estimate_file(loaded, method, cold=cold, watch=progress(method))
     save_arrays(out, answers)
     frames = len(answers["converged"])
     TERMINAL.print(

@@ -20,10 +20,11 @@ from typer import Option
 
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, shades
-from ohmskin.cli.board import Port, Scans, Seconds, asked_for
+from ohmskin.cli.board import REF_STD, Port, Scans, Seconds, asked_for
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
 from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES
+from ohmskin.estimate.knowledge import REF_LOG_STD
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.contacts import ContactTracker
@@ -56,6 +57,7 @@ def stream(
     ] = None,
     force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
     tare_s: Annotated[float, Option("--tare", min=0, help="touch nothing for so long, in s")] = 0.0,
+    ref_std: Annotated[float, REF_STD] = REF_LOG_STD,
     as_json: Annotated[bool, Option("--json", help="one JSON object a scan")] = False,
     scans: Scans = 0,
     seconds: Seconds = 0.0,
@@ -71,7 +73,7 @@ def stream(
     with ohmskin.open(port) as skin:
         reader = None
         if method != "none":
-            reader = SkinReader(skin.info, loaded, method=method, force=force)
+            reader = SkinReader(skin.info, loaded, method=method, force=force, ref_log_std=ref_std)
             skin.only_unit = None if loaded is None else skin.info.unit_id
             if tare_s:
                 # Without a calibration the rest is unknown, and cells may seem touched.

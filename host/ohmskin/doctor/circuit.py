@@ -144,7 +144,8 @@ def _cells(rest: Rest, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
     kept = np.ix_(~no_row, ~no_column)
     ratio = rest.ratio[kept]
     rest_of_board = replace(rest.board, rows=ratio.shape[0], columns=ratio.shape[1])
-    estimate = make_estimator("matrix", SkinKnowledge.of(rest_of_board)).estimate(ratio)
+    knowledge = SkinKnowledge.of(rest_of_board, ref_log_std=0.0)
+    estimate = make_estimator("matrix", knowledge).estimate(ratio)
     siemens, std = np.full((2, *rest.codes.shape[:2]), np.nan)
     siemens[kept], std[kept] = estimate.cell_siemens, estimate.cell_siemens_std
     return siemens, std

@@ -123,7 +123,9 @@ class PlateExam:
             self.settling_lsb = np.abs(usual.mean - settled.mean).max(axis=2)
             if examine_settling(usual, settled, diagnosis, self.tolerance.settling_lsb):
                 scans = settled
-        knowledge = SkinKnowledge.of(scans.board, nominal_wire_ohm=self.wire_ohm._replace(lead=0.0))
+        knowledge = SkinKnowledge.of(
+            scans.board, nominal_wire_ohm=self.wire_ohm._replace(lead=0.0), ref_log_std=0.0
+        )
         shown = circuit.READING_SIGN * (scans.mean + 0.5 - FULL_LSB * circuit.READING_OFFSET)
         # 1 / I less the leads, with I = s / 1024 R.
         per_ohm = circuit.reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) * FULL_LSB

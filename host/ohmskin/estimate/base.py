@@ -39,10 +39,12 @@ class Estimate:
 
     cell_siemens: conductance of each cell (R, C) [S].
     cell_siemens_std: its standard deviation (R, C) [S], NaN where the method gives none. It covers
-        the noise of the readings, not what the method neglects. About 58 % of cells lie within one,
-        98 % within two, because rounding is uniform.
+        the noise of the readings and the error of both references (`SkinKnowledge.ref_log_std`),
+        not what the method neglects. By noise alone, about 58 % of cells lie within one, 98 %
+        within two, because rounding is uniform.
     level: what a force is read from (R, C): cell_siemens; for `voltage`, a voltage over Vdd [1].
-    level_std: its standard deviation (R, C).
+    level_std: its standard deviation (R, C), by noise alone: a calibration was learned through the
+        same references.
     touched: which cells are touched (R, C); `Estimator.estimate` says by which rule.
     top_wire_ohm: each segment of the top layer (R, C) [ohm], NaN where wires are not estimated.
     bottom_wire_ohm: the same of the bottom layer.
@@ -203,9 +205,13 @@ class Estimator(ABC):
         unknown = np.full((2, *shape), np.nan)
         wires = unknown if solution.wire_ohm is None else solution.wire_ohm
         wires_std = unknown if solution.wire_ohm_std is None else solution.wire_ohm_std
+        if knowledge.ref_log_std:
+            wires_std = np.hypot(wires_std, knowledge.ref_log_std * wires)
         return Estimate(
             cell_siemens=solution.cell_siemens,
-            cell_siemens_std=solution.cell_siemens_std,
+            cell_siemens_std=np.hypot(
+                solution.cell_siemens_std, knowledge.ref_log_std * solution.cell_siemens
+            ),
             level=level,
             level_std=level_std,
             touched=touched,

@@ -5,7 +5,7 @@ Estimators, and the modules that prepare readings for them, are told a `SkinKnow
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -19,6 +19,9 @@ from ohmskin.link.protocol import MODES
 
 # An open cell counts as so much. Chosen: no converter sees a gigohm, and logs of it stay finite.
 MIN_CELL_SIEMENS: Final = 1e-9
+# Standard deviation of the log of a board's references, as far as both are off alike. Chosen: usual
+# resistors are within 1 % (E96), and the pins that drive them add less: some 30 ohm to 30 kOhm.
+REF_LOG_STD: Final = 0.01
 # A shorted cell counts as so much. Chosen: beside references of 30 kOhm, an ohm is nothing.
 MAX_CELL_SIEMENS: Final = 1.0
 
@@ -77,6 +80,8 @@ class SkinKnowledge:
     nominal_wire_ohm: what is known of the wires.
     reading_names: the names of the readings of each cell, in their order.
     may_be_bent: whether the skin may have been bent since its wires were measured.
+    ref_log_std: standard deviation of the log of the references, as far as both are off alike; 0:
+        they are exact. Readings are ratios: all resistances have this error, and none shows it.
     """
 
     rows: int
@@ -88,6 +93,7 @@ class SkinKnowledge:
     nominal_wire_ohm: WireOhm = NO_WIRES
     reading_names: tuple[str, ...] = NEAR
     may_be_bent: bool = True
+    ref_log_std: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -101,15 +107,22 @@ class SkinKnowledge:
             rest.setflags(write=False)
             object.__setattr__(self, "rest_ratio", rest)
         self.nominal_wire_ohm.check()
+        if not 0 <= self.ref_log_std <= 1:
+            raise ValueError(f"ref_log_std is {self.ref_log_std:g}, it must be from 0 to 1")
 
     @classmethod
     def of(
-        cls, board: Hello, rest_ratio: Float | None = None, nominal_wire_ohm: WireOhm = NO_WIRES
+        cls,
+        board: Hello,
+        rest_ratio: Float | None = None,
+        nominal_wire_ohm: WireOhm = NO_WIRES,
+        ref_log_std: float = REF_LOG_STD,
     ) -> Self:
         """What is known of the skin at this board."""
         size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
         names = MODES[board.mode]
-        return cls(*size, *references, board.adc_bits, rest_ratio, nominal_wire_ohm, names)
+        known = cls(*size, *references, board.adc_bits, rest_ratio, nominal_wire_ohm, names)
+        return replace(known, ref_log_std=ref_log_std)
 
     @property
     def ratio_std(self) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 from ohmskin.arrays import FULL_SCALE_N, Bool, Float, heat_map
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import Estimate, Estimator
-from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge
+from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
@@ -109,8 +109,8 @@ class _SharedKnowledge:
         knows most of the wires.
     """
 
-    def __init__(self, board: Hello, calibration: Calibration | None) -> None:
-        self.board = board
+    def __init__(self, board: Hello, calibration: Calibration | None, ref_log_std: float) -> None:
+        self.board, self._ref_log_std = board, ref_log_std
         self.calibration = calibration
         self.rests: list[Rest | Untouched | None] = [None]
         self.last_estimator: Estimator | None = None
@@ -138,7 +138,8 @@ class _SharedKnowledge:
     def knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
         """What a method is told of the skin, with this rest."""
         wires = NO_WIRES if self.calibration is None else self.calibration.nominal_wire_ohm
-        return SkinKnowledge.of(self.board, None if rest is None else rest.ratio, wires)
+        ratio = None if rest is None else rest.ratio
+        return SkinKnowledge.of(self.board, ratio, wires, self._ref_log_std)
 
 
 class SkinReader:
@@ -148,6 +149,7 @@ class SkinReader:
     calibration: gives newtons, as long as the method is its own.
     method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
     force: take the calibration of another unit.
+    ref_log_std: how well both references are known (`SkinKnowledge`). Newtons do not depend on it.
 
     The latest tare is the rest, whether `tare` took it or a played scan came with it
     (`Scan.rest_ratio`). Scans are read by one thread; all else may be called from any thread.
@@ -162,12 +164,13 @@ class SkinReader:
         *,
         method: str = "",
         force: bool = False,
+        ref_log_std: float = REF_LOG_STD,
     ) -> None:
         if calibration is not None:
             calibration.check(board, force=force)
         self.board = board
         self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
-        self._shared = _SharedKnowledge(board, calibration)
+        self._shared = _SharedKnowledge(board, calibration, ref_log_std)
         self._begin()
 
     def another(self) -> SkinReader:

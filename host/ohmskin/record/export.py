@@ -19,6 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ohmskin.errors import RecordingError
+from ohmskin.estimate.knowledge import REF_LOG_STD
 from ohmskin.files import PathName, save_table, whole_file
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -117,6 +118,7 @@ def _save_npz(part: Part, file: BinaryIO, ratios: Any) -> None:
         "reading_names": scan.reading_names,
         "ref_top_ohm": float(board.ref_top_ohm),
         "ref_bottom_ohm": float(board.ref_bottom_ohm),
+        "ref_log_std": REF_LOG_STD,
         "adc_bits": board.adc_bits,
         **columns,
     }

@@ -13,6 +13,7 @@ ref_bottom_ohm          scalar
 nominal_top_wire_ohm    scalar or F                  one wire segment, per layer (optional)
 nominal_bottom_wire_ohm scalar or F
 nominal_lead_ohm        scalar or F                  from multiplexer to first crossing; 0: nothing
+ref_log_std             scalar                       what both may be off by together; absent: 0
 adc_bits                scalar                       absent: the readings are exact
 reading_names           4, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
@@ -75,7 +76,7 @@ _NAMES: Final = tuple(ENUMS["reading"].values)
 # What may be given for each frame, and how many dimensions it has where it is given once.
 _WIRES: Final = WIRE_FIELDS[:3]
 _ONCE_NDIM: Final = {"rest_ratio": 3} | dict.fromkeys(_WIRES, 0)
-_SCALARS: Final = {"ref_top_ohm", "ref_bottom_ohm", "adc_bits"}
+_SCALARS: Final = {"ref_top_ohm", "ref_bottom_ohm", "ref_log_std", "adc_bits"}
 _RATIOS: Final = ("ratio", "rest_ratio")
 # The arrays that go out, in this order.
 _OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
@@ -92,6 +93,7 @@ class Readings:
     rest_ratio: Float | None = None
     ref_top_ohm: float = DEFAULT_REF_OHM
     ref_bottom_ohm: float = DEFAULT_REF_OHM
+    ref_log_std: float = 0.0
     nominal_top_wire_ohm: Float | None = None
     nominal_bottom_wire_ohm: Float | None = None
     nominal_lead_ohm: Float | None = None
@@ -141,6 +143,7 @@ class Readings:
             rest_ratio=rest_ratio,
             nominal_wire_ohm=WireOhm(*wires),
             reading_names=self.reading_names,
+            ref_log_std=self.ref_log_std,
         )
 
     def _of_frame(self, name: str, frame: int) -> Any:
