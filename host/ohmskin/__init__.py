@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ohmskin.force.calibration import Calibration, load_calibration
     from ohmskin.force.contacts import Contact
     from ohmskin.force.reader import CalibratedSkin, ForceScan
+    from ohmskin.force.simulated import SimulatedSkin
     from ohmskin.link.clock import BoardClock
     from ohmskin.link.device import Device
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
@@ -69,6 +70,7 @@ __all__ = [
     "RecordingError",
     "Scan",
     "SelfTestReport",
+    "SimulatedSkin",
     "SkinKnowledge",
     "SteppedSkin",
     "TareRefused",
@@ -91,6 +93,7 @@ _MODULES = {
     "force.calibration": ("Calibration", "load_calibration"),
     "force.contacts": ("Contact",),
     "force.reader": ("CalibratedSkin", "ForceScan"),
+    "force.simulated": ("SimulatedSkin",),
     "link.clock": ("BoardClock",),
     "link.device": ("Device",),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),

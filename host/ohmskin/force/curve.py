@@ -126,6 +126,17 @@ class ForceModel:
         variance = by_rise**2 + scatter + np.maximum(by_fit, 0.0)
         return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))
 
+    def rise(self, force_n: ArrayLike) -> Float:
+        """The rise x above rest, (R, C), at which a force [N] is predicted: x = (F / a)^(1 / b).
+
+        Raises ValueError, naming the cell, for a shape or a force that cannot be.
+        """
+        force = np.asarray(force_n, dtype=np.float64)
+        if force.shape != self.kind.shape:
+            raise ValueError(f"force_n has shape {force.shape}, this calibration {self.kind.shape}")
+        require("force_n", np.isfinite(force) & (force >= 0), "negative or not finite")
+        return np.asarray((force / self.slope) ** (1 / self.exponent))
+
 
 @dataclass(frozen=True)
 class Curve:

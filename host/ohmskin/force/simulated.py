@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A skin that a simulation presses: what ohmskin would make of these forces.
+
+    forces -> rises (the calibration, backwards) -> circuit -> codes -> `SkinReader` -> forces
+
+So a policy that is trained in MuJoCo meets ghosts, noise, deviations and contacts as the calibrated
+skin has them. It is a simulation: no textile's creep, hysteresis or drift is in it.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ohmskin.arrays import Float
+from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.driver import EmulatorLink
+from ohmskin.emulate.faults import SkinFaults
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, LEAD_OHM, TOP_WIRE_OHM, Scene
+from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
+from ohmskin.estimate.methods import METHODS
+from ohmskin.force.calibration import Calibration
+from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
+from ohmskin.link.codes import ratio_from_codes
+from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.link.protocol import ADC_BITS
+from ohmskin.link.session import Session
+
+# The skin is tared at first by the mean of so many scans. Chosen: as `ohmskin tare` takes them.
+_TARE_SCANS: Final = 90
+
+
+class SimulatedSkin:
+    """The skin of a calibration, pressed by whatever forces a program says.
+
+    calibration: its curves, its rest, its wires, and where it says nothing of these, those of
+    emulated skins. noise_lsb: of the converter, before rounding [LSB]. seed: of the noise, and of
+    the wires, which scatter by 10 % about what the calibration says.
+
+    >>> skin = SimulatedSkin(ohmskin.load_calibration("skin.json"))
+    >>> skin.step(force_n, time_s=0.01).force_n.shape
+    (8, 8)
+
+    :raises ValueError: the calibration is of voltages, which say nothing of the cells.
+    """
+
+    def __init__(
+        self, calibration: Calibration, *, noise_lsb: float = DEFAULT_NOISE_LSB, seed: int = 0
+    ) -> None:
+        if calibration.method not in METHODS:
+            raise ValueError(
+                "a calibration by 'voltage' knows no conductances: take another method"
+            )
+        rows, columns, wires = calibration.rows, calibration.columns, calibration.nominal_wire_ohm
+        told = (wires.top, TOP_WIRE_OHM), (wires.bottom, BOTTOM_WIRE_OHM), (wires.lead, LEAD_OHM)
+        top, bottom, lead = (usual if known is None else known for known, usual in told)
+        drawn = Scene("rest", rows, columns, seed=seed).rest
+        self._rest = replace(
+            drawn,
+            cell_siemens=calibration.untouched.level,
+            top_wire_ohm=drawn.top_wire_ohm * top / TOP_WIRE_OHM,
+            bottom_wire_ohm=drawn.bottom_wire_ohm * bottom / BOTTOM_WIRE_OHM,
+            lead_ohm=np.full(rows + columns, lead),
+        )
+        self._model, self._force_n = calibration.model, np.zeros((rows, columns))
+        self._number, self._new_board = (
+            0,
+            lambda force_n: EmulatedBoard(
+                lambda time_s, mode: self._ratio(force_n(time_s), mode),
+                BoardSettings(rows, columns, calibration.mode, unit_id=calibration.unit_id),
+                noise_lsb=noise_lsb,
+                seed=seed,
+            ),
+        )
+        self._board = self._new_board(lambda _: self._force_n)
+        hello = BoardDecoder().feed(self._board.advance(0.0), 0.0)[0]
+        assert isinstance(hello, Hello)
+        self._reader = SkinReader(hello, calibration)
+        codes = [self._board.codes_at(0.0) for _ in range(_TARE_SCANS)]
+        self._reader.tare(ratio_from_codes(np.mean(codes, axis=0), ADC_BITS), force=True)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration with the rest of this skin as its tare."""
+        calibration = self._reader.calibration
+        assert calibration is not None
+        return calibration
+
+    def _ratio(self, force_n: ArrayLike, mode: str) -> Float:
+        siemens = self._rest.cell_siemens + self._model.rise(force_n)
+        return SkinFaults().readings(replace(self._rest, cell_siemens=siemens), mode)
+
+    def step(self, force_n: ArrayLike, time_s: float) -> ForceScan:
+        """What a scan at this time shows while these forces (R, C) [N] press: no clock passes.
+
+        time_s: the time of the simulation, which goes on from step to step; `ForceScan.time_ns` is
+        the same. Raises ValueError for forces of another shape, below 0 or not finite.
+        """
+        self._force_n = np.asarray(force_n, dtype=np.float64)
+        codes = self._board.codes_at(time_s)
+        self._number += 1
+        scan = Scan(
+            codes, self._number, round(1e6 * time_s), time_s, 0, mode=self._reader.board.mode
+        )
+        return self._reader.read(replace(scan, time_ns=round(1e9 * time_s)))
+
+    def opened(self, force_n: Callable[[float], ArrayLike]) -> CalibratedSkin:
+        """The same skin on an emulated board in real time, as `ohmskin.open` gives one.
+
+        force_n: gives the forces (R, C) [N] at a time since this call [s]; another thread asks it.
+        """
+        link = EmulatorLink(self._new_board(force_n), "simulated skin")
+        return CalibratedSkin(Session(link), self.calibration)
