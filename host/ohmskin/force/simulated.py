@@ -64,17 +64,11 @@ class SimulatedSkin:
             bottom_wire_ohm=drawn.bottom_wire_ohm * bottom / BOTTOM_WIRE_OHM,
             lead_ohm=np.full(rows + columns, lead),
         )
-        self._model, self._force_n = calibration.model, np.zeros((rows, columns))
-        self._number, self._new_board = (
-            0,
-            lambda force_n: EmulatedBoard(
-                lambda time_s, mode: self._ratio(force_n(time_s), mode),
-                BoardSettings(rows, columns, calibration.mode, unit_id=calibration.unit_id),
-                noise_lsb=noise_lsb,
-                seed=seed,
-            ),
-        )
-        self._board = self._new_board(lambda _: self._force_n)
+        self._model, self._number = calibration.model, 0
+        self._settings = BoardSettings(rows, columns, calibration.mode, None, calibration.unit_id)
+        self._noise_lsb, self._seed = noise_lsb, seed
+        self._force_n: ArrayLike = np.zeros((rows, columns))
+        self._board = self._pressed(lambda _: self._force_n)
         hello = BoardDecoder().feed(self._board.advance(0.0), 0.0)[0]
         assert isinstance(hello, Hello)
         self._reader = SkinReader(hello, calibration)
@@ -88,9 +82,14 @@ class SimulatedSkin:
         assert calibration is not None
         return calibration
 
-    def _ratio(self, force_n: ArrayLike, mode: str) -> Float:
-        siemens = self._rest.cell_siemens + self._model.rise(force_n)
-        return SkinFaults().readings(replace(self._rest, cell_siemens=siemens), mode)
+    def _pressed(self, force_n: Callable[[float], ArrayLike]) -> EmulatedBoard:
+        """A board whose skin these forces press at its time [s]."""
+
+        def ratio(time_s: float, mode: str) -> Float:
+            siemens = self._rest.cell_siemens + self._model.rise(force_n(time_s))
+            return SkinFaults().readings(replace(self._rest, cell_siemens=siemens), mode)
+
+        return EmulatedBoard(ratio, self._settings, noise_lsb=self._noise_lsb, seed=self._seed)
 
     def step(self, force_n: ArrayLike, time_s: float) -> ForceScan:
         """What a scan at this time shows while these forces (R, C) [N] press: no clock passes.
@@ -98,7 +97,7 @@ class SimulatedSkin:
         time_s: the time of the simulation, which goes on from step to step; `ForceScan.time_ns` is
         the same. Raises ValueError for forces of another shape, below 0 or not finite.
         """
-        self._force_n = np.asarray(force_n, dtype=np.float64)
+        self._force_n = force_n
         codes = self._board.codes_at(time_s)
         self._number += 1
         scan = Scan(
@@ -111,5 +110,5 @@ class SimulatedSkin:
 
         force_n: gives the forces (R, C) [N] at a time since this call [s]; another thread asks it.
         """
-        link = EmulatorLink(self._new_board(force_n), "simulated skin")
+        link = EmulatorLink(self._pressed(force_n), "simulated skin")
         return CalibratedSkin(Session(link), self.calibration)
