@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ohmskin.link.clock import BoardClock
     from ohmskin.link.device import Device
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+    from ohmskin.live import LiveSkin
     from ohmskin.opening import open
     from ohmskin.record.recording import load_recording
     from ohmskin.several_boards import Boards, BoardScan, open_all
@@ -62,6 +63,7 @@ __all__ = [
     "Estimator",
     "ForceScan",
     "Hello",
+    "LiveSkin",
     "OhmskinError",
     "PortError",
     "ProtocolError",
@@ -97,6 +99,7 @@ _MODULES = {
     "link.clock": ("BoardClock",),
     "link.device": ("Device",),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
+    "live": ("LiveSkin",),
     "opening": ("open",),
     "record.recording": ("load_recording",),
     "several_boards": ("BoardScan", "Boards", "open_all"),

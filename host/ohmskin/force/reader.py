@@ -29,6 +29,7 @@ from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
 from ohmskin.force.geometry import Geometry
+from ohmskin.link.codes import quantise
 from ohmskin.link.device import Device, in_threads
 from ohmskin.link.messages import BoardStats, Hello, Scan
 
@@ -323,7 +324,23 @@ class CalibratedSkin(Closing):
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
         device.only_unit = device.info.unit_id
+        self._warm_up()
         self._lock = threading.Lock()  # a reader takes one scan at a time
+
+    def _warm_up(self) -> None:
+        """Read a made-up scan of the untouched skin, by a reader that goes.
+
+        A first estimate loads modules for most of a second. Scans would wait for it meanwhile, and
+        whoever reads every scan would be late for hundreds of them.
+        """
+        board, calibration = self.info, self.calibration
+        codes = quantise(calibration.untouched.ratio, board.adc_bits)
+        reader = SkinReader(board, calibration, force=True)
+        reader.read(Scan(codes, 0, 0, 0.0, 0, mode=board.mode))
+
+    def new_reader(self) -> SkinReader:
+        """A reader of this skin for another way of reading its scans; it knows the same tares."""
+        return self._reader.another()
 
     @property
     def info(self) -> Hello:
@@ -351,7 +368,7 @@ class CalibratedSkin(Closing):
 
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, with its forces."""
-        return map(self._reader.another().read, self.device)
+        return map(self.new_reader().read, self.device)
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
         """The same for ``async for``."""

@@ -31,6 +31,7 @@ from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import LOG, Device
+from ohmskin.live import AGAIN_S
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
 
@@ -43,9 +44,6 @@ _NEEDED_LATER: Final = (
 )
 # A page has at most so many boards. Chosen: each is a thread that may use a good part of a core.
 MOST_BOARDS: Final = 16
-# A port that is not there is tried again after this time [s]. Chosen: somebody who plugs a board in
-# does not wait for long, and a system looks for its ports without effort.
-AGAIN_S: Final = 1.0
 # `close` waits so long for a board's thread [s]. Chosen: it ends in a tenth of that, unless its
 # port never answers, and such a port must not hold up the end of the program.
 _CLOSE_S: Final = 1.0

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A skin that is always read: what comes, once each, through everything that is unplugged."""
+
+import asyncio
+from itertools import islice, pairwise
+from pathlib import Path
+
+import pytest
+
+import ohmskin
+from calibrations import of_scene
+from ohmskin import live
+from ohmskin.errors import OhmskinError, PortError
+from ohmskin.live import LiveSkin
+from ohmskin.record.recorder import Recorder
+
+URL = "emulator://8x8?scene=ghost&seed=1&begin=0"
+ENOUGH_S = 20.0  # a test waits so long for what comes at once, unless it never comes
+
+pytestmark = pytest.mark.usefixtures("nothing_left")
+
+
+def drained(skin: LiveSkin, scans: int) -> list[ohmskin.ForceScan]:
+    """So many scans or more, from the first, by asking again and again."""
+    count, found = 0, []
+    while len(found) < scans:
+        count, more = skin.since(count, ENOUGH_S)
+        assert more, skin.failure
+        found += more
+        assert len(found) == count
+    return found
+
+
+def test_every_scan_comes_once() -> None:
+    with LiveSkin(URL, of_scene("ghost")) as skin:
+        found = drained(skin, 40)
+        assert skin.newest().number >= found[-1].number
+        assert skin.since(10**9)[1] == []
+    assert all(b.number - a.number == 1 + b.missed for a, b in pairwise(found))
+    assert all(len(scan.contacts) == 3 for scan in found[1:])
+    assert skin.newest() is skin.since(0)[1][-1]  # as long as somebody wants it
+
+
+def test_it_goes_on_when_it_was_unplugged_20_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "AGAIN_S", 0.01)
+    count = 0
+    with LiveSkin(f"{URL}&vanish=0.1", of_scene("ghost")) as skin:
+        for time in range(1, 21):
+            while skin.opened <= time:
+                count, scans = skin.since(count, ENOUGH_S)
+                assert scans, skin.failure
+                assert all(scan.contacts for scan in scans)
+
+
+def test_a_tare_outlasts_the_plug(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "AGAIN_S", 0.01)
+    with LiveSkin(f"{URL}&vanish=1", of_scene("ghost")) as skin:
+        assert drained(skin, 1)[0].contacts
+        with pytest.raises(ohmskin.TareRefused):
+            skin.tare(0.0)
+        skin.tare(0.0, force=True)
+        count = skin.since(0)[0]
+        while skin.opened < 2:
+            count, scans = skin.since(count, ENOUGH_S)
+            assert scans
+        count, scans = skin.since(count, ENOUGH_S)
+        assert not scans[-1].contacts
+
+
+def test_async_for_gives_every_scan() -> None:
+    async def read() -> list[int]:
+        with LiveSkin(URL, of_scene("ghost")) as skin:
+            numbers = []
+            async for scan in skin:
+                numbers.append(scan.number)
+                if len(numbers) == 10:
+                    return numbers
+
+    numbers = asyncio.run(read())
+    assert numbers == list(range(numbers[0], numbers[0] + 10))
+
+
+def test_a_program_waits_for_what_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "AGAIN_S", 0.01)
+    with LiveSkin("/dev/nothing", of_scene("ghost")) as skin:
+        assert skin.newest() is None
+        assert skin.since(0)[0] == 0
+        while skin.failure is None:
+            skin.since(0, 0.01)
+        with pytest.raises(PortError, match="no port /dev/nothing"):
+            skin.tare()
+    with pytest.raises(ValueError, match=r"no\.json: cannot be read"):
+        LiveSkin(URL, "no.json")
+
+
+def test_a_machine_that_is_too_slow_passes_scans_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "LATE_S", -1.0)  # so that any scan is late
+    with LiveSkin(URL, of_scene("ghost")) as skin:
+        while skin.skipped < 3:
+            skin.since(0, 0.01)
+            assert not isinstance(skin.failure, OhmskinError)
+        assert skin.newest() is None
+
+
+def test_a_recording_ends(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with ohmskin.open(URL) as board, Recorder(path, board.info) as recorder:
+        for scan in islice(board, 20):
+            recorder.add(scan)
+    with LiveSkin(f"replay://{path}?speed=0", of_scene("ghost")) as skin:
+        assert len(drained(skin, 20)) == 20
+        assert list(skin) == []
