@@ -120,13 +120,15 @@ class Estimator(ABC):
     """One method for one skin, frame after frame. Raises ValueError for readings it cannot take.
 
     name: what the method is called. takes_far: whether it takes readings at far ends.
+    takes_partial: whether it takes frames of which not all was read.
     """
 
     name: ClassVar[str]
     takes_far: ClassVar[bool] = False
+    takes_partial: ClassVar[bool] = True
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
-        if knowledge.reading_names != NEAR and not self.takes_far:
+        if knowledge.checked_names != NEAR and not self.takes_far:
             raise ValueError(
                 f"'{self.name}' takes the readings {' '.join(NEAR)}, not "
                 f"{' '.join(knowledge.reading_names)}: use 'joint' or 'touch', or scan with "
@@ -174,6 +176,9 @@ class Estimator(ABC):
     def estimate(self, ratio: ArrayLike) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
+        Readings that were not taken are NaN: those of some configurations, or of cells outside of a
+        region of rows and columns. Their ports are as they were, and less certain with each frame.
+
         A cell is touched if its conductance g has risen, and by more than noise,
 
             g - g_rest > 0.5e-6 S ,   1 / (1 / g + 4 std_ohm) > g_rest ,
@@ -194,6 +199,8 @@ class Estimator(ABC):
         knowledge = self.knowledge
         shape = knowledge.rows, knowledge.columns
         readings = check_ratio(ratio, *shape, of=knowledge.reading_names)
+        if not self.takes_partial and np.isnan(readings).any():
+            raise ValueError(f"'{self.name}' takes whole scans of a b c d: use 'joint' or 'touch'")
         self.rest()
         started = time.perf_counter()
         with one_blas_thread:
@@ -253,9 +260,11 @@ class Estimator(ABC):
     def _chi2(self, ports: PortReadings, current_siemens: Float) -> float:
         """`Estimate.chi2` of a model that gives these currents of ports (R, C) [S]."""
         knowledge = self.knowledge
-        if knowledge.reading_names != NEAR:
+        if knowledge.checked_names != NEAR:
             return float(np.mean(((ports.current - current_siemens) / ports.current_std) ** 2))
         references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
         model = ratio_from_current(current_siemens, *references)
         residual = (ports.ratio - model).ravel() / knowledge.ratio_std
+        if np.isnan(residual @ residual):
+            residual = residual[~np.isnan(residual)]
         return float(residual @ residual) / residual.size

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM, MAX_OHM, NEAR, check_references, current_std
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
@@ -104,6 +104,8 @@ class SkinKnowledge:
         if self.rest_ratio is not None:
             cells = self.rows, self.columns
             rest = check_ratio(self.rest_ratio, *cells, "rest_ratio", self.reading_names).copy()
+            if np.any(np.isnan(rest).all(axis=-1)):
+                raise ValueError("rest_ratio has cells without any reading")
             rest.setflags(write=False)
             object.__setattr__(self, "rest_ratio", rest)
         self.nominal_wire_ohm.check()
@@ -125,6 +127,11 @@ class SkinKnowledge:
         return replace(known, ref_log_std=ref_log_std)
 
     @property
+    def checked_names(self) -> tuple[str, ...]:
+        """The names of the readings that `check_ratio` returns: some of a to d are all of them."""
+        return NEAR if set(self.reading_names) <= set(NEAR) else self.reading_names
+
+    @property
     def ratio_std(self) -> float:
         """Standard deviation of one reading, by its rounding alone [V/Vdd]."""
         return ratio_std(self.adc_bits)
@@ -143,13 +150,25 @@ class SkinKnowledge:
 def check_ratio(
     ratio: ArrayLike, rows: int, columns: int, name: str = "ratio", of: Sequence[str] = NEAR
 ) -> Float:
-    """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell."""
+    """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell.
+
+    Of near ends, what was not read is NaN, and n is 4: a frame of `b` alone may be of shape
+    (R, C, 1), or (R, C, 4) with NaN for a, c and d. What was read are the same readings of all
+    crossings of some rows with some columns.
+    """
     readings = np.asarray(ratio, dtype=np.float64)
-    expected = (rows, columns, len(of))
-    if readings.shape != expected:
-        raise ValueError(f"{name} has shape {readings.shape}, this skin {expected}")
+    is_near = set(of) <= set(NEAR)
+    shapes = [(rows, columns, len(of)), *([(rows, columns, len(NEAR))] if is_near else [])]
+    if readings.shape not in shapes:
+        raise ValueError(f"{name} has shape {readings.shape}, this skin {shapes[0]}")
+    if is_near and readings.shape[-1] < len(NEAR):
+        some, readings = readings, np.full(shapes[1], np.nan)
+        readings[..., [NEAR.index(each) for each in of]] = some
+        of = NEAR
     # Written so that NaN fails too.
     good = (readings >= 0) & (readings <= 1)
+    if is_near and not good.all():
+        good |= np.isnan(readings) & ~_read_of_lines(readings)
     if not good.all():
         row, column, k = (int(index) for index in np.argwhere(~good)[0])
         raise ValueError(
@@ -157,3 +176,12 @@ def check_ratio(
             f"{readings[row, column, k]:g}, not in 0..1"
         )
     return readings
+
+
+def _read_of_lines(ratio: Float) -> Bool:
+    """Which of the readings (R, C, n) must be there, if all that are NaN were not asked for."""
+    is_read = ~np.isnan(ratio)
+    rows, columns, kinds = (np.any(is_read, axis=axes) for axes in ((1, 2), (0, 2), (0, 1)))
+    if not kinds.any():
+        return np.ones_like(is_read)
+    return np.asarray(rows[:, None, None] & columns[:, None] & kinds)

@@ -57,6 +57,7 @@ class VoltageEstimator(OhmEstimator):
     """As `ohm`, but `Estimate.level` is the `voltage_level` of the readings [1]."""
 
     name = "voltage"
+    takes_partial = False
 
     def _level(self, ratio: Float, solution: Solution) -> tuple[Float, Float]:
         level = voltage_level(ratio)

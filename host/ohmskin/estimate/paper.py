@@ -181,6 +181,7 @@ class PaperEstimator(Estimator):
     more than 64 cells.
     """
 
+    takes_partial: ClassVar[bool] = False
     steps: ClassVar[tuple[Step, ...]]
     # Step 2's "zero": a logarithm cannot be zero. The least wire of the paper's simulations.
     start_wire_megohm: ClassVar[float] = 1e-4

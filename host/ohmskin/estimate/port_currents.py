@@ -110,7 +110,7 @@ class NearEnds:
     """Reads the currents at the near ends of the lines. per_cell: n, readings of a cell there."""
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
-        names = knowledge.reading_names
+        names = knowledge.checked_names
         for node in "ab":
             if node not in names and EXCHANGED[node] not in names:
                 raise ValueError(f"readings {' '.join(names)}: of each near end, one is needed")
@@ -190,7 +190,7 @@ class FarEnds:
     """Reads the far ends of rows, of columns, or of both. sensed: which of the two have any."""
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
-        self._names = names = knowledge.reading_names
+        self._names = names = knowledge.checked_names
         row, column = (node in names or EXCHANGED[node] in names for node in "ef")
         self.sensed = row, column
         self._ref_ohm = (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)

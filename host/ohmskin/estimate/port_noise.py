@@ -50,7 +50,7 @@ from ohmskin.arrays import Float
 from ohmskin.estimate.knowledge import SkinKnowledge
 
 # Median of chi-square, by its degrees of freedom: from tables of the distribution.
-_MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}
+MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}
 # A cell is usual if its readings disagree by less than so many standard deviations, of the median
 # cell or of rounding. Chosen: noise hardly ever exceeds it; what does has a cause of its own.
 USUAL_STDS: Final = 3.0
@@ -127,7 +127,7 @@ class ReadingNoise:
         by_cell = square / self._mean_degrees
         # The limit goes by the median cell, because one cell that is far off does not move it. The
         # median cell itself is always within the limit, so there is always a usual cell.
-        level = max(self._rounding, median / _MEDIAN_CHI2[self._degrees])
+        level = max(self._rounding, median / MEDIAN_CHI2[self._degrees])
         usual = by_cell[by_cell <= USUAL_STDS**2 * level]
         return Spread(
             rms=np.sqrt(square / self._degrees),
@@ -150,7 +150,7 @@ class ReadingNoise:
             return np.inf
         change = residual - self._residual
         square = np.einsum("ijk,ijk->ij", change, change)
-        return _median(square) / (2.0 * _MEDIAN_CHI2[self._degrees])
+        return _median(square) / (2.0 * MEDIAN_CHI2[self._degrees])
 
     def of_mean(self, ratio: Float) -> float:
         """v_n of readings (R, C, n) at rest: 0 in a mean of many scans, inf (unknown) in one scan.

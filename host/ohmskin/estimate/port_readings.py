@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame's readings to what estimators take: a current for each port, and what is wrong.
 
-`PortReader` brings three subjects together, of which each is a module:
+`PortReader` brings four subjects together, of which each is a module:
 
 - `port_currents`: the current through each port, without offsets of the board and without what
   floating lines draw; at far ends also what the wires lose.
+- `port_partial`: the same where not all was read.
 - `port_noise`: the standard deviation of each current, by how far readings disagree and change.
 - `port_faults`: what no touches can make of a skin.
 """
@@ -19,6 +20,7 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import FarEnds, NearEnds, PortCurrents
 from ohmskin.estimate.port_faults import Contradictions, FarFaults, SkinFaults
 from ohmskin.estimate.port_noise import ReadingNoise, Spread, Variances
+from ohmskin.estimate.port_partial import PartialEnds, Shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +63,10 @@ class NearPorts(NamedTuple):
     """
 
     ports: PortCurrents
-    fault: str
-    spread: Spread
-    variances: Variances
-    offset_ratio: float
+    fault: str = ""
+    spread: Spread | None = None
+    variances: Variances | None = None
+    offset_ratio: float = 0.0
 
 
 class PortReader:
@@ -79,20 +81,25 @@ class PortReader:
         per_cell, square_ohm = self._near_ends.per_cell, self._near_ends.square_ohm
         self._noise = ReadingNoise(knowledge, per_cell, square_ohm)
         self._contradictions = Contradictions(self._near_ends, knowledge.ratio_std)
+        self._partial = PartialEnds(knowledge)
         rest = None
         if knowledge.rest_ratio is not None:
             rest = self._read_near(knowledge.rest_ratio, in_order=False).ports
+            self._partial.keep_as_rest()
         self._faults, self._far_faults = SkinFaults(knowledge, rest), FarFaults(knowledge, self.far)
         self._rest_fault = self._faults.at_rest()
 
     def reset(self) -> None:
         """Forget the frames before: the last one, and which lines they have shown apart."""
         self._noise.reset()
+        self._partial.reset()
         self._faults.reset()
         self._far_faults.reset()
 
     def read(self, ratio: Float, *, in_order: bool = False) -> PortReadings:
         """Currents of checked readings (R, C, m), m for each cell, and what is wrong with them.
+
+        Of near ends, readings may be NaN: `port_partial`.
 
         in_order: True for live frames: how the residuals have changed since the frame before is
         noise. False for readings at rest, which may be one scan or the mean of many. They, too,
@@ -104,6 +111,8 @@ class PortReader:
         fault = near.fault or self._rest_fault or self._faults.find(near.ports)
         if not any(self.far):
             return PortReadings(ratio, *near.ports, fault)
+        assert near.variances is not None  # at far ends, all is read
+        assert near.spread is not None
         variance = self._noise.between_ends(near.variances)
         far = self._far_ends.read(ratio, near.ports, variance)
         drop_ratio_std = np.sqrt(variance)
@@ -130,6 +139,8 @@ class PortReader:
         Where they disagree by more, it is made whatever the cause: in a frame that is only noisy,
         too.
         """
+        if np.isnan(ratio).any():
+            return NearPorts(self._partial.read(ratio))
         near, noise = self._near_ends.read(ratio), self._noise
         current, v_n = near.current, np.inf  # inf: not known
         spread = noise.spread(near.residual)
@@ -141,5 +152,7 @@ class PortReader:
             noise.keep(near.residual)
         ports = PortCurrents(current, noise.current_std(variances))
         ports, fault = self._contradictions.mended(near, spread, ports)
+        if not any(self.far):
+            self._partial.keep(Shown(ports, near.offset_ratio, variances))
         # In mode far, both near ends have the same offset. Mode near does not use it.
         return NearPorts(ports, fault, spread, variances, float(near.offset_ratio[0]))

@@ -6,8 +6,8 @@ In (F frames of R x C cells, 4 readings a cell unless named; other arrays are ig
 ======================= ============================ =========================================
 array                   shape                        meaning
 ======================= ============================ =========================================
-ratio                   F, R, C, 4                   sense voltage / Vdd
-rest_ratio              R, C, 4 or F, R, C, 4        the same untouched (optional)
+ratio                   F, R, C, n                   sense voltage / Vdd; NaN where not read
+rest_ratio              R, C, n or F, R, C, n        the same untouched (optional)
 ref_top_ohm             scalar                       reference resistors, 30 kOhm if absent
 ref_bottom_ohm          scalar
 nominal_top_wire_ohm    scalar or F                  one wire segment, per layer (optional)
@@ -15,7 +15,7 @@ nominal_bottom_wire_ohm scalar or F
 nominal_lead_ohm        scalar or F                  from multiplexer to first crossing; 0: nothing
 ref_log_std             scalar                       what both may be off by together; absent: 0
 adc_bits                scalar                       absent: the readings are exact
-reading_names           4, text                      names out of a to h; absent: a b c d
+reading_names           n, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
 
 Out: attributes of `Estimate` by the same names, NaN where the method does not estimate them.

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Currents of frames of which not all was read: some readings of a cell, or some cells.
+
+Symbols are those of `port_currents` and `port_noise`; K are the readings of a cell that were read.
+
+    I = sum_{k in K} s_k R_k (y_k - o_k - b_k) / sum_{k in K} R_k^2 ,
+    s_I^2 = v_I / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2 .
+
+Four readings show what fewer do not: the offset o_k of each node, v and v_I. They are those of the
+last frame in which all was read, at rest if there was no other; else o_k is 0, and
+
+    v = v_I = max(2 s^2, median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455) ,
+
+by the currents that two of the readings show. A port that was not read has its last current; that
+is less certain by `STALE_SHARE` of it for each frame since then.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN, reference_ohm
+from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.port_currents import PortCurrents
+from ohmskin.estimate.port_noise import MEDIAN_CHI2, Variances
+
+# Share of its current by which a port that is not read may change from frame to frame. Chosen: by
+# the next whole scan, 30 frames later, it may be anything.
+STALE_SHARE: Final = 0.03
+# Ports that no frame has shown yet are taken for as old as so many frames. Chosen: as above.
+_NEVER_FRAMES: Final = 30
+
+
+class Shown(NamedTuple):
+    """What a frame has shown: its ports; of all readings, also the two others.
+
+    offset_ratio: of each reading (4,) [V/Vdd]. variances: of readings.
+    """
+
+    ports: PortCurrents
+    offset_ratio: Float | None = None
+    variances: Variances | None = None
+
+
+class PartialEnds:
+    """Reads the near ends of frames of which not all was read, one after the other."""
+
+    def __init__(self, knowledge: SkinKnowledge) -> None:
+        self._reference = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
+        self._rounding = knowledge.ratio_std**2
+        nothing = np.zeros((knowledge.rows, knowledge.columns))
+        self._rest = Shown(PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frames before, but for rest."""
+        self._last = self._rest
+        self._age: Float = np.full(self._rest.ports.current.shape, _NEVER_FRAMES)
+
+    def keep(self, shown: Shown) -> None:
+        """A frame of all readings has shown this."""
+        self._last = shown
+        self._age = np.zeros_like(self._age)
+
+    def keep_as_rest(self) -> None:
+        """What the last frame has shown is of the untouched skin."""
+        self._rest = self._last
+        self.reset()
+
+    def read(self, ratio: Float) -> PortCurrents:
+        """Currents of all ports, by readings (R, C, 4) of which some are NaN."""
+        kinds = ~np.isnan(ratio).all(axis=(0, 1))
+        slope = (READING_SIGN * self._reference)[kinds]
+        signal = ratio - READING_OFFSET
+        if self._last.offset_ratio is not None:
+            signal -= self._last.offset_ratio
+        signal = signal[..., kinds]
+        variances = self._last.variances or self._variances(signal, slope)
+        square_ohm = float(slope @ slope)
+        alike = max(0.0, self._rounding - 0.5 * variances.noise) * np.abs(slope).sum() ** 2
+        std = np.sqrt(variances.error / square_ohm + alike / square_ohm**2)
+        current = signal @ slope / square_ohm
+        is_read, last = ~np.isnan(current), self._last.ports
+        ports = PortCurrents(
+            np.where(is_read, current, last.current), np.where(is_read, std, last.std)
+        )
+        self._last = self._last._replace(ports=ports)
+        self._age = np.where(is_read, 0.0, self._age + 1.0)
+        stale = STALE_SHARE * self._age * ports.current
+        return PortCurrents(ports.current, np.hypot(ports.std, stale))
+
+    def _variances(self, signal: Float, slope: Float) -> Variances:
+        """v and v_I by this frame alone: signals (R, C, n), which are slopes (n,) times I."""
+        noise = 2.0 * self._rounding
+        if slope.size > 1:
+            square = np.diff((signal / slope)[..., :2])[..., 0] ** 2 / np.sum(slope[:2] ** -2.0)
+            noise = max(noise, float(np.nanmedian(square)) / MEDIAN_CHI2[1])
+        return Variances(noise, np.full(signal.shape[:2], noise))

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of which not all was read. Readings are those of the node Laplacian, with noise."""
+
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from network import SkinCircuit
+from ohmskin.arrays import Float
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.port_readings import PortReader
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.record.readings import estimate_file, load_readings
+from studies.judge import STATED_STDS, answers_of, judge, pooled
+from studies.trials import Trial, finger_trial, random_trial
+
+NOISE_RATIO = 0.3 / 1024
+READ = {"near": (0, 1, 2, 3), "half": (0, 1), "quick": (1,)}
+TRIALS = {"touches": partial(random_trial, 8, 8, 6, 14), "finger": partial(finger_trial, 8, 8, 14)}
+
+
+@cache
+def trial(scene: str, seed: int = 2) -> tuple[Trial, Float, Float]:
+    """A skin; what a board reads of it at rest, the mean of 50 scans, and in each frame."""
+    made, random = TRIALS[scene](seed), np.random.default_rng(5)
+    circuit = SkinCircuit(made.rest)
+    exact = np.array([circuit.readings(cells)[..., :4] for cells in made.cell_siemens])
+    rest = np.repeat(circuit.readings(made.rest.cell_siemens)[None, ..., :4], 50, axis=0)
+    rest, frames = (
+        ratio_from_codes(quantise(ratio + NOISE_RATIO * random.standard_normal(ratio.shape)))
+        for ratio in (rest, exact)
+    )
+    return made, rest.mean(axis=0), frames
+
+
+def knowledge(rest_ratio: Float | None, names: str = "abcd") -> SkinKnowledge:
+    wires = WireOhm(100.0, 200.0, 0.0)
+    return SkinKnowledge(
+        8, 8, adc_bits=10, rest_ratio=rest_ratio, nominal_wire_ohm=wires, reading_names=tuple(names)
+    )
+
+
+def of_region(frame: Float, rows: slice, columns: slice, read: tuple[int, ...]) -> Float:
+    some = np.full_like(frame, np.nan)
+    some[rows, columns, read] = frame[rows, columns, read]
+    return some
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize("scene", list(TRIALS))
+def test_one_reading_of_each_cell_errs_by_twice_as_much_at_most(scene: str, method: str) -> None:
+    medians = {}
+    for mode, read in READ.items():
+        parts = []
+        for seed in (2, 3):
+            made, rest, frames = trial(scene, seed)
+            estimator = make_estimator(method, knowledge(rest))
+            every = slice(None)
+            found = [estimator.estimate(of_region(each, every, every, read)) for each in frames]
+            assert all(one.converged for one in found)
+            parts.append(judge(answers_of(found), made.cell_siemens, made.rest.cell_siemens))
+        judged = pooled(parts)
+        assert judged.pressed_within_percent() > 98
+        medians[mode] = judged.error_percent()
+    # Were there nothing but independent noise, by the roots of 2 and of 4.
+    assert medians["half"] < 1.15 * 2**0.5 * medians["near"]
+    assert medians["quick"] < 1.15 * 2.0 * medians["near"]
+
+
+@pytest.mark.parametrize("names", ["ab", "b", "ba"])
+def test_a_file_has_what_was_read(names: str, tmp_path: Path) -> None:
+    """All of it, rest as well, has the same few readings; the same with the others not a number."""
+    _, rest, frames = trial("touches")
+    read = ["abcd".index(name) for name in names]
+    np.savez(
+        tmp_path / "some.npz",
+        ratio=frames[..., read],
+        rest_ratio=rest[..., read],
+        reading_names=np.array(list(names)),
+        adc_bits=10,
+        nominal_top_wire_ohm=100.0,
+        nominal_bottom_wire_ohm=200.0,
+        nominal_lead_ohm=0.0,
+    )
+    found = estimate_file(load_readings(tmp_path / "some.npz"), "joint")["cell_siemens"]
+    every = slice(None)
+    estimator = make_estimator("joint", knowledge(of_region(rest, every, every, tuple(read))))
+    for frame, cells in zip(frames, found, strict=True):
+        again = estimator.estimate(of_region(frame, every, every, tuple(read)))
+        np.testing.assert_array_equal(again.cell_siemens, cells)
+
+
+def test_a_region_is_read_as_well_as_the_whole() -> None:
+    """A finger that stays: only the 5x5 cells around it are read after the first scan."""
+    made, rest, frames = trial("finger")
+    row, column = np.unravel_index(made.cell_siemens[0].argmax(), (8, 8))
+    rows, columns = slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3)
+    estimator = make_estimator("joint", knowledge(rest))
+    whole = estimator.estimate(frames[0])
+    for _ in range(5):
+        again = estimator.estimate(of_region(frames[0], rows, columns, READ["near"]))
+    inside = np.zeros((8, 8), dtype=bool)
+    inside[rows, columns] = True
+    np.testing.assert_allclose(
+        again.cell_siemens[inside], whole.cell_siemens[inside], rtol=0.05, atol=1e-6
+    )
+    off_by = np.abs(again.cell_siemens - made.cell_siemens[0])
+    assert (off_by < STATED_STDS * again.cell_siemens_std).all()
+
+
+def test_ports_that_are_not_read_become_less_certain() -> None:
+    _, rest, frames = trial("touches")
+    reader = PortReader(knowledge(rest))
+    whole = reader.read(frames[3], in_order=True)
+    some = of_region(frames[3], slice(0, 3), slice(0, 3), READ["quick"])
+    first, second = (reader.read(some, in_order=True) for _ in range(2))
+    outside = np.ones((8, 8), dtype=bool)
+    outside[:3, :3] = False
+    np.testing.assert_array_equal(second.current[outside], whole.current[outside])
+    assert (whole.current_std < first.current_std)[outside].all()
+    assert (first.current_std < second.current_std)[outside].all()
+    read_again = reader.read(frames[3], in_order=True)
+    np.testing.assert_allclose(read_again.current_std, whole.current_std)
+
+
+def test_offsets_that_whole_scans_have_shown_are_taken_from_one_reading() -> None:
+    _, rest, frames = trial("touches")
+    offset = 3.0 / 1024 * np.array([0.5, -1.0, -1.0, 0.5])  # of the nodes of a, d and of b, c
+    reader, exact = PortReader(knowledge(rest)), PortReader(knowledge(rest))
+    shifted = [np.clip(frame + offset, 0, 1) for frame in frames[:2]]
+    reader.read(shifted[0], in_order=True)
+    quick = of_region(shifted[1], slice(None), slice(None), READ["quick"])
+    true = exact.read(frames[1], in_order=True).current
+    found = reader.read(quick, in_order=True)
+    assert (np.abs(found.current - true) < 4 * found.current_std).mean() > 0.98
+    reader.reset()
+    never_shown = reader.read(quick, in_order=True)
+    assert np.median(np.abs(never_shown.current - true)) > 3 * np.median(
+        np.abs(found.current - true)
+    )
+
+
+@pytest.mark.parametrize(
+    "method", sorted({*METHODS, "voltage"} - {"joint", "touch", "matrix", "ohm"})
+)
+def test_methods_that_need_all_readings_say_so(method: str) -> None:
+    _, rest, frames = trial("touches")
+    estimator = make_estimator(method, knowledge(rest))
+    with pytest.raises(ValueError, match=f"'{method}' takes whole scans of a b c d: use 'joint'"):
+        estimator.estimate(of_region(frames[0], slice(None), slice(None), READ["half"]))
+
+
+def test_what_no_board_leaves_out_is_refused() -> None:
+    """A hole amid what was read; nothing at all; rest of some cells only."""
+    _, rest, frames = trial("touches")
+    estimator = make_estimator("joint", knowledge(rest))
+    hole = of_region(frames[0], slice(1, 6), slice(1, 6), READ["half"])
+    hole[3, 4, 1] = np.nan
+    with pytest.raises(ValueError, match=r"of cell \(3, 4\), reading B, is nan, not in 0..1"):
+        estimator.estimate(hole)
+    with pytest.raises(ValueError, match=r"of cell \(0, 0\), reading A, is nan, not in 0..1"):
+        estimator.estimate(np.full((8, 8, 4), np.nan))
+    with pytest.raises(ValueError, match="rest_ratio has cells without any reading"):
+        knowledge(of_region(rest, slice(1, 6), slice(1, 6), READ["near"]))
