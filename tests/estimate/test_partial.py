@@ -111,6 +111,40 @@ def test_a_region_is_read_as_well_as_the_whole() -> None:
     assert (off_by < STATED_STDS * again.cell_siemens_std).all()
 
 
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_region_follows_a_finger_and_touches_in_it(method: str) -> None:
+    """After one whole scan, a finger's cells become harder, softer, and one of them lets go."""
+    made, rest, _ = trial("finger")
+    circuit, at_rest = SkinCircuit(made.rest), made.rest.cell_siemens
+    random, before = np.random.default_rng(3), made.cell_siemens[0]
+    row, column = np.unravel_index(before.argmax(), (8, 8))
+    region = np.ix_(*(range(max(n - 2, 0), min(n + 3, 8)) for n in (row, column)))
+    estimator = make_estimator(method, knowledge(rest))
+    errors, stds = [], []
+    for number in range(12):
+        cells = before.copy()
+        if number:
+            cells[region] = (
+                at_rest[region]
+                + random.uniform(0.3, 2, cells[region].shape) * (before - at_rest)[region]
+            )
+            cells[row, column] = at_rest[row, column]
+        exact = circuit.readings(cells)[..., :4]
+        ratio = ratio_from_codes(
+            quantise(exact + NOISE_RATIO * random.standard_normal(exact.shape))
+        )
+        some = np.full_like(ratio, np.nan)
+        some[region] = ratio[region]
+        found = estimator.estimate(some if number else ratio)
+        assert found.converged
+        if number:
+            errors.append((found.cell_siemens - cells)[region])
+            stds.append(found.cell_siemens_std[region])
+    assert (np.abs(errors) < STATED_STDS * np.array(stds)).mean() > 0.98
+    # Cells of a finger have up to hundreds of microsiemens.
+    assert np.median(np.abs(errors)) < 0.02 * before.max()
+
+
 def test_ports_that_are_not_read_become_less_certain() -> None:
     _, rest, frames = trial("touches")
     reader = PortReader(knowledge(rest))

@@ -44,6 +44,7 @@ from ohmskin.estimate.prior import (
     rest_level,
     siemens_std,
 )
+from ohmskin.estimate.region_fit import RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
 from ohmskin.estimate.wire_belief import FAR_LOG, MOST_FITS, LearnedWires, WireBelief
 
@@ -96,6 +97,9 @@ class JointEstimator(Estimator):
         super().reset()
         self._cells_before: Float | None = None  # what `matrix` found in the last frame it started
         self._touches = 0  # of the last fit
+        # The last whole frame, for regions of the frames after it; and the last region.
+        self._whole: FullFit | Touched | WholeFrame | None = None
+        self._region: RegionFit | None = None
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
@@ -126,6 +130,8 @@ class JointEstimator(Estimator):
     def _fitted(self, ports: PortReadings, *, again: bool) -> tuple[Solution, bool]:
         """A few touches for `touch`, else the fit of all resistances; and `after_fit` of it."""
         prior = self._prior_of(ports)
+        if ports.region is not None and (part := self._of_region(prior, ports)):
+            return self._solution(ports, part), False
         touches = None
         # Trying takes time, and under a finger that stays, few touches explain no frame. So they
         # are not tried after a fit with many.
@@ -150,12 +156,29 @@ class JointEstimator(Estimator):
         self._belief.expect_usual_leads(True)
         return solution, again
 
+    def _of_region(self, prior: CellPrior, ports: PortReadings) -> RegionFit | None:
+        """The answer by the cells that were read, about the last whole frame; None: not by them."""
+        assert ports.region is not None
+        if self._whole is None:
+            return None
+        if isinstance(self._whole, FullFit | Touched):
+            fit, ref_ohm = self._whole, self.knowledge.ref_ohm
+            logs = fit.log_cells, fit.log_cells_std
+            self._whole, self._region = WholeFrame(prior, self._belief, ref_ohm, *logs), None
+        if self._region is None or not np.array_equal(self._region.region, ports.region):
+            self._region = RegionFit(self._whole, ports.region)
+        return self._region if self._region.explains(ports) else None
+
     def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer, if these few touches are all that the frame shows: never, for `joint`."""
         return None
 
-    def _solution(self, ports: PortReadings, fit: FullFit | Touched, message: str = "") -> Solution:
+    def _solution(
+        self, ports: PortReadings, fit: FullFit | Touched | RegionFit, message: str = ""
+    ) -> Solution:
         belief = self._belief
+        if not isinstance(fit, RegionFit):
+            self._whole = fit
         full = fit if isinstance(fit, FullFit) else None
         wires = belief.believed_wires() if full is None else belief.wires(full.wires)
         stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()

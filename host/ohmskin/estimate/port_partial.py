@@ -18,6 +18,7 @@ is less certain by `STALE_SHARE` of it for each frame since then.
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN, reference_ohm
@@ -44,7 +45,10 @@ class Shown(NamedTuple):
 
 
 class PartialEnds:
-    """Reads the near ends of frames of which not all was read, one after the other."""
+    """Reads the near ends of frames of which not all was read, one after the other.
+
+    region: flat indices of the ports that the last frame has read, (k,); None: all of them.
+    """
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         self._reference = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
@@ -56,11 +60,12 @@ class PartialEnds:
     def reset(self) -> None:
         """Forget the frames before, but for rest."""
         self._last = self._rest
+        self.region: NDArray[np.intp] | None = None
         self._age: Float = np.full(self._rest.ports.current.shape, _NEVER_FRAMES)
 
     def keep(self, shown: Shown) -> None:
         """A frame of all readings has shown this."""
-        self._last = shown
+        self._last, self.region = shown, None
         self._age = np.zeros_like(self._age)
 
     def keep_as_rest(self) -> None:
@@ -87,6 +92,7 @@ class PartialEnds:
         )
         self._last = self._last._replace(ports=ports)
         self._age = np.where(is_read, 0.0, self._age + 1.0)
+        self.region = None if is_read.all() else np.flatnonzero(is_read)
         stale = STALE_SHARE * self._age * ports.current
         return PortCurrents(ports.current, np.hypot(ports.std, stale))
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.knowledge import SkinKnowledge
@@ -33,6 +34,7 @@ class PortReadings:
     current_std: standard deviation of current (R, C) [S].
     fault: why the frame cannot be relied on, in words; empty if it can.
     far: whether rows, and whether columns, are sensed at their far ends.
+    region: flat indices of the ports that were read, (k,); None: all.
 
     Only where far ends are sensed:
 
@@ -47,6 +49,7 @@ class PortReadings:
     current_std: Float
     fault: str = ""
     far: tuple[bool, bool] = (False, False)
+    region: NDArray[np.intp] | None = None
     drop_ohm: Float = field(default_factory=lambda: np.zeros((2, 0, 0)))
     drop_std: Float = field(default_factory=lambda: np.zeros((0, 0)))
     drop_shift: Float = field(default_factory=lambda: np.zeros((0, 0)))
@@ -110,7 +113,7 @@ class PortReader:
         # shows lines alike, or apart.
         fault = near.fault or self._rest_fault or self._faults.find(near.ports)
         if not any(self.far):
-            return PortReadings(ratio, *near.ports, fault)
+            return PortReadings(ratio, *near.ports, fault, region=self._partial.region)
         assert near.variances is not None  # at far ends, all is read
         assert near.spread is not None
         variance = self._noise.between_ends(near.variances)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of a region: its cells alone are fitted, the others stay as the last whole frame has them.
+
+Symbols are those of `sparse_fit`; k are the cells of the region, and at once its ports. The skin of
+the last whole frame, g0, takes the place of the untouched one, and d = exp(x) - g0 may be negative:
+
+    v = (1 + M_kk diag(d))^-1 H_kk ,   rho = rho0 - sum_k H d v ,   d rho / d g_e = -v_e^2 .
+
+Gauss-Newton steps on x minimise (I_read - I)^T S^-1 (I_read - I) and the prior of the cells, that
+of whole frames. S is the covariance of the readings, of the wires, and of what the last whole frame
+left open of the cells outside: these are noise here.
+
+A whole frame takes milliseconds, and a region a part of one: a region is read a thousand times a
+second.
+"""
+
+from typing import Final
+
+import numpy as np
+from scipy.linalg import lapack
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.small import cholesky, gram, solve_lower, solve_positive
+from ohmskin.estimate.port_partial import STALE_SHARE
+from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.prior import CLOSE_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
+from ohmskin.estimate.sparse_fit import Cells, RestNetwork
+from ohmskin.estimate.wire_belief import WireBelief
+
+# Steps of a frame. Chosen: it begins at the frame before, a millisecond ago; one that needs more is
+# fitted as a whole.
+MOST_STEPS: Final = 6
+
+
+class WholeFrame:
+    """What the last whole frame has shown, for regions of the frames after it.
+
+    log_cells, log_cells_std: of all cells, and their deviations, (RC,).
+    """
+
+    def __init__(
+        self,
+        prior: CellPrior,
+        belief: WireBelief,
+        ref_ohm: float,
+        log_cells: Float,
+        log_cells_std: Float,
+    ) -> None:
+        about = prior.about(belief.means)
+        is_soft = about.is_soft(log_cells, belief.shape)
+        self.prior, self.belief = about.for_soft_touches() if is_soft else about, belief
+        self.log_cells, self.log_cells_std = log_cells, log_cells_std
+        self.series_ohm = ref_ohm + belief.leads_of_port * belief.means[2]
+        siemens = np.exp(-log_cells).reshape(belief.shape)
+        self.net = RestNetwork(siemens, *np.exp(belief.means[:2]), far=belief.far)
+
+
+class RegionFit:
+    """Fits frames of one region, one after the other.
+
+    log_cells, log_cells_std: of all cells, those outside as in the whole frame, (RC,).
+    wires_log_std, leads_log_std: the parts of it that come from the means of the wires, (RC,).
+    modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
+    iterations: steps of the last frame.
+    misfit: 0: a frame that does not fit is not answered by its region.
+    """
+
+    misfit: Final = 0.0
+
+    def __init__(self, whole: WholeFrame, region: Cells) -> None:
+        self.region, self._whole, net, belief = region, whole, whole.net, whole.belief
+        self._x = -whole.log_cells[region]
+        self._before = net.cell_siemens[region]
+        self._port_volt = net.port_volt[region[:, None], region]
+        self._cell_volt = net.cell_volt[region[:, None], region]
+        self._rho = net.port_ohm[region]
+        self._eye = np.eye(region.size)
+        currents = (net.port_volt[:, region] * net.cell_siemens[:, None]).T
+        square = ((self._rho + whole.series_ohm) ** -2.0)[:, None]
+        by_cell = currents * currents / net.cell_siemens * square
+        by_cell[:, region] = 0.0
+        self._by_wires = -belief.per_std(
+            square * net.by_wires_of(region, currents, currents),
+            square * belief.leads_of_ports[region],
+            by_cell @ whole.prior.by_means,
+        )
+        noise = np.hstack([self._by_wires, by_cell * whole.log_cells_std])
+        self._noise = gram(noise)
+        self._age = 0
+
+    def explains(self, ports: PortReadings) -> bool:
+        """Fit this frame; whether this region explains it."""
+        region, whole, x = self.region, self._whole, self._x
+        measured = ports.current.ravel()[region]
+        system = self._noise.copy(order="F")
+        system.ravel(order="F")[:: region.size + 1] += ports.current_std.ravel()[region] ** 2
+        factor = cholesky(system)
+        is_last = False
+        for self.iterations in range(MOST_STEPS + 1):
+            siemens = np.exp(x)
+            added = siemens - self._before
+            _, _, volt, _ = lapack.dgesv(self._eye + self._cell_volt * added, self._port_volt)
+            rho = self._rho - (self._port_volt * volt * added[:, None]).sum(axis=0)
+            current = 1.0 / (rho + whole.series_ohm)
+            slopes = volt * volt * siemens[:, None] * (current * current)
+            whitened = solve_lower(factor, np.column_stack([slopes.T, measured - current]))
+            by_cell, residual = whitened[:, :-1], whitened[:, -1]
+            if is_last:
+                break
+            centre, variance = whole.prior.normal(-x, region)
+            system = by_cell.T @ by_cell
+            system.ravel()[:: region.size + 1] += 1.0 / variance
+            move = solve_positive(system, residual @ by_cell - (x + centre) / variance)
+            is_last = (move * move * system.diagonal()).max() < CLOSE_STDS**2
+            x = x + np.minimum(np.maximum(move, -MAX_STEP_LOG), MAX_STEP_LOG)
+        self._x = x
+        if not is_last or residual @ residual > MAX_CHI2 * region.size:
+            return False
+        whitened_means = solve_lower(factor, self._by_wires[:, -whole.belief.means.size :])
+        covariance = solve_positive(system, self._eye.copy(order="F"))
+        self._answer(covariance, covariance @ (by_cell.T @ whitened_means))
+        noise = ports.current_std.ravel()[region] ** 2
+        noise = noise * solve_lower(factor, residual, transposed=True)
+        self.modelled = ports.current.ravel().copy()
+        self.modelled[region] -= noise
+        return True
+
+    def _answer(self, covariance: Float, by_means: Float) -> None:
+        """Logs of all cells, from the covariance of those of the region, (k, k) and (k, means)."""
+        whole, region = self._whole, self.region
+        self._age += 1
+        self.log_cells = whole.log_cells.copy()
+        self.log_cells[region] = -self._x
+        self.log_cells_std = np.hypot(whole.log_cells_std, STALE_SHARE * self._age)
+        self.log_cells_std[region] = np.sqrt(covariance.diagonal())
+        self.wires_log_std, self.leads_log_std = np.zeros((2, self.log_cells.size))
+        self.wires_log_std[region] = np.hypot(by_means[:, 0], by_means[:, 1])
+        self.leads_log_std[region] = np.abs(by_means[:, 2])
