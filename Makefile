@@ -29,7 +29,7 @@ PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
 BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far orders desk force \
-                view strangers largest boards honest quick)
+                export view strangers largest boards honest quick)
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
@@ -178,6 +178,9 @@ bench-desk: setup firmware sim ## measure estimates from a board as unkind as on
 
 bench-force: setup-host ## measure the way from scan to force: time, ten minutes live, replay
 	$(BENCH)/bench_force.py
+
+bench-export: setup-host ## measure bringing the forces of recordings into files: time, memory
+	$(BENCH)/bench_export.py
 
 bench-view: setup ## measure the page: latency to the screen, frames, load
 	$(BENCH)/bench_view.py

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ohmskin.force.contacts import Contact
     from ohmskin.force.reader import CalibratedSkin, ForceScan
     from ohmskin.force.simulated import SimulatedSkin
+    from ohmskin.force.tables import load_forces
     from ohmskin.link.clock import BoardClock
     from ohmskin.link.device import Device
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
@@ -78,6 +79,7 @@ __all__ = [
     "TareRefused",
     "WireOhm",
     "load_calibration",
+    "load_forces",
     "load_recording",
     "make_estimator",
     "open",
@@ -96,6 +98,7 @@ _MODULES = {
     "force.contacts": ("Contact",),
     "force.reader": ("CalibratedSkin", "ForceScan"),
     "force.simulated": ("SimulatedSkin",),
+    "force.tables": ("load_forces",),
     "link.clock": ("BoardClock",),
     "link.device": ("Device",),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),

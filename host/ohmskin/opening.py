@@ -7,6 +7,8 @@
                                     ``speed=0``: its time passes as fast as its scans are taken
 ``simavr://uno?scene=ghost``        the built firmware, run by an AVR simulator in real time
 ``replay://FILE.mcap?speed=1``      a recording (`ohmskin.record.replay`); 0: as fast as it is taken
+``socket://robot:4000``             a serial port of another computer, behind ser2net or socat
+                                    (pyserial opens it); ``rfc2217://`` sets its speed, too
 ==================================  ==========================================================
 
 What only one kind needs is imported when that kind is opened.
@@ -83,10 +85,10 @@ def _device(text: str) -> Device:
     """The device of a URL, connected and not started."""
     url = PortUrl.of(text)
     match url.scheme:
-        case "":
+        case "" | "socket" | "rfc2217":
             url.check_options("baud")
             baud = url.baud  # which a wrong URL fails at, before a port is opened
-            return Session(SerialLink(url.place), baud)
+            return Session(SerialLink(text.partition("?")[0]), baud)
         case "emulator":
             from ohmskin.emulate.urls import open_emulator
 
@@ -101,5 +103,5 @@ def _device(text: str) -> Device:
             url.check_options("speed")
             with url.blamed():
                 return Replay(url.place, url.number("speed", 1.0), text)
-    kinds = "serial ports by name, emulator://, simavr:// and replay://"
+    kinds = "serial ports by name, socket://, rfc2217://, emulator://, simavr:// and replay://"
     raise PortError(f"no kind of port '{url.scheme}://': there are {kinds}")

@@ -433,12 +433,12 @@ TAKES = {
     "estimate": "READINGS --method --out --cold --ref-std",
     "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale"
     " --force-unit --force-column",
-    "export": "RECORDING OUT --begin --end",
+    "export": "RECORDING OUT --begin --end --calibration --format --backend",
     "emulate": "URL --seconds",
     "demo": "--seconds --port --picture",
     "calibrate": "knead recording scale table weights",
 }
-NAMES = {"stream": METHODS, "estimate": METHODS, "export": (".npz", ".csv")}
+NAMES = {"stream": METHODS, "estimate": METHODS, "export": (".npz", ".csv", ".parquet")}
 
 
 @pytest.mark.parametrize("name", TAKES)

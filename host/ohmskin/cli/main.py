@@ -32,7 +32,7 @@ _COMMANDS: Final = {
     "verify.verify": "Compare the board at PORT with a plate of known resistors.",
     "record.estimate": "Estimate every cell of every frame of a readings file.",
     "record.record": "Record every scan at PORT. Ctrl-C ends it; a line typed becomes a mark.",
-    "record.export": "Write a recording's scans as readings (.npz) or as a table (.csv).",
+    "record.export": "Write recordings as .npz or .csv: readings, or forces by a calibration.",
     "emulate.emulate": "Serve an emulated board at a pseudo-terminal. Ctrl-C ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
     "calibrate.calibrate": "Learn forces from presses of single cells: a calibration file (.json).",

@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from rich.console import Group
@@ -29,11 +30,13 @@ from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import check_place
+from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import DEFAULT_METHOD
+from ohmskin.force.tables import FORMATS, export_forces
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
-from ohmskin.record.export import FORMATS
+from ohmskin.record.export import Part
 from ohmskin.record.export import export as export_recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.readings import estimate_file, load_readings, save_arrays
@@ -150,13 +153,15 @@ def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
     """Passes things on; in a terminal, a bar says how many have been, and for how long."""
 
     def watched(things: Iterable[_T]) -> Iterator[_T]:
-        columns, shown = Progress.get_default_columns(), _errors.is_terminal
-        with Progress(
-            *columns, TimeElapsedColumn(), console=_errors, transient=True, disable=not shown
-        ) as bar:
+        with _bar() as bar:
             yield from bar.track(things, description=what)
 
     return watched
+
+
+def _bar() -> Progress:
+    columns = (*Progress.get_default_columns(), TimeElapsedColumn())
+    return Progress(*columns, console=_errors, transient=True, disable=not _errors.is_terminal)
 
 
 class PressDisplay:
@@ -211,18 +216,68 @@ def _take_marks(recorder: Recorder) -> None:
 
 
 def export(
-    recording: Annotated[Path, Argument(help="recording (.mcap)")],
-    out: Annotated[Path, Argument(help=f"file to write: {' or '.join(FORMATS)}")],
+    recordings: Annotated[list[Path], Argument(metavar="RECORDING", help="recordings (.mcap)")],
+    out: Annotated[
+        Path, Argument(help=f"file to write: {', '.join(FORMATS)}; or a folder for all of them")
+    ],
     begin_s: Annotated[
         float, Option("--begin", min=0, help="from so long after the first scan, in s")
     ] = 0.0,
     end_s: Annotated[float, Option("--end", min=0, help="until then, in s; 0: to the last")] = 0.0,
+    calibration: Annotated[
+        Path | None, Option(envvar="OHMSKIN_CALIBRATION", help="forces in place of readings")
+    ] = None,
+    kind: Annotated[str, Option("--format", help="of the files in a folder")] = ".npz",
+    backend: Annotated[str, Option(help="joblib's, where a folder is written: dask")] = "loky",
 ) -> None:
-    """Write a recording's scans as readings (.npz) or as a table (.csv)."""
-    written = export_recording(recording, out, begin_s, end_s)
-    TERMINAL.print(f"{out}: {written.scans} scans")
-    if written.cut_off:
-        print(f"{recording} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
+    """Write recordings as .npz or .csv: readings, or forces by a calibration.
+
+    Recordings that go into a folder are read by all cores at once. .parquet needs pyarrow.
+    """
+    known = None if calibration is None else load_calibration(calibration)
+    pairs = [(path, out / f"{path.stem}{kind}" if out.is_dir() else out) for path in recordings]
+    if len({to for _, to in pairs}) < len(pairs):
+        raise ValueError(f"{out}: a folder takes several recordings, of different names")
+    for path, to in pairs:
+        check_place(to, path, calibration)
+    if len(pairs) == 1:
+        with ends_in_time(_errors.show_cursor), _bar() as bar:
+            task = bar.add_task(pairs[0][1].name, total=pairs[0][0].stat().st_size)
+            read = partial(bar.update, task)
+            done = [_exported(*pairs[0], known, begin_s, end_s, lambda size: read(completed=size))]
+    else:
+        done = _at_once(pairs, backend, known, begin_s, end_s)
+    for (path, to), written in zip(pairs, done, strict=True):
+        TERMINAL.print(f"{to}: {written.scans} scans")
+        if written.cut_off:
+            print(f"{path} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
+
+
+def _exported(path: Path, out: Path, known: Calibration | None, *more: Any) -> Part:
+    """more: begin, end, and who watches."""
+    if known is None:
+        return export_recording(path, out, *more)
+    return export_forces(path, out, known, *more)
+
+
+def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[Part]:
+    """Each of these recordings to its file, by all cores, or by a cluster that joblib knows."""
+    try:
+        import joblib
+
+        with ExitStack() as stack:
+            if backend == "dask":
+                from dask.distributed import Client
+
+                # That of the lab, which dask's own configuration names; else one of this machine.
+                stack.enter_context(Client(dashboard_address=None))
+            stack.enter_context(joblib.parallel_config(backend))
+            jobs = (joblib.delayed(_exported)(*pair, *told) for pair in pairs)
+            done = joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)
+            bar = stack.enter_context(_bar())
+            return list(bar.track(done, total=len(pairs), description="recordings"))
+    except ImportError as exc:
+        raise OhmskinError(f"several recordings need {exc.name}: run pip install joblib") from exc
 
 
 def estimate(

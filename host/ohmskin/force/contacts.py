@@ -104,14 +104,16 @@ def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
 
 def _unnumbered(touched: Bool, force_n: Float, force_n_std: Float) -> list[Contact]:
     """The contacts of a scan, with the identity 0."""
-    from scipy.ndimage import center_of_mass, label
+    from scipy.ndimage import label
 
     labels, number_of_contacts = label(touched, structure=_EIGHT_NEIGHBOURS)
     contacts = []
     for number in range(1, number_of_contacts + 1):
         cells = labels == number
-        total_n, std_n = float(force_n[cells].sum()), float(force_n_std[cells].sum())
+        places, of_cells_n = np.nonzero(cells), force_n[cells]
+        total_n, std_n = float(of_cells_n.sum()), float(force_n_std[cells].sum())
         # A touch that is too light for its curve has no force: then all its cells count alike.
-        row, column = center_of_mass(force_n if total_n > 0 else cells, cells)
-        contacts.append(Contact(0, float(row), float(column), total_n, std_n, cells))
+        weights = of_cells_n if total_n > 0 else np.ones_like(of_cells_n)
+        row, column = (float(np.dot(weights, place) / weights.sum()) for place in places)
+        contacts.append(Contact(0, row, column, total_n, std_n, cells))
     return contacts

@@ -121,7 +121,7 @@ class ForceModel:
         # 1 S, far from any press: where its error is large, so is that of the exponent, and the two
         # nearly cancel. Rounding may then leave less than 0.
         by_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
-        reported_n = np.maximum(force_by(self, x), 0.0)
+        reported_n = self.slope * powered  # of a linear cell, b is 1
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
         variance = by_rise**2 + scatter + np.maximum(by_fit, 0.0)
         return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))

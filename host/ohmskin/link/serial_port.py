@@ -22,6 +22,8 @@ READ_TIMEOUT_S: Final = 0.2
 # A write waits at most so long for the system's buffer. Chosen: on a line that works, the buffer
 # empties in a tenth of this.
 _WRITE_TIMEOUT_S: Final = 2.0
+# At most so many bytes of a socket are taken at once. Chosen: a second of a fast line.
+_SOCKET_BYTES: Final = 100_000
 # Linux shows the settings of USB serial bridges here.
 USB_SERIAL: Final = Path("/sys/bus/usb-serial/devices")
 # Boards by the USB ids of Arduino's product, under both of its vendor ids (boards.txt of its AVR
@@ -53,7 +55,7 @@ class Link(Protocol):
 
 
 class SerialLink:
-    """A serial port, opened for this program alone.
+    """A serial port, opened for this program alone, or one elsewhere by a URL of pyserial.
 
     :raises PortUnusable: it does not exist, is in use, or may not be opened.
     """
@@ -61,7 +63,7 @@ class SerialLink:
     def __init__(self, path: str, baud: int = protocol.CONSTANTS["baud_default"]) -> None:
         self.name = path
         try:
-            self._port = serial.Serial(
+            self._port = serial.serial_for_url(
                 path, baud, timeout=READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as exc:
@@ -73,7 +75,13 @@ class SerialLink:
         """See `Link.read`: waits for one byte, then takes all there are."""
         try:
             octets: bytes = self._port.read(1)
-            return octets and octets + self._port.read(self._port.in_waiting)
+            if not octets or not self.name.startswith("socket://"):
+                return octets and octets + self._port.read(self._port.in_waiting)
+            # A socket does not say how much there is: take it without waiting.
+            self._port.timeout = 0.0
+            octets += self._port.read(_SOCKET_BYTES)
+            self._port.timeout = READ_TIMEOUT_S
+            return octets
         except (serial.SerialException, OSError, TypeError) as exc:
             # pyserial raises TypeError when another thread closes the port meanwhile.
             raise DeviceLost(f"{self.name} is gone: is the board still plugged in?") from exc

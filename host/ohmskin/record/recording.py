@@ -37,7 +37,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, BinaryIO, Final, TypeVar
 
@@ -111,10 +111,12 @@ class Mark:
 
     text: any.
     host_time_s: when, on the host's monotonic clock [s].
+    time_ns: the same, since 1970 [ns]; 0: nobody has asked for it.
     """
 
     text: str
     host_time_s: float
+    time_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -210,11 +212,14 @@ def load_recording(path: PathName) -> Recording:
     return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), cut_off)
 
 
-def messages(path: PathName, *, timed: bool = False) -> Generator[Recorded | None, None, None]:
+def messages(
+    path: PathName, *, timed: bool = False, watch: Callable[[int], object] | None = None
+) -> Generator[Recorded | None, None, None]:
     """The messages of a recording in order, hello first; None last of all if it ended properly.
 
-    timed: scans get their `time_ns`, which takes half as long again. Topics that are not ours are
-    passed over, so that other programs may write into a recording.
+    timed: scans and marks get their `time_ns`, which takes half as long again. watch: is told how
+    many bytes of the file were read. Topics that are not ours are passed over, so that other
+    programs may write into a recording.
 
     :raises RecordingError: as `load_recording`.
     """
@@ -242,11 +247,14 @@ def messages(path: PathName, *, timed: bool = False) -> Generator[Recorded | Non
                     has_hello = True
                     if isinstance(message, Hello):
                         board = message
-                    elif timed and isinstance(message, Scan):
+                    elif timed and isinstance(message, Scan | Mark):
                         log_ns = int.from_bytes(content[_LOG_TIME], "little")
-                        epoch_ns = log_ns - round(1e9 * message.host_time_s)
-                        clock = clock or ScanClock(epoch_ns)
-                        message = replace(message, time_ns=clock.time_ns(message, board))
+                        clock = clock or ScanClock(log_ns - round(1e9 * message.host_time_s))
+                        if isinstance(message, Scan):
+                            log_ns = clock.time_ns(message, board)
+                        message = replace(message, time_ns=log_ns)
+                    if watch is not None:
+                        watch(file.tell())
                     yield message
                 is_whole = opcode == Opcode.FOOTER
         if not has_hello:

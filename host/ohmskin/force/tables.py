@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The forces of a recording as arrays, and in files for other programs (.npz, .csv, .parquet).
+
+====================== ========== ==============================================================
+array                  shape      meaning
+====================== ========== ==============================================================
+number, missed         F          as of `Scan`, of each of F scans
+time_ns                F          the middle of the scan, since 1970 [ns]
+force_n, force_n_std   F, R, C    forces of the cells and their standard deviations [N]
+contact_scan           K          which scan each of all K contacts is in: an index from 0
+contact_identity, ...  K          as of `Contact`: row, column, force_n, force_n_std
+contact_position_m     K, 3       where the contact is [m]; NaN where the calibration does not say
+contact_normal         K, 3       its normal there, likewise
+mark_text, mark_time_ns  M        what was noted, and when, since 1970 [ns]
+====================== ========== ==============================================================
+
+A .csv has a row a scan without its contacts; a .parquet has a row a scan with a list of them, and
+the marks in the file's metadata. Files are written scan by scan: hours need no more memory.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.errors import OhmskinError
+from ohmskin.files import PathName, save_table, whole_file
+from ohmskin.force.calibration import Calibration
+from ohmskin.force.contacts import Contact
+from ohmskin.force.reader import ForceScan, SkinReader
+from ohmskin.record.export import Part, Stacks
+
+FORMATS: Final = (".npz", ".csv", ".parquet")
+_OF_SCAN: Final = ("number", "missed", "time_ns")
+_OF_CELLS: Final = ("force_n", "force_n_std")
+_OF_CONTACT: Final = ("row", "column", "force_n", "force_n_std")
+# Scans of a group of rows in a .parquet. Chosen: programs read whole groups; 1 MB of 8x8.
+_GROUP_SCANS: Final = 2048
+
+
+def load_forces(
+    path: PathName, calibration: Calibration, begin_s: float = 0.0, end_s: float = 0.0
+) -> dict[str, NDArray[Any]]:
+    """The arrays of the module's table, of the scans from `begin_s` to `end_s` [s after the first].
+
+    0 is to the last. An hour of 8x8 at 90 Hz takes 200 MB: `export_forces` keeps less in memory.
+
+    :raises RecordingError: the recording cannot be read.
+    :raises ValueError: the calibration is of another unit, size or mode.
+    """
+    part = Part(path, begin_s, end_s or float("inf"), timed=True)
+    return _stacked(part, calibration, _stacks(calibration, None)).arrays() | _marks(part)
+
+
+def export_forces(
+    path: PathName,
+    out: Path,
+    calibration: Calibration,
+    begin_s: float = 0.0,
+    end_s: float = 0.0,
+    watch: Callable[[int], object] | None = None,
+) -> Part:
+    """Write them to `out`, a file of one of `FORMATS`, complete or not at all.
+
+    watch: is told how many bytes of the recording were read. Returns what was written.
+
+    :raises RecordingError, ValueError: as `load_forces`; `out` cannot be written.
+    :raises OhmskinError: pyarrow is missing.
+    """
+    if out.suffix not in FORMATS:
+        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
+    part = Part(path, begin_s, end_s or float("inf"), timed=True, watch=watch)
+    if out.suffix == ".csv":
+        _save_csv(read_forces(part, calibration), out)
+    elif out.suffix == ".parquet":
+        _save_parquet(part, calibration, out)
+    else:
+        with whole_file(out) as file, _stacks(calibration, out.parent) as stacks:
+            _stacked(part, calibration, stacks).save(file, _marks(part))
+    return part
+
+
+def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
+    """The scans of a part of a recording with their forces, each with the tare before it."""
+    reader: SkinReader | None = None
+    for scan in part:
+        reader = reader or SkinReader(part.boards[0], calibration)
+        tare = part.tares.get(scan.kind)
+        yield reader.read(scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio))
+
+
+def _stacks(calibration: Calibration, folder: Path | None) -> Stacks:
+    cells = calibration.rows, calibration.columns
+    return Stacks(
+        dict.fromkeys(_OF_SCAN, ("<i8", ()))
+        | dict.fromkeys(_OF_CELLS, ("<f4", cells))
+        | dict.fromkeys(("contact_scan", "contact_identity"), ("<i8", ()))
+        | {f"contact_{name}": ("<f8", ()) for name in _OF_CONTACT}
+        | dict.fromkeys(("contact_position_m", "contact_normal"), ("<f8", (3,))),
+        folder,
+    )
+
+
+def _stacked(part: Part, calibration: Calibration, stacks: Stacks) -> Stacks:
+    for index, scan in enumerate(read_forces(part, calibration)):
+        stacks.add({name: getattr(scan, name) for name in (*_OF_SCAN, *_OF_CELLS)})
+        for contact in scan.contacts:
+            told = {f"contact_{name}": value for name, value in _told(contact).items()}
+            stacks.add({"contact_scan": index, **told})
+    return stacks
+
+
+def _told(contact: Contact) -> dict[str, Any]:
+    nowhere = (np.nan, np.nan, np.nan)
+    told = {name: getattr(contact, name) for name in ("identity", *_OF_CONTACT)}
+    for name in ("position_m", "normal"):
+        known = getattr(contact, name)
+        told[name] = list(nowhere if known is None else known)
+    return told
+
+
+def _marks(part: Part) -> dict[str, NDArray[Any]]:
+    return {
+        "mark_text": np.array([mark.text for mark in part.marks], dtype=np.str_),
+        "mark_time_ns": np.array([mark.time_ns for mark in part.marks], dtype=np.int64),
+    }
+
+
+def _save_csv(scans: Iterator[ForceScan], out: Path) -> None:
+    first = next(scans)
+    cells = list(np.ndindex(first.force_n.shape))
+    names = [f"r{row}c{column}_{name}" for name in _OF_CELLS for row, column in cells]
+    rows = (
+        [getattr(scan, name) for name in _OF_SCAN]
+        + [newtons for name in _OF_CELLS for newtons in getattr(scan, name).reshape(-1).tolist()]
+        for scan in chain([first], scans)
+    )
+    save_table(out, [*_OF_SCAN, *names], rows)
+
+
+def _save_parquet(part: Part, calibration: Calibration, out: Path) -> None:
+    try:
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetWriter
+    except ImportError as exc:
+        raise OhmskinError(f".parquet needs {exc.name}: run pip install pyarrow") from exc
+    rows, columns = calibration.rows, calibration.columns
+    three = pa.list_(pa.float64(), 3)
+    contact = {"identity": pa.int64(), **dict.fromkeys(_OF_CONTACT, pa.float64())}
+    contact |= {"position_m": three, "normal": three}
+    forms = dict.fromkeys(_OF_SCAN, pa.int64())
+    forms |= dict.fromkeys(_OF_CELLS, pa.list_(pa.float32(), rows * columns))
+    forms |= {"contacts": pa.list_(pa.struct(contact))}
+    schema = pa.schema(forms, metadata={"rows": str(rows), "columns": str(columns)})
+    scans = read_forces(part, calibration)
+    with whole_file(out) as file, ParquetWriter(file, schema) as writer:
+        while group := list(islice(scans, _GROUP_SCANS)):
+            of_group = [
+                {name: getattr(scan, name) for name in _OF_SCAN}
+                | {name: getattr(scan, name).reshape(-1) for name in _OF_CELLS}
+                | {"contacts": [_told(contact) for contact in scan.contacts]}
+                for scan in group
+            ]
+            writer.write_table(pa.Table.from_pylist(of_group, schema))
+        marks = [{"text": mark.text, "time_ns": mark.time_ns} for mark in part.marks]
+        writer.add_key_value_metadata({"marks": json.dumps(marks)})

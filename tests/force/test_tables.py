@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forces of a recording in arrays and files, against those of a replay."""
+
+import csv
+import json
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ohmskin
+from calibrations import of_scene
+from command_line import Run, well
+from ohmskin.errors import OhmskinError
+from ohmskin.force.reader import ForceScan
+from ohmskin.force.tables import export_forces, load_forces
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Mark
+from stepped import stepped
+
+URL = "emulator://8x8?scene=ghost&seed=1&begin=0.2"
+CELLS = ("force_n", "force_n_std")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A third of a second, with a tare, a mark in the middle and one at the end."""
+    path, skin = tmp_path_factory.mktemp("recorded") / "a.mcap", stepped(URL)
+    with Recorder(path, skin.info, lambda: skin.now_s) as recorder:
+        for k, scan in enumerate(islice(skin, 30)):
+            if k == 12:
+                calibrated = ohmskin.CalibratedSkin(skin, of_scene("ghost"))
+                recorder.add(calibrated.tare(0.0, force=True))
+                recorder.add(Mark("here", scan.host_time_s))
+            recorder.add(scan)
+        recorder.add(Mark("end", skin.now_s))
+    return path
+
+
+@pytest.fixture(scope="module")
+def played(recorded: Path) -> list[ForceScan]:
+    with ohmskin.open(f"replay://{recorded}?speed=0", calibration=of_scene("ghost")) as skin:
+        return list(skin)
+
+
+def test_arrays_are_those_of_a_replay(recorded: Path, played: list[ForceScan]) -> None:
+    arrays = load_forces(recorded, of_scene("ghost"))
+    for name in ("number", "missed", "time_ns"):
+        assert arrays[name].tolist() == [getattr(scan, name) for scan in played]
+    for name in CELLS:
+        expected = np.array([getattr(scan, name) for scan in played], dtype=np.float32)
+        np.testing.assert_array_equal(arrays[name], expected)
+    contacts = [(k, contact) for k, scan in enumerate(played) for contact in scan.contacts]
+    assert len(contacts) >= 3
+    assert arrays["contact_scan"].tolist() == [k for k, _ in contacts]
+    for name in ("identity", "row", "column", "force_n", "force_n_std"):
+        assert arrays[f"contact_{name}"].tolist() == [getattr(c, name) for _, c in contacts]
+    assert np.isnan(arrays["contact_position_m"]).all()
+    assert arrays["mark_text"].tolist() == ["here", "end"]
+    # A mark is set when a scan arrives, half a period after its middle.
+    assert arrays["mark_time_ns"][0] - arrays["time_ns"][12] == pytest.approx(0.5e9 / 90, rel=0.1)
+
+
+def test_a_file_of_arrays_holds_the_same(recorded: Path, tmp_path: Path) -> None:
+    export_forces(recorded, tmp_path / "a.npz", of_scene("ghost"))
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as file:
+        arrays = load_forces(recorded, of_scene("ghost"))
+        assert sorted(file) == sorted(arrays)
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(file[name], array)
+            assert file[name].dtype == array.dtype
+
+
+def test_a_table_has_a_row_a_scan(
+    recorded: Path, played: list[ForceScan], tmp_path: Path, run: Run
+) -> None:
+    of_scene("ghost").save(tmp_path / "skin.json")
+    out, known = tmp_path / "a.csv", ("--calibration", str(tmp_path / "skin.json"))
+    assert "30 scans" in well(run("export", str(recorded), str(out), *known)).out
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 30
+    for row, scan in zip(rows, played, strict=True):
+        assert int(row["time_ns"]) == scan.time_ns
+        assert float(row["r2c5_force_n"]) == scan.force_n[2, 5]
+        assert float(row["r7c0_force_n_std"]) == scan.force_n_std[7, 0]
+
+
+def test_parquet_is_read_by_its_library(
+    recorded: Path, played: list[ForceScan], tmp_path: Path
+) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
+    export_forces(recorded, tmp_path / "a.parquet", of_scene("ghost"))
+    table = parquet.read_table(tmp_path / "a.parquet")
+    assert table["time_ns"].to_pylist() == [scan.time_ns for scan in played]
+    force_n = np.array(table["force_n"].to_pylist(), dtype=np.float32).reshape(30, 8, 8)
+    np.testing.assert_array_equal(force_n, [scan.force_n.astype(np.float32) for scan in played])
+    of_contacts = [[c["row"] for c in contacts] for contacts in table["contacts"].to_pylist()]
+    assert of_contacts == [[contact.row for contact in scan.contacts] for scan in played]
+    told = parquet.read_metadata(tmp_path / "a.parquet").metadata
+    assert [mark["text"] for mark in json.loads(told[b"marks"])] == ["here", "end"]
+
+
+def test_a_part_of_it(recorded: Path) -> None:
+    arrays = load_forces(recorded, of_scene("ghost"), 0.1, 0.2)
+    assert arrays["number"].tolist() == list(range(9, 18))
+    assert arrays["force_n"].shape == (9, 8, 8)
+
+
+def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: Run) -> None:
+    pytest.importorskip("joblib")
+    of_scene("ghost").save(tmp_path / "skin.json")
+    (out := tmp_path / "out").mkdir()
+    again = tmp_path / "b.mcap"
+    again.write_bytes(recorded.read_bytes())
+    words = ("export", str(recorded), str(again), str(out), "--backend", "threading")
+    well(run(*words, "--calibration", str(tmp_path / "skin.json")))
+    assert (out / "a.npz").read_bytes()[:2] == b"PK"
+    with np.load(out / "a.npz") as one, np.load(out / "b.npz") as other:
+        np.testing.assert_array_equal(one["force_n"], other["force_n"])
+    done = run("export", str(recorded), str(again), str(tmp_path / "one.npz"))
+    assert (done.code, "a folder takes several recordings" in done.err) == (2, True)
+
+
+def test_what_cannot_be_written(recorded: Path, tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(ValueError, match=r"there are \.npz, \.csv, \.parquet"):
+        export_forces(recorded, tmp_path / "a.xls", of_scene("ghost"))
+    with pytest.raises(ValueError, match="of unit 5"):
+        load_forces(recorded, replace(of_scene("ghost"), unit_id=5))
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(OhmskinError, match="run pip install pyarrow"):
+        export_forces(recorded, tmp_path / "a.parquet", of_scene("ghost"))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board on another computer: what a socket brings is what a port would bring."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from itertools import islice, pairwise
+
+import pytest
+
+import ohmskin
+from ohmskin.emulate.board import EmulatedBoard
+from ohmskin.emulate.faults import LineFaults
+from ohmskin.emulate.urls import emulated
+from ohmskin.errors import DeviceLost, PortError
+
+
+class Serving:
+    """An emulated board behind a socket of this machine, as socat serves one."""
+
+    def __init__(self, board: EmulatedBoard) -> None:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
+        self._board, self.ends = board, threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        begin_s, faults = time.monotonic(), LineFaults()
+        connection, _ = self._server.accept()
+        with connection:
+            connection.settimeout(0.005)
+            while not self.ends.is_set():
+                try:
+                    if not (octets := connection.recv(4096)):
+                        return
+                    self._board.receive(octets)
+                except TimeoutError:
+                    pass
+                connection.sendall(self._board.heard(faults, time.monotonic() - begin_s))
+
+    def close(self) -> None:
+        self.ends.set()
+        self._thread.join()
+        self._server.close()
+
+
+@pytest.fixture
+def serving() -> Iterator[Serving]:
+    served = Serving(emulated("emulator://8x8?scene=ghost&seed=1&begin=0&unit=7")[0])
+    yield served
+    served.close()
+
+
+def test_a_board_behind_a_socket_is_a_board(serving: Serving) -> None:
+    with ohmskin.open(serving.url) as skin:
+        assert skin.info.unit_id == 7
+        scans = list(islice(skin, 30))
+        assert skin.configure(rate_hz=45.0).rate_hz == pytest.approx(45.0, rel=1e-3)
+    assert all(b.number == a.number + 1 for a, b in pairwise(scans))
+    # What is waiting is taken at once, and not byte by byte.
+    assert skin.stats.line.damaged == 0
+
+
+def test_a_connection_that_ends_is_a_board_that_is_gone(serving: Serving) -> None:
+    with ohmskin.open(serving.url) as skin:
+        skin.latest()
+        serving.ends.set()
+        with pytest.raises(DeviceLost, match="is gone"):
+            list(skin)
+
+
+@pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+def test_nobody_serves(scheme: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with pytest.raises(PortError, match=f"{scheme}://127.0.0.1:{port}"):
+        ohmskin.open(f"{scheme}://127.0.0.1:{port}")
+
+
+def test_no_other_scheme_is_opened() -> None:
+    """One of pyserial's writes what it hears to a file."""
+    with pytest.raises(PortError, match="no kind of port 'spy://': there are"):
+        ohmskin.open("spy:///dev/ttyACM0?file=heard.txt")
