@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from network import Network, laplacian_readings, skin_network
+from network import Network, SkinCircuit, laplacian_readings, leaks, skin_network
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import SKIN_FAULTS, SkinFaults, faults_of
 from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, Scene
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import PortError
-from ohmskin.link.protocol import MODES
+from ohmskin.link.protocol import ENUMS, MODES
 from skins import scan_order
 
 R, C = 4, 5
@@ -55,6 +55,19 @@ def test_readings_are_those_of_the_network(name: str, mode: str) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     changed = np.abs(found - Scene("rest", R, C, seed=4).ratio(0.0, mode)).max()
     assert changed > 1e-2 or name == "none"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_damp_skin_reads_as_one_whose_neighbouring_lines_leak_at_each_crossing(mode: str) -> None:
+    """The emulator has the leaks at the ends of lines: that is 3 % of what they do."""
+    names = [ENUMS["reading"].values[name] for name in MODES[mode]]
+    for scene, leak_ohm in (("rest", 1e6), ("multi", 1e6), ("multi", 3e5)):
+        sound = Scene(scene, 8, 8, seed=4).skin(BEGIN_S)
+        circuit = SkinCircuit(Scene("rest", 8, 8, seed=4).skin(0.0), leaks((8, 8), leak_ohm))
+        expected = circuit.readings(sound.cell_siemens)[..., names]
+        found = Scene(scene, 8, 8, seed=4, faults=SkinFaults(damp=leak_ohm)).ratio(BEGIN_S, mode)
+        of_leaks = np.abs(Scene(scene, 8, 8, seed=4).ratio(BEGIN_S, mode) - expected).max()
+        assert np.abs(found - expected).max() < 0.03 * of_leaks
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -242,6 +242,23 @@ def _unit_path(rows: int, columns: int) -> Float:
     return _path_of_lines(ones, ones, ones.shape)
 
 
+def leak_admittance(shape: tuple[int, int], leak_siemens: tuple[float, float]) -> Float:
+    """What leaks between neighbouring lines of a layer add to Y, (R+C, R+C) [S].
+
+    leak_siemens: of rows and of columns, at each crossing. It is as if they joined the electrodes,
+    because they resist a thousand times as much as the wires up to them.
+    """
+    rows, columns = shape
+    leaks = np.zeros((rows + columns, rows + columns))
+    for first, lines, leak in (
+        (0, rows, columns * leak_siemens[0]),
+        (rows, columns, rows * leak_siemens[1]),
+    ):
+        chain = np.diff(np.eye(lines), axis=0)  # a row for each pair of neighbours
+        leaks[first : first + lines, first : first + lines] = leak * (chain.T @ chain)
+    return leaks
+
+
 @one_blas_thread
 def end_admittance(skin: Skin) -> Float:
     """Y [S] of both ends of all lines, (2(R+C), 2(R+C)): near ends, rows first, then far ends.
@@ -293,6 +310,9 @@ class PortCircuit:
     shape, rows: (R, C), and R.
     wire_ohm: segments of the top and of the bottom layer, as they were given.
     far: whether rows, and whether columns, are sensed at their far ends.
+    leak_siemens: between neighbouring rows, and columns, at each crossing [S] (`leak_admittance`).
+    impedance: potentials of electrodes per current into each electrode, (R+C, R+C) [ohm].
+    sensed: potentials of electrodes per current into each sensed end, (R+C, R+C) [ohm].
     factor: L of `factorised` (RC, RC).
     port_ohm: voltage between the sensed ends per current through the port (RC,) [ohm]: rho, or at
         far ends that without the wires up to them.
@@ -317,8 +337,9 @@ class PortCircuit:
         bottom_wire_ohm: Wire,
         *,
         far: tuple[bool, bool] = (False, False),
+        leak_siemens: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Cells (R, C) [S], all > 0; wire segments [ohm]; far: as the attribute."""
+        """Cells (R, C) [S], all > 0; wire segments [ohm]; far, leak_siemens: as the attributes."""
         self.shape, self.rows = cell_siemens.shape, len(cell_siemens)
         self.wire_ohm, self.far = (top_wire_ohm, bottom_wire_ohm), far
         self._root, to_sense = np.sqrt(cell_siemens), None
@@ -327,11 +348,14 @@ class PortCircuit:
             to_sense = sign * _path_of_lines(top_wire_ohm, bottom_wire_ohm, self.shape)
         self.factor, self._half = factorised(self._root, *self.wire_ohm, to_sense)
         near = self._half[:, : sum(self.shape)]
-        self._impedance, port_ohm = impedance_of(admittance_of(near), self.rows)
-        self._sensed = self._impedance
+        admittance, self.leak_siemens = admittance_of(near), leak_siemens
+        if any(leak_siemens):
+            admittance += leak_admittance(self.shape, leak_siemens)
+        self.impedance, port_ohm = impedance_of(admittance, self.rows)
+        self.sensed = self.impedance
         if to_sense is not None:
-            lost = self._impedance @ (near.T @ self._half[:, sum(self.shape) :])
-            self._sensed = self._impedance - lost
+            lost = self.impedance @ (near.T @ self._half[:, sum(self.shape) :])
+            self.sensed = self.impedance - lost
             drop = _ends_of_ports(lost, self.rows)
             self.drop_ohm: Float = np.stack([drop[0], -drop[1]]).reshape(2, -1)
             port_ohm = port_ohm - self.drop_ohm.sum(axis=0).reshape(self.shape)
@@ -354,7 +378,7 @@ class PortCircuit:
     @cached_property
     def cell_current(self) -> Float:
         """Currents through all cells per current into each electrode, (R+C, R, C)."""
-        return (self._impedance @ self.per_potential.T).reshape(-1, *self.shape)
+        return (self.impedance @ self.per_potential.T).reshape(-1, *self.shape)
 
     @cached_property
     def sense_current(self) -> Float:
@@ -362,7 +386,7 @@ class PortCircuit:
         if not any(self.far):
             return self.cell_current
         driven = self._currents[:, sum(self.shape) :].T
-        return (self._sensed.T @ self.per_potential.T + driven).reshape(-1, *self.shape)
+        return (self.sensed.T @ self.per_potential.T + driven).reshape(-1, *self.shape)
 
     @cached_property
     def _wire_current(self) -> Float:
@@ -421,13 +445,36 @@ class PortCircuit:
         They are the sums of `by_wires` over each layer. A product of the currents of lines makes
         them without the slopes by all segments, which takes less time.
         """
-        slopes, lines = [], len(self._impedance)
+        slopes, lines = [], len(self.impedance)
         for layer, ohm in enumerate(self.wire_ohm):
             current = self._wire_current[:, layer].reshape(lines, -1)
             sensed = self._wire_sense_current[:, layer].reshape(lines, -1)
             row, column = _ends_of_ports((current * np.ravel(ohm)) @ sensed.T, self.rows)
             slopes.append((row - column).ravel())
         return np.transpose(slopes)
+
+    def by_leaks(self) -> Float:
+        """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""
+        volt, sensed = (
+            port_difference(potential.T, self.rows) for potential in (self.impedance, self.sensed)
+        )
+        return leak_slopes(volt, sensed, self.shape)
+
+
+def leak_slopes(volt: Float, sensed: Float, shape: tuple[int, int]) -> Float:
+    """d port_ohm / d leak of rows, and of columns, at each crossing, (n, 2) [ohm / S].
+
+    volt, sensed: potentials of electrodes (n, R+C) per current of n ports into their driven, and
+    into their sensed ends [ohm]. As for one conductance, d port_ohm / d g = -v v'.
+    """
+    rows, columns = shape
+    return np.stack(
+        [
+            -crossings * np.einsum("pl,pl->p", np.diff(volt[:, lines]), np.diff(sensed[:, lines]))
+            for lines, crossings in ((slice(rows), columns), (slice(rows, None), rows))
+        ],
+        axis=1,
+    )
 
 
 def _ends_of_ports(lines: Float, rows: int) -> Float:

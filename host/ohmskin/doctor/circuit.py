@@ -37,6 +37,7 @@ from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
 from ohmskin.doctor import limits
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.signal import Rest
+from ohmskin.estimate.joint import JointEstimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
@@ -137,6 +138,14 @@ def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> LinesAndCells:
     cell_ohm = 1 / np.nanmedian(siemens)
     diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
     return LinesAndCells(open_lines, shorts, touched, dead, wrong | dead | saturated)
+
+
+def examine_leaks(rest: Rest, diagnosis: Diagnosis) -> None:
+    """Add whether neighbouring lines leak into each other, by a skin that is otherwise sound."""
+    known = SkinKnowledge.of(rest.board, np.clip(rest.ratio, 0.0, 1.0), rest.told)
+    if (leak_ohm := JointEstimator(known).leak_ohm()) is not None:
+        row_megohm, column_megohm = (1e-6 * ohm for ohm in leak_ohm)
+        diagnosis.add(Kind.DAMP, row_megohm=row_megohm, column_megohm=column_megohm)
 
 
 def _cells(rest: Rest, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:

@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 
 from ohmskin.circuit.small import one_blas_thread
-from ohmskin.doctor.circuit import examine_circuit
+from ohmskin.doctor.circuit import examine_circuit, examine_leaks
 from ohmskin.doctor.far import examine_far, near_ends
-from ohmskin.doctor.findings import Diagnosis, Kind, Place, merged
+from ohmskin.doctor.findings import Diagnosis, Kind, Place, Severity, merged
 from ohmskin.doctor.signal import Look, Rest, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
@@ -87,13 +87,18 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     rest = Rest(
         scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves=moves, told=told
     )
-    near = examine_circuit(near_ends(rest) if far else rest, diagnosis)
+    at_near = near_ends(rest) if far else rest
+    near = examine_circuit(at_near, diagnosis)
     if far and not moves and not near.wrong.all():
         examine_far(rest, near, diagnosis)
     # A cell that moves in all may conduct no more on average than one at rest.
     touched = near.touched if near.touched.any() else moved
     if touched.any():
         diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
+    # What else is wrong with a skin may look like leaks.
+    is_faulty = any(one.kind.severity is Severity.FAULT for one in diagnosis.findings)
+    if not (touched.any() or is_faulty):
+        examine_leaks(at_near, diagnosis)
     if far or touched.any() or near.wrong.any():
         return  # far ends show the wires, or touches and faults hide them
     diagnosis.nominal_ohm = wire_ohm

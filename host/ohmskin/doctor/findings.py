@@ -77,6 +77,7 @@ class Kind(Enum):
     BAD_SEGMENT = "bad_segment", _WARNING, "more_ohm std_ohm between"
     LINE_WIRE = "line_wire", _WARNING, "ohm std_ohm usual_ohm"
     WIRES = "wires", _WARNING, "share nominal_ohm"
+    DAMP = "damp", _WARNING, "row_megohm column_megohm"
     TOUCHED = "touched", _NOTE, "moves"
     VERSION = "version", _NOTE, "firmware host"
     USB_LATENCY = "usb_latency", _NOTE, "timer_ms file"

@@ -23,7 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM, Skin, all_readings, end_admittance, readings
+from ohmskin.circuit.skin import (
+    DEFAULT_REF_OHM,
+    Skin,
+    all_readings,
+    end_admittance,
+    leak_admittance,
+    readings,
+)
 from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, from_scan_order, in_scan_order
 
 # An open wire, and a cell without contact, have this resistance [ohm]. Chosen: a million times that
@@ -161,6 +168,7 @@ class SkinFaults:
     ref_top: Annotated[Positive, "true ohms of the rows' reference resistor"] = DEFAULT_REF_OHM
     ref_bottom: Annotated[Positive, "the same of the columns; hello says 30000"] = DEFAULT_REF_OHM
     wires: Annotated[Positive, "factor on all wires"] = 1.0
+    damp: Annotated[Amount, "ohms that leak between neighbouring lines at each crossing"] = 0.0
     hum: Annotated[Amount, "hertz of the mains that every reading picks up"] = 0.0
     hum_lsb: Annotated[Amount, "amplitude of the hum in LSB, 3 unless told"] = 3.0
     tau_us: Annotated[Amount, "microseconds of the sense nodes' time constant of settling"] = 0.0
@@ -207,13 +215,13 @@ class SkinFaults:
         firsts = {"rows": 0, "columns": rows, "far_rows": far, "far_columns": far + rows}
         shorts = [(n, getattr(self, f"short_{what}")) for what, n in firsts.items()]
         joints = [(n + pair[0], n + pair[1]) for n, pair in shorts if pair]
-        if mode == "near" and not joints:
+        if mode == "near" and not (joints or self.damp):
             return readings(damaged)  # quicker: no fault of far ends is seen at near ends
         ends = np.arange(2 * far)
         for n, pair in ((far, self.swap_far_rows), (far + rows, self.swap_far_columns)):
             if pair:
                 ends[[n + pair[0], n + pair[1]]] = n + pair[1], n + pair[0]
-        a_to_h = joined_readings(damaged, joints, ends)
+        a_to_h = joined_readings(damaged, joints, ends, 1 / self.damp if self.damp else 0.0)
         if (row := self.open_far_row) is not None:
             before = a_to_h[row - 1] if row else np.roll(a_to_h[-1], 1, axis=0)
             a_to_h[row, :, 4::3] = before[:, 4::3]  # e and h
@@ -258,8 +266,13 @@ def _settled(voltage: Float, kept: float) -> Float:
     return np.array(settled)
 
 
-def joined_readings(skin: Skin, joints: Iterable[Pair], ends: NDArray[np.intp]) -> Float:
+def joined_readings(
+    skin: Skin, joints: Iterable[Pair], ends: NDArray[np.intp], leak_siemens: float = 0.0
+) -> Float:
     """Readings a to h, (R, C, 8), with pairs of ends joined by 0.1 ohm each.
+
+    leak_siemens: between neighbouring lines at each crossing: half of it joins their near ends, and
+    half their far ends.
 
     Ends are numbered as in `circuit.skin.end_admittance`; ends: where the multiplexers find each.
     Near ends are joined in front of their leads. A joint adds its conductance to Y. Cells without
@@ -271,4 +284,7 @@ def joined_readings(skin: Skin, joints: Iterable[Pair], ends: NDArray[np.intp]) 
         pair = np.array(joint)
         admittance[pair, pair] += SHORT_SIEMENS
         admittance[pair, pair[::-1]] -= SHORT_SIEMENS
+    if leak_siemens:
+        half = leak_admittance(skin.shape, (0.5 * leak_siemens, 0.5 * leak_siemens))
+        admittance += np.kron(np.eye(2), half)
     return all_readings(skin, admittance[np.ix_(ends, ends)])

@@ -219,7 +219,7 @@ class MeasuredWires(WireBelief):
         """Later frames are expected about the wires at rest, but for a bend."""
         prior = np.diagonal(self._prior_covariance)
         found = np.diagonal(self._root) ** 2
-        bend = np.array([*np.where(self.far, LAYER_STD**2 + found[:2], prior[:2]), found[2]])
+        bend = np.array([*np.where(self.far, LAYER_STD**2 + found[:2], prior[:2]), *found[2:]])
         self._nominal, self._prior_covariance = self.means, np.diag(bend)
         self._means_before = self._nominal, bend
 
@@ -234,8 +234,8 @@ class MeasuredWires(WireBelief):
             return False
         variance = np.diagonal(self._root) ** 2
         most = np.diagonal(self._prior_covariance)
-        fades = np.array([FADE_SHARE, FADE_SHARE, 0.0])  # a bend does not change leads
-        self._means_before = self.means, variance + fades * (most - variance)
+        variance[:2] += FADE_SHARE * (most - variance)[:2]  # a bend does not change leads
+        self._means_before = self.means, variance
         segments = self.segment_ohm(self.mean)
         for layer in (0, 1):
             if self.far[layer]:

@@ -6,18 +6,20 @@ Symbols
 ====== ============ ============================================================= ==========
 symbol shape        meaning                                                       unit
 ====== ============ ============================================================= ==========
-x      (RC + 3,)    log resistances of cells and mean segments of both layers,    log ohm,
-                    and the mean lead                                             ohm
-m      (RC + 3,)    what the prior expects of x                                   as x
-P      (RC+3, RC+3) covariance of the prior
-u      (RC + 3,)    deviations from the prior: x = m + P^1/2 u                    1
+n                   means of the wires: of the segments of both layers, of the
+                    leads; and of the leaks, if there are any (`wire_belief`)
+x      (RC + n,)    log resistances of cells, and the means                       log ohm,
+                                                                                  ohm, uS
+m      (RC + n,)    what the prior expects of x                                   as x
+P      (RC+n, RC+n) covariance of the prior
+u      (RC + n,)    deviations from the prior: x = m + P^1/2 u                    1
 y, h   (RC,)        measured and modelled port currents per Vdd, over noise       1
-J      (RC, RC + 3) dh / du                                                       1
+J      (RC, RC + n) dh / du                                                       1
 W      (RC, w)      dh / dw s, w the log segments and the leads, s the deviation  1
                     that each has of its own
 N      (RC, RC)     covariance of y: of its noise and of what is not in x         1
 S      (RC, RC)     covariance of y, N + J J^T: of all that is not certain        1
-O      (RC, RC + 3) J whitened: L^-1 J, with L L^T = S                            1
+O      (RC, RC + n) J whitened: L^-1 J, with L L^T = S                            1
 ====== ============ ============================================================= ==========
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2, P of the cells re-weighted for the tails of their prior
@@ -80,7 +82,7 @@ class FullFit:
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
         self.log_cells: Float = start
-        self._mean_stds = np.zeros(3)  # u of the layers and the lead
+        self._mean_stds = np.zeros(len(belief.means))  # u of them
         self._moved_log = np.inf  # the most that a log resistance can have moved since N was made
         self._evaluate()
         self._minimise()
@@ -123,7 +125,10 @@ class FullFit:
             self._of_leads = gram(self._by_lead)
         self._by_cell = self._weighted(self._circuit.by_cell())
         by_lead = np.full((self._modelled.size, 1), float(self._belief.leads_of_port))
-        by_mean = self._weighted(np.hstack([self._circuit.by_layers(), by_lead]))
+        by_means = [self._circuit.by_layers(), by_lead]
+        if len(self._mean_stds) > 3:
+            by_means.append(1e-6 * self._circuit.by_leaks())  # by uS
+        by_mean = self._weighted(np.hstack(by_means))
         self._by_mean = by_mean + self._by_cell @ self._prior.by_means
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
@@ -135,9 +140,10 @@ class FullFit:
 
     def _factorised(self, cell_std: Float, odd_lead_ohm: float = 0.0) -> tuple[Float, Float]:
         """J for cells of these deviations (RC,), and L. odd_lead_ohm: what N has not of leads."""
-        slopes = np.empty((len(cell_std), len(cell_std) + 3))
-        np.multiply(self._by_cell, cell_std, out=slopes[:, :-3])
-        slopes[:, -3:] = self._per_mean_std
+        cells = cell_std.size
+        slopes = np.empty((cells, cells + self._mean_stds.size))
+        np.multiply(self._by_cell, cell_std, out=slopes[:, :cells])
+        slopes[:, cells:] = self._per_mean_std
         noise = self._with_leads(float(np.hypot(self._own_lead_ohm, odd_lead_ohm)))
         return slopes, cholesky(gram(slopes, onto=noise))
 
@@ -174,20 +180,22 @@ class FullFit:
         self._weighted_residual = solve(self._factor, self._residual + self._slopes @ present)
         step = self._weighted_residual @ self._slopes - present
         readings_step = self._slopes @ step
-        return step, float(max(np.abs(readings_step).max(), np.abs(step[:-3]).max()))
+        cells_step = step[: cell_stds.size]
+        return step, float(max(np.abs(readings_step).max(), np.abs(cells_step).max()))
 
     def _move(self, step: Float) -> None:
         """Take a step, or so much of it that no log resistance moves by more than MAX_STEP_LOG."""
-        means_step = self._belief.means_off(step[-3:]) - self._belief.means
+        step, stds_step = np.split(step, [self.log_cells.size])
+        means_step = self._belief.means_off(stds_step) - self._belief.means
         # A cell that would leave its limits goes to the limit, and does not shorten the whole step.
-        log_cells = self.log_cells + self._cell_std * step[:-3] + self._prior.by_means @ means_step
+        log_cells = self.log_cells + self._cell_std * step + self._prior.by_means @ means_step
         cells_step = np.minimum(np.maximum(log_cells, _LEAST_LOG_OHM), _MOST_LOG_OHM)
         cells_step -= self.log_cells
         most = max(np.abs(cells_step).max(), np.abs(means_step[:2]).max(), 1e-9)
         share = min(1.0, MAX_STEP_LOG / most)
         self._moved_log += share * most
         self.log_cells = self.log_cells + share * cells_step
-        self._mean_stds = self._mean_stds + share * step[-3:]
+        self._mean_stds = self._mean_stds + share * stds_step
 
     @cached_property
     def wires(self) -> Float:
@@ -234,19 +242,19 @@ class FullFit:
 
         The last term is the correction. After it, the columns of J of these cells grow by c' / c.
         """
-        cell_std = self._cell_std
+        cell_std, cells = self._cell_std, slice(self._cell_std.size)
         whitened = solve_lower(self._factor, self._slopes)
-        learned = np.einsum("ij,ij->j", whitened, whitened)[:-3]
-        with_means = whitened[:, :-3].T @ whitened[:, -3:]  # O^T O of cells and means
+        learned = np.einsum("ij,ij->j", whitened, whitened)[cells]
+        with_means = whitened[:, cells].T @ whitened[:, cell_std.size :]  # O^T O of cells and means
         self._unnoticed, unnoticed_std = self._find_unnoticed(learned)
         if self._unnoticed.any():
             wider = np.where(self._unnoticed, unnoticed_std / cell_std, 1.0)
             added = np.sqrt(wider[self._unnoticed] ** 2 - 1.0)  # (c'^2 / c^2 - 1)^1/2
-            coupling = (whitened[:, :-3][:, self._unnoticed] * added).T @ whitened  # H^T O
-            system = np.eye(len(added)) + coupling[:, :-3][:, self._unnoticed] * added
+            coupling = (whitened[:, cells][:, self._unnoticed] * added).T @ whitened  # H^T O
+            system = np.eye(len(added)) + coupling[:, cells][:, self._unnoticed] * added
             correction = solve_lower(cholesky(system), coupling)
-            learned = learned - np.einsum("ij,ij->j", correction, correction)[:-3]
-            with_means -= correction[:, :-3].T @ correction[:, -3:]
+            learned = learned - np.einsum("ij,ij->j", correction, correction)[cells]
+            with_means -= correction[:, cells].T @ correction[:, cell_std.size :]
             learned = wider**2 * learned
             with_means *= wider[:, None]
             cell_std = wider * cell_std
@@ -286,14 +294,22 @@ class FullFit:
         return unnoticed & (unnoticed_std > self._cell_std), unnoticed_std
 
     def cells_by_means(self) -> Float:
-        """How the fitted cells follow the means, (RC, 3): d log r / d m, the readings being kept.
+        """How the fitted cells follow the means, (RC, n): d log r / d m, for the same readings."""
+        return self._cells_by(self._by_mean)
 
-        A fit about other means would have other residuals, by -`_by_mean` dm. Its answer is that of
-        cells alone: P J^T (N + J P J^T)^-1 times that, P their prior's variance.
+    def cells_by_leaks(self) -> Float:
+        """The same by what neighbouring rows, and columns, leak into each other, (RC, 2) [1/uS]."""
+        return self._cells_by(self._weighted(1e-6 * self._circuit.by_leaks()))
+
+    def _cells_by(self, slopes: Float) -> Float:
+        """How the fitted cells follow what changes y - h by -`slopes`, the readings being kept.
+
+        The answer is that of cells alone: P J^T (N + J P J^T)^-1 times that, P their prior's
+        variance.
         """
         by_cell = self._by_cell * self._cell_std
         factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
-        return -self._cell_std[:, None] * (by_cell.T @ solve(factor, self._by_mean))
+        return -self._cell_std[:, None] * (by_cell.T @ solve(factor, slopes))
 
     @property
     def lesson(self) -> Lesson:

@@ -55,6 +55,17 @@ from ohmskin.estimate.wire_belief import FAR_LOG, MOST_FITS, LearnedWires, WireB
 REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
+# Lines leak if that explains so much of how cells differ at rest: the gain in twice the log
+# likelihood. Chosen: chance gains 25 in one of 270,000 skins, exp(-25 / 2) by the F distribution.
+DAMP_GAIN: Final = 25.0
+# Fits of the leaks, each from the one before. Chosen: the last moves them by less than their
+# deviation.
+LEAK_FITS: Final = 8
+# [uS] The largest leak, and one that does not matter. Chosen: 10 kOhm at each crossing, which is a
+# wet skin, and a gigohm.
+MOST_LEAK_US, LEAST_LEAK_US = 100.0, 1e-3
+# A leak differs from crossing to crossing, and dries: what is known of it, as a share. Chosen.
+LEAK_STD: Final = 0.2
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
 # by less than their rounding.
 LEAST_LEAD_OHM: Final = 20.0
@@ -85,6 +96,15 @@ class JointEstimator(Estimator):
         """As told, until a frame has taught more."""
         learned = self._belief.learned()
         return super().wires() if learned is None else learned
+
+    def leak_ohm(self) -> tuple[float, float] | None:
+        """What leaks from row to row, and from column to column, at each crossing [ohm].
+
+        None: the rest readings show no leaks, or were not told.
+        """
+        self.rest()
+        by_row, by_column = np.maximum(self._belief.leak_siemens(self._belief.means), 1e-9)
+        return (1 / float(by_row), 1 / float(by_column)) if len(self._belief.means) > 3 else None
 
     def wires_are(self) -> str:
         """By what was told, and by how well the belief knows both layers since."""
@@ -269,7 +289,8 @@ class JointEstimator(Estimator):
         if not any(self._belief.far) and np.abs(means - self._rest_means)[:2].max() > FAR_LOG:
             return self._prior_by_rest(self._rest_ports)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
-        if (np.abs(means - prior.means) > [least_log, least_log, LEAST_LEAD_OHM]).any():
+        least = [least_log, least_log, LEAST_LEAD_OHM, *(SEGMENT_STD * np.abs(means[3:]))]
+        if (np.abs(means - prior.means) > least).any():
             return prior.about(means)
         return prior
 
@@ -288,8 +309,8 @@ class JointEstimator(Estimator):
 
     def _alike(self, cells: int, log_ohm: float, std: float) -> CellPrior:
         """A prior of so many cells, all alike."""
-        logs, stds = np.full(cells, log_ohm), np.full(cells, std)
-        return CellPrior(logs, stds, np.zeros((cells, 3)), self._belief.means)
+        logs, stds, means = np.full(cells, log_ohm), np.full(cells, std), self._belief.means
+        return CellPrior(logs, stds, np.zeros((cells, len(means))), means)
 
     def _prior_by_rest(self, ports: PortReadings) -> CellPrior:
         """Log resistances of the untouched cells, and how well they are known: by the same fit.
@@ -299,11 +320,10 @@ class JointEstimator(Estimator):
         """
         level = rest_level(ports.current, self.knowledge.ref_ohm)
         log_cells: Float = np.full(ports.current.size, -np.log(level))
-        for _ in range(REST_FITS):
-            self._belief.before_fit(log_cells, ports)
-            alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
-            fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)
-            log_cells = fit.log_cells
+        alike, fit = self._fit_rest(ports, log_cells)
+        if len(self._belief.means) == 3 and leaks_of(fit)[0] > DAMP_GAIN:
+            alike, fit = self._expect_leaks(ports, fit)
+        log_cells = fit.log_cells
         self._rest_means = means = self._belief.means
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
@@ -312,6 +332,47 @@ class JointEstimator(Estimator):
         by_means = alike.by_means if hidden else fit.cells_by_means()
         std = np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
         return CellPrior(log_cells, std, by_means, means)
+
+    def _expect_leaks(self, ports: PortReadings, fit: FullFit) -> tuple[CellPrior, FullFit]:
+        """Find what lines leak, from a fit without leaks, for the belief; the last fit of rest."""
+        leaks_us = np.zeros(2)
+        for _ in range(LEAK_FITS):
+            _, more_us, stds_us = leaks_of(fit)
+            # Half a step: cells do not follow leaks linearly, and whole steps go back and forth.
+            leaks_us = np.clip(leaks_us + 0.5 * more_us, 0.0, MOST_LEAK_US)
+            self._belief.expect_leaks(leaks_us, np.full(2, LEAST_LEAK_US))
+            alike, fit = self._fit_rest(ports, fit.log_cells)
+        self._belief.expect_leaks(leaks_us, np.hypot(stds_us, LEAK_STD * leaks_us))
+        return alike, fit
+
+    def _fit_rest(self, ports: PortReadings, log_cells: Float) -> tuple[CellPrior, FullFit]:
+        """Fits of the rest readings from these cells (RC,), and the prior of the last."""
+        for _ in range(REST_FITS):
+            self._belief.before_fit(log_cells, ports)
+            alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
+            fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)
+            log_cells = fit.log_cells
+        return alike, fit
+
+
+def leaks_of(fit: FullFit) -> tuple[float, Float, Float]:
+    """What neighbouring rows, and columns, leak into each other beyond what a rest fit supposes.
+
+    By leaks that were neglected, the lines at the edge, of one neighbour, seem to conduct less than
+    others. So the leaks are those with which cells at rest are most alike, by least squares.
+    Returns the gain of that in twice the log likelihood (0 where leaks would have to be negative),
+    the leaks, and their deviations, (2,) [uS].
+    """
+    off, by_leaks = fit.log_cells - fit.log_cells.mean(), fit.cells_by_leaks()
+    by_leaks = by_leaks - by_leaks.mean(axis=0)
+    covariance = np.linalg.pinv(by_leaks.T @ by_leaks)  # a single line leaks into none
+    leaks_us = -covariance @ by_leaks.T @ off
+    left = off + by_leaks @ leaks_us
+    # Cells that differ by less than they drift tell nothing. The mean and the leaks are fitted.
+    square, drift, free = left @ left, off.size * REST_STD**2, max(off.size - 3, 0)
+    gain = free * float(np.log((off @ off + drift) / (square + drift)))
+    stds_us = np.sqrt(covariance.diagonal() * (square + drift) / max(free, 1))
+    return gain if leaks_us.max() > 0 else 0.0, leaks_us, stds_us
 
 
 class TouchEstimator(JointEstimator):

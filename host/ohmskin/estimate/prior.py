@@ -97,8 +97,8 @@ class CellPrior:
 
     expected: log resistances at rest, (RC,) [log ohm].
     std: deviation of a cell that is not touched, (RC,).
-    by_means: how `expected` follows the means, (RC, 3).
-    means: those for which `expected` is right, (3,).
+    by_means: how `expected` follows the means, (RC, n).
+    means: those for which `expected` is right, (n,).
     """
 
     expected: Float
@@ -107,7 +107,7 @@ class CellPrior:
     means: Float
 
     def about(self, means: Float) -> "CellPrior":
-        """The same for other means of the wires, (3,)."""
+        """The same for other means of the wires, (n,)."""
         expected = self.expected + self.by_means @ (means - self.means)
         return CellPrior(expected, self.std, self.by_means, means)
 

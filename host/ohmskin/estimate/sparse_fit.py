@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit, port_difference, wire_current
+from ohmskin.circuit.skin import PortCircuit, leak_slopes, port_difference, wire_current
 from ohmskin.circuit.small import cholesky, gram, inverse, solve, solve_lower, solve_positive
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
@@ -99,8 +99,11 @@ class RestNetwork(PortCircuit):
         bottom_wire_ohm: float,
         *,
         far: tuple[bool, bool] = (False, False),
+        leak_siemens: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        super().__init__(cell_siemens, top_wire_ohm, bottom_wire_ohm, far=far)
+        super().__init__(
+            cell_siemens, top_wire_ohm, bottom_wire_ohm, far=far, leak_siemens=leak_siemens
+        )
         self.cell_siemens = siemens = cell_siemens.ravel()
         lines = self.cell_current.reshape(-1, siemens.size) / siemens
         self.port_volt = self.sense_volt = port_difference(lines, self.rows).T
@@ -175,6 +178,23 @@ class TouchedNetwork:
         cell_volt = rest.cell_volt[cells, cells] - (coupling * by_forced).sum(axis=0)
         return volt * sense_volt, cell_volt
 
+    def by_leaks(self, ports: Cells) -> Float:
+        """d rho / d leak of rows, and of columns, at each crossing, (m, 2) [ohm / S], of ports.
+
+        The current that the touches draw lowers the voltage between neighbouring lines.
+        """
+        rest, rows = self._rest, self._rest.rows
+        of_cells = rest.cell_current.reshape(-1, rest.cell_siemens.size) / rest.cell_siemens
+        by_touch = of_cells[:, self._cells].T
+        volt, sensed = (
+            port_difference(potential, rows)[ports] - drawn.T[ports] @ by_touch
+            for potential, drawn in (
+                (rest.impedance.T, self._drawn),
+                (rest.sensed.T, self._sense_drawn),
+            )
+        )
+        return leak_slopes(volt, sensed, rest.shape)
+
     def cell_current(self, ports: Cells) -> tuple[Float, Float]:
         """Currents through all cells per current through some ports, (m, RC): driven, sensed."""
         rest, cell_volt_of_touched = self._rest, self._rest.cell_volt[self._cells]
@@ -235,7 +255,12 @@ class SparseFit:
         self.most = MAX_TOUCHES_PER_LINE * sum(belief.shape)
         self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(rest_siemens, *np.exp(prior.means[:2]), far=belief.far)
+        self.net = net = RestNetwork(
+            rest_siemens,
+            *np.exp(prior.means[:2]),
+            far=belief.far,
+            leak_siemens=belief.leak_siemens(prior.means),
+        )
         self.untouched = TouchedNetwork(net, NO_CELLS, np.zeros(0))
         self.current = 1.0 / (net.port_ohm + self.series_ohm)
         siemens = net.cell_siemens[:, None]
@@ -246,11 +271,14 @@ class SparseFit:
         by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
         by_ohm = (self.current**2)[:, None]
         by_lead = by_ohm * belief.leads_of_ports
-        per_std = belief.per_std(by_wire * by_ohm, by_lead, by_cell.T @ prior.by_means)
+        of_cells = by_cell.T @ prior.by_means
+        if of_cells.shape[1] > 3:
+            of_cells[:, 3:] += 1e-6 * by_ohm * net.by_leaks()  # by uS
+        per_std = belief.per_std(by_wire * by_ohm, by_lead, of_cells)
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
         self.path_ohm = belief.believed_wires().path_ohm
-        *layer_std, lead_std_ohm = belief.mean_std().tolist()
+        *layer_std, lead_std_ohm = belief.mean_std()[:3].tolist()
         wires_std = np.hypot(max(layer_std), SEGMENT_STD) * self.path_ohm
         self.path_std_ohm = wires_std + belief.leads_of_port * lead_std_ohm
 
@@ -402,7 +430,9 @@ class FewTouches:
         factor = cholesky(residual_covariance)
         # The network was solved with wires as they were believed then. `offset` is what newer ones
         # change in these residuals, to first order.
-        offset = self._skin.belief.moved_since(self._skin.prior.means, wires[:, -3:])
+        belief = self._skin.belief
+        by_mean_std = wires[:, -len(belief.means) :]
+        offset = belief.moved_since(self._skin.prior.means, by_mean_std)
         for _ in range(2):  # `converge` has led near, by steps without S
             slopes = self._slopes()
             residual = self._residual[ports] - offset
@@ -429,32 +459,32 @@ class FewTouches:
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
         # By how much a mean that is one deviation off moves x: A^-1 J S^-1 W, of the means in W.
-        by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, wires[:, -3:])
+        by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, by_mean_std)
         # The lesson's S: whatever these touches are, they are noise without limit.
         by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
-        belief = self._skin.belief
         odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
         noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
         unlimited = cholesky(gram(noise, onto=residual_covariance))
-        lesson = Lesson(wires[:, -3:], residual, unlimited)
+        lesson = Lesson(by_mean_std, residual, unlimited)
         return self._answer(covariance_of_cells, np.abs(by_means), modelled, lesson)
 
     def _nothing_touched(self) -> Touched | None:
         """The answer if no cell is touched; None if a current is below an untouched skin's."""
         if self._residual.min() < -DEMAND_STDS:
             return None
-        lesson = Lesson(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 0)))
-        return self._answer(np.zeros((0, 0)), np.zeros((0, 3)), self._current, lesson)
+        none = np.zeros((0, len(self._skin.belief.means)))
+        lesson = Lesson(none, np.zeros(0), np.zeros((0, 0)))
+        return self._answer(np.zeros((0, 0)), none, self._current, lesson)
 
     def _answer(
         self, covariance: Float, by_means: Float, modelled: Float, lesson: Lesson
     ) -> Touched:
-        """covariance, and what a deviation of each mean moves: (k, k) and (k, 3), of touched cells.
+        """covariance, and what a deviation of each mean moves: (k, k) and (k, n), of touched cells.
 
         Others have their prior's deviation.
         """
         prior, cells = self._skin.prior, self.cells
-        std, of_means = prior.std.copy(), np.zeros((modelled.size, 3))
+        std, of_means = prior.std.copy(), np.zeros((modelled.size, by_means.shape[1]))
         std[cells] = np.sqrt(covariance.diagonal())
         of_means[cells] = by_means
         parts = np.hypot(*of_means[:, :2].T), of_means[:, 2]
@@ -482,6 +512,8 @@ class FewTouches:
         by_cell = currents * sensed / net.cell_siemens
         by_cell[:, self.cells] = 0.0
         by_mean = by_cell @ skin.prior.by_means
+        if any(net.leak_siemens):
+            by_mean[:, 3:] += 1e-6 * self._touched.by_leaks(ports)  # by uS
         by_cell *= skin.prior.std
         model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
         std = self._std.copy()

@@ -14,11 +14,12 @@ symbol shape      meaning                                                       
 R, C              number of rows and of columns
 W                 number of wires: 2RC segments and R+C leads
 w      (W,)       the wires: logs of the segments, then leads                     log ohm, ohm
-m      (3,)       log of the mean segment of each layer, top and bottom, and the  log ohm, ohm
-                  mean lead
-V      (3, 3)     its covariance; V0 before any frame
+m      (n,)       log of the mean segment of each layer, top and bottom, and the  log ohm, ohm
+                  mean lead: n = 3. On a damp skin n = 5: also what neighbouring  uS
+                  rows, and columns, leak into each other at each crossing
+V      (n, n)     its covariance; V0 before any frame
 s      (W,)       deviation of a wire from its mean, each by itself               log ohm, ohm
-L      (3, W)     ones: which wires are of which mean
+L      (n, W)     ones: which wires are of which mean
 P      (W, W)     covariance of w, L^T V L + s^2
 J      (n, W)     slope of n readings by w, over their noise
 N      (n, n)     covariance of these readings, were the means known: of their    1
@@ -156,7 +157,7 @@ class WireBelief(ABC):
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
-    means: m, (3,). It is replaced when the belief changes, and never written into.
+    means: m, (n,). It is replaced when the belief changes, and never written into.
     leads_of_ports: which leads are in the readings of each port: those of its lines that are sensed
         at near ends, (RC, R+C), ones and zeros.
     """
@@ -194,13 +195,23 @@ class WireBelief(ABC):
         self._nominal: Float = np.array([*np.log(nominal), lead_ohm])
         self.reset()
 
+    def expect_leaks(self, leaks_us: Float, stds_us: Float) -> None:
+        """Know that lines leak, by the rest readings, and forget what frames have shown.
+
+        leaks_us: from row to row, and from column to column, at each crossing (2,) [uS].
+        """
+        self._nominal = np.concatenate([self._nominal[:3], leaks_us])
+        stds = np.sqrt(np.diagonal(self._prior_covariance)[:3])
+        self._prior_covariance = np.diag(np.concatenate([stds, stds_us])) ** 2
+        self.reset()
+
     def reset(self) -> None:
         """Forget what frames have shown."""
         self._lesson_cells: Float | None = None  # log resistances of the last lesson's frame
         self._believe(self._nominal, self._prior_covariance)
 
     def _believe(self, means: Float, covariance: Float) -> None:
-        """Take these for what is known, (3,) and (3, 3).
+        """Take these for what is known, (n,) and (n, n).
 
         A lead that nobody told may be anything up to kilohms, and that is how frames teach it. But
         most skins have a usual lead, and frames that tell nothing of it, as under fingertips, are
@@ -267,12 +278,21 @@ class WireBelief(ABC):
         means, covariance = self._known
         top, bottom = np.exp(means[:2]).tolist()
         lead = max(float(means[2]), 0.0)
-        return WireOhm(top, bottom, lead, *np.sqrt(covariance.diagonal()).tolist())
+        return WireOhm(top, bottom, lead, *np.sqrt(covariance.diagonal()[:3]).tolist())
 
     def circuit(self, log_cells: Float, means: Float) -> PortCircuit:
-        """The skin with these logs of its cells (RC,), and these means (3,), without its leads."""
+        """The skin with these logs of its cells (RC,), and these means (n,), without its leads."""
         cell_siemens = np.exp(-log_cells).reshape(self.shape)
-        return PortCircuit(cell_siemens, *np.exp(means[:2]), far=self.far)
+        return PortCircuit(
+            cell_siemens, *np.exp(means[:2]), far=self.far, leak_siemens=self.leak_siemens(means)
+        )
+
+    def leak_siemens(self, means: Float) -> tuple[float, float]:
+        """From row to row, and from column to column, at each crossing, by these means (n,) [S]."""
+        if len(means) == 3:
+            return 0.0, 0.0
+        by_row, by_column = (1e-6 * max(leak, 0.0) for leak in means[3:].tolist())
+        return by_row, by_column
 
     @property
     def leads_of_port(self) -> int:
@@ -286,10 +306,10 @@ class WireBelief(ABC):
     @property
     def mean(self) -> Float:
         """Expected wires w, (W,)."""
-        return np.repeat(self.means, self._counts)
+        return np.repeat(self.means[:3], self._counts)
 
     def mean_std(self) -> Float:
-        """Standard deviations of the means, (3,)."""
+        """Standard deviations of the means, (n,)."""
         return np.asarray(np.linalg.norm(self._root, axis=1))
 
     def odd_lead_ohm(self) -> float:
@@ -301,7 +321,7 @@ class WireBelief(ABC):
 
     def stds(self) -> WireStds:
         """How well the means are known."""
-        *layers, lead_std_ohm = self.mean_std().tolist()
+        *layers, lead_std_ohm = self.mean_std()[:3].tolist()
         return WireStds(max(layers), self._known_lead_std_ohm / lead_std_ohm)
 
     @property
@@ -309,41 +329,42 @@ class WireBelief(ABC):
         return float(self._known[1][2, 2] ** 0.5)
 
     def per_mean_std(self, slopes: Float) -> Float:
-        """J L^T V^1/2, (n, 3), from slopes by the means, J L^T (n, 3)."""
+        """J L^T V^1/2 from slopes by the means, J L^T: one row a reading, one column a mean."""
         return slopes @ self._root
 
     def per_std(self, by_segment: Float, by_lead: Float, of_cells: Float) -> Float:
-        """J P^1/2, (n, W + 3): by what wires have of their own, by what they share.
+        """J P^1/2: by what wires have of their own (W columns), by what they share (one a mean).
 
-        by_segment, by_lead: J of the log segments (n, 2RC) and of the leads (n, R+C).
-        of_cells: what the means change in readings by the cells at rest that follow them, (n, 3).
+        by_segment, by_lead: J of the log segments (2RC columns) and of the leads (R+C).
+        of_cells: what the means change in readings besides: by leaks, and by the cells at rest that
+            follow all means.
         """
-        segments = by_segment.shape[1]
-        root = np.empty((len(by_segment), sum(self._counts) + 3))
+        segments, wires = by_segment.shape[1], sum(self._counts)
+        root = np.empty((len(by_segment), wires + len(self.means)))
         np.multiply(by_segment, SEGMENT_STD, out=root[:, :segments])
-        np.multiply(by_lead, self.own_lead_ohm(self.means), out=root[:, segments:-3])
+        np.multiply(by_lead, self.own_lead_ohm(self.means), out=root[:, segments:wires])
         by_mean = of_cells.copy()
         by_mean[:, :2] += by_segment.reshape(len(root), 2, -1).sum(axis=2)
         by_mean[:, 2] += by_lead.sum(axis=1)
-        root[:, -3:] = self.per_mean_std(by_mean)
+        root[:, wires:] = self.per_mean_std(by_mean)
         return root
 
     def means_off(self, mean_stds: Float) -> Float:
-        """The means (3,) that are so many deviations off: m + V^1/2 `mean_stds` (3,)."""
+        """The means (n,) that are so many deviations off: m + V^1/2 `mean_stds` (n,)."""
         return self.means + self._root @ mean_stds
 
     def wires_off(self, mean_stds: Float, segments_off: Float, leads_off: Float) -> Float:
-        """w (W,) of means that are so many deviations off (3,), and wires, about their means.
+        """w (W,) of means that are so many deviations off (n,), and wires, about their means.
 
         segments_off: of the logs of segments (2RC,). leads_off: of leads (R+C,) [ohm].
         """
         # What comes from slopes holds as far as readings are linear in the logs.
         logs_off = np.minimum(np.maximum(segments_off, -MAX_STEP_LOG), MAX_STEP_LOG)
-        common = np.repeat(self.means_off(mean_stds), self._counts)
+        common = np.repeat(self.means_off(mean_stds)[:3], self._counts)
         return np.asarray(common + np.concatenate([logs_off, leads_off]))
 
     def moved_since(self, means: Float, per_mean_std: Float) -> Float:
-        """What readings have moved since m was `means` (3,): J L^T (m - means), (n,)."""
+        """What readings have moved since m was `means` (n,): J L^T (m - means)."""
         return np.asarray(per_mean_std @ solve_lower(self._root, self.means - means))
 
     def segment_ohm(self, wires: Float) -> Float:
@@ -409,7 +430,8 @@ class LearnedWires(WireBelief):
         self._lesson_cells, self._lesson_noise = fit.log_cells, noise
         before = self.means
         self.take(fit.lesson, replace_last=again or not is_news)
-        return bool((np.abs(self.means - before) > [FAR_LOG, FAR_LOG, USUAL_LEAD_STD_OHM]).any())
+        moved = np.abs(self.means - before)[:3]
+        return bool((moved > [FAR_LOG, FAR_LOG, USUAL_LEAD_STD_OHM]).any())
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
         """One Kalman step.
@@ -430,7 +452,7 @@ class LearnedWires(WireBelief):
         # belief is V' = (V^-1 + A)^-1, m' = m + V' L J^T N^-1 z: the same as that by S above.
         gain = solve(factor, per_mean_std).T
         per_log = np.linalg.inv(self._root)
-        weights = per_log.T @ np.linalg.inv(np.eye(3) - gain @ per_mean_std) @ gain
+        weights = per_log.T @ np.linalg.inv(np.eye(len(gain)) - gain @ per_mean_std) @ gain
         information, pull = weights @ per_mean_std @ per_log, weights @ residual
         fades = STEADY_FADE, AGILE_FADE
         self._filters = [
@@ -446,15 +468,17 @@ class LearnedWires(WireBelief):
         self._believe(steady.means + share * apart, covariance)
 
     def _stepped(self, before: _Filter, fade: float, information: Float, pull: Float) -> _Filter:
-        """One filter after a lesson. information: A, (3, 3). pull: g_0 at `self.means`, (3,)."""
-        # A bend changes no leads, and layers by no more than told ones may be off.
-        bent = np.minimum(np.diagonal(self._prior_covariance), [LAYER_STD**2, LAYER_STD**2, 0.0])
+        """One filter after a lesson. information: A, (n, n). pull: g_0 at `self.means`, (n,)."""
+        # A bend changes no leads, and layers by no more than told ones may be off. Nor does it
+        # change leaks, but these dry.
+        bent = np.diagonal(self._prior_covariance).copy()
+        bent[:3] = np.minimum(bent[:3], [LAYER_STD**2, LAYER_STD**2, 0.0])
         widest = np.diag(np.maximum(np.diagonal(before.covariance), bent))
         faded = before.covariance + fade * (widest - before.covariance)
         covariance = np.asarray(np.linalg.inv(np.linalg.inv(faded) + information), np.float64)
         off = before.means - self.means
         here = pull - information @ off
         score = off @ pull - 0.5 * off @ information @ off + 0.5 * here @ covariance @ here
-        score -= 0.5 * np.linalg.slogdet(np.eye(3) + faded @ information)[1]
+        score -= 0.5 * np.linalg.slogdet(np.eye(len(off)) + faded @ information)[1]
         means: Float = np.asarray(before.means + covariance @ here, np.float64)
         return _Filter(means, covariance, MEMORY * before.score + float(score))
