@@ -34,7 +34,7 @@ BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host pins demo test check docs format firmware wheel test-firmware test-arduino-gcc check-firmware sim \
-        test-host fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
+        test-host test-world fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -109,6 +109,9 @@ sim: setup ## build the simulator that runs the firmware on an emulated skin
 # Half of the time that tests take is waiting, so three processes keep two cores busy.
 test-host: setup firmware sim ## pytest, three processes for two cores
 	$(ONE_THREAD) $(BIN)/pytest --numprocesses $$((($$(nproc) * 3 + 1) / 2)) --dist worksteal
+
+test-world: setup-host ## test integrations/ with the real libraries: MuJoCo and others (build/world)
+	tools/test_world.sh mujoco
 
 FUZZED := build/fuzz/frame_reader
 READER := firmware/src/core/frame_reader

@@ -22,6 +22,10 @@ OUTSIDE = {
     "SECURITY.md": "security.md",
     "protocol/FRAMES.md": "frames.md",
     **{f"examples/{path.name}": f"examples/{path.name}" for path in ROOT.glob("examples/*.*")},
+    **{
+        f"integrations/{path.parent.name}/README.md": f"integrations/{path.parent.name}.md"
+        for path in ROOT.glob("integrations/*/README.md")
+    },
 }
 _INSIDE = {uri: path for path, uri in OUTSIDE.items()}
 _LINK = re.compile(r"(\]\()([^)#\s:]+)((?:#[^)\s]*)?\))")

@@ -54,7 +54,7 @@ PAGES = [
     Page(path)
     for pattern in (
         *("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md"),
-        *("docs/*.md", "examples/*.md", ".github/ISSUE_TEMPLATE/*.md"),
+        *("docs/*.md", "examples/*.md", "integrations/*/*.md", ".github/ISSUE_TEMPLATE/*.md"),
     )
     for path in sorted(ROOT.glob(pattern))
 ]

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pad against forces that are known without it: a weight, and the motors of a gripper."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import ohmskin
+from ohmskin_mujoco import Pad
+
+HERE = Path(__file__).parents[1]
+WEIGHT = """<mujoco><option timestep="0.001"/><worldbody>
+<body name="plate"><geom type="box" size="0.04 0.04 0.005" pos="0 0 -0.005"/>
+<site name="skin" pos="-0.035 -0.035 0"/></body>
+<body pos="{x} {y} 0.0199"><freejoint/><geom type="sphere" size="0.02" mass="{kg}"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def skin_json(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """As a user makes one: made-up presses, then a pitch."""
+    path = tmp_path_factory.mktemp("skin") / "skin.json"
+    presses = HERE.parents[1] / "examples" / "presses.csv"
+    for words in (
+        ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80"),
+        ("skin", path, "--pitch-mm", "10,10"),
+    ):
+        subprocess.run([sys.executable, "-m", "ohmskin", *map(str, words)], check=True)
+    return str(path)
+
+
+def resting(kg: float, x: float = 0.0, y: float = 0.0) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = mujoco.MjModel.from_xml_string(WEIGHT.format(x=x, y=y, kg=kg))
+    data = mujoco.MjData(model)
+    for _ in range(1500):
+        mujoco.mj_step(model, data)
+    return model, data
+
+
+def test_a_weight_lies_on_the_skin(skin_json: str) -> None:
+    """m g by hand; at a place between taxels, which its centre must be."""
+    model, data = resting(0.3, x=0.012, y=-0.007)
+    pad = Pad(model, "skin", ohmskin.load_calibration(skin_json))
+    assert pad.spread_m == pytest.approx(0.01)
+    true_n = pad.force_n(data)
+    assert true_n.sum() == pytest.approx(0.3 * 9.81, rel=1e-3)
+    column, row = (np.array([0.012, -0.007]) + 0.035) / 0.01
+    assert (true_n.sum(0) @ np.arange(8)) / true_n.sum() == pytest.approx(column, abs=0.05)
+    assert (true_n.sum(1) @ np.arange(8)) / true_n.sum() == pytest.approx(row, abs=0.05)
+    scan = pad.read(data)
+    assert scan.force_n.sum() == pytest.approx(0.3 * 9.81, rel=0.02)
+    assert scan.wrench[0] == pytest.approx([0, 0, -0.3 * 9.81], rel=0.02)
+    (contact,) = scan.contacts
+    assert (contact.row, contact.column) == pytest.approx((row, column), abs=0.3)
+
+
+def test_nothing_touches_it(skin_json: str) -> None:
+    model, data = resting(0.3, x=0.2)  # it has fallen beside
+    pad = Pad(model, "skin", ohmskin.load_calibration(skin_json))
+    assert not pad.force_n(data).any()
+    assert not pad.read(data).contacts
+
+
+def test_1_to_10_newtons_are_shown_to_2_percent(skin_json: str) -> None:
+    sys.path.insert(0, str(HERE))
+    from squeeze import squeezed
+
+    table = squeezed(skin_json)
+    _, motor_n, on_skin_n, shown_n = table.T
+    assert motor_n.min() < 1.7
+    assert motor_n.max() > 9.9
+    assert on_skin_n == pytest.approx(motor_n, rel=0.05, abs=0.2)  # the gripper moves slowly
+    rms = np.sqrt(np.mean((shown_n - on_skin_n) ** 2)) / on_skin_n.mean()
+    print(f"rms over the mean {100 * rms:.2f} %")
+    assert rms < 0.02
+
+
+def test_what_is_missing_is_said(skin_json: str) -> None:
+    model, _ = resting(0.1)
+    known = ohmskin.load_calibration(skin_json)
+    with pytest.raises(ValueError, match="no site 'hand'"):
+        Pad(model, "hand", known)
+    with pytest.raises(ValueError, match="ohmskin skin FILE --pitch-mm"):
+        Pad(model, "skin", replace(known, geometry=None))

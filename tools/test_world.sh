@@ -1,0 +1,55 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+#
+# Usage: tools/test_world.sh NAME...        (run by `make test-world`, from the repository's root)
+#
+# Tests integrations/NAME with the real libraries, each in an environment of its own below
+# build/world. Prints a line for each, with the number of tests that passed. A test that is skipped
+# is a failure, because all that a test needs is installed here.
+#
+#   PYTHON312=/path/to/python3.12     for ros2 and lerobot, which need this version
+set -uo pipefail
+
+python_for() { # name
+    local candidate
+    case $1 in
+        ros2 | lerobot)
+            for candidate in "${PYTHON312:-}" python3.12 ~/.pyenv/versions/3.12*/bin/python3.12 \
+                "$(command -v uv >/dev/null && uv python find 3.12 2>/dev/null)"; do
+                [[ -n $candidate ]] || continue
+                if "$candidate" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null; then
+                    echo "$candidate"
+                    return
+                fi
+            done
+            return 1
+            ;;
+        *) echo .venv/bin/python ;;
+    esac
+}
+
+failed=0
+for name in "$@"; do
+    env=build/world/$name
+    if ! python=$(python_for "$name"); then
+        echo "test-world: $name: not tested: needs Python 3.12 (say PYTHON312=/path/to/python3.12)"
+        continue
+    fi
+    if [[ ! $env/.stamp -nt integrations/$name/pyproject.toml || ! $env/.stamp -nt pyproject.toml ]]; then
+        echo "test-world: $name: making $env with $("$python" --version)"
+        "$python" -m venv --clear "$env" &&
+            "$env/bin/pip" install --quiet -e . -e "integrations/$name[test]" 2>"$env/pip.log" &&
+            touch "$env/.stamp" || { tail -5 "$env/pip.log"; failed=1; continue; }
+    fi
+    said=$(env -u PYTHONPATH PYTHONPATH=tests/helpers OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+        "$env/bin/python" -m pytest --rootdir "integrations/$name" -c "integrations/$name/pyproject.toml" \
+        "integrations/$name" 2>&1)
+    code=$?
+    summary=$(tail -1 <<<"$said")
+    if ((code)) || grep -q skipped <<<"$summary"; then
+        echo "$said"
+        failed=1
+    fi
+    echo "test-world: $name: $summary"
+done
+exit $failed
