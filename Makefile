@@ -28,7 +28,7 @@ BIOME = $(firstword $(shell ls tools/page_lint/node_modules/@biomejs/cli-*/biome
 PAGE := --config-path=tools/page_lint --error-on-warnings host/ohmskin/view/page
 C_FILES = $(shell find firmware fuzz -name '*.c' -o -name '*.cpp' -o -name '*.h')
 
-BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far orders desk force \
+BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers newtons knead far pace orders desk force \
                 export view strangers largest boards honest quick)
 
 .DEFAULT_GOAL := help
@@ -169,6 +169,9 @@ bench-knead: setup-host ## measure forces of skins that were kneaded over a scal
 
 bench-honest: setup-host ## measure whether answers say so where a skin is not as the model supposes
 	$(BENCH)/bench_honest.py
+
+bench-pace: setup-host ## measure what it costs to read less of a skin, and what it saves, simulated
+	$(BENCH)/bench_pace.py
 
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
 	$(BENCH)/bench_far.py

@@ -260,8 +260,9 @@ class Estimator(ABC):
     def _chi2(self, ports: PortReadings, current_siemens: Float) -> float:
         """`Estimate.chi2` of a model that gives these currents of ports (R, C) [S]."""
         knowledge = self.knowledge
-        if knowledge.checked_names != NEAR:
-            return float(np.mean(((ports.current - current_siemens) / ports.current_std) ** 2))
+        if knowledge.checked_names != NEAR or ports.region is not None:
+            off = ((ports.current - current_siemens) / ports.current_std).ravel()[ports.region]
+            return float(off.ravel() @ off.ravel()) / off.size
         references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
         model = ratio_from_current(current_siemens, *references)
         residual = (ports.ratio - model).ravel() / knowledge.ratio_std

@@ -249,16 +249,17 @@ class SkinFaults:
                 return f"{pair} conducted alike at rest, and more than others"
         return ""
 
-    def find(self, now: PortCurrents) -> str:
+    def find(self, now: PortCurrents, *, is_whole: bool = True) -> str:
         """The first fault that a frame's currents show, in words, or empty.
 
-        A frame is compared for shorted lines only if it has no shorted port and no loss, and its
-        columns only if no rows are shorted.
+        A frame is compared for shorted lines only if it is whole and has no shorted port and no
+        loss, and its columns only if no rows are shorted.
         """
         fault = self._short(now)
         if fault or self._rest is None:
             return fault
-        if fault := self._loss(now, self._rest):
+        fault = self._loss(now, self._rest)
+        if fault or not is_whole:
             return fault
         is_higher = now.current > (1.0 + DRIFT_SHARE) * self._rest.current
         for axis, pairs in enumerate(self._pairs):

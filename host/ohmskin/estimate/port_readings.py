@@ -111,9 +111,11 @@ class PortReader:
         near = self._read_near(ratio, in_order=in_order)
         # `find` is not called where another fault is known: such a frame must not count as one that
         # shows lines alike, or apart.
-        fault = near.fault or self._rest_fault or self._faults.find(near.ports)
+        region = self._partial.region
+        fault = near.fault or self._rest_fault
+        fault = fault or self._faults.find(near.ports, is_whole=region is None)
         if not any(self.far):
-            return PortReadings(ratio, *near.ports, fault, region=self._partial.region)
+            return PortReadings(ratio, *near.ports, fault, region=region)
         assert near.variances is not None  # at far ends, all is read
         assert near.spread is not None
         variance = self._noise.between_ends(near.variances)

@@ -52,7 +52,9 @@ class WholeFrame:
         self.log_cells, self.log_cells_std = log_cells, log_cells_std
         self.series_ohm = ref_ohm + belief.leads_of_port * belief.means[2]
         siemens = np.exp(-log_cells).reshape(belief.shape)
-        self.net = RestNetwork(siemens, *np.exp(belief.means[:2]), far=belief.far)
+        leak_siemens = belief.leak_siemens(belief.means)
+        wires_ohm = np.exp(belief.means[:2])
+        self.net = RestNetwork(siemens, *wires_ohm, far=belief.far, leak_siemens=leak_siemens)
 
 
 class RegionFit:
@@ -75,15 +77,16 @@ class RegionFit:
         self._cell_volt = net.cell_volt[region[:, None], region]
         self._rho = net.port_ohm[region]
         self._eye = np.eye(region.size)
+        self._right = np.empty((region.size, region.size + 1), order="F")
         currents = (net.port_volt[:, region] * net.cell_siemens[:, None]).T
         square = ((self._rho + whole.series_ohm) ** -2.0)[:, None]
         by_cell = currents * currents / net.cell_siemens * square
         by_cell[:, region] = 0.0
-        self._by_wires = -belief.per_std(
-            square * net.by_wires_of(region, currents, currents),
-            square * belief.leads_of_ports[region],
-            by_cell @ whole.prior.by_means,
-        )
+        of_cells = by_cell @ whole.prior.by_means
+        if belief.means.size > 3:
+            of_cells[:, 3:] += 1e-6 * square * net.by_leaks()[region]  # by uS
+        by_wire = square * net.by_wires_of(region, currents, currents)
+        self._by_wires = belief.per_std(by_wire, square * belief.leads_of_ports[region], of_cells)
         noise = np.hstack([self._by_wires, by_cell * whole.log_cells_std])
         self._noise = gram(noise)
         self._age = 0
@@ -95,24 +98,27 @@ class RegionFit:
         system = self._noise.copy(order="F")
         system.ravel(order="F")[:: region.size + 1] += ports.current_std.ravel()[region] ** 2
         factor = cholesky(system)
-        is_last = False
-        for self.iterations in range(MOST_STEPS + 1):
+        for self.iterations in range(1, MOST_STEPS + 1):
             siemens = np.exp(x)
             added = siemens - self._before
             _, _, volt, _ = lapack.dgesv(self._eye + self._cell_volt * added, self._port_volt)
-            rho = self._rho - (self._port_volt * volt * added[:, None]).sum(axis=0)
+            rho = self._rho - added @ (self._port_volt * volt)
             current = 1.0 / (rho + whole.series_ohm)
-            slopes = volt * volt * siemens[:, None] * (current * current)
-            whitened = solve_lower(factor, np.column_stack([slopes.T, measured - current]))
+            # The slopes by each cell, and the residual, whitened.
+            self._right[:, :-1] = (volt * volt).T * siemens * (current * current)[:, None]
+            self._right[:, -1] = measured - current
+            whitened = solve_lower(factor, self._right)
             by_cell, residual = whitened[:, :-1], whitened[:, -1]
-            if is_last:
-                break
             centre, variance = whole.prior.normal(-x, region)
             system = by_cell.T @ by_cell
             system.ravel()[:: region.size + 1] += 1.0 / variance
             move = solve_positive(system, residual @ by_cell - (x + centre) / variance)
             is_last = (move * move * system.diagonal()).max() < CLOSE_STDS**2
-            x = x + np.minimum(np.maximum(move, -MAX_STEP_LOG), MAX_STEP_LOG)
+            move = np.minimum(np.maximum(move, -MAX_STEP_LOG), MAX_STEP_LOG)  # faster than np.clip
+            x = x + move
+            if is_last:
+                break
+        residual = residual - by_cell @ move
         self._x = x
         if not is_last or residual @ residual > MAX_CHI2 * region.size:
             return False

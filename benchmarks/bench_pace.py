@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure what it costs to read less of a skin than all: accuracy, and what it saves: time.
+
+    make bench-pace
+
+Simulated: 8x8 cells, 10 bits, noise of 0.3 LSB, lines that settle at once; `touch`, wires told,
+rest of 90 whole scans. Random touches (6 at most, each frame anew), fingertips; five skins of each.
+
+half_*, quick_*     two readings of each cell, a and b, and one, b: their median error over that of
+                    all four (whichever scene is worse), and the share of pressed cells within four
+                    stated deviations.
+partial_*           a region of 3x3 cells around one fingertip, b alone, after one whole frame in
+                    thirty: time of its estimate over that of whole frames, and in units of `make
+                    bench-estimators`.
+joint_16x16_*       time of `joint` under a fingertip on 16x16 cells, wires not told, in units of
+                    8x8 cells: median and 99th percentile.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from bars import Part, at_least, at_most, run  # beside this file
+from bench_estimators import times_of, unit_s
+from ohmskin.arrays import Float
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.protocol import ADC_BITS
+from studies.judge import answers_of, judge, pooled
+from studies.trials import (
+    NOISE_LSB,
+    NOMINAL_WIRE_OHM,
+    Trial,
+    finger_trial,
+    random_trial,
+    rounded,
+)
+
+SEED, SKINS, FRAMES, REST_SCANS = 7000, 5, 40, 90
+READ = {"near": [0, 1, 2, 3], "half": [0, 1], "quick": [1]}
+WHOLE_EVERY = 30  # frames, of which one is whole
+STAYS = 10  # frames of a region for which a fingertip stays where it is
+WARM_UP = 3  # frames whose time does not count
+SMALL_FINGER = (0.45, 0.5)  # standard deviations of a fingertip that 3x3 cells show [cells]
+
+
+def read(exact: Float, random: np.random.Generator) -> Float:
+    """What a board reads: noise, then codes."""
+    noise = NOISE_LSB / 2**ADC_BITS * random.standard_normal(exact.shape)
+    return ratio_from_codes(quantise(exact + noise))
+
+
+def frames_of(trial: Trial, seed: int, times: int = 1) -> tuple[SkinKnowledge, Float]:
+    """What is known of a skin, and readings of its frames, each so many times, (F, R, C, 4)."""
+    random = np.random.default_rng(seed)
+    rest = trial.readings.rest_ratio
+    assert rest is not None
+    rest_ratio = read(np.repeat(rest[None], REST_SCANS, axis=0), random).mean(axis=0)
+    rows, columns, _ = rest.shape
+    knowledge = SkinKnowledge(
+        rows,
+        columns,
+        adc_bits=ADC_BITS,
+        rest_ratio=rest_ratio,
+        nominal_wire_ohm=WireOhm(*NOMINAL_WIRE_OHM, lead=0.0),
+    )
+    return knowledge, read(np.repeat(trial.readings.ratio, times, axis=0), random)
+
+
+def part_of(ratio: Float, kinds: list[int], rows: slice, columns: slice) -> Float:
+    """These readings (R, C, 4) of these lines alone: others are not a number."""
+    some = np.full_like(ratio, np.nan)
+    some[rows, columns, kinds] = ratio[rows, columns, kinds]
+    return some
+
+
+def estimates(trial: Trial, mode: str, seed: int) -> list[Estimate]:
+    knowledge, frames = frames_of(trial, seed)
+    estimator, every = make_estimator("touch", knowledge), slice(None)
+    return [estimator.estimate(part_of(ratio, READ[mode], every, every)) for ratio in frames]
+
+
+def of_modes(part: Part) -> dict[str, float]:
+    """half_*, quick_*."""
+    scenes: list[Callable[[int], Trial]] = [
+        lambda seed: random_trial(8, 8, 6, part.of(FRAMES), seed),
+        lambda seed: finger_trial(8, 8, part.of(FRAMES), seed),
+    ]
+    over: dict[str, list[float]] = {mode: [] for mode in READ}
+    within: dict[str, list[float]] = {mode: [] for mode in READ}
+    for scene in scenes:
+        trials = [scene(SEED + number) for number in range(part.of(SKINS))]
+        for mode in READ:
+            judged = [
+                judge(
+                    answers_of(estimates(each, mode, number)),
+                    each.cell_siemens,
+                    each.rest.cell_siemens,
+                )
+                for number, each in enumerate(trials)
+            ]
+            over[mode].append(float(np.mean([one.error_percent() for one in judged])))
+            within[mode].append(pooled(judged).pressed_within_percent() / 100)
+    figures = {}
+    for mode in ("half", "quick"):
+        ratios = np.array(over[mode]) / over["near"]
+        figures[f"{mode}_over_near"] = round(float(ratios.max()), 2)
+        figures[f"{mode}_within_4"] = round(min(within[mode]), 4)
+    return figures
+
+
+def of_region(part: Part) -> dict[str, float]:
+    """partial_*."""
+    trial = finger_trial(8, 8, part.of(40), SEED, sigma_cells=SMALL_FINGER)
+    knowledge, frames = frames_of(trial, SEED, STAYS)
+    peaks = [np.unravel_index(cells.argmax(), cells.shape) for cells in trial.cell_siemens]
+    peaks = [peak for peak in peaks for _ in range(STAYS)]
+    lines = [tuple(slice(n - 1, n + 2) for n in np.clip(peak, 1, 6)) for peak in peaks]
+    unit = unit_s(64)
+
+    def seconds(of_frames: Iterable[Float]) -> Float:
+        estimator, taken = make_estimator("joint", knowledge), []
+        for ratio in of_frames:
+            whole = not np.isnan(ratio).any()
+            taken.append((estimator.estimate(ratio).seconds, unit(), whole))
+        return np.array(taken[WARM_UP:] or taken)
+
+    whole = seconds(frames)
+    some = seconds(
+        ratio if number % WHOLE_EVERY == 0 else part_of(ratio, READ["quick"], *where)
+        for number, (ratio, where) in enumerate(zip(frames, lines, strict=True))
+    )
+    partial = some[some[:, 2] == 0] if (some[:, 2] == 0).any() else some
+    return {
+        "partial_time_over_whole": round(
+            float(np.median(partial[:, 0]) / np.median(whole[:, 0])), 2
+        ),
+        "partial_3x3_units": round(float(np.median(partial[:, 0] / partial[:, 1])), 1),
+    }
+
+
+def of_large(part: Part) -> dict[str, float]:
+    """joint_16x16_*."""
+    trials = (finger_trial(16, 16, WARM_UP + part.of(60), SEED + number) for number in range(part.of(4)))
+    readings = [rounded(trial.readings) for trial in trials]
+    seconds, _ = times_of("joint", readings)
+    unit = unit_s(64)
+    units = seconds / float(np.median([unit() for _ in range(part.of(200))]))
+    median, p99 = np.percentile(units, [50, 99])
+    return {
+        "joint_16x16_finger_units": round(float(median)),
+        "joint_16x16_finger_units_p99": round(float(p99)),
+    }
+
+
+def measure(part: Part) -> dict[str, float]:
+    """All figures, as the JSON line has them."""
+    return of_modes(part) | of_region(part) | of_large(part)
+
+
+BARS = [
+    at_most("half_over_near", 1.3),
+    at_most("quick_over_near", 1.9),
+    at_least("half_within_4", 0.98),
+    at_least("quick_within_4", 0.98),
+    at_most("partial_time_over_whole", 0.6),
+    at_most("partial_3x3_units", 5),
+    at_most("joint_16x16_finger_units", 115),
+    at_most("joint_16x16_finger_units_p99", 145),
+]
+
+if __name__ == "__main__":
+    sys.exit(run(__doc__, measure, BARS))
