@@ -146,8 +146,8 @@ def of_region(part: Part) -> dict[str, float]:
 
 def of_large(part: Part) -> dict[str, float]:
     """joint_16x16_*."""
-    trials = (finger_trial(16, 16, WARM_UP + part.of(60), SEED + number) for number in range(part.of(4)))
-    readings = [rounded(trial.readings) for trial in trials]
+    frames, seeds = WARM_UP + part.of(60), range(SEED, SEED + part.of(4))
+    readings = [rounded(finger_trial(16, 16, frames, seed).readings) for seed in seeds]
     seconds, _ = times_of("joint", readings)
     unit = unit_s(64)
     units = seconds / float(np.median([unit() for _ in range(part.of(200))]))
