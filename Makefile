@@ -33,7 +33,7 @@ BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers 
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-host pins demo test check docs format firmware wheel test-firmware test-arduino-gcc check-firmware sim \
+.PHONY: help setup setup-host pins demo test check docs format firmware pico wheel test-firmware test-arduino-gcc check-firmware sim \
         test-host test-world fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
 
 help: ## list the targets
@@ -42,7 +42,7 @@ help: ## list the targets
 demo: setup-host ## estimate touches on an emulated skin: no board, no compiler needed
 	$(BIN)/ohmskin demo
 
-test: setup check test-firmware firmware sim check-firmware test-host ## build, check and test everything
+test: setup check test-firmware firmware pico sim check-firmware test-host ## build, check and test everything
 
 setup: $(STAMP) $(PIO_STAMP) ## install what development needs (apt packages, .venv, PlatformIO)
 
@@ -87,6 +87,9 @@ format: setup ## put Python, C++ and JavaScript sources into the common format
 firmware: setup ## build the firmware for all boards
 	$(BIN)/pio run
 
+pico: setup ## build the firmware for a Raspberry Pi Pico: firmware/pico/build/ohmskin.uf2
+	$(MAKE) -C firmware/pico
+
 # The copies go: a later wheel would carry an old firmware.
 wheel: firmware ## build dist/ohmskin-*.whl with the firmware of all boards, to flash without a checkout
 	mkdir -p $(HEX)
@@ -107,7 +110,7 @@ sim: setup ## build the simulator that runs the firmware on an emulated skin
 	$(MAKE) -C firmware/sim
 
 # Half of the time that tests take is waiting, so three processes keep two cores busy.
-test-host: setup firmware sim ## pytest, three processes for two cores
+test-host: setup firmware pico sim ## pytest, three processes for two cores
 	$(ONE_THREAD) $(BIN)/pytest --numprocesses $$((($$(nproc) * 3 + 1) / 2)) --dist worksteal
 
 test-world: setup-host ## test integrations/ with the real libraries: MuJoCo and others (build/world)
@@ -209,6 +212,7 @@ clean: ## remove what was built
 	rm -rf .pio/build .pio/libdeps build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name .venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
 	$(MAKE) -C firmware/sim clean
+	$(MAKE) -C firmware/pico clean
 
 distclean: clean ## remove .venv and PlatformIO's packages too
 	rm -rf .venv .pio firmware/second_sim/node_modules tools/page_lint/node_modules

@@ -46,8 +46,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _is_missing("ngspice", "ngspice")
     if item.get_closest_marker("browser") and not shutil.which("chromium"):
         _is_missing("Chromium", "chromium")
-    if item.get_closest_marker("second_sim") and not second_simulator.is_installed():
+    if item.get_closest_marker("second_sim") and not second_simulator.is_installed("avr8js"):
         _is_missing("avr8js", "npm")
+    if item.get_closest_marker("pico"):
+        if not second_simulator.PICO_ELF.exists():
+            pytest.skip("needs 'make pico'")
+        if not second_simulator.is_installed("rp2040js"):
+            _is_missing("rp2040js", "npm")
 
 
 def _is_missing(program: str, package: str) -> None:

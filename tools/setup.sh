@@ -4,13 +4,14 @@
 # Usage: tools/setup.sh host|all        (run by `make`, from the repository's root)
 #
 # host: .venv with the ohmskin package.
-# all: also the AVR tools, ngspice, Chromium and node (for tests) from apt, avr8js (a second
-# simulator, for tests) and biome (for the page's JavaScript) from npm, and the development tools.
+# all: also the tools of AVR and ARM, ngspice, Chromium and node (for tests) from apt, avr8js and
+# rp2040js (simulators, for tests) and biome (for the page's JavaScript) from npm, and the development tools.
 # Installs only what is missing, and says what. Python packages are those files that were tested, by their
 # hashes, and no package is built but this one: tools/pins.
 set -euo pipefail
 
 APT_PACKAGES=(gcc-avr binutils-avr avr-libc arduino-core-avr avrdude cppcheck
+              gcc-arm-none-eabi libnewlib-arm-none-eabi
               simavr libsimavr-dev libelf-dev gcc g++ make ngspice)
 
 fail() {
@@ -106,7 +107,7 @@ all)
             echo "setup: without Chromium (Ubuntu has a snap alone) tests of the page are skipped"
         command -v npm >/dev/null || apt_install nodejs npm || true
     fi
-    npm_install firmware/second_sim avr8js "tests in the second simulator are skipped"
+    npm_install firmware/second_sim "avr8js and rp2040js" "tests in the second simulator, and of the Pico, are skipped"
     npm_install tools/page_lint biome "the page's JavaScript is not linted"
     make_venv
     pip_install tools/pins/all.txt

@@ -169,6 +169,10 @@ class Board {
     }
 
     // ---- the skin
+    setTable(table) {
+        this.table.set(table);
+    }
+
     pins([letter, bit], width) {
         const { DDR, PORT } = this.chip.ports[letter];
         const mask = ((1 << width) - 1) << bit;

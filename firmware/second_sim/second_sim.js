@@ -1,10 +1,11 @@
 #!/usr/bin/env node
 // SPDX-License-Identifier: Apache-2.0
-// second_sim.js --board uno|megaatmega2560 firmware.hex: see README.md for the operations.
+// second_sim.js --board uno|megaatmega2560|pico FIRMWARE: see README.md for the operations.
 "use strict";
 
 const fs = require("fs");
 const { Board } = require("./board");
+const { Pico } = require("./pico");
 
 const STDIN = 0, STDOUT = 1;
 const HOLD_BYTES = 18;
@@ -50,7 +51,7 @@ const OPERATIONS = {
     },
     W: (board, content) => board.line.write(content),
     T: (board, content) => {
-        board.table.forEach((_, i) => (board.table[i] = content.readDoubleLE(8 * i)));
+        board.setTable(Float64Array.from(board.table, (_, i) => content.readDoubleLE(8 * i)));
     },
     Z: (board) => board.restartCounters(),
     S: (board) => Buffer.from(JSON.stringify(board.stats())),
@@ -59,15 +60,19 @@ const OPERATIONS = {
     e: (board, content) => board.eeprom.memory.set(content.subarray(2), content.readUInt16LE()),
     X: (board) => board.reset(),
     J: (board, content) => board.jump(content.readUInt32LE()),
+    P: (board) => board.cutPower(),
+    U: (board, content) => board.line.setOpen(content[0] !== 0),
+    V: (board) => Buffer.from(JSON.stringify(board.line.said())),
 };
 
 function main() {
     const [flag, name, path] = process.argv.slice(2);
     if (flag !== "--board" || path === undefined) {
-        console.error("usage: second_sim.js --board uno|megaatmega2560 firmware.hex");
+        console.error("usage: second_sim.js --board uno|megaatmega2560|pico FIRMWARE");
         process.exit(2);
     }
-    const board = new Board(name, fs.readFileSync(path, "latin1"));
+    const file = fs.readFileSync(path);
+    const board = name === "pico" ? new Pico(file) : new Board(name, file.toString("latin1"));
     for (;;) {
         const header = read(5);
         const op = String.fromCharCode(header[0]);

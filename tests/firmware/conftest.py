@@ -6,7 +6,6 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from firmware_helpers import BOOT_S
 from lockstep import BOARDS, Rig
 
 
@@ -19,6 +18,6 @@ def rng() -> np.random.Generator:
 def rig(request: pytest.FixtureRequest, rng: np.random.Generator) -> Iterator[Rig]:
     """A board that has booted with a blank EEPROM, on a random skin."""
     with Rig(request.param) as rig:
-        rig.run(BOOT_S)
+        rig.run(rig.sim.boot_s)
         rig.randomize(rng)
         yield rig

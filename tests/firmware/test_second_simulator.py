@@ -10,7 +10,7 @@ import test_firmware_scan as scans
 import test_firmware_self_test as self_test
 import test_firmware_settings as settings
 
-from firmware_helpers import BOOT_S, CYCLES_PER_US, assert_whole, go_fast
+from firmware_helpers import CYCLES_PER_US, assert_whole, go_fast
 from lockstep import BOARDS, TABLE_SHAPE, Rig, elf_of, first_holds
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance
 from ohmskin.link.codes import quantise
@@ -34,7 +34,7 @@ test_watchdog = scans.test_watchdog_restarts_a_hung_main_loop
 @pytest.fixture(params=BOARDS)
 def rig(request: pytest.FixtureRequest, rng: np.random.Generator) -> Iterator[Rig]:
     with Rig(request.param, SecondSim(request.param)) as rig:
-        rig.run(BOOT_S)
+        rig.run(rig.sim.boot_s)
         rig.randomize(rng)
         yield rig
 

@@ -8,7 +8,6 @@ from lockstep import CPU_HZ, Rig
 from ohmskin.link import protocol
 from places import ROOT
 
-BOOT_S = 0.01
 CYCLES_PER_US = CPU_HZ // 1_000_000
 BAUD_DEFAULT = protocol.CONSTANTS["baud_default"]
 BAUD_FAST = protocol.CONSTANTS["baud_fast"]
@@ -31,7 +30,7 @@ def reset(rig: Rig, registers: dict[int, int] | None = None) -> dict[str, Any]:
     rig.sim.reset()
     for address, value in (registers or {}).items():
         rig.sim.poke(address, value)
-    rig.run(BOOT_S)
+    rig.run(rig.sim.boot_s)
     (hello,) = rig.frames("hello")[before:]
     return hello
 

@@ -51,6 +51,11 @@ HOLD_DTYPE = np.dtype(
 class LockstepSim(SkinSim):
     """All that the simulator can be asked for; operations are those of firmware/sim/README.md."""
 
+    boot_s = 0.01
+    """A board has said hello so long after a reset [s]."""
+    jitter_cycles = 0
+    """By so much a hold may come early or late."""
+
     def run_cycles(self, cycles: int) -> bytes:
         """Run for `cycles` CPU cycles (16 MHz), to the end of the instruction that reaches them.
 

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The built firmware in avr8js, in lock-step: firmware/second_sim, independent of simavr."""
+"""The built firmware in avr8js, or a Pico's in rp2040js, in lock-step: firmware/second_sim."""
 
+import json
 import shutil
+import struct
+from typing import Any
 from unittest.mock import patch
 
 from lockstep import LockstepSim, elf_of
 from places import ROOT
 
 FOLDER = ROOT / "firmware" / "second_sim"
+PICO_ELF = ROOT / "firmware" / "pico" / "build" / "ohmskin.elf"
 
 
-def is_installed() -> bool:
-    """Whether there are node and avr8js: 'make setup' gets them."""
-    return shutil.which("node") is not None and (FOLDER / "node_modules" / "avr8js").exists()
+def is_installed(chip: str) -> bool:
+    """Whether there are node and a chip's simulator, avr8js or rp2040js: 'make setup' gets them."""
+    return shutil.which("node") is not None and (FOLDER / "node_modules" / chip).exists()
 
 
 class SecondSim(LockstepSim):
@@ -21,3 +25,29 @@ class SecondSim(LockstepSim):
     def __init__(self, board: str) -> None:
         with patch("ohmskin.emulate.simavr.PROGRAM", FOLDER / "second_sim.js"):
             super().__init__(board, elf_of(board).with_suffix(".hex"))
+
+
+class PicoSim(LockstepSim):
+    """A Pico with its UF2 file, and a host at its USB that has opened its port."""
+
+    boot_s = 0.06
+    """Until the host has it: 10 ms of bus reset are the most of it."""
+    jitter_cycles = 2
+    """Its processor starts each conversion, up to some instructions late."""
+
+    def __init__(self) -> None:
+        with patch("ohmskin.emulate.simavr.PROGRAM", FOLDER / "second_sim.js"):
+            super().__init__("pico", PICO_ELF.with_suffix(".uf2"))
+
+    def cut_power(self) -> None:
+        """Switch it off and on again: what the flash was writing is left half done."""
+        self.request("P")
+
+    def open_port(self, is_open: bool) -> None:
+        """Let a program of the host open the port, or close it."""
+        self.request("U", struct.pack("<?", is_open))
+
+    def described(self) -> dict[str, bytes]:
+        """The descriptors that the board has given: device, configuration, serial_number."""
+        said: dict[str, Any] = json.loads(self.request("V"))
+        return {name: bytes.fromhex(digits) for name, digits in said.items()}

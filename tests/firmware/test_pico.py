@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A Pico's firmware as it is copied to the board, in rp2040js: boot, scan, USB, flash, watchdog."""
+
+import subprocess
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import test_firmware_commands as commands
+import test_firmware_scan as scans
+import test_firmware_self_test as self_test
+import test_firmware_settings as settings
+
+from firmware_helpers import OTHER_SCAN, assert_whole, go_fast, reset
+from lockstep import DEFAULT_SCAN, Rig
+from second_simulator import PICO_ELF, PicoSim
+
+pytestmark = pytest.mark.pico
+
+saved = settings.saved
+settings_in = settings.settings_in
+test_boot_hello = commands.test_boot_hello
+test_golden_commands = commands.test_golden_commands_are_acknowledged
+test_golden_damaged_frames = commands.test_golden_damaged_frames_are_not_answered
+test_bad_commands = commands.test_bad_commands_are_refused_by_name_and_change_nothing
+test_codes_order_time_and_settling = scans.test_codes_order_time_and_settling_are_exact
+test_settle_time_is_kept = scans.test_settle_time_is_kept_while_commands_arrive
+test_board_clock_runs_on = scans.test_board_clock_runs_on_between_scans
+test_stop = scans.test_stop_ends_with_a_whole_scan_and_its_ack
+test_start_and_stop = scans.test_start_and_stop_at_random_phases_damage_nothing
+test_no_load_damages_a_frame = scans.test_no_load_damages_a_frame
+test_commands_at_the_highest_rate = scans.test_commands_back_to_back_at_the_highest_rate
+test_commands_that_wait = scans.test_commands_that_wait_for_the_same_event_are_all_answered
+test_more_commands_than_can_wait = scans.test_more_commands_than_can_wait_do_not_silence_the_board
+test_a_command_at_the_highest_rate = scans.test_a_command_at_the_highest_rate_loses_no_scan
+test_every_scan_arrives = scans.test_the_fast_line_carries_every_scan
+test_random_bytes = scans.test_random_bytes_change_nothing
+test_save_while_scanning = settings.test_save_while_scanning_loses_no_scan
+test_load_defaults = settings.test_load_defaults_leaves_the_eeprom_alone
+test_self_test = self_test.test_self_test_of_a_sound_board
+test_self_test_of_far_nodes = self_test.test_self_test_judges_far_nodes
+
+SECTOR_BYTES, ENTRY_BYTES = 4096, 4
+
+
+@pytest.fixture
+def rig(rng: np.random.Generator) -> Iterator[Rig]:
+    with Rig("uno", PicoSim()) as rig:  # its name in the link, until that has another one
+        rig.run(rig.sim.boot_s)
+        rig.randomize(rng)
+        yield rig
+
+
+def cut_power(rig: Rig) -> dict[str, Any]:
+    """Switch the board off and on; what it says by itself."""
+    before = len(rig.frames("hello"))
+    assert isinstance(rig.sim, PicoSim)
+    rig.sim.cut_power()
+    rig.run(rig.sim.boot_s)
+    (hello,) = rig.frames("hello")[before:]
+    return hello
+
+
+def entries(content: bytes) -> list[int]:
+    """How many entries each of the two sectors has."""
+    words = np.frombuffer(content, "<u4").reshape(2, -1)
+    return [int((sector != 0xFFFFFFFF).sum()) for sector in words]
+
+
+def test_pins_and_channel_stay_until_a_conversion_has_ended(rig: Rig) -> None:
+    go_fast(rig)
+    rig.start_scan(rate_mhz=0, settle_us=1)
+    rig.run(0.1)
+    rig.must("stop")
+    assert_whole(rig)
+    assert rig.sim.stats()["changed_while_converting"] == 0
+
+
+def test_usb_keeps_to_the_rules(rig: Rig) -> None:
+    assert isinstance(rig.sim, PicoSim)
+    said = rig.sim.described()
+    assert said["device"] == said["begin"]
+    configuration = said["configuration"]
+    assert int.from_bytes(configuration[2:4], "little") == len(configuration)
+    assert said["serial_number"][2:].decode("utf-16-le") == "D0D1D2D3D4D5D6D7"
+    rig.start_scan()
+    rig.run(0.1)
+    rig.must("stop")
+    stats = rig.sim.stats()
+    assert stats["wrong_toggles"] == stats["stalls"] == 0
+    assert stats["usb_packets"] > 20
+
+
+def test_a_port_that_nobody_reads_stops_no_scan(rig: Rig) -> None:
+    assert isinstance(rig.sim, PicoSim)
+    rig.start_scan()
+    rig.run(0.1)
+    rig.sim.open_port(False)
+    rig.run(0.3)
+    rig.sim.open_port(True)
+    rig.run(0.1)
+    rig.must("stop")
+    numbers = [scan.header["scan"] for scan in rig.scans]
+    assert 20 < max(np.diff(numbers)) < 32
+    assert rig.scans[-1].header["dropped"] == 0
+    assert rig.damaged <= 2  # frames of which the host has a part
+    assert rig.check().wrong == 0
+
+
+def test_saved_settings_survive_a_reset_and_power(rig: Rig, saved: dict[str, Any]) -> None:
+    for start in (reset, cut_power):
+        hello = start(rig)
+        assert hello["settings"] == "stored"
+        assert settings_in(hello) == saved
+    content = rig.sim.eeprom()
+    rig.must("save")
+    assert rig.sim.eeprom() == content
+
+
+def save(rig: Rig, unit_id: int) -> dict[str, Any]:
+    """Save other settings; what `hello` says of them."""
+    rig.must("configure", **(OTHER_SCAN if unit_id % 2 else DEFAULT_SCAN))
+    rig.must("set_unit_id", unit_id=unit_id * 0x01010101)
+    rig.must("save")
+    return settings_in(rig.hello())
+
+
+def test_a_full_sector_moves_to_the_other_one(rig: Rig) -> None:
+    now = save(rig, 0)
+    full = [entries(rig.sim.eeprom())]
+    for unit_id in range(1, 150):
+        now = save(rig, unit_id)
+        full.append(entries(rig.sim.eeprom()))
+    assert settings_in(cut_power(rig)) == now
+    most = SECTOR_BYTES // ENTRY_BYTES
+    assert max(map(max, full)) > most - 40
+    assert {number[1] > 0 for number in full} == {False, True}
+    stats = rig.sim.stats()
+    assert stats["flash_refused"] == 0
+    assert 2 <= stats["flash_erases"] <= 4
+
+
+@pytest.mark.parametrize("begun", [0, 900])
+def test_power_cut_during_save_leaves_the_old_settings_or_the_new(
+    rig: Rig, rng: np.random.Generator, begun: int
+) -> None:
+    """With a new sector, and with one that is full soon: its erasing is cut, too."""
+    old = save(rig, 1)
+    while max(entries(rig.sim.eeprom())) < begun:
+        old = save(rig, int(rng.integers(256)))
+    seen = set()
+    for unit_id in range(25):
+        rig.must("configure", **(OTHER_SCAN if unit_id % 2 else DEFAULT_SCAN))
+        rig.must("set_unit_id", unit_id=unit_id * 0x01010101)
+        new = settings_in(rig.hello())
+        rig.send("save")
+        rig.run((0.02 if begun == 0 or unit_id % 4 else 0.09) * rng.random())
+        hello = cut_power(rig)
+        assert hello["settings"] == "stored"
+        assert settings_in(hello) in (old, new)
+        seen.add(settings_in(hello) == new)
+        old = settings_in(hello)
+    assert seen == {False, True}
+
+
+def address_of(symbol: str) -> int:
+    listing = subprocess.check_output(["arm-none-eabi-nm", PICO_ELF], text=True)
+    return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
+
+
+@pytest.mark.parametrize("scanning", [False, True])
+def test_watchdog_restarts_a_hung_main_loop(rig: Rig, scanning: bool) -> None:
+    if scanning:
+        rig.start_scan()
+        rig.run(0.1)
+    hellos, resets = len(rig.frames("hello")), rig.sim.stats()["resets"]
+    rig.sim.jump(address_of("hang"))
+    rig.run(0.2)
+    assert rig.sim.stats()["resets"] == resets
+    rig.run(0.05 + rig.sim.boot_s)
+    assert rig.sim.stats()["resets"] == resets + 1
+    (hello,) = rig.frames("hello")[hellos:]
+    assert (hello["reset_cause"], hello["scanning"]) == (("watchdog",), 0)
+    rig.start_scan()
+    rig.run(0.5)  # and it does not come again
+    rig.must("stop")
+    assert_whole(rig)
+    assert reset(rig)["reset_cause"] == ("external",)
