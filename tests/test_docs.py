@@ -217,7 +217,7 @@ def test_the_site_is_searched_from_the_disk_and_follows_the_scheme(
     for scheme, name in (("light", "default"), ("dark", "slate")):
         page = browser.new_context(color_scheme=scheme).new_page()
         page.on("request", lambda request: foreign.append(request.url))
-        page.goto((tmp_path / "examples/foxglove.html").as_uri())
+        page.goto((tmp_path / "integrations/foxglove.html").as_uri())
         assert page.locator("body").get_attribute("data-md-color-scheme") == name
     page.locator(".md-search__input").click()
     page.keyboard.type("brown-out", delay=30)

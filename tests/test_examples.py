@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The examples run, and do what they say they do."""
 
-import base64
 import json
 import re
 import signal
@@ -256,37 +255,14 @@ def messages_of(path: Path) -> list[tuple[str, str, str, dict, int, dict]]:
 def test_a_recording_is_as_foxglove_wants_it(recorded: Path) -> None:
     found = messages_of(recorded)
     assert {topic for topic, *_ in found} == {"/skin/hello", "/skin/mark", "/skin/scan"}
-    named = (EXAMPLES / "foxglove.md").read_text()
+    named = (ROOT / "integrations/foxglove/README.md").read_text()
     for _, _, text, _, content in found:
         assert set(text["properties"]) == set(content)
     for topic in ("/skin/hello", "/skin/mark", "/skin/scan.codes", "/skin/scan.missed"):
         assert f"`{topic}" in named
 
 
-def test_foxglove_forces_writes_a_grid(recorded: Path, skin_json: str, tmp_path: Path) -> None:
-    out = tmp_path / "forces.mcap"
-    output_of(str(EXAMPLES / "foxglove_forces.py"), str(recorded), skin_json, str(out))
-    found = messages_of(out)
-    grids = [each for each in found if each[0] == "/skin/grid"]
-    cells = [each for each in found if each[0] == "/skin/cells"]
-    scans = [each for each in messages_of(recorded) if each[0] == "/skin/scan"]
-    assert len(grids) == len(cells) == len(scans) == 20
-    for (_, name, text, log_ns, grid), (*_, scan_ns, _) in zip(grids, scans, strict=True):
-        assert name == "foxglove.Grid"
-        assert text["properties"]["data"]["contentEncoding"] == "base64"
-        assert 0 < 1e-9 * (scan_ns - log_ns) < 0.1  # it came after its middle
-        assert grid["timestamp"] == {"sec": log_ns // 10**9, "nsec": log_ns % 10**9}
-    force_n = np.frombuffer(base64.b64decode(grid["data"]), "<f4").reshape(8, 8)
-    assert (grid["column_count"], grid["row_stride"], grid["cell_stride"]) == (8, 32, 4)
-    assert grid["fields"] == [{"name": "force", "offset": 0, "type": 7}]
-    assert np.count_nonzero(force_n > 0.1) == 3
-    assert cells[-1][-1]["force_n"] == pytest.approx(force_n.flatten(), abs=1e-4)
-    with ohmskin.open(f"replay://{recorded}?speed=0", calibration=skin_json) as skin:
-        *_, last = skin
-    assert cells[-1][-1]["force_n_std"] == pytest.approx(last.force_n_std.flatten(), abs=1e-4)
-
-
-@pytest.mark.parametrize("name", ["every_scan", "estimate", "forces", "foxglove_forces"])
+@pytest.mark.parametrize("name", ["every_scan", "estimate", "forces"])
 def test_an_example_without_arguments_says_how_to_call_it(name: str) -> None:
     done = python(str(EXAMPLES / f"{name}.py"))
     assert (done.code, done.out) == (1, "")
@@ -297,6 +273,6 @@ def test_an_example_without_arguments_says_how_to_call_it(name: str) -> None:
 def test_every_example_is_run_here() -> None:
     tested = {
         *("every_scan.py", "estimate.py", "forces.py", "two_boards.py", "ros2_node.py"),
-        *("lsl_outlet.py", "foxglove_forces.py"),
+        "lsl_outlet.py",
     }
     assert {path.name for path in EXAMPLES.glob("*.py")} == tested

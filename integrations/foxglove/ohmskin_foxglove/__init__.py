@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Forces of a skin in Foxglove and Rerun: in recordings, and live.
+
+Both draw Protobuf messages of the schema foxglove.PointCloud, so a skin is two clouds of points:
+
+=================  ===========================================================================
+/skin/points       a point a cell: x y z, normal, force [N] and its standard deviation [N]
+/skin/contacts     a point a contact: the same of the contact
+=================  ===========================================================================
+
+Rerun draws neither foxglove.Grid nor foxglove.SceneUpdate, so neither is written.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove.channels import PointCloudChannel
+from foxglove.messages import (
+    PackedElementField,
+    PackedElementFieldNumericType,
+    PointCloud,
+    Pose,
+    Quaternion,
+    Timestamp,
+    Vector3,
+)
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import ohmskin
+from ohmskin.force.tables import read_forces
+from ohmskin.record.export import Part
+
+__all__ = ["POINTS", "add_clouds", "clouds", "serve"]
+
+POINTS, CONTACTS = "/skin/points", "/skin/contacts"
+NAMES = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "force", "force_std")
+# Forces are kept in steps of 1/1024 N, far below any deviation: digits of noise do not pack.
+STEPS_A_NEWTON = 1024
+_FIELDS = [
+    PackedElementField(name=name, offset=4 * index, type=PackedElementFieldNumericType.Float32)
+    for index, name in enumerate(NAMES)
+]
+_HERE = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
+
+
+def clouds(scan: ohmskin.ForceScan) -> dict[str, PointCloud]:
+    """The two clouds of a scan, by topic. Raises ValueError if the calibration has no geometry."""
+    placed = scan.geometry
+    if placed is None:
+        raise ValueError("nobody has said where the cells are: ohmskin skin FILE --pitch-mm 10,10")
+    newtons = [scan.force_n[..., None], scan.force_n_std[..., None]]
+    cells = np.concatenate([placed.position_m, placed.normal, *newtons], axis=-1)
+    contacts = [[*c.position_m, *c.normal, c.force_n, c.force_n_std] for c in scan.contacts]
+    return {
+        topic: _cloud(np.array(points).reshape(-1, len(NAMES)), scan.time_ns, placed.frame_id)
+        for topic, points in ((POINTS, cells), (CONTACTS, contacts))
+    }
+
+
+def _cloud(points: Any, time_ns: int, frame_id: str) -> PointCloud:
+    points[:, -2:] = np.round(STEPS_A_NEWTON * points[:, -2:]) / STEPS_A_NEWTON
+    return PointCloud(
+        timestamp=Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9),
+        frame_id=frame_id,
+        pose=_HERE,
+        point_stride=4 * len(NAMES),
+        fields=_FIELDS,
+        data=points.astype("<f4").tobytes(),
+    )
+
+
+def add_clouds(recording: Path, calibration: ohmskin.Calibration, out: Path) -> int:
+    """Write a recording with all its channels and the clouds of its forces. Returns its scans.
+
+    `out` plays, exports and calibrates as the recording does.
+
+    :raises FileExistsError: `out` is there already.
+    :raises RecordingError: the recording cannot be read.
+    :raises ValueError: the calibration is of another skin, or says no geometry.
+    """
+    part = Part(recording, float("-inf"), float("inf"), timed=True)
+    forces, schema = read_forces(part, calibration), PointCloud.get_schema()
+    with recording.open("rb") as read, out.open("xb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="ohmskin")
+        pointed = writer.register_schema(schema.name, schema.encoding, schema.data)
+        of_topic = {
+            topic: writer.register_channel(topic, "protobuf", pointed)
+            for topic in (POINTS, CONTACTS)
+        }
+        channels: dict[int, int] = {}
+        for kind, channel, message in make_reader(read).iter_messages(log_time_order=False):
+            if channel.topic in of_topic:  # of clouds that were added before
+                continue
+            if channel.id not in channels:
+                form = writer.register_schema(kind.name, kind.encoding, kind.data) if kind else 0
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, form, channel.metadata
+                )
+            told = message.log_time, message.data, message.publish_time, message.sequence
+            writer.add_message(channels[channel.id], *told)
+            if channel.topic == "/skin/scan" and (scan := next(forces, None)) is not None:
+                for topic, cloud in clouds(scan).items():
+                    time_ns = scan.time_ns
+                    writer.add_message(of_topic[topic], time_ns, cloud.encode(), time_ns)
+        writer.finish()
+    return part.scans
+
+
+def serve(
+    skin: ohmskin.LiveSkin, port: int = 8765, started: Callable[[], object] = lambda: None
+) -> None:
+    """Serve the clouds of a live skin to Foxglove, on loopback, until Ctrl-C.
+
+    started: is called when clients may connect. Raises what `clouds` raises, and RuntimeError if
+    the port is taken.
+    """
+    import foxglove
+
+    server = foxglove.start_server(name="ohmskin", host="127.0.0.1", port=port)
+    channels = {topic: PointCloudChannel(topic) for topic in (POINTS, CONTACTS)}
+    try:
+        started()
+        count = 0
+        while True:
+            count, scans = skin.since(count, timeout_s=0.2)
+            for scan in scans[-32:]:  # what came before anybody looked is not sent
+                for topic, cloud in clouds(scan).items():
+                    channels[topic].log(cloud, log_time=scan.time_ns)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()

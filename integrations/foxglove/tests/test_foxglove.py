@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What Foxglove and Rerun are given, read by their own libraries."""
+
+import asyncio
+import json
+import os
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import websockets
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import ohmskin
+from ohmskin.record.recorder import Recorder
+from ohmskin_foxglove import CONTACTS, NAMES, POINTS, add_clouds
+
+HERE = Path(__file__).parents[1]
+URL = "emulator://8x8?scene=moving&seed=1&begin=0"
+
+
+def run(*words: object) -> str:
+    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def skin_json(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("skin") / "skin.json"
+    presses = HERE.parents[1] / "examples" / "presses.csv"
+    table = ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80")
+    run("-m", "ohmskin", *table)
+    run("-m", "ohmskin", "skin", path, "--pitch-mm", "10,10")
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recorded") / "a.mcap"
+    with (
+        ohmskin.open(f"{URL}&speed=0") as skin,
+        Recorder(path, skin.info, lambda: skin.now_s) as recorder,
+    ):
+        for scan in islice(skin, 900):
+            recorder.add(scan)
+    return path
+
+
+@pytest.fixture(scope="module")
+def both(recorded: Path, skin_json: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("both") / "both.mcap"
+    assert add_clouds(recorded, ohmskin.load_calibration(skin_json), out) == 900
+    return out
+
+
+def points(cloud: object) -> np.ndarray:
+    """(points, 8), by the message's own fields."""
+    assert [(f.name, f.offset, f.type) for f in cloud.fields] == [
+        (name, 4 * index, 7) for index, name in enumerate(NAMES)
+    ]
+    return np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)
+
+
+def test_a_recording_with_clouds_plays_as_before(
+    recorded: Path, both: Path, skin_json: Path
+) -> None:
+    of_clouds: dict[str, list] = {POINTS: [], CONTACTS: []}
+    with both.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        for schema, channel, message, cloud in reader.iter_decoded_messages([POINTS, CONTACTS]):
+            assert schema.name == "foxglove.PointCloud"
+            assert message.log_time == cloud.timestamp.ToNanoseconds()
+            of_clouds[channel.topic].append(cloud)
+    plays = [f"replay://{path}?speed=0" for path in (recorded, both)]
+    one, other = (list(ohmskin.open(url, calibration=skin_json)) for url in plays)
+    assert len(one) == len(other) == len(of_clouds[POINTS]) == 900
+    for before, scan, cells, contacts in zip(one, other, *of_clouds.values(), strict=True):
+        assert scan.time_ns == before.time_ns == cells.timestamp.ToNanoseconds()
+        np.testing.assert_array_equal(scan.force_n, before.force_n)
+        table = points(cells)
+        assert table[:, 6] == pytest.approx(scan.force_n.ravel(), abs=1e-3)
+        assert table[:, 7] == pytest.approx(scan.force_n_std.ravel(), abs=1e-3, rel=1e-5)
+        assert points(contacts)[:, 6] == pytest.approx([c.force_n for c in scan.contacts], abs=1e-3)
+    assert table[3 * 8 + 5, :6] == pytest.approx([0.05, 0.03, 0, 0, 0, 1])
+    run("-m", "ohmskin", "export", both, both.with_suffix(".csv"))
+    times = both.stat().st_size / recorded.stat().st_size
+    print(f"size over the recording's: {times:.2f}")
+    assert times < 2.5
+
+
+def test_clouds_are_added_once(both: Path, skin_json: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.mcap"
+    run("-m", "ohmskin_foxglove", "add", both, skin_json, again)
+    with again.open("rb") as file:
+        counts = make_reader(file).get_summary().statistics.channel_message_counts
+    assert sorted(counts.values()) == [1, 900, 900, 900]
+
+
+def test_rerun_draws_the_clouds(both: Path, tmp_path: Path) -> None:
+    """Its importer makes Points3D of them, by its own program."""
+    out = tmp_path / "both.rrd"
+    program = Path(sys.executable).with_name("rerun")
+    done = subprocess.run([program, "mcap", "convert", both, "-o", out], capture_output=True)
+    assert done.returncode == 0, done.stderr
+    printed = subprocess.run([program, "rrd", "print", "-v", out], capture_output=True, text=True)
+    assert "Points3D:positions" in printed.stdout
+    assert POINTS in printed.stdout
+
+
+def test_the_rerun_logger_logs(recorded: Path, skin_json: Path, tmp_path: Path) -> None:
+    out = tmp_path / "live.rrd"
+    run(HERE / "rerun_logger.py", f"replay://{recorded}?speed=0", skin_json, out)
+    program = Path(sys.executable).with_name("rerun")
+    printed = subprocess.run([program, "rrd", "print", "-v", out], capture_output=True, text=True)
+    assert "Points3D:positions" in printed.stdout
+
+
+@pytest.fixture
+def served(skin_json: Path, request: pytest.FixtureRequest) -> Iterator[tuple[str, object]]:
+    """Serves a board; its port is that which this process gives the next one."""
+    port = 20_000 + os.getpid() % 20_000
+    url = getattr(request, "param", URL)
+    command = [sys.executable, "-m", "ohmskin_foxglove", "live", url, str(skin_json)]
+    process = subprocess.Popen(
+        [*command, "--ws-port", str(port)], stdout=subprocess.PIPE, text=True
+    )
+    threading.Timer(60, process.kill).start()
+    assert "Foxglove: open" in process.stdout.readline()
+    yield f"ws://127.0.0.1:{port}", process
+    process.kill()
+    process.wait()
+
+
+async def received(url: str, count: int) -> list[tuple[str, int, int]]:
+    """Topic, log time and time of arrival [ns] of messages, by Foxglove's client protocol."""
+    topics, found = {}, []
+    async with websockets.connect(url, subprotocols=["foxglove.sdk.v1"], max_size=None) as ws:
+        while len(found) < count:
+            text = await asyncio.wait_for(ws.recv(), 20)
+            now_ns = time.time_ns()
+            if isinstance(text, bytes) and text[0] == 1:
+                number, log_ns = struct.unpack_from("<IQ", text, 1)
+                found.append((topics[number], log_ns, now_ns))
+            elif isinstance(text, str) and (said := json.loads(text))["op"] == "advertise":
+                for channel in said["channels"]:
+                    assert channel["schemaName"] == "foxglove.PointCloud"
+                    topics[channel["id"]] = channel["topic"]
+                    wanted = [{"id": channel["id"], "channelId": channel["id"]}]
+                    await ws.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+    return found
+
+
+def test_a_client_gets_scans_live(served: tuple[str, object]) -> None:
+    found = asyncio.run(received(served[0], 400))
+    times_ns = np.array([log_ns for topic, log_ns, _ in found if topic == POINTS])
+    late_ms = [1e-6 * (now - log) for topic, log, now in found[200:] if topic == POINTS]
+    # A scan's last byte comes half a period after its middle.
+    late_ms = np.median(late_ms) - 1e3 * 0.5 / 90
+    print(f"last byte to client, median: {late_ms:.1f} ms")
+    # In order, and none twice. (A machine that is too busy for 90 estimates a second skips scans.)
+    periods = np.diff(times_ns) / (1e9 / 90)
+    assert (periods > 0.9).all()
+    assert periods == pytest.approx(np.round(periods), abs=0.1)
+
+
+@pytest.mark.parametrize("served", [f"{URL}&vanish=1"], indirect=True)
+def test_it_goes_on_when_the_board_is_plugged_again(served: tuple[str, object]) -> None:
+    """A board that vanishes every second, and is opened again a second later."""
+    found = asyncio.run(received(served[0], 700))
+    times_s = np.array([1e-9 * log_ns for topic, log_ns, _ in found if topic == POINTS])
+    assert np.count_nonzero(np.diff(times_s) > 0.5) >= 2
+
+
+def test_what_is_missing_is_said(recorded: Path, skin_json: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare.json"
+    content = json.loads(skin_json.read_text())
+    del content["geometry"]
+    bare.write_text(json.dumps(content))
+    words = ("-m", "ohmskin_foxglove", "add", recorded, bare, tmp_path / "out.mcap")
+    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("ohmskin-foxglove: nobody has said where the cells are: ohmskin")
+    assert done.stderr.count("\n") == 1
