@@ -91,9 +91,10 @@ pico: setup ## build the firmware for a Raspberry Pi Pico: firmware/pico/build/o
 	$(MAKE) -C firmware/pico
 
 # The copies go: a later wheel would carry an old firmware.
-wheel: firmware ## build dist/ohmskin-*.whl with the firmware of all boards, to flash without a checkout
+wheel: firmware pico ## build dist/ohmskin-*.whl with the firmware of all boards, to flash without a checkout
 	mkdir -p $(HEX)
 	for board in uno nano megaatmega2560; do cp .pio/build/$$board/firmware.hex $(HEX)/$$board.hex || exit; done
+	cp firmware/pico/build/ohmskin.uf2 $(HEX)/pico.uf2
 	$(BIN)/hatchling build -t wheel
 	rm -r $(HEX)
 

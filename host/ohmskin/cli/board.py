@@ -20,6 +20,7 @@ from rich.text import Text
 from typer import Argument, Option
 
 import ohmskin
+from ohmskin.cli import pico
 from ohmskin.cli.terminal import Terminal
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import WireOhm
@@ -176,14 +177,22 @@ def configure(
 
 
 def flash(
-    board: Annotated[str, Argument(help=" | ".join(_BOARDS))] = "",
-    port: Annotated[str, Option(help="serial port of the board")] = "",
+    board: Annotated[str, Argument(help=" | ".join((*_BOARDS, "pico")))] = "",
+    port: Annotated[str, Option(help="serial port of the board; of a Pico, its drive")] = "",
 ) -> None:
     """Write the firmware to a board, and check that it answers.
 
     In a checkout, PlatformIO builds it; an installed wheel has it, and needs avrdude. Without
-    arguments: to the one board that is attached.
+    arguments: to the one board that is attached. A Pico is plugged in while its button BOOTSEL is
+    held; nobody has tried that yet.
     """
+    if board == "pico":
+        built = _ROOT / "firmware" / "pico" / "build" / "ohmskin.uf2"
+        firmware = built if (_ROOT / "platformio.ini").is_file() else _FIRMWARE / "pico.uf2"
+        TERMINAL.print(f"copied to {pico.copy_firmware(firmware, port)}")
+        port = pico.port_of_pico()
+        TERMINAL.print(f"{port}: pico, firmware {_answer(port).version}, answers")
+        return
     board, port = _chosen(board, port, serial_ports())
     packages = _ROOT / ".pio" / "core"  # where `make setup` puts them
     environment = {"PLATFORMIO_CORE_DIR": str(packages)} if packages.is_dir() else {}
