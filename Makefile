@@ -114,8 +114,8 @@ sim: setup ## build the simulator that runs the firmware on an emulated skin
 test-host: setup firmware pico sim ## pytest, three processes for two cores
 	$(ONE_THREAD) $(BIN)/pytest --numprocesses $$((($$(nproc) * 3 + 1) / 2)) --dist worksteal
 
-test-world: setup-host ## test integrations/ with the real libraries: MuJoCo and others (build/world)
-	tools/test_world.sh mujoco foxglove
+test-world: setup-host ## test integrations/ with the real libraries: MuJoCo, Foxglove, Rerun, ROS 2 (build/world)
+	tools/test_world.sh mujoco foxglove ros2
 
 FUZZED := build/fuzz/frame_reader
 READER := firmware/src/core/frame_reader

@@ -26,7 +26,6 @@ from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
 from places import ROOT
-from ros_stub import Float32MultiArray, PointCloud2, PointField, Ros
 
 EXAMPLES = ROOT / "examples"
 GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
@@ -137,47 +136,6 @@ def check_periods(times_s: Sequence[float]) -> None:
     assert np.diff(times_s) == pytest.approx(periods / 90, abs=3e-3)
 
 
-def test_the_ros_node_publishes_forces_and_taxels(
-    monkeypatch: pytest.MonkeyPatch, skin_json: str
-) -> None:
-    ros = Ros({"port": GHOST, "calibration": skin_json, "pitch_m": 0.02}, turns=20)
-    for name, module in ros.modules().items():
-        monkeypatch.setitem(sys.modules, name, module)
-    begin_s = time.time()
-    example("ros2_node").main()
-    assert ros.shut_down
-    arrays = [each for topic, each in ros.published if topic == "~/forces"]
-    clouds = [each for topic, each in ros.published if topic == "~/taxels"]
-    assert len(arrays) == len(clouds) == 20
-    forces, cloud = arrays[-1], clouds[-1]
-    assert isinstance(forces, Float32MultiArray)
-    assert isinstance(cloud, PointCloud2)
-
-    # multiarray(i,j,k) = data[data_offset + dim_stride[1]*i + dim_stride[2]*j + k]
-    assert [(d.label, d.size, d.stride) for d in forces.layout.dim] == [
-        ("rows", 8, 64),
-        ("columns", 8, 8),
-    ]
-    force_n = np.array(forces.data).reshape(8, 8)
-    touched = set(zip(*np.nonzero(force_n > 0.1), strict=True))
-    assert len(touched) == 3
-
-    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (8, 8, 20, 160)
-    assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
-        (name, 4 * index, PointField.FLOAT32, 1) for index, name in enumerate("xyz")
-    ] + [("force", 12, 7, 1), ("force_std", 16, 7, 1)]
-    assert cloud.is_dense
-    points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(8, 8, 5)
-    assert points[3, 5, :3] == pytest.approx([0.10, 0.06, 0])
-    np.testing.assert_array_equal(points[:, :, 3], force_n)
-    assert np.all(points[:, :, 4] > 0)
-    assert np.all(points[:, :, 4][force_n > 0.1] < force_n[force_n > 0.1])
-    stamps_s = [each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec for each in clouds]
-    assert cloud.header.frame_id == "skin"
-    check_periods(stamps_s)
-    assert begin_s < stamps_s[0] < stamps_s[-1] < time.time()
-
-
 LABELS = [f"row {row} column {column}" for row in range(8) for column in range(8)]
 
 
@@ -272,7 +230,7 @@ def test_an_example_without_arguments_says_how_to_call_it(name: str) -> None:
 
 def test_every_example_is_run_here() -> None:
     tested = {
-        *("every_scan.py", "estimate.py", "forces.py", "two_boards.py", "ros2_node.py"),
+        *("every_scan.py", "estimate.py", "forces.py", "two_boards.py"),
         "lsl_outlet.py",
     }
     assert {path.name for path in EXAMPLES.glob("*.py")} == tested

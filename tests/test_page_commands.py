@@ -85,8 +85,6 @@ NOT_RUN = {
     "recordings",
     "python examples/lsl_outlet.py emulator://8x8?scene=moving skin.json": "needs liblsl; "
     "tests/test_examples.py runs it with a stand-in",
-    "python examples/ros2_node.py --ros-args -p calibration:=skin.json -p "
-    "port:='emulator://8x8?scene=moving'": "needs ROS 2; tests/test_examples.py has a stand-in",
 }
 # What a command is given besides, to be short, by the beginning of its words.
 STOPPED = {

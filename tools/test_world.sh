@@ -35,7 +35,9 @@ for name in "$@"; do
         echo "test-world: $name: not tested: needs Python 3.12 (say PYTHON312=/path/to/python3.12)"
         continue
     fi
-    if [[ ! $env/.stamp -nt integrations/$name/pyproject.toml || ! $env/.stamp -nt pyproject.toml ]]; then
+    # What says what is installed has changed since.
+    changed=$(find pyproject.toml integrations/"$name"/{pyproject.toml,setup.py} -newer "$env/.stamp" 2>&1 | grep -v "setup.py.*No such")
+    if [[ -n $changed ]]; then
         echo "test-world: $name: making $env with $("$python" --version)"
         "$python" -m venv --clear "$env" &&
             "$env/bin/pip" install --quiet -e . -e "integrations/$name[test]" 2>"$env/pip.log" &&

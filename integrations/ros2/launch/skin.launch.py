@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ros2 launch ohmskin_ros skin.launch.py port:=/dev/ttyACM0 calibration:=skin.json"""
+
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+
+ARGUMENTS = {"port": "/dev/ttyACM0", "calibration": "skin.json", "frame_id": ""}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The node, with its parameters as arguments."""
+    told = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=usual)
+                for name, usual in ARGUMENTS.items()
+            ),
+            Node(package="ohmskin_ros", executable="skin", name="ohmskin", parameters=[told]),
+        ]
+    )

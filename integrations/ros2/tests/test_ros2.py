@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node in a process of its own, by a subscriber of rclpy; and the package, by colcon."""
+
+import ast
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Image, PointCloud2
+from std_srvs.srv import Trigger
+
+HERE = Path(__file__).parents[1]
+URL = "emulator://8x8?scene=ghost&seed=1"
+TOUCHED = f"{URL}&begin=0"
+ENOUGH_S = 60.0  # a test waits so long for what comes at once, unless it never comes
+
+
+@pytest.fixture(scope="module")
+def skin_json(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("skin") / "skin.json"
+    presses = HERE.parents[1] / "examples" / "presses.csv"
+    for words in (
+        ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80"),
+        ("skin", path, "--pitch-mm", "10,20", "--frame", "palm"),
+    ):
+        subprocess.run([sys.executable, "-m", "ohmskin", *map(str, words)], check=True)
+    return path
+
+
+@pytest.fixture
+def node(skin_json: Path) -> Iterator[Callable[[str], subprocess.Popen]]:
+    started = []
+
+    def start(url: str) -> subprocess.Popen:
+        parameters = ("-p", f"calibration:={skin_json}", "-p", f"port:='{url}'")
+        command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", *parameters]
+        started.append(subprocess.Popen(command))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+
+
+@pytest.fixture
+def reader() -> Iterator[Node]:
+    rclpy.init()
+    yield (node := rclpy.create_node("reader"))
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def until(reader: Node, ready: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + ENOUGH_S
+    while not ready():
+        assert time.monotonic() < end_s
+        rclpy.spin_once(reader, timeout_sec=0.1)
+
+
+def stamp_ns(message: PointCloud2 | Image) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def test_clouds_and_images_come(node: Callable, reader: Node) -> None:
+    clouds, images, late_ms = [], [], []
+
+    def take(cloud: PointCloud2) -> None:
+        clouds.append(cloud)
+        late_ms.append(1e-6 * (time.time_ns() - stamp_ns(cloud)) - 1e3 * 0.5 / 90)
+
+    reader.create_subscription(PointCloud2, "/ohmskin/points", take, qos_profile_sensor_data)
+    reader.create_subscription(Image, "/ohmskin/image", images.append, 100)  # reliable, as RViz
+    node(TOUCHED)
+    until(reader, lambda: len(clouds) >= 300 and len(images) >= 300)
+    print(f"last byte to subscriber, median: {np.median(late_ms[100:]):.1f} ms")
+    cloud, picture = clouds[-1], {stamp_ns(i): i for i in images}.get(stamp_ns(clouds[-1]))
+    assert cloud.header.frame_id == "palm"
+    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (8, 8, 32, 256)
+    names = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "force", "force_std")
+    assert [(f.name, f.offset, f.datatype) for f in cloud.fields] == [
+        (name, 4 * index, 7) for index, name in enumerate(names)
+    ]
+    cells = np.frombuffer(bytes(cloud.data), "<f4").reshape(8, 8, 8)
+    assert cells[3, 5, :6] == pytest.approx([0.05, 0.06, 0, 0, 0, 1])
+    touched = {tuple(cell) for cell in np.argwhere(cells[..., 6] > 0.1)}
+    assert touched == {(2, 2), (2, 5), (5, 2)}
+    if picture is not None:
+        assert (picture.encoding, picture.step) == ("32FC1", 32)
+        np.testing.assert_array_equal(
+            np.frombuffer(bytes(picture.data), "<f4").reshape(8, 8), cells[..., 6]
+        )
+    # In order, and none twice. (A machine that is too busy for 90 estimates a second skips scans.)
+    periods = np.diff([stamp_ns(cloud) for cloud in clouds]) / (1e9 / 90)
+    assert (periods > 0.5).all()
+
+
+def test_a_tare_is_a_service(node: Callable, reader: Node) -> None:
+    client = reader.create_client(Trigger, "/ohmskin/tare")
+    node(TOUCHED)
+    assert client.wait_for_service(ENOUGH_S)
+
+    def answer() -> Trigger.Response:
+        asked = client.call_async(Trigger.Request())
+        until(reader, asked.done)
+        return asked.result()
+
+    said = answer()
+    while "being opened" in said.message:
+        said = answer()
+    assert not said.success
+    assert "cells (2, 2), (2, 5), (5, 2) are touched" in said.message
+
+
+def test_it_goes_on_when_the_board_is_plugged_again(node: Callable, reader: Node) -> None:
+    clouds, states = [], []
+    reader.create_subscription(PointCloud2, "/ohmskin/points", clouds.append, 100)
+    reader.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda each: states.append(each.status[0]), 10
+    )
+    node(f"{TOUCHED}&vanish=1.5")
+    opened = "times the port was opened"
+
+    def times() -> int:
+        return max([int(v.value) for s in states for v in s.values if v.key == opened], default=0)
+
+    until(reader, lambda: times() >= 3)
+    seen = len(clouds)
+    until(reader, lambda: len(clouds) > seen)
+    assert {b"\x00", b"\x02"} & {state.level for state in states}
+    assert any("is gone" in state.message for state in states) or times() >= 3
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", "-p"]
+    done = subprocess.run(
+        [*command, f"calibration:={tmp_path}/no.json"], capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert "no.json: cannot be read" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_colcon_builds_it(tmp_path: Path) -> None:
+    colcon = [str(Path(sys.executable).with_name("colcon")), "build", "--base-paths", str(HERE)]
+    places = ("--build-base", tmp_path / "build", "--install-base", tmp_path / "install")
+    done = subprocess.run(
+        [*colcon, *map(str, places)], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    built = tmp_path / "install" / "ohmskin_ros"
+    assert (built / "share/ament_index/resource_index/packages/ohmskin_ros").exists()
+    assert (built / "share/ohmskin_ros/launch/skin.launch.py").exists()
+    assert (built / "lib/ohmskin_ros/skin").exists()
+
+
+def test_the_launch_file_is_python() -> None:
+    """PyPI has no `launch`: it cannot be run here."""
+    tree = ast.parse((HERE / "launch/skin.launch.py").read_text())
+    assert "generate_launch_description" in {
+        node.name for node in tree.body if isinstance(node, ast.FunctionDef)
+    }
