@@ -115,7 +115,7 @@ test-host: setup firmware pico sim ## pytest, three processes for two cores
 	$(ONE_THREAD) $(BIN)/pytest --numprocesses $$((($$(nproc) * 3 + 1) / 2)) --dist worksteal
 
 test-world: setup-host ## test integrations/ with the real libraries: MuJoCo, Foxglove, Rerun, ROS 2 (build/world)
-	tools/test_world.sh mujoco foxglove ros2
+	tools/test_world.sh mujoco foxglove ros2 notebook
 
 FUZZED := build/fuzz/frame_reader
 READER := firmware/src/core/frame_reader
