@@ -88,7 +88,7 @@ firmware: setup ## build the firmware for all boards
 	$(BIN)/pio run
 
 pico: setup ## build the firmware for a Raspberry Pi Pico: firmware/pico/build/ohmskin.uf2
-	$(MAKE) -C firmware/pico
+	$(MAKE) -C firmware/pico OHMSKIN_FLAGS="$(OHMSKIN_FLAGS)"
 
 # The copies go: a later wheel would carry an old firmware.
 wheel: firmware pico ## build dist/ohmskin-*.whl with the firmware of all boards, to flash without a checkout

@@ -9,26 +9,28 @@
 #include "flash_store.h"
 #include "rp2040.h"
 #include "usb_serial.h"
+#include "wiring.h"
 
 namespace ohmskin {
 namespace board {
 
 using namespace rp2040;
 
-// ------------------------------------------------------------- wiring: the one table that says it
-// Numbers of pins (GP...). Sense nodes: top on A0 (GP26), bottom on A1 (GP27), far end of the row
-// on A2 (GP28), of the column on A3 (GP29), which a Pico has not on its edge: other boards do. They
-// float, as analog inputs. All other pins keep the chip's pull-downs.
+// ------------------------------------------------------------------ wiring: wiring.h says it
+// Sense nodes: top on A0 (GP26), bottom on A1 (GP27), far end of the row on A2 (GP28), of the
+// column on A3 (GP29), which a Pico has not on its edge: other boards do. They float, as analog
+// inputs. All other pins keep the chip's pull-downs.
 const frames::Board KIND = frames::Board::Uno;  // until the protocol has a value of its own
-const uint32_t REF_TOP_OHM = 30000;
-const uint32_t REF_BOTTOM_OHM = 30000;
+const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
+const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 
 namespace {
-constexpr uint8_t ROW_PINS[] = {2, 3, 4, 5};
-constexpr uint8_t COLUMN_PINS[] = {6, 7, 8, 9};
-constexpr uint8_t DRIVE_TOP_PIN = 10, DRIVE_BOTTOM_PIN = 11;
+using wiring::COLUMN_PINS;
+using wiring::DRIVE_BOTTOM_PIN;
+using wiring::DRIVE_TOP_PIN;
+using wiring::ROW_PINS;
 // Channels of the converter, by Sense.
-constexpr uint8_t CHANNELS[] = {0, 1, 2, 3};
+constexpr const uint8_t (&CHANNELS)[4] = wiring::SENSE_INPUTS;
 // The switch of a Pico's supply: high, its ripple is smaller (Pico's data sheet, "Powerchain").
 constexpr uint8_t SUPPLY_MODE_PIN = 23;
 constexpr uint8_t FIRST_ANALOG_PIN = 26;
@@ -39,6 +41,14 @@ constexpr uint32_t levels(const uint8_t *pins, uint8_t number) {
     return (number & 1 ? bit(pins[0]) : 0) | (number & 2 ? bit(pins[1]) : 0) |
            (number & 4 ? bit(pins[2]) : 0) | (number & 8 ? bit(pins[3]) : 0);
 }
+constexpr bool exist(const uint8_t *list, uint8_t size, uint8_t end) {
+    return size == 0 || (list[0] < end && exist(list + 1, size - 1, end));
+}
+static_assert(exist(wiring::PINS, wiring::PIN_COUNT, FIRST_ANALOG_PIN),
+              "there is no such pin, or it is an analog input: 0 to 25 may be outputs");
+static_assert(wiring::count(wiring::PINS, wiring::PIN_COUNT, SUPPLY_MODE_PIN) == 0,
+              "pin 23 is the supply's on a Pico");
+static_assert(exist(CHANNELS, 4, 4), "OHMSKIN_SENSE_INPUTS: there are 0 to 3");
 constexpr uint32_t SCAN_PINS =
     levels(ROW_PINS, 15) | levels(COLUMN_PINS, 15) | bit(DRIVE_TOP_PIN) | bit(DRIVE_BOTTOM_PIN);
 

@@ -13,7 +13,7 @@ const MCUSR = 0x54, TIFR1 = 0x36, OCF1B = 0x04;
 const POWER_ON = 0x01, EXTERNAL = 0x02, WATCHDOG = 0x08; // bits of MCUSR
 const NEVER_CYCLES = 0xffffffff;
 const A_TO_H = 8, EQUAL_DRIVE = 8, UNDRIVEN = 9, OTHER_CHANNEL = 10;
-// Readings by channel: A0 and A1 are at the near ends of row and column, A2 and A3 at the far ends.
+// Readings by node: the near ends of row and column, then the far ends.
 const TOP_HIGH = "abef", BOTTOM_HIGH = "dchg";
 
 const { timer0Config, timer1Config, usart0Config, eepromConfig, watchdogConfig } = avr8js;
@@ -39,11 +39,7 @@ const CHIPS = {
         eeprom: eepromConfig,
         watchdog: watchdogConfig,
         converterVector: 0x2a,
-        // Port and lowest bit, as in the README's table of wires.
-        row: ["D", 4],
-        column: ["B", 0],
-        driveTop: ["D", 2],
-        driveBottom: ["D", 3],
+        wires: "PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3",
     },
     megaatmega2560: {
         flashBytes: 0x40000,
@@ -72,19 +68,18 @@ const CHIPS = {
         eeprom: { ...eepromConfig, eepromReadyInterrupt: 0x3c },
         watchdog: { ...watchdogConfig, watchdogInterrupt: 0x18 },
         converterVector: 0x3a,
-        row: ["A", 0],
-        column: ["C", 0],
-        driveTop: ["L", 0],
-        driveBottom: ["L", 1],
+        wires: "PA0,PA1,PA2,PA3,PC0,PC1,PC2,PC3,PL0,PL1,0,1,2,3",
     },
 };
 
 class Board {
-    // hex: text of an Intel HEX file, as avrdude writes it into the flash.
-    constructor(name, hex) {
+    // hex: text of an Intel HEX file, as avrdude writes it into the flash. pins: another wiring, as
+    // in README.md.
+    constructor(name, hex, pins) {
         this.chip = CHIPS[name];
         const names = Object.keys(CHIPS).join(", ");
         if (!this.chip) throw new Error(`no board '${name}': there are ${names}`);
+        this.wires = readWires(pins ?? this.chip.wires);
         this.flash = loadHex(hex, this.chip.flashBytes);
         this.eeprom = new avr8js.EEPROMMemoryBackend(this.chip.eepromBytes);
         this.table = new Float64Array(16 * 16 * A_TO_H);
@@ -120,7 +115,7 @@ class Board {
         for (const [letter, config] of Object.entries(chip.ports))
             this.ports[letter] = new avr8js.AVRIOPort(cpu, config);
         this.pinsChanged = -Infinity;
-        for (const letter of new Set([chip.row, chip.column, chip.driveTop].map((pin) => pin[0])))
+        for (const letter of new Set(this.wires.pins.map(([letter]) => letter)))
             this.ports[letter].addListener(() => {
                 this.pinsChanged = cpu.cycles + 2; // an STS writes in its second cycle
             });
@@ -173,19 +168,24 @@ class Board {
         this.table.set(table);
     }
 
-    pins([letter, bit], width) {
-        const { DDR, PORT } = this.chip.ports[letter];
-        const mask = ((1 << width) - 1) << bit;
+    // What some of the pins show, the first one bit 0, and whether all of them are outputs.
+    pins(first, count) {
         const { data } = this.cpu;
-        return { value: (data[PORT] & mask) >> bit, driven: (data[DDR] & mask) === mask };
+        let value = 0, driven = true;
+        this.wires.pins.slice(first, first + count).forEach(([letter, bit], i) => {
+            const { DDR, PORT } = this.chip.ports[letter];
+            value |= ((data[PORT] >> bit) & 1) << i;
+            driven &&= Boolean((data[DDR] >> bit) & 1);
+        });
+        return { value, driven };
     }
 
     sample(channel, cycle) {
-        const { chip } = this;
-        const row = this.pins(chip.row, 4), column = this.pins(chip.column, 4);
-        const top = this.pins(chip.driveTop, 1), bottom = this.pins(chip.driveBottom, 1);
+        const row = this.pins(0, 4), column = this.pins(4, 4);
+        const top = this.pins(8, 1), bottom = this.pins(9, 1);
+        const node = this.wires.channels.indexOf(channel);
         let configuration, ratio = 0;
-        if (channel >= TOP_HIGH.length) {
+        if (node < 0) {
             configuration = OTHER_CHANNEL;
         } else if (![row, column, top, bottom].every((pin) => pin.driven)) {
             configuration = UNDRIVEN;
@@ -193,14 +193,14 @@ class Board {
             configuration = EQUAL_DRIVE;
             ratio = top.value;
         } else {
-            const letter = (top.value ? TOP_HIGH : BOTTOM_HIGH)[channel];
+            const letter = (top.value ? TOP_HIGH : BOTTOM_HIGH)[node];
             configuration = letter.charCodeAt() - "a".charCodeAt();
             ratio = this.table[(row.value * 16 + column.value) * A_TO_H + configuration];
         }
         const code = Math.min(1023, Math.max(0, Math.floor(ratio * 1024)));
         if (this.logging) {
             const settle = Math.min(NEVER_CYCLES, Math.max(0, cycle - this.pinsChanged));
-            this.holds.push([cycle, row.value, column.value, configuration, channel, code, settle]);
+            this.holds.push([cycle, row.value, column.value, configuration, node & 0xff, code, settle]);
         }
         return code;
     }
@@ -219,6 +219,14 @@ class Board {
 function matchCycle(timer) {
     const turn = timer.TOP + 1;
     return timer.lastCycle - ((timer.tcnt - timer.ocrB + turn) % turn) * timer.divider;
+}
+
+function readWires(text) {
+    const pin = "P([A-HJ-L])([0-7])", wires = new RegExp(`^${Array(10).fill(pin)},${Array(4).fill("([0-7])")}$`);
+    const found = wires.exec(text)?.slice(1);
+    if (!found) throw new Error(`not a wiring: ${text}`);
+    const pins = Array.from({ length: 10 }, (_, i) => [found[2 * i], Number(found[2 * i + 1])]);
+    return { pins, channels: found.slice(20).map(Number) };
 }
 
 function loadHex(text, flashBytes) {

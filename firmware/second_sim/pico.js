@@ -18,11 +18,17 @@ const ADC_CHANNEL_SHIFT = 12;
 const NEVER_COUNTS = 0xffffffff;
 const A_TO_H = 8, EQUAL_DRIVE = 8, UNDRIVEN = 9, OTHER_CHANNEL = 10;
 const TOP_HIGH = "abef", BOTTOM_HIGH = "dchg";
-const WIRES = { row: [2, 3, 4, 5], column: [6, 7, 8, 9], driveTop: 10, driveBottom: 11 };
+const WIRES = "2,3,4,5,6,7,8,9,10,11,0,1,2,3"; // pins, and inputs of the converter
 
 class Pico {
-    // uf2: what a Pico is given in place of a hex file.
-    constructor(uf2) {
+    // uf2: what a Pico is given in place of a hex file. pins: another wiring, as WIRES.
+    constructor(uf2, pins = WIRES) {
+        const numbers = pins.split(",").map(Number);
+        const fits = numbers.every((number) => Number.isInteger(number) && number >= 0 && number < 26);
+        if (numbers.length !== 14 || !fits) throw new Error(`not a wiring: ${pins}`);
+        const part = (begin, end) => numbers.slice(begin, end);
+        this.wires = { row: part(0, 4), column: part(4, 8), top: part(8, 9), bottom: part(9, 10) };
+        this.channels = part(10, 14);
         this.memory = new Uint8Array(FLASH_BYTES).fill(0xff);
         loadUf2(uf2, this.memory);
         this.random = generator(1);
@@ -136,7 +142,7 @@ class Pico {
 
     watchPins() {
         const { sio, adc, clock } = this.mcu;
-        const pins = [...WIRES.row, ...WIRES.column, WIRES.driveTop, WIRES.driveBottom];
+        const pins = Object.values(this.wires).flat();
         const mask = pins.reduce((bits, pin) => bits | (1 << pin), 0);
         this.pinsChangedNs = this.channelChangedNs = -Infinity;
         const write = sio.writeUint32.bind(sio);
@@ -172,10 +178,12 @@ class Pico {
     // that change before its end are counted.
     sample(channel) {
         const { adc, clock } = this.mcu;
-        const row = this.pins(WIRES.row), column = this.pins(WIRES.column);
-        const top = this.pins([WIRES.driveTop]), bottom = this.pins([WIRES.driveBottom]);
+        const { wires } = this;
+        const row = this.pins(wires.row), column = this.pins(wires.column);
+        const top = this.pins(wires.top), bottom = this.pins(wires.bottom);
+        const node = this.channels.indexOf(channel);
         let configuration, ratio = 0;
-        if (channel >= TOP_HIGH.length) {
+        if (node < 0) {
             configuration = OTHER_CHANNEL;
         } else if (![row, column, top, bottom].every((pin) => pin.driven)) {
             configuration = UNDRIVEN;
@@ -184,7 +192,7 @@ class Pico {
             configuration = EQUAL_DRIVE;
             ratio = top.value;
         } else {
-            const letter = (top.value ? TOP_HIGH : BOTTOM_HIGH)[channel];
+            const letter = (top.value ? TOP_HIGH : BOTTOM_HIGH)[node];
             configuration = letter.charCodeAt() - "a".charCodeAt();
             ratio = this.table[(row.value * 16 + column.value) * A_TO_H + configuration];
         }
@@ -198,7 +206,7 @@ class Pico {
         // A count is several instructions: a hold after a new table comes a count after it, too.
         const count = Math.max(this.counts, this.tableCounts + 1);
         if (this.logging)
-            this.holds.push([count, row.value, column.value, configuration, channel, code, settle]);
+            this.holds.push([count, row.value, column.value, configuration, node & 0xff, code, settle]);
         adc.channelValues[channel] = code;
         adc.currentChannel = channel;
         adc.sampleAlarm.schedule(CONVERSION_NS);

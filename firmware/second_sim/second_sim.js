@@ -66,13 +66,15 @@ const OPERATIONS = {
 };
 
 function main() {
-    const [flag, name, path] = process.argv.slice(2);
-    if (flag !== "--board" || path === undefined) {
-        console.error("usage: second_sim.js --board uno|megaatmega2560|pico FIRMWARE");
+    const given = process.argv.slice(2);
+    const [flag, name] = given;
+    const path = given.at(-1), pins = given[2] === "--pins" ? given[3] : undefined;
+    if (flag !== "--board" || given.length !== (pins === undefined ? 3 : 5)) {
+        console.error("usage: second_sim.js --board uno|megaatmega2560|pico [--pins PINS] FIRMWARE");
         process.exit(2);
     }
     const file = fs.readFileSync(path);
-    const board = name === "pico" ? new Pico(file) : new Board(name, file.toString("latin1"));
+    const board = name === "pico" ? new Pico(file, pins) : new Board(name, file.toString("latin1"), pins);
     for (;;) {
         const header = read(5);
         const op = String.fromCharCode(header[0]);

@@ -34,7 +34,7 @@ static struct {
     instant start, end; /* of the conversion in progress */
     unsigned divider;   /* CPU cycles in one ADC clock, of the conversion in progress */
     double hold_clocks, all_clocks;
-    unsigned channel; /* connected to the sample and hold */
+    unsigned channel; /* its node, connected to the sample and hold */
     uint16_t code, result;
     bool locked, unread; /* ADCL read and ADCH not; result not read */
 } adc;
@@ -44,8 +44,11 @@ static unsigned divider(void) {
     return 1u << (adps ? adps : 1);
 }
 
+/* A channel without a node is numbered behind the nodes. */
 static unsigned selected_channel(void) {
-    return (cpu->data[ADMUX_] & MUX_) | (cpu->data[ADCSRB_] & MUX5_) << 2;
+    const unsigned channel = (cpu->data[ADMUX_] & MUX_) | (cpu->data[ADCSRB_] & MUX5_) << 2;
+    const unsigned node = skin_node_at(channel);
+    return node < NODES ? node : NODES + channel;
 }
 
 static bool multiplexer_is_free(void) {
@@ -275,8 +278,8 @@ void adc_start(void) {
 
 void adc_reset(void) {
     adc.phase = IDLE;
-    adc.channel = 0;
-    skin_connect(0, cpu->cycle);
+    adc.channel = selected_channel();
+    skin_connect(adc.channel, cpu->cycle);
     adc.result = 0;
     adc.locked = adc.unread = false;
     events_set(EVENT_ADC, NEVER);

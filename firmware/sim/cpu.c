@@ -25,7 +25,7 @@ enum {
     PORF_ = 1,
     EXTRF_ = 2,
     WDRF_ = 8,
-    CHAINED_MAX = 12
+    CHAINED_MAX = 64
 };
 
 avr_t *cpu;

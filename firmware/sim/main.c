@@ -12,23 +12,28 @@
 #include <unistd.h>
 
 static int usage(void) {
-    fprintf(stderr, "usage: skinsim --board uno|megaatmega2560 [--bootloader HEX] [--pty] ELF\n");
+    fprintf(stderr, "usage: skinsim --board uno|megaatmega2560 [--bootloader HEX] [--pins PINS] "
+                    "[--pty] ELF\n");
     return 2;
 }
 
 int main(int argc, char **argv) {
     static const struct option OPTIONS[] = {{"board", required_argument, NULL, 'b'},
                                             {"bootloader", required_argument, NULL, 'l'},
+                                            {"pins", required_argument, NULL, 'w'},
                                             {"pty", no_argument, NULL, 'p'},
                                             {0}};
     const struct board *board = NULL;
-    const char *loader = NULL;
+    struct board wired; /* the board with another wiring */
+    const char *loader = NULL, *pins = NULL;
     bool pty = false;
     for (int option; (option = getopt_long(argc, argv, "", OPTIONS, NULL)) != -1;) {
         if (option == 'b')
             board = skin_find_board(optarg);
         else if (option == 'l')
             loader = optarg;
+        else if (option == 'w')
+            pins = optarg;
         else if (option == 'p')
             pty = true;
         else
@@ -40,6 +45,12 @@ int main(int argc, char **argv) {
         loader = board->loader;
     if (!board || optind != argc - 1)
         return usage();
+    if (pins) {
+        wired = *board;
+        board = &wired;
+        if (!skin_read_wiring(pins, &wired.wiring))
+            return usage();
+    }
 
     /* libsimavr prints on stdout; only replies may go there. */
     const int replies = dup(STDOUT_FILENO);

@@ -12,38 +12,48 @@
 #define LOADERS "/usr/share/arduino/hardware/arduino/avr/bootloaders/"
 
 /* The one table of pins. PINx, DDRx and PORTx follow each other in data space. Of all ports: the
- * pins that a board can use, without the sense pins, the crystal's and the reset pin. */
-static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x30}, {0x2B, 0xFF}, {0, 0}};
+ * pins that a board can use, without the crystal's and the reset pin. */
+static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x3F}, {0x2B, 0xFF}, {0, 0}};
 static const struct port MEGA[] = {{0x22, 0xFF},  {0x25, 0xFF},  {0x28, 0xFF},  {0x2B, 0xFF},
-                                   {0x2E, 0xFF},  {0x31, 0xF0},  {0x34, 0x3F},  {0x102, 0xFF},
+                                   {0x2E, 0xFF},  {0x31, 0xFF},  {0x34, 0x3F},  {0x102, 0xFF},
                                    {0x105, 0xFF}, {0x108, 0xFF}, {0x10B, 0xFF}, {0, 0}};
 static const struct board BOARDS[] = {
     /* rows PORTD4-7, columns PORTB0-3, drive PD2 and PD3 */
-    {"uno",
-     "atmega328p",
-     0x2B,
-     0x25,
-     0x2B,
-     4,
-     0,
-     2,
-     3,
-     UNO,
-     {0x2B, 1 << 1},
-     LOADERS "optiboot/optiboot_atmega328.hex"},
+    {.name = "uno",
+     .mcu = "atmega328p",
+     .wiring = {{{0x2B, 4},
+                 {0x2B, 5},
+                 {0x2B, 6},
+                 {0x2B, 7},
+                 {0x25, 0},
+                 {0x25, 1},
+                 {0x25, 2},
+                 {0x25, 3},
+                 {0x2B, 2},
+                 {0x2B, 3}},
+                {0, 1, 2, 3}},
+     .ports = UNO,
+     .analog_port = 0x28,
+     .tx = {0x2B, 1 << 1},
+     .loader = LOADERS "optiboot/optiboot_atmega328.hex"},
     /* rows PORTA0-3, columns PORTC0-3, drive PL0 and PL1 */
-    {"megaatmega2560",
-     "atmega2560",
-     0x22,
-     0x28,
-     0x10B,
-     0,
-     0,
-     0,
-     1,
-     MEGA,
-     {0x2E, 1 << 1},
-     LOADERS "stk500v2/stk500boot_v2_mega2560.hex"},
+    {.name = "megaatmega2560",
+     .mcu = "atmega2560",
+     .wiring = {{{0x22, 0},
+                 {0x22, 1},
+                 {0x22, 2},
+                 {0x22, 3},
+                 {0x28, 0},
+                 {0x28, 1},
+                 {0x28, 2},
+                 {0x28, 3},
+                 {0x10B, 0},
+                 {0x10B, 1}},
+                {0, 1, 2, 3}},
+     .ports = MEGA,
+     .analog_port = 0x31,
+     .tx = {0x2E, 1 << 1},
+     .loader = LOADERS "stk500v2/stk500boot_v2_mega2560.hex"},
 };
 
 struct node {
@@ -82,6 +92,32 @@ const struct board *skin_find_board(const char *name) {
         if (!strcmp(name, BOARDS[i].name))
             return &BOARDS[i];
     return NULL;
+}
+
+bool skin_read_wiring(const char *text, struct wiring *wiring) {
+    static const char LETTERS[] = "ABCDEFGHJKL";
+    static const uint16_t PORTS[] = {0x22, 0x25,  0x28,  0x2B,  0x2E, 0x31,
+                                     0x34, 0x102, 0x105, 0x108, 0x10B};
+    for (unsigned i = 0; i < PINS; i++) {
+        const char *letter = text[0] == 'P' && text[1] ? strchr(LETTERS, text[1]) : NULL;
+        if (!letter || text[2] < '0' || text[2] > '7' || text[3] != ',')
+            return false;
+        wiring->pins[i] = (struct pin){PORTS[letter - LETTERS], (uint8_t)(text[2] - '0')};
+        text += 4;
+    }
+    for (unsigned node = 0; node < NODES; node++, text++) {
+        if (*text < '0' || *text > '7' || text[1] != (node + 1 < NODES ? ',' : '\0'))
+            return false;
+        wiring->channels[node] = (uint8_t)(*text++ - '0');
+    }
+    return true;
+}
+
+unsigned skin_node_at(unsigned channel) {
+    for (unsigned node = 0; node < NODES; node++)
+        if (skin.board->wiring.channels[node] == channel)
+            return node;
+    return NODES;
 }
 
 static uint8_t configuration(unsigned node) {
@@ -254,17 +290,24 @@ static void retarget(instant when) {
 
 static bool is_output(uint16_t port, uint8_t mask) { return (cpu->data[port - 1] & mask) == mask; }
 
+/* What some of the pins show, the first one bit 0. */
+static uint8_t number_at(unsigned first, unsigned count) {
+    uint8_t number = 0;
+    for (unsigned i = 0; i < count; i++) {
+        const struct pin pin = skin.board->wiring.pins[first + i];
+        number |= (uint8_t)((cpu->data[pin.port] >> pin.bit & 1) << i);
+    }
+    return number;
+}
+
 static void on_pins(instant when) {
-    const struct board *b = skin.board;
-    const uint8_t row = cpu->data[b->row_port] >> b->row_shift & 15;
-    const uint8_t column = cpu->data[b->column_port] >> b->column_shift & 15;
-    const uint8_t drive = cpu->data[b->drive_port];
-    const bool top_high = drive >> b->drive_top_bit & 1,
-               bottom_high = drive >> b->drive_bottom_bit & 1;
-    const bool undriven =
-        !is_output(b->row_port, (uint8_t)(15 << b->row_shift)) ||
-        !is_output(b->column_port, (uint8_t)(15 << b->column_shift)) ||
-        !is_output(b->drive_port, (uint8_t)(1 << b->drive_top_bit | 1 << b->drive_bottom_bit));
+    const uint8_t row = number_at(PIN_ROW, 4), column = number_at(PIN_COLUMN, 4);
+    const bool top_high = number_at(PIN_DRIVE_TOP, 1), bottom_high = number_at(PIN_DRIVE_BOTTOM, 1);
+    bool undriven = false;
+    for (unsigned i = 0; i < PINS; i++) {
+        const struct pin pin = skin.board->wiring.pins[i];
+        undriven |= !is_output(pin.port, (uint8_t)(1 << pin.bit));
+    }
     if (row == skin.row && column == skin.column && top_high == skin.top_high &&
         bottom_high == skin.bottom_high && undriven == skin.undriven)
         return;
@@ -280,10 +323,16 @@ static void on_pins(instant when) {
 
 unsigned skin_floating_pins(void) {
     unsigned count = 0;
-    for (const struct port *p = skin.board->ports; p->mask; p++)
-        for (uint8_t left = p->mask & ~(cpu->data[p->port - 1] | cpu->data[p->port]); left;
-             left >>= 1)
+    uint8_t sensing = 0;
+    for (unsigned node = 0; node < NODES; node++)
+        sensing |= (uint8_t)(1 << skin.board->wiring.channels[node]);
+    for (const struct port *p = skin.board->ports; p->mask; p++) {
+        uint8_t left = p->mask & ~(cpu->data[p->port - 1] | cpu->data[p->port]);
+        if (p->port == skin.board->analog_port)
+            left &= (uint8_t)~sensing;
+        for (; left; left >>= 1)
             count += left & 1;
+    }
     return count;
 }
 
@@ -299,12 +348,13 @@ void skin_start(const struct board *board) {
         for (int c = 0; c < SKIN_COLUMNS; c++) /* nothing connected: no current */
             memcpy(skin.ratio[r][c], (const double[]){1, 0, 1, 0, 1, 0, 1, 0},
                    sizeof skin.ratio[r][c]);
-    const uint16_t ports[] = {board->row_port, board->column_port, board->drive_port};
-    for (int i = 0; i < 3; i++) {
-        if (i == 2 && (ports[2] == ports[0] || ports[2] == ports[1]))
-            continue;
-        for (uint16_t offset = 0; offset < 3; offset++) /* PINx too: writing it toggles PORTx */
-            cpu_after_write(ports[i] - offset, offset == 2, on_pins);
+    for (unsigned i = 0; i < PINS; i++) {
+        const uint16_t port = board->wiring.pins[i].port;
+        bool hooked = false;
+        for (unsigned j = 0; j < i; j++)
+            hooked |= board->wiring.pins[j].port == port;
+        for (uint16_t offset = 0; offset < 3 && !hooked; offset++) /* PINx too: it toggles PORTx */
+            cpu_after_write(port - offset, offset == 2, on_pins);
     }
 }
 

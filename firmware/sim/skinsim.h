@@ -89,15 +89,30 @@ struct port {
     uint16_t port; /* data-space address of PORTx */
     uint8_t mask;
 };
+struct pin {
+    uint16_t port; /* data-space address of PORTx */
+    uint8_t bit;
+};
+/* S0 to S3 of rows and of columns, and the drive pins; the converter's channels, by node. */
+enum { PIN_ROW, PIN_COLUMN = 4, PIN_DRIVE_TOP = 8, PIN_DRIVE_BOTTOM, PINS };
+struct wiring {
+    struct pin pins[PINS];
+    uint8_t channels[NODES];
+};
 struct board {
     const char *name, *mcu;
-    uint16_t row_port, column_port, drive_port; /* data-space addresses of PORTx */
-    uint8_t row_shift, column_shift, drive_top_bit, drive_bottom_bit;
+    struct wiring wiring;
     const struct port *ports; /* to a mask of 0 */
+    uint16_t analog_port;     /* channels 0 to 7 of the converter are its pins */
     struct port tx;
     const char *loader; /* with which it is sold */
 };
 const struct board *skin_find_board(const char *name);
+/* Another wiring of the board, as in PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3. False: it is
+ * none. */
+bool skin_read_wiring(const char *text, struct wiring *wiring);
+/* The node at a channel of the converter; NODES: none is. */
+unsigned skin_node_at(unsigned channel);
 void skin_start(const struct board *board);
 void skin_reset(void);
 void skin_set_table(const double *ratio);

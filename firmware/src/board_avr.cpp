@@ -8,33 +8,47 @@
 #include <avr/io.h>
 #include <avr/wdt.h>
 
+#include "avr_pins.h"
 #include "board.h"
 #include "core/reset_cause.h"
 
 namespace ohmskin {
 namespace board {
 
-// ------------------------------------------------------------- wiring: the one table that says it
+// ------------------------------------------------------------------ wiring: wiring.h says it
 // Sense nodes: top on A0, bottom on A1, far end of the row on A2, of the column on A3. A pull-up
 // would draw current through the skin, so they float, as analog inputs. No other pin floats. The
 // serial line's RX has its pull-up on. Its TX is an output at 1, which holds the line idle while
 // the transmitter is off. Unused pins of the ports that each slot writes as a whole are outputs at
 // 0: connect nothing to them. All other unused pins are inputs with pull-ups.
 const uint32_t CLOCK_HZ = F_CPU;
-// The reference resistors of README.md's wiring; docs/build.md says why they are 30 kOhm. Boards
-// with others need other numbers here: the host computes with what `hello` says.
-const uint32_t REF_TOP_OHM = 30000;
-const uint32_t REF_BOTTOM_OHM = 30000;
+const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
+const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 
 namespace {
-// Channels of the converter, by Sense.
-constexpr uint8_t CHANNELS[] = {0, 1, 2, 3};
-// Their pins, as bits of port C (Uno) or F (Mega).
-constexpr uint8_t CHANNEL_PINS = 0x0F;
+// Channels of the converter, by Sense, and their pins, as bits of port C (Uno) or F (Mega).
+constexpr const uint8_t (&CHANNELS)[4] = wiring::SENSE_INPUTS;
+constexpr uint8_t CHANNEL_PINS = avr_pins::SENSE_BITS;
 }  // namespace
 
 #if defined(__AVR_ATmega328P__)
 const frames::Board KIND = frames::Board::Uno;
+#elif defined(__AVR_ATmega2560__)
+const frames::Board KIND = frames::Board::Megaatmega2560;
+#else
+#error "no pin table for this chip"
+#endif
+
+#if OHMSKIN_OWN_PINS
+namespace {
+using avr_pins::DRIVE_BOTTOM;
+using avr_pins::DRIVE_TOP;
+inline void pins_begin() { avr_pins::begin(); }
+inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
+    avr_pins::set(row, column, drive);
+}
+}  // namespace
+#elif defined(__AVR_ATmega328P__)
 namespace {
 // Row address D4-D7 (PD4-7), drive top D2 (PD2), drive bottom D3 (PD3), column address D8-D11
 // (PB0-3). Serial line: RX D0 (PD0), TX D1 (PD1). Outputs at 0: D12, D13 (PB4-5). Pull-ups: A4, A5
@@ -55,8 +69,7 @@ inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
     PORTB = column;
 }
 }  // namespace
-#elif defined(__AVR_ATmega2560__)
-const frames::Board KIND = frames::Board::Megaatmega2560;
+#else
 namespace {
 // Row address D22-D25 (PA0-3), column address D37-D34 (PC0-3), drive top D49 (PL0), drive bottom
 // D48 (PL1). Serial line: RX D0 (PE0), TX D1 (PE1). Outputs at 0: D26-D33 (PA4-7, PC4-7), D42-D47
@@ -79,8 +92,6 @@ inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
     PORTL = drive;
 }
 }  // namespace
-#else
-#error "no pin table for this chip"
 #endif
 
 // ----------------------------------------------------------------------------------- slots

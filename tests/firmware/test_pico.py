@@ -3,6 +3,7 @@
 
 import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ import test_firmware_settings as settings
 
 from firmware_helpers import OTHER_SCAN, assert_whole, go_fast, reset
 from lockstep import DEFAULT_SCAN, Rig
+from pin_maps import PinMap
+from places import ROOT
 from second_simulator import PICO_ELF, PicoSim
 
 pytestmark = pytest.mark.pico
@@ -75,6 +78,26 @@ def test_pins_and_channel_stay_until_a_conversion_has_ended(rig: Rig) -> None:
     rig.must("stop")
     assert_whole(rig)
     assert rig.sim.stats()["changed_while_converting"] == 0
+
+
+def test_a_pico_that_is_wired_otherwise_reads_right(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
+    pin_map = PinMap((12, 0, 25, 14), (22, 21, 20, 3), (1, 16), (3, 1, 2, 0), (10_000, 47_000))
+    pico = ROOT / "firmware" / "pico"
+    command = ["make", "-s", "-C", pico, f"BUILD={tmp_path}", f"OHMSKIN_FLAGS={pin_map.flags}"]
+    subprocess.run(command, check=True, capture_output=True)
+    pins = (*pin_map.rows, *pin_map.columns, *pin_map.drive, *pin_map.sense)
+    sim = PicoSim(tmp_path / "ohmskin.elf", ",".join(map(str, pins)))
+    with Rig("uno", sim) as rig:
+        rig.run(sim.boot_s)
+        rig.randomize(rng)
+        rig.start_scan(mode="far", rows=16, columns=5)
+        hello = rig.hello()
+        assert (hello["ref_top_ohm"], hello["ref_bottom_ohm"]) == pin_map.ref_ohm
+        rig.run(0.05)
+        rig.must("stop")
+        assert_whole(rig)
 
 
 def test_usb_keeps_to_the_rules(rig: Rig) -> None:

@@ -4,6 +4,7 @@
 import json
 import shutil
 import struct
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -22,9 +23,9 @@ def is_installed(chip: str) -> bool:
 class SecondSim(LockstepSim):
     """A board with its HEX file; has the operations that firmware/second_sim/README.md lists."""
 
-    def __init__(self, board: str) -> None:
+    def __init__(self, board: str, elf: Path | None = None, pins: str = "") -> None:
         with patch("ohmskin.emulate.simavr.PROGRAM", FOLDER / "second_sim.js"):
-            super().__init__(board, elf_of(board).with_suffix(".hex"))
+            super().__init__(board, (elf or elf_of(board)).with_suffix(".hex"), pins=pins)
 
 
 class PicoSim(LockstepSim):
@@ -35,9 +36,9 @@ class PicoSim(LockstepSim):
     jitter_cycles = 2
     """Its processor starts each conversion, up to some instructions late."""
 
-    def __init__(self) -> None:
+    def __init__(self, elf: Path = PICO_ELF, pins: str = "") -> None:
         with patch("ohmskin.emulate.simavr.PROGRAM", FOLDER / "second_sim.js"):
-            super().__init__("pico", PICO_ELF.with_suffix(".uf2"))
+            super().__init__("pico", elf.with_suffix(".uf2"), pins=pins)
 
     def cut_power(self) -> None:
         """Switch it off and on again: what the flash was writing is left half done."""

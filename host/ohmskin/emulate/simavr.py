@@ -58,17 +58,20 @@ class SkinSim(Closing):
     board: one of `BOARDS`. elf: the firmware. bootloader: an Intel hex file of the boot section, or
     "board" for the one the board is sold with. pty: run in real time, from the request "G" on, with
     the UART on the pseudo-terminal `pty_path`; else time passes only in requests that run the
-    board.
+    board. pins: a wiring unlike the board's own, as firmware/sim/README.md has it.
 
     Raises FileNotFoundError if the simulator or the firmware is not built, SimulationError if the
     simulator does not start. Requests may come from any thread, but after `close` none.
     """
 
-    def __init__(self, board: str, elf: Path, *, pty: bool = False, bootloader: str = "") -> None:
+    def __init__(
+        self, board: str, elf: Path, *, pty: bool = False, bootloader: str = "", pins: str = ""
+    ) -> None:
         for path, made_by in ((PROGRAM, "make sim"), (elf, "make firmware")):
             if not path.is_file():
                 raise FileNotFoundError(f"{path} is missing: run '{made_by}' in a checkout")
         options = pty * ["--pty"] + bool(bootloader) * ["--bootloader", bootloader]
+        options += bool(pins) * ["--pins", pins]
         command = [str(PROGRAM), "--board", board, *options, str(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
         pipe = subprocess.PIPE

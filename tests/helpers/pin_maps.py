@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards that are wired otherwise: their firmware, and the same wiring for the simulators."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from places import ROOT
+
+# Debian's arduino-core-avr: which port and bit a pin is. The firmware has a table of its own.
+VARIANTS = Path("/usr/share/arduino/hardware/arduino/avr/variants")
+VARIANT = {"uno": "standard", "megaatmega2560": "mega"}
+
+
+@dataclass(frozen=True)
+class PinMap:
+    """A wiring by Arduino's numbers; sense: analog inputs, top, bottom, far of rows, of columns."""
+
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+    drive: tuple[int, int]
+    sense: tuple[int, ...]
+    ref_ohm: tuple[int, int] = (30_000, 30_000)
+
+    @property
+    def flags(self) -> str:
+        """What platformio.ini's build_flags are told."""
+        lists = {"ROW_PINS": self.rows, "COLUMN_PINS": self.columns, "SENSE_INPUTS": self.sense}
+        numbers = {
+            "DRIVE_TOP_PIN": self.drive[0],
+            "DRIVE_BOTTOM_PIN": self.drive[1],
+            "REF_TOP_OHM": self.ref_ohm[0],
+            "REF_BOTTOM_OHM": self.ref_ohm[1],
+        }
+        said = {name: ",".join(map(str, pins)) for name, pins in lists.items()} | numbers
+        return " ".join(f"-DOHMSKIN_{name}={value}" for name, value in said.items())
+
+    def pins(self, board: str) -> str:
+        """The option --pins of both simulators."""
+        ports = _ports(board)
+        wired = [ports[pin] for pin in (*self.rows, *self.columns, *self.drive)]
+        return ",".join([*wired, *map(str, self.sense)])
+
+
+# Three for each board: all ports that it has, among the sense pins too; blocks in other places; the
+# lamp's pin, and analog inputs as outputs.
+MAPS = {
+    "uno": (
+        PinMap((16, 7, 12, 2), (8, 3, 10, 11), (5, 19), (1, 0, 3, 4), (10_000, 47_000)),
+        PinMap((8, 9, 10, 11), (4, 5, 6, 7), (12, 2), (5, 4, 1, 0)),
+        PinMap((4, 5, 6, 13), (8, 9, 10, 18), (3, 14), (1, 2, 3, 5)),
+    ),
+    "megaatmega2560": (
+        PinMap((5, 22, 40, 53), (69, 14, 2, 33), (10, 3), (7, 5, 0, 2), (10_000, 47_000)),
+        PinMap((37, 36, 35, 34), (25, 24, 23, 22), (48, 49), (3, 2, 1, 0)),
+        PinMap((62, 63, 64, 65), (6, 7, 8, 9), (13, 54), (1, 2, 3, 4)),
+    ),
+}
+
+
+@cache
+def _ports(board: str) -> tuple[str, ...]:
+    """Port and bit of each pin, as PD4."""
+    header = (VARIANTS / VARIANT[board] / "pins_arduino.h").read_text()
+    listed = []
+    for name in ("digital_pin_to_port_PGM", "digital_pin_to_bit_mask_PGM"):
+        body = header.split(f"{name}[] = {{", 1)[1].split("};", 1)[0]
+        listed.append(re.sub(r"//.*", "", body))
+    ports = re.findall(r"\bP([A-L])\b", listed[0])
+    bits = re.findall(r"_BV\(\s*(\d)\s*\)", listed[1])
+    assert len(ports) == len(bits)
+    return tuple(f"P{port}{bit}" for port, bit in zip(ports, bits, strict=True))
+
+
+def build(board: str, flags: str, place: Path) -> Path:
+    """Build the firmware with these flags below `place`; its ELF file.
+
+    :raises subprocess.CalledProcessError: it does not compile; its `stdout` says why.
+    """
+    variables = {
+        "PLATFORMIO_BUILD_DIR": str(place),
+        "PLATFORMIO_BUILD_FLAGS": flags,
+        "PLATFORMIO_CORE_DIR": str(ROOT / ".pio" / "core"),
+    }
+    pio = Path(sys.executable).parent / "pio"
+    command = [str(pio), "run", "-s", "-d", str(ROOT), "-e", board]
+    subprocess.run(
+        command,
+        env=os.environ | variables,
+        check=True,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    return place / board / "firmware.elf"
