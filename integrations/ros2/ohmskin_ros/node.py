@@ -56,8 +56,13 @@ class SkinNode(Node):
     def _publish(self) -> None:
         for scan in self.skin:
             head = header(scan, self._frame_id)
-            self._points.publish(point_cloud(scan, head))
-            self._image.publish(image(scan, head))
+            try:
+                self._points.publish(point_cloud(scan, head))
+                self._image.publish(image(scan, head))
+            except Exception:
+                if rclpy.ok():
+                    raise
+                return  # Ctrl-C ends the context, which all publishers need, before this thread
             self.missed += scan.missed
             self.published += 1
 

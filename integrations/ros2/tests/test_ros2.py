@@ -48,13 +48,14 @@ def node(skin_json: Path) -> Iterator[Callable[[str], subprocess.Popen]]:
     def start(url: str) -> subprocess.Popen:
         parameters = ("-p", f"calibration:={skin_json}", "-p", f"port:='{url}'")
         command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", *parameters]
-        started.append(subprocess.Popen(command))
+        started.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
         return started[-1]
 
     yield start
     for process in started:
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
+        _, said = process.communicate(timeout=30)
+        assert (process.returncode, "Traceback" in said) == (0, False), said
 
 
 @pytest.fixture

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node of a skin.
+
+~/points      sensor_msgs/PointCloud2          x y z normal_x normal_y normal_z force force_std
+~/image       sensor_msgs/Image                forces [N], one pixel a cell, 32FC1
+/diagnostics  diagnostic_msgs/DiagnosticArray  once a second: whether scans come, and what was lost
+~/tare        std_srvs/Trigger                 what the skin reads now is no force
+
+Parameters: port, calibration (with a geometry), frame_id ("": that of the geometry).
+
+Points and images are reliable with a depth of 100: a second of scans. RViz subscribes so, and a
+subscriber that asks for best effort gets them as well.
+"""
+
+import threading
+from contextlib import suppress
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image, PointCloud2
+from std_srvs.srv import Trigger
+
+import ohmskin
+from ohmskin_ros.messages import header, image, point_cloud
+
+QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class SkinNode(Node):
+    """Publishes every scan of one skin, through all that is unplugged."""
+
+    def __init__(self) -> None:
+        super().__init__("ohmskin")
+        port = self.declare_parameter("port", "/dev/ttyACM0").value
+        path = self.declare_parameter("calibration", "skin.json").value
+        frame_id = self.declare_parameter("frame_id", "").value
+        calibration = ohmskin.load_calibration(path)
+        if calibration.geometry is None:
+            said = "nobody has said where the cells are: ohmskin skin"
+            raise ValueError(f"{path}: {said} {path} --pitch-mm 10,10")
+        self._frame_id = frame_id or calibration.geometry.frame_id
+        self._points = self.create_publisher(PointCloud2, "~/points", QOS)
+        self._image = self.create_publisher(Image, "~/image", QOS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_service(Trigger, "~/tare", self._tare)
+        self.create_timer(1.0, self._diagnose)
+        self.missed = self.published = 0
+        self.skin = ohmskin.LiveSkin(port, calibration)
+        # A thread, so that a tare, which takes a second, holds up no scan.
+        self._thread = threading.Thread(target=self._publish)
+        self._thread.start()
+
+    def _publish(self) -> None:
+        for scan in self.skin:
+            head = header(scan, self._frame_id)
+            try:
+                self._points.publish(point_cloud(scan, head))
+                self._image.publish(image(scan, head))
+            except Exception:
+                if rclpy.ok():
+                    raise
+                return  # Ctrl-C ends the context, which all publishers need, before this thread
+            self.missed += scan.missed
+            self.published += 1
+
+    def _tare(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        try:
+            self.skin.tare()
+            answer.success, answer.message = True, "tared"
+        except (ohmskin.OhmskinError, ValueError) as exc:
+            answer.success, answer.message = False, str(exc)
+        return answer
+
+    def _diagnose(self) -> None:
+        failure, newest = self.skin.failure, self.skin.newest()
+        level, said = DiagnosticStatus.OK, "scanning"
+        if failure is not None or newest is None:
+            level, said = DiagnosticStatus.ERROR, str(failure or "no scan yet")
+        elif newest.estimate.message:
+            level, said = DiagnosticStatus.WARN, newest.estimate.message
+        counts = {
+            "scans": self.published,
+            "missed on the line": self.missed,
+            "skipped, as this machine is too slow": self.skin.skipped,
+            "times the port was opened": self.skin.opened,
+        }
+        values = [KeyValue(key=key, value=str(count)) for key, count in counts.items()]
+        status = DiagnosticStatus(
+            level=level, name="ohmskin", message=said, hardware_id=self.skin.port, values=values
+        )
+        stamp = self.get_clock().now().to_msg()
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = stamp
+        self._diagnostics.publish(array)
+
+    def close(self) -> None:
+        """End reading and publishing."""
+        self.skin.close()
+        self._thread.join()
+        self.destroy_node()
+
+
+def main() -> None:
+    """Run the node until Ctrl-C."""
+    rclpy.init()
+    try:
+        node = SkinNode()
+    except (ValueError, ohmskin.OhmskinError) as exc:
+        rclpy.try_shutdown()
+        raise SystemExit(f"ohmskin_ros: {exc}") from exc
+    try:
+        with suppress(KeyboardInterrupt, ExternalShutdownException):
+            rclpy.spin(node)
+    finally:
+        node.close()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
