@@ -34,7 +34,7 @@ BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help setup setup-host pins demo test check docs format firmware pico wheel test-firmware test-arduino-gcc check-firmware sim \
-        test-host test-world fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
+        test-host test-world test-lerobot fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -116,6 +116,9 @@ test-host: setup firmware pico sim ## pytest, three processes for two cores
 
 test-world: setup-host ## test integrations/ with the real libraries: MuJoCo, Foxglove, Rerun, ROS 2 (build/world)
 	tools/test_world.sh mujoco foxglove ros2 notebook
+
+test-lerobot: setup-host ## test integrations/lerobot with LeRobot: installs 6.4 GB below build/world
+	tools/test_world.sh lerobot
 
 FUZZED := build/fuzz/frame_reader
 READER := firmware/src/core/frame_reader

@@ -4,7 +4,7 @@
 # Usage: tools/test_world.sh NAME...        (run by `make test-world`, from the repository's root)
 #
 # Tests integrations/NAME with the real libraries, each in an environment of its own below
-# build/world. Prints a line for each, with the number of tests that passed. A test that is skipped
+# build/world. Prints its figures and a line for each, with the number of tests that passed. A test that is skipped
 # is a failure, because all that a test needs is installed here.
 #
 #   PYTHON312=/path/to/python3.12     for ros2 and lerobot, which need this version
@@ -45,13 +45,14 @@ for name in "$@"; do
     fi
     said=$(env -u PYTHONPATH PYTHONPATH=tests/helpers OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
         "$env/bin/python" -m pytest --rootdir "integrations/$name" -c "integrations/$name/pyproject.toml" \
-        "integrations/$name" 2>&1)
+        "integrations/$name" -s 2>&1)
     code=$?
     summary=$(tail -1 <<<"$said")
     if ((code)) || grep -q skipped <<<"$summary"; then
         echo "$said"
         failed=1
     fi
+    grep -o "figure: .*" <<<"$said"
     echo "test-world: $name: $summary"
 done
 exit $failed

@@ -93,7 +93,7 @@ def test_a_recording_with_clouds_plays_as_before(
     assert table[3 * 8 + 5, :6] == pytest.approx([0.05, 0.03, 0, 0, 0, 1])
     run("-m", "ohmskin", "export", both, both.with_suffix(".csv"))
     times = both.stat().st_size / recorded.stat().st_size
-    print(f"size over the recording's: {times:.2f}")
+    print(f"figure: size over the recording's: {times:.2f}")
     assert times < 2.5
 
 
@@ -165,7 +165,7 @@ def test_a_client_gets_scans_live(served: tuple[str, object]) -> None:
     late_ms = [1e-6 * (now - log) for topic, log, now in found[200:] if topic == POINTS]
     # A scan's last byte comes half a period after its middle.
     late_ms = np.median(late_ms) - 1e3 * 0.5 / 90
-    print(f"last byte to client, median: {late_ms:.1f} ms")
+    print(f"figure: last byte to client, median: {late_ms:.1f} ms")
     # In order, and none twice. (A machine that is too busy for 90 estimates a second skips scans.)
     periods = np.diff(times_ns) / (1e9 / 90)
     assert (periods > 0.9).all()

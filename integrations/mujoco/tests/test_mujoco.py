@@ -76,7 +76,7 @@ def test_1_to_10_newtons_are_shown_to_2_percent(skin_json: str) -> None:
     assert motor_n.max() > 9.9
     assert on_skin_n == pytest.approx(motor_n, rel=0.05, abs=0.2)  # the gripper moves slowly
     rms = np.sqrt(np.mean((shown_n - on_skin_n) ** 2)) / on_skin_n.mean()
-    print(f"rms over the mean {100 * rms:.2f} %")
+    print(f"figure: total force shown, rms over the mean: {100 * rms:.2f} %")
     assert rms < 0.02
 
 

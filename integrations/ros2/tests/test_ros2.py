@@ -88,7 +88,7 @@ def test_clouds_and_images_come(node: Callable, reader: Node) -> None:
     reader.create_subscription(Image, "/ohmskin/image", images.append, 100)  # reliable, as RViz
     node(TOUCHED)
     until(reader, lambda: len(clouds) >= 300 and len(images) >= 300)
-    print(f"last byte to subscriber, median: {np.median(late_ms[100:]):.1f} ms")
+    print(f"figure: last byte to subscriber, median: {np.median(late_ms[100:]):.1f} ms")
     cloud, picture = clouds[-1], {stamp_ns(i): i for i in images}.get(stamp_ns(clouds[-1]))
     assert cloud.header.frame_id == "palm"
     assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (8, 8, 32, 256)
