@@ -85,7 +85,8 @@ def fit() -> tuple[TotalFit, Float, list[int]]:
     at_s = np.arange(0.5, time_s[-1], 0.1)
     shown_n = Scale(0.1, 0.1).shown(time_s, total_n[:, None], at_s)[:, 0] + 0.8
     shown_n += 0.02 * random.standard_normal(at_s.size)
-    totals = Totals(time_s, rises(force_n, gains), press, at_s, shown_n)
+    none = np.zeros_like(time_s)
+    totals = Totals(time_s, rises(force_n, gains), press, none, at_s, shown_n)
     return TotalFit(totals).fit(), gains, beside
 
 

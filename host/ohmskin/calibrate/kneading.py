@@ -48,9 +48,12 @@ from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Scan
 
-# At most so many scans of presses are estimated for the curves; and for each trial of the wires, so
-# many cells of them. Chosen: 16x16 then takes some minutes.
-MOST_SCANS, TRIAL_CELLS = 8000, 400_000
+# Scans of presses are estimated that are so far apart [s]. Chosen: half of the time in which a
+# finger comes or goes has two.
+SCAN_STEP_S: Final = 0.04
+# At most so many of them are estimated for the curves; and for each trial of the wires, so many
+# cells of them: first trials, and those after a short step. Chosen: 16x16 then takes some minutes.
+MOST_SCANS, FIRST_CELLS, TRIAL_CELLS = 8000, 60_000, 240_000
 # Presses are chosen in stretches of so many. Chosen: what a slow scale still shows of a press that
 # was not chosen is in one of so many.
 STRETCH: Final = 12
@@ -58,8 +61,13 @@ STRETCH: Final = 12
 PAUSE_SCANS: Final = 200
 # Rises below this many times what cells show of nothing tell no force.
 PAUSE_TIMES: Final = 2.0
-# Trials of the wires, their longest step, and the one that is the last.
-TRIALS, LONGEST_STEP, LAST_STEP = 6, 1.0, 0.1
+# Trials of the wires, their longest step, one that is short, and the one that is the last.
+TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 8, 1.5, 0.5, 0.1
+# A step that is shorter than so many deviations is short enough.
+CLOSE_STDS: Final = 0.7
+# Untold segments are at first tried with this [ohm]. Chosen: with wires that are far too large,
+# cells under much force conduct without limit, and the slopes tell nothing.
+START_OHM: Final = 50.0
 # How well a trial's segments are told: so well that no scan teaches others. Chosen.
 TRIAL_LOG_STD: Final = 1e-3
 
@@ -92,7 +100,9 @@ class Kneading:
         self.time_s = scan_times_s(scans)
         self._weighed: Bool | None = None  # scans whose force is known, if the scale does not lag
         self.of_skin: Float = np.sum(rise, axis=1, where=rises)
-        self._press = number_presses(np.where(rises.any(axis=1), 0, -1), self.of_skin)
+        is_pressed = rises.any(axis=1)
+        self._press = number_presses(np.where(is_pressed, 0, -1), self.of_skin)
+        self._is_clear = (self._press >= 0) | ~is_pressed  # a press that is too short is neither
 
     def learn(self, log: ForceLog, progress: Progress = iter, *, lags: bool = True) -> TotalFit:
         """Find the wires, unless the estimator shows them, and fit the curves.
@@ -105,11 +115,23 @@ class Kneading:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         if not calibrator.shows_wires:
             calibrator.take_wires(self._found_wires(log))
-        counts = np.cumsum(self._press >= 0)
-        every = int(counts[-1] // MOST_SCANS) + 1
-        used = (self._press < 0) | (counts % every == 0)
-        levels = self._levels(calibrator.estimator, used, progress)
+        levels = self._levels(calibrator.estimator, self._spaced(MOST_SCANS), progress)
         return TotalFit(self._totals(levels, log)).fit()
+
+    def _spaced(self, most: int) -> Bool:
+        """Which scans to use, (n,): pauses, ends of presses, and at most so many others."""
+        counts = np.cumsum(self._press >= 0)
+        step_s = float(np.median(np.diff(self.time_s)))
+        every = max(round(SCAN_STEP_S / step_s), int(counts[-1] // most) + 1, 1)
+        is_edge = np.diff(self._press, append=-1) != 0
+        is_edge[1:] |= is_edge[:-1]
+        return np.asarray(self._is_clear & ((self._press < 0) | is_edge | (counts % every == 0)))
+
+    def _in_stretches(self, most_cells: int) -> Bool:
+        """Which scans to use, (n,): as `_spaced`, of some stretches of presses."""
+        used, press = self._spaced(MOST_SCANS), np.maximum.accumulate(self._press)
+        cells = int(np.count_nonzero(used & (self._press >= 0))) * self.shape[0] * self.shape[1]
+        return np.asarray(used & (press // STRETCH % (cells // most_cells + 1) == 0))
 
     def _found_wires(self, log: ForceLog) -> FoundWires:
         """The wires with which one curve and gains fit the totals best."""
@@ -119,10 +141,10 @@ class Kneading:
         lead_ohm, lead_std_ohm = lead * UNKNOWN_LEAD_OHM, lead_std * UNKNOWN_LEAD_OHM
         if told.lead is None:
             lead_std_ohm = USUAL_LEAD_STD_OHM
-        cells = int(np.count_nonzero(self._press >= 0)) * knowledge.rows * knowledge.columns
-        every = cells // TRIAL_CELLS + 1
-        used = np.maximum.accumulate(self._press) // STRETCH % every == 0
         w, scale = np.array(centre), None
+        if told.both is None:
+            w = np.minimum(w, np.log(START_OHM))
+        used, is_first = self._in_stretches(FIRST_CELLS), True
         for _ in range(TRIALS):
             top_ohm, bottom_ohm = np.exp(w).tolist()
             wires = WireOhm(
@@ -137,7 +159,9 @@ class Kneading:
             scale = fit.scale_
             step, stds = fit.w
             w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
-            if np.abs(step).max() < LAST_STEP:
+            if is_first and (np.abs(step) < np.maximum(SHORT_STEP, stds)).all():
+                used, is_first = self._in_stretches(TRIAL_CELLS), False
+            elif (np.abs(step) < np.maximum(LAST_STEP, CLOSE_STDS * stds)).all():
                 break
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), stds.tolist()
         lead_std = wires.lead_std_ohm
@@ -164,8 +188,9 @@ class Kneading:
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
         """What skin and scale have shown, of the scans that were used: no more rows than scans."""
         time_s, used = self.time_s, levels.used
+        rise = levels.rise[used]
+        of_scans = time_s[used], rise, self._press[used], self._margin(rise)
         if self._weighed is not None:
-            of_scans = time_s[used], levels.rise[used], self._press[used]
             return Totals(*of_scans, time_s[used], log.at(time_s[used]), lags=False)
         inside = (log.time_s >= time_s[0]) & (log.time_s <= time_s[-1])
         at_s = log.time_s[inside]
@@ -176,8 +201,15 @@ class Kneading:
         known = np.isfinite(shown_n) & used[scan]
         if not known.any():
             raise ValueError("skin and scale were not read at the same time")
-        of_scans = time_s[used], levels.rise[used], self._press[used]
         return Totals(*of_scans, at_s[known], shown_n[known])
+
+    def _margin(self, rise: Float) -> Float:
+        """How many cells that seem untouched are beside touched ones, (n,)."""
+        from scipy.ndimage import binary_dilation
+
+        on = (rise > 0).reshape(-1, *self.shape)
+        near = binary_dilation(on, np.ones((1, 3, 3)))
+        return np.asarray(np.sum(near & ~on, axis=(1, 2)), dtype=np.float64)
 
     @one_blas_thread
     def _slopes(self, wires: WireOhm, levels: _Levels) -> Float:

@@ -64,7 +64,8 @@ class Scale:
             ends = (between(grid_s, area, at_s - self.delay_s - w) for w in (0.0, self.length_s))
             return np.asarray((next(ends) - next(ends)) / self.length_s)
         stays = np.exp(-step_s / self.length_s)
-        smooth = lfilter([0.5 * (1 - stays)] * 2, [1, -stays], force, axis=0)
+        bends = self.length_s / step_s * (1 - stays)  # exact where the force is straight
+        smooth = lfilter([1 - bends, bends - stays], [1, -stays], force, axis=0)
         return between(grid_s, smooth, at_s - self.delay_s)
 
 

@@ -12,17 +12,22 @@ x0                a usual rise, so that k and b are nearly independent          
 k, b              log of the force at x0, and exponent, of all cells
 c                 what lies in series with a contact, times a hard x1, the quantile     1
                   `HARD_QUANTILE` of all x; x' is the contact alone                     S, or 1
+h, t     (n, C)   half the width of a contact's hysteresis, a log of x; where in it a   1
+                  cell is: 1 if its force grows, -1 if it falls
+v, M     (n,)     force on a cell that is pressed too little to be seen; number of      N, 1
+                  cells that seem untouched, beside touched ones
 g        (C,)     log of each cell's gain about that
 P        (n, C)   force on each cell                                                    N
 w        (2,)     logs of a top and of a bottom segment, less those that x is of        1
-S                 the scale's filter (`scale`): (n,) to (m,)
+S                 the scale's filter (`scale`): (n,) to (m,); its delay is learned here
 z        (q,)     zero of the scale at times `KNOT_S` apart; B (m, q) is straight       N
                   between them
 y, r     (m,)     what the scale shows; y - S sum(P) - B z                              N
 s0, s1            scatter of y at no force; its share of the force                      N, 1
 ======== ======== ===================================================================== ==========
 
-    P = exp(k + g) (x' / x0)^b ,    1 / x' = 1 / x - c / x1 ,    y = S sum(P) + B z + scatter ,
+    P = exp(k + g) (x' exp(h t) / x0)^(b + e) ,    1 / x' = 1 / x - c / x1 ,
+    y = S (sum(P) + v M) + B z + scatter ,
     variance of y = s0^2 + s1^2 ((S sum P)^2 + F0^2) where the skin is pressed, F0 = max / 2 .
 
 F0 is large, because what is wrong at little force, such as cells that have not come back yet, is as
@@ -35,13 +40,20 @@ left out as a whole: at first only those count that fit best, and cells hardly d
 those that are off by more than `OUTLIER_STDS` robust deviations. Such a press is one whose force
 does not go through the skin: a finger beside it, a hand on the plate.
 
-c is 0 but while the wires are looked for: what no force lowers bends the curve as wires do, and so
-does hysteresis. Wires are learned with a row a press, because errors of presses look like them.
+What no force lowers (c) bends the curve as wires do. So do hysteresis, because the largest force of
+each press comes while it grows, and force that is not seen, because it is a larger share of little
+force. Without h and v, wires come out 20 to 50 % too large. Hysteresis looks as a scale that is
+early, so its delay is found together with h. Wires are learned with a row a press, because errors
+of presses look like them.
+
+A reader of forces does not know t: curves are those of t = 0, and b h is part of their scatter.
+They are kept as the power laws that are nearest to them.
 
 A cell's force is wrong by more than the sum, where errors average out. With r of the sum from s1 of
 each cell, r^2 = s1^2 sum(P^2): this s1 is the `residual_share` of the model.
 """
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -50,8 +62,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.rules import MIN_PRESSES
-from ohmskin.calibrate.scale import Scale, fit_scale
-from ohmskin.force.curve import LINEAR, MAX_EXPONENT, MIN_EXPONENT, POWER, ForceModel
+from ohmskin.calibrate.scale import EARLIEST_S, Scale, fit_scale
+from ohmskin.force.curve import MAX_EXPONENT, MIN_EXPONENT, POWER, ForceModel
 
 # Prior deviation of log gains. Chosen: cells of one skin scatter by some ten percent, and knitted
 # by hand by more.
@@ -63,8 +75,24 @@ FIRST_GAIN_STD: Final = 0.05
 GAIN_CELLS: Final = 4.0
 # Exponent of F by x: contacts conduct by F^1 to F^2.
 EXPONENT, EXPONENT_STD = 0.67, 0.3
-# c: its prior, the deviation of that, and the most. Chosen: 350 ohm at 280 microsiemens.
-SERIES, SERIES_STD, MOST_SERIES = 0.1, 0.1, 0.8
+# Deviation of cells' exponents about b. Chosen: as those of single presses.
+BEND_STD: Final = 0.02
+# c. Chosen: 350 ohm at 280 microsiemens.
+SERIES, MOST_SERIES = 0.1, 0.8
+# The widest h, and the log of x within which a cell turns. Chosen: contacts of textile have some
+# percent, rarely twenty.
+MOST_PLAY, TURN_LOG = 0.2, 0.1
+# Deviations of k, b, c, h and v [N] before anything is known. Chosen: k is free, half of the cells
+# have no series to speak of, and 0.1 N on one cell is seen.
+FIRST_STD: Final = (10.0, EXPONENT_STD, 0.1, 0.1, 0.1)
+# Least and most of b, c, h and v.
+LIMITS: Final = ((MIN_EXPONENT, 0.0, 0.0, 0.0), (MAX_EXPONENT, MOST_SERIES, MOST_PLAY, np.inf))
+# Prior deviation of the scale's delay from that of the step before, and step of its slopes [s].
+DELAY_STD_S, DELAY_STEP_S = 0.1, 0.005
+# The power law of the model is that of rises from the first to the second of these, times the
+# largest ones, which are this quantile. Chosen: from a tenth of the force that presses had on one
+# cell, to half as much again.
+LEAST_RISE, MOST_RISE, MOST_RISE_QUANTILE = 0.03, 2.0, 0.999
 # x1 is this quantile of all rises.
 HARD_QUANTILE: Final = 0.99
 # A contact seems worse by its series by at most this factor.
@@ -75,6 +103,9 @@ KNOT_S, ZERO_STEP_N = 15.0, 0.05
 # The rows of a press count as so many; and while the wires are looked for. Chosen: from no force to
 # its highest and back; see the module.
 PRESS_ROWS, WIRE_PRESS_ROWS = 4.0, 1.0
+# A press is not over so many scans before and after it. Chosen: forces are straight between scans
+# here, which no finger's is.
+NEAR_SCANS: Final = 2
 # F0 as a share of the largest total. Chosen: see the module.
 FLOOR_SHARE: Final = 0.5
 # A press that is off by more robust standard deviations is left out. Chosen: by chance, one normal
@@ -100,7 +131,7 @@ class Totals(NamedTuple):
     """What a skin and the scale under it have shown.
 
     time_s: of the scans, (n,) [s]. rise: x (n, C). press: number of the press that each scan is of,
-    (n,), below 0: of none.
+    (n,), below 0: of none. margin: M (n,).
     shown_s, shown_n: when the scale has shown what, (m,) [s], [N]. lags: whether its filter, zero
     and drift are to be found; else it shows the force at its time.
     """
@@ -108,6 +139,7 @@ class Totals(NamedTuple):
     time_s: Float
     rise: Float
     press: NDArray[np.intp]
+    margin: Float
     shown_s: Float
     shown_n: Float
     lags: bool = True
@@ -125,7 +157,7 @@ class TotalFit:
     """The fit of the module's equations.
 
     scale: the scale's filter; None: it is found. After `fit`: `scale_`; `covariance_` of k, b, c,
-    w, g, z.
+    h, v, w, g, z and the delay.
     """
 
     def __init__(
@@ -142,12 +174,14 @@ class TotalFit:
         self._hard = float(np.quantile(totals.rise[self._on], HARD_QUANTILE))
         self._log_x = np.log(np.where(self._on, totals.rise, self._unit) / self._unit)
         self._set_zero()
-        # p: k, b, c, w, g, z
-        size = 3 + offsets + cells
-        self._of_wires = slice(3, 3 + offsets)
-        self._of_gains, self._of_zero = slice(3 + offsets, size), slice(size, None)
-        self._p = np.zeros(size + self._basis.shape[1])
-        self._p[1:3] = self._law = EXPONENT, SERIES if wires else 0.0
+        self._turn = _turns(self._log_x, self._on)
+        sizes = (5, offsets, cells, cells, self._basis.shape[1], int(totals.lags))
+        ends = np.cumsum(sizes).tolist()
+        parts = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+        # p: k, b, c, h, v; w; g; z; delay
+        self._of_wires, self._of_gains, self._of_bends, self._of_zero, self._of_delay = parts[1:]
+        self._p = np.zeros(ends[-1])
+        self._p[1:3] = EXPONENT, SERIES
         self._gain_std = FIRST_GAIN_STD
         self._group()
         self._out: Bool = np.zeros(self._groups, dtype=bool)
@@ -172,7 +206,9 @@ class TotalFit:
         scan = np.searchsorted(totals.time_s, totals.shown_s - self.scale_.lag_s)
         scan = scan.clip(0, totals.time_s.size - 1)
         self._of_scan, self._of_row, self._groups = number, number[scan], int(number[-1]) + 1
-        self._pressed = totals.press[scan] >= 0
+        pressed = totals.press >= 0
+        near = np.convolve(pressed, np.ones(2 * NEAR_SCANS + 1), "same") > 0
+        self._pressed, self._ends = pressed[scan], near[scan] & ~pressed[scan]
         self._is_press = np.bincount(number, totals.press >= 0) > 0
 
     def _contact(self) -> tuple[Float, Float, Float]:
@@ -181,13 +217,18 @@ class TotalFit:
         if self._wires is not None:
             log_x = log_x + np.tensordot(self._p[self._of_wires], self._wires.slopes, 1)
         u = np.exp(log_x) * self._unit / self._hard
-        steeper = 1 / np.maximum(1 - self._p[2] * u, LEAST_OF_SERIES)
-        return log_x + np.log(steeper), steeper, u * steeper
+        steeper = 1 / self._loss(u)
+        return log_x + np.log(steeper) + self._p[3] * self._turn, steeper, u * steeper
+
+    def _loss(self, u: Float) -> Float:
+        """x / x' of rises u = x / x1."""
+        return np.asarray(np.maximum(1 - self._p[2] * u, LEAST_OF_SERIES))
 
     def _parts(self, log_contact: Float) -> Float:
         """P (n, C)."""
-        k, b = self._p[:2]
-        return np.where(self._on, np.exp(k + self._p[self._of_gains] + b * log_contact), 0.0)
+        p = self._p
+        b = p[1] + p[self._of_bends]
+        return np.where(self._on, np.exp(p[0] + p[self._of_gains] + b * log_contact), 0.0)
 
     def _shown(self, forces: Float) -> Float:
         """S of forces (n, k): (m, k)."""
@@ -214,21 +255,17 @@ class TotalFit:
     def _fit_scale(self) -> None:
         totals = self._totals
         weight = 1.0 * ~self._out[self._of_row]
-        force_n = self._parts(self._contact()[0]).sum(axis=1)
+        force_n = self._parts(self._contact()[0]).sum(axis=1) + self._p[4] * totals.margin
         shown_n = totals.shown_n - self._basis @ self._p[self._of_zero]
-        self.scale_ = fit_scale(totals.time_s, force_n, totals.shown_s, shown_n, weight)
+        self._take_scale(fit_scale(totals.time_s, force_n, totals.shown_s, shown_n, weight))
+
+    def _take_scale(self, scale: Scale) -> None:
+        self.scale_, self._p[self._of_delay] = scale, scale.delay_s
         self._group()
 
     def _step(self) -> None:
         """One step of Gauss-Newton."""
-        log_contact, steeper, by_series = self._contact()
-        parts, b = self._parts(log_contact), self._p[1]
-        slopes = [np.ones_like(parts), log_contact, b * by_series]
-        if self._wires is not None:
-            slopes += list(b * steeper * self._wires.slopes)
-        columns = [(parts * slope).sum(axis=1) for slope in slopes]
-        jacobian = np.hstack([self._shown(np.column_stack([*columns, parts])), self._basis])
-        self.total_n_ = jacobian[:, 0].copy()
+        jacobian = self._jacobian()
         self.off_n_ = self._totals.shown_n - self.total_n_ - self._basis @ self._p[self._of_zero]
         weight = self._weights()
         precision, pull = self._prior()
@@ -236,20 +273,41 @@ class TotalFit:
         precision = precision + weighted.T @ jacobian
         step = np.linalg.solve(precision, weighted.T @ self.off_n_ + pull)
         farthest = np.abs(step[: self._of_zero.start]).max()
-        self._p += step * min(1.0, 1.0 / farthest)
-        self._p[1] = np.clip(self._p[1], MIN_EXPONENT, MAX_EXPONENT)
-        self._p[2] = np.clip(self._p[2], 0.0, MOST_SERIES)
+        p = self._p = self._p + step * min(1.0, 1.0 / farthest)
+        p[1:5] = p[1:5].clip(*LIMITS)
         self.covariance_ = np.linalg.inv(precision)
+        if self._totals.lags:
+            self._take_scale(replace(self.scale_, delay_s=max(float(p[-1]), EARLIEST_S)))
+
+    def _jacobian(self) -> Float:
+        """How what the scale shows follows p, (m, p); sets `total_n_`, what it is to show."""
+        totals, b, v = self._totals, self._p[1] + self._p[self._of_bends], self._p[4]
+        log_contact, steeper, by_series = self._contact()
+        parts = self._parts(log_contact)
+        slopes = [np.ones_like(parts), log_contact, b * by_series, b * self._turn]
+        if self._wires is not None:
+            slopes += list(b * steeper * self._wires.slopes)
+        columns = [(parts * slope).sum(axis=1) for slope in slopes]
+        columns.insert(4, totals.margin)
+        shown = self._shown(np.column_stack([*columns, parts, parts * log_contact]))
+        self.total_n_ = shown[:, 0] + v * shown[:, 4]
+        by_delay = np.zeros((totals.shown_n.size, 0))
+        if totals.lags:
+            total_n = (columns[0] + v * totals.margin)[:, None]
+            around_s = totals.shown_s + DELAY_STEP_S * np.array([[-1.0], [1.0]])
+            around_n = self.scale_.shown(totals.time_s, total_n, around_s.ravel())
+            by_delay = -np.diff(around_n.reshape(2, -1), axis=0).T / (2 * DELAY_STEP_S)
+        return np.hstack([shown, self._basis, by_delay])
 
     def _weights(self) -> Float:
         """What each row weighs, (m,) [1/N^2], by how far rows are off now."""
         off_n, total_n, kept = np.abs(self.off_n_), self.total_n_, ~self._out[self._of_row]
         self._floor_n = FLOOR_SHARE * float(total_n.max())
         size_n = np.hypot(total_n, self._floor_n)
-        pressed, still = kept & self._pressed, kept & ~self._pressed
+        pressed, still = kept & self._pressed, kept & ~(self._pressed | self._ends)
         s1 = _robust_std(off_n[pressed] / size_n[pressed], 0.005)
         s0 = _robust_std(off_n[still], 0.005) if still.sum() > 10 else 0.005
-        moves = self._pressed | (total_n > s0)
+        moves = self._pressed | self._ends | (total_n > s0)
         variance = s0**2 + np.where(moves, (s1 * size_n) ** 2, 0.0)
         rows = np.bincount(self._of_row, minlength=self._groups)[self._of_row]
         press_rows = PRESS_ROWS if self._wires is None else WIRE_PRESS_ROWS
@@ -260,10 +318,9 @@ class TotalFit:
         """Precision of p, and its pull."""
         p = self._p
         centre, std = np.zeros(p.size), np.full(p.size, self._gain_std)
-        centre[:3], std[:3] = (
-            (p[0], *self._law),
-            (10.0, EXPONENT_STD, SERIES_STD if self._wires else 1e-9),
-        )
+        centre[:3], std[:5] = (p[0], EXPONENT, SERIES), FIRST_STD
+        std[self._of_bends] = BEND_STD
+        centre[self._of_delay], std[self._of_delay] = p[self._of_delay], DELAY_STD_S
         if self._wires is not None:
             centre[self._of_wires], std[self._of_wires] = self._wires.centre, self._wires.std
         precision = np.diag(std**-2.0)
@@ -272,7 +329,7 @@ class TotalFit:
 
     def _judge(self, *, trims: bool) -> None:
         """Leave out groups by how far each is off. trims: outliers alone; cells may differ then."""
-        size_n = self.total_n_ + self._floor_n
+        size_n = np.where(self._ends, 0.0, self.total_n_ + self._floor_n)
         weight = np.bincount(self._of_row, size_n, self._groups) + 1e-12
         off_n = np.bincount(self._of_row, size_n * self.off_n_, self._groups) / weight
         force_n = np.bincount(self._of_row, size_n * self.total_n_, self._groups) / weight
@@ -323,37 +380,44 @@ class TotalFit:
         return np.asarray(np.sqrt(self.covariance_.diagonal()[self._of_gains]))
 
     def model(self, shape: tuple[int, int]) -> ForceModel:
-        """The curves of all cells."""
-        k, b = self._p[:2]
-        covariance, gains = self.covariance_, self._of_gains
-        variance = covariance[0, 0] + covariance.diagonal()[gains] + 2 * covariance[0, gains]
-        with_b, b_std = covariance[0, 1] + covariance[1, gains], float(np.sqrt(covariance[1, 1]))
-        if abs(b - 1) < b_std:  # a line will do
-            kind, b, b_std, with_b = LINEAR, 1.0, 0.0, 0 * with_b
-        else:
-            kind = POWER
-        # a = exp(k + g) x0^-b, so d log(a) = d(k + g) - log(x0) db.
-        log_unit = np.log(self._unit)
-        slope = np.exp(k + self._p[self._of_gains] - b * log_unit)
-        variance = variance - 2 * log_unit * with_b + (log_unit * b_std) ** 2
-        slope_log_std = np.sqrt(np.maximum(variance, 1e-12))
-        correlation = np.zeros_like(slope)
-        if b_std:
-            correlation = (with_b - log_unit * b_std**2) / (slope_log_std * b_std)
-        share = self._residual_share()
+        """The curves of all cells: power laws as near to those of the fit as there are."""
+        p, cells = self._p, np.arange(self._on.shape[1])
+        level, steeper = self._straight()
+        by_exponent = level - steeper * np.log(self._unit)
+        # log(slope) = k + g + (b + e) by_exponent, exponent = (b + e) steeper
+        of_law = np.array([[1.0, by_exponent, 1.0, by_exponent], [0.0, steeper, 0.0, steeper]])
+        numbers = np.broadcast_arrays(
+            0, 1, self._of_gains.start + cells, self._of_bends.start + cells
+        )
+        chosen = np.stack(numbers, axis=-1)
+        log_slope, exponent = of_law @ p[chosen].T
+        covariance = self.covariance_[chosen[:, :, None], chosen[:, None, :]]
+        (slope_var, both), (_, exponent_var) = np.moveaxis(of_law @ covariance @ of_law.T, 0, -1)
+        share, slope = self._residual_share(), np.exp(log_slope)
         every = np.ones(shape)
         return ForceModel(
-            kind=np.full(shape, kind),
+            kind=np.full(shape, POWER),
             slope=slope.reshape(shape),
-            slope_std=(slope * slope_log_std).reshape(shape),
-            exponent=b * every,
-            exponent_std=b_std * every,
-            correlation=correlation.clip(-1, 1).reshape(shape),
+            slope_std=(slope * np.sqrt(slope_var)).reshape(shape),
+            exponent=exponent.clip(MIN_EXPONENT, MAX_EXPONENT).reshape(shape),
+            exponent_std=np.sqrt(exponent_var).reshape(shape),
+            correlation=(both / np.sqrt(slope_var * exponent_var)).clip(-1, 1).reshape(shape),
             residual_std=0.1 * share * self._largest_n * every,
             residual_share=share * every,
             pooled=(self.gain_std() > POOLED_SHARE * self._gain_std).reshape(shape),
             held_out_rmse=np.nan * every,
         )
+
+    def _straight(self) -> tuple[float, float]:
+        """Level and steepness of the line that is most like log(x' / x0) by log(x / x0)."""
+        rises = self._totals.rise[self._on]
+        top = float(np.quantile(rises, MOST_RISE_QUANTILE))
+        x = top * np.geomspace(LEAST_RISE, MOST_RISE, 50)
+        log_contact = np.log(x / self._unit / self._loss(x / self._hard))
+        force = np.exp(self._p[1] * log_contact)
+        weight = force / np.hypot(force, 0.1 * force[-1])
+        steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=weight)
+        return float(level), float(steeper)
 
     def _residual_share(self) -> float:
         """s1 of each cell, from how far sums are off."""
@@ -361,7 +425,19 @@ class TotalFit:
         root = np.sqrt((parts**2).sum(axis=1))[:, None]
         size_n = self._shown(root)[:, 0]
         good = self._pressed & ~self._out[self._of_row] & (size_n > 0.25 * size_n.max())
-        return float(np.sqrt(np.mean((self.off_n_[good] / size_n[good]) ** 2)))
+        by_play = self._p[1] * self._p[3]
+        return float(np.sqrt(np.mean((self.off_n_[good] / size_n[good]) ** 2) + by_play**2))
+
+
+def _turns(log_x: Float, on: Bool) -> Float:
+    """t of each cell, (n, C), as the play of a gear has it."""
+    turns, now = np.ones_like(log_x), np.ones(log_x.shape[1])
+    steps = 2 / TURN_LOG * np.diff(log_x, axis=0)
+    begins = ~(on[1:] & on[:-1])
+    for n, step in enumerate(steps):
+        now = np.where(begins[n], 1.0, (now + step).clip(-1.0, 1.0))
+        turns[n + 1] = now
+    return turns
 
 
 def _robust_std(off: Float, least: float) -> float:
