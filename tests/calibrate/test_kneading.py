@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from ohmskin.arrays import Float
-from ohmskin.calibrate.scale import Scale, fit_scale
-from ohmskin.calibrate.totals import TotalFit, Totals
+from ohmskin.calibrate.scale import Scale, fit_scale, printed_s
+from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.force.calibration import load_calibration
 from pressed_skin import Plan
 
@@ -71,6 +71,34 @@ def test_the_filter_of_a_scale_is_found(scale: Scale) -> None:
     found = fit_scale(time_s, total_n, at_s, shown_n, np.ones_like(at_s))
     assert found.lag_s == pytest.approx(scale.lag_s, abs=0.01)
     assert found.length_s == pytest.approx(scale.length_s, abs=0.04)
+
+
+def late(seed: int, count: int, step_s: float) -> tuple[Float, Float]:
+    """When numbers were printed, and when they arrived: a busy machine lets most of them wait."""
+    random = np.random.default_rng(seed)
+    true_s = 70.0 + step_s * np.arange(count)
+    load = np.clip(np.sin(true_s / 7) + 0.6, 0.05, None)  # it is busier and less busy
+    waits_s = random.exponential(0.1 * load) * (random.random(count) < 0.8)
+    return true_s, np.maximum.accumulate(true_s + waits_s) + 1e-6 * np.arange(count)
+
+
+def test_numbers_of_a_scale_are_where_they_were_printed_on_a_busy_machine() -> None:
+    true_s, arrival_s = late(1, 1200, 0.1)
+    assert np.quantile(arrival_s - true_s, 0.9) > 0.1
+    assert printed_s(arrival_s) == pytest.approx(true_s, abs=0.01)
+    # Lines 300 and 301 could not be read, and after 800 lines somebody had lunch.
+    arrival_s[800:] += 1800.0
+    kept = np.delete(np.arange(1200), [300, 301])
+    expected_s = true_s + np.where(np.arange(1200) < 800, 0.0, 1800.0)
+    found_s = printed_s(arrival_s[kept])
+    far = np.abs(kept - 300) > 60
+    assert found_s[far] == pytest.approx(expected_s[kept][far], abs=0.02)
+
+
+def test_a_scale_that_prints_when_it_likes_keeps_its_times() -> None:
+    random = np.random.default_rng(2)
+    arrival_s = np.cumsum(random.exponential(0.3, 300))
+    np.testing.assert_array_equal(printed_s(arrival_s), arrival_s)
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +163,26 @@ def test_a_skin_that_was_kneaded_reads_forces(run: Run, tmp_path: Path) -> None:
     forces = skin.read(out)
     assert forces.rmse_n() < 0.6
     assert forces.within_percent() > 97
+
+
+def test_hysteresis_and_unseen_force_are_not_taken_for_wires() -> None:
+    time_s, press, force_n = presses(5, 240)
+    phase = time_s % 0.6
+    hold = np.interp(phase, [0.0, 0.15, 0.25, 0.4], [0.0, 1.0, 1.0, 0.0])
+    peaks_n = np.array([force_n[press == n].max(axis=0) for n in range(240)])
+    force_n = peaks_n[(time_s / 0.6 + 1e-9).astype(int)] * hold[:, None]
+    random = np.random.default_rng(6)
+    rise = rises(force_n, np.exp(0.15 * random.standard_normal(12)))
+    rise *= np.where(np.diff(force_n, axis=0, prepend=0.0) > -1e-9, 0.96, 1.04)
+    margin = 4.0 * (hold > 0)  # cells around each press, which has 0.06 N on each of them
+    shown_n = force_n.sum(axis=1) + 0.06 * margin + 0.01 * random.standard_normal(time_s.size)
+    totals = Totals(time_s, rise, press, margin, time_s, shown_n)
+    # The further a cell is, and the harder it is pressed, the less it shows with such wires.
+    far = np.array([[0, 1, 2, 3] * 3, [0] * 4 + [1] * 4 + [2] * 4])
+    slopes = 0.05 * far[:, None, :] * rise / 1e-4
+    found = TotalFit(totals, WireSlopes(slopes, np.zeros(2), np.full(2, 1.5))).fit()
+    assert np.abs(found.w[0]).max() < 0.35
+    assert abs(found.scale_.lag_s) < 2e-3
 
 
 def test_total_and_an_indenter_exclude_each_other(run: Run, tmp_path: Path) -> None:

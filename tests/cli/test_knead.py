@@ -2,6 +2,7 @@
 """``calibrate knead`` and ``weights --anywhere``: emulated skins, and how near to the truth."""
 
 import re
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import ohmskin
 from command_line import Command, Run, assert_one_line, well
 from ohmskin.calibrate.coverage import LiveCoverage
 from ohmskin.cli.knead import KneadMap
+from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.record.recorder import Recorder
@@ -72,6 +74,24 @@ def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
     assert known[-1] < now[-1]
     assert len(list(tmp_path.glob("skin.knead-*.mcap"))) == 2
     assert load_calibration(out).model.slope_std.max() < first.model.slope_std.max()
+
+
+def test_fingertips_wait_until_somebody_reads() -> None:
+    """Else a slow start of the command would measure the rest under them."""
+    with ohmskin.open(f"{SKIN}&scene=knead", start=False) as skin:
+        assert isinstance(skin, SteppedSkin)
+        skin.step(60.0)
+        forces_n = [skin.true_force_n(scan).sum() for scan in islice(skin, 200)]
+    assert not np.any(forces_n[:119])
+    assert np.any(forces_n[119:])
+
+
+def test_a_rest_during_which_the_scale_moves_is_refused(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "skin.json"
+    done = run("calibrate", "knead", f"{SKIN}&scene=knead&begin=0.5", str(out), *TRUTH)
+    assert_one_line(done._replace(out=""), "at rest")
+    assert "the force moved by" in done.err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_wrong_uses_of_knead(run: Run, tmp_path: Path) -> None:

@@ -143,6 +143,12 @@ class LiveCoverage:
             self.look(recording.scans[near], tare if is_later else None, sample)
 
     @property
+    def moved_n(self) -> float:
+        """By how much the scale moved while the rest was measured [N]."""
+        least, most = np.quantile(self._zeros_n or [0.0], [0.1, 0.9]).tolist()
+        return float(most - least)
+
+    @property
     def known(self) -> Bool:
         """Which cells are known, (R, C)."""
         return (self.log_std <= KNOWN_LOG) & (self._coverage.numbers >= self._least)

@@ -19,11 +19,13 @@ Whoever only shifts forces by a lag has them wrong wherever they change faster t
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.link.clock import without_delays_s
 
 # Filters begin the search from all pairs of these [s]. Chosen: from a fast load cell to a kitchen
 # scale.
@@ -34,6 +36,47 @@ LENGTHS_S: Final = (0.02, 0.1, 0.3)
 EARLIEST_S: Final = -0.1
 # Filters are computed on a grid of half a scan, or of this, the longer [s].
 LEAST_STEP_S: Final = 0.01
+
+
+# A scale that prints nothing for so long has made a pause [s].
+SILENCE_S: Final = 2.0
+# Lines are lost where the earliest of so many seconds is late by half a step or more [s]. Chosen:
+# no machine is too busy for so long.
+LOST_WINDOW_S: Final = 5.0
+# Fewer numbers than so many tell no step, nor do numbers whose median is late by more than a step
+# and this [s]: they are not printed at equal steps.
+LEAST_NUMBERS, MOST_LATE_S = 20, 0.05
+
+
+def printed_s(arrival_s: Float) -> Float:
+    """When a scale printed what arrived at these times, (m,) [s].
+
+    Arrival can only be late, by a buffer, a latency timer or a busy machine, so the earliest of the
+    numbers tell when all were printed, at equal steps (`link.clock`). Where a scale prints at
+    other times, such as when it is stable, the times stay.
+    """
+    pauses = np.flatnonzero(np.diff(arrival_s) > SILENCE_S) + 1
+    return np.concatenate([_in_steps(part) for part in np.split(arrival_s, pauses)])
+
+
+def _in_steps(arrival_s: Float) -> Float:
+    """The same between two pauses."""
+    half = arrival_s.size // 2
+    if arrival_s.size < LEAST_NUMBERS:
+        return arrival_s
+    step_s = max(float(np.median(arrival_s[half:] - arrival_s[:-half])) / half, 1e-6)
+    number = np.arange(arrival_s.size)
+    late_s = arrival_s - step_s * number
+    blocks = np.array_split(number, max(1, int(np.ptp(arrival_s) / LOST_WINDOW_S)))
+    earliest = [int(block[np.argmin(late_s[block])]) for block in blocks]
+    lost = np.zeros_like(number)
+    for first, last in pairwise(earliest):
+        more = round(float(late_s[last] - late_s[first]) / step_s)
+        if more > -lost[-1]:  # none was lost that was not printed
+            lost[first + 1 + int(np.argmax(np.diff(arrival_s[first : last + 1]))) :] += more
+    times_s = without_delays_s(np.asarray(step_s * (number + lost)), arrival_s)
+    is_even = np.median(arrival_s - times_s) < max(step_s, MOST_LATE_S)
+    return times_s if is_even else arrival_s
 
 
 @dataclass(frozen=True)

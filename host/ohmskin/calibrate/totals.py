@@ -78,15 +78,17 @@ EXPONENT, EXPONENT_STD = 0.67, 0.3
 # Deviation of cells' exponents about b. Chosen: as those of single presses.
 BEND_STD: Final = 0.02
 # c. Chosen: 350 ohm at 280 microsiemens.
-SERIES, MOST_SERIES = 0.1, 0.8
-# The widest h, and the log of x within which a cell turns. Chosen: contacts of textile have some
-# percent, rarely twenty.
-MOST_PLAY, TURN_LOG = 0.2, 0.1
+SERIES: Final = 0.1
+# A cell turns within this log of x. Chosen: noise of a pressed cell is less.
+TURN_LOG: Final = 0.1
+# So much of a rise at least is left with other wires.
+LEAST_LEFT: Final = 0.2
 # Deviations of k, b, c, h and v [N] before anything is known. Chosen: k is free, half of the cells
 # have no series to speak of, and 0.1 N on one cell is seen.
 FIRST_STD: Final = (10.0, EXPONENT_STD, 0.1, 0.1, 0.1)
-# Least and most of b, c, h and v.
-LIMITS: Final = ((MIN_EXPONENT, 0.0, 0.0, 0.0), (MAX_EXPONENT, MOST_SERIES, MOST_PLAY, np.inf))
+# Least and most of b, c, h. Chosen: no fit gets there but by going astray; others end at 0 by their
+# priors, because a limit at 0 would pull what goes with it.
+LIMITS: Final = ((MIN_EXPONENT, -0.4, -0.2), (MAX_EXPONENT, 0.8, 0.2))
 # Prior deviation of the scale's delay from that of the step before, and step of its slopes [s].
 DELAY_STD_S, DELAY_STEP_S = 0.1, 0.005
 # The power law of the model is that of rises from the first to the second of these, times the
@@ -117,12 +119,13 @@ SURE_SHARE: Final = 0.7
 LEAST_OFF: Final = 0.15
 LEAST_OFF_N: Final = 0.15
 # Rounds of the fit: robust ones, then ones with outliers left out; the filter is fitted after some.
-ROBUST_ROUNDS, TRIMMED_ROUNDS = 5, 5
-SCALE_ROUNDS: Final = (0, 4, 7)
+ROBUST_ROUNDS, TRIMMED_ROUNDS = 5, 8
+SCALE_ROUNDS: Final = (0, 3)
 # A gain whose deviation is still so much of the prior's is not the cell's own.
 POOLED_SHARE: Final = 0.7
 # Cells whose forces scatter by more than this share follow no curve.
 MOST_SHARE: Final = 0.7
+STRANGE: Final = "the total force does not follow the skin: is this its scale, and its rest?"
 # A median of |r| is so much of a normal standard deviation.
 _MEDIAN_STD: Final = 0.6745
 
@@ -215,10 +218,16 @@ class TotalFit:
         """log(x' / x0), and its slopes by log x and by c, each (n, C)."""
         log_x = self._log_x
         if self._wires is not None:
-            log_x = log_x + np.tensordot(self._p[self._of_wires], self._wires.slopes, 1)
+            log_x = log_x + np.log(self._changed())
         u = np.exp(log_x) * self._unit / self._hard
         steeper = 1 / self._loss(u)
         return log_x + np.log(steeper) + self._p[3] * self._turn, steeper, u * steeper
+
+    def _changed(self) -> Float:
+        """What w makes of x, a factor, (n, C): by logs, small rises would grow without end."""
+        assert self._wires is not None
+        change = np.tensordot(self._p[self._of_wires], self._wires.slopes, 1)
+        return np.asarray(np.maximum(1 + change, LEAST_LEFT))
 
     def _loss(self, u: Float) -> Float:
         """x / x' of rises u = x / x1."""
@@ -242,14 +251,17 @@ class TotalFit:
         totals, parts = self._totals, self._parts(self._contact()[0]).sum(axis=1)
         shown = self._shown(parts[:, None])[:, 0]
         spreads = (np.quantile(n, 0.9) - np.quantile(n, 0.1) for n in (totals.shown_n, shown))
-        self._p[0] = np.log(next(spreads) / next(spreads))
+        shown_spread_n, spread_n = spreads
+        if not (shown_spread_n > 0 and spread_n > 0):
+            raise ValueError(STRANGE)
+        self._p[0] = np.log(shown_spread_n / spread_n)
         for number in range(ROBUST_ROUNDS + TRIMMED_ROUNDS):
             if totals.lags and self._seeks_scale and number in SCALE_ROUNDS:
                 self._fit_scale()
             self._step()
             self._judge(trims=number >= ROBUST_ROUNDS)
         if not self._residual_share() < MOST_SHARE:
-            raise ValueError("the total force does not follow the skin: is this its scale?")
+            raise ValueError(STRANGE)
         return self
 
     def _fit_scale(self) -> None:
@@ -274,7 +286,7 @@ class TotalFit:
         step = np.linalg.solve(precision, weighted.T @ self.off_n_ + pull)
         farthest = np.abs(step[: self._of_zero.start]).max()
         p = self._p = self._p + step * min(1.0, 1.0 / farthest)
-        p[1:5] = p[1:5].clip(*LIMITS)
+        p[1:4] = p[1:4].clip(*LIMITS)
         self.covariance_ = np.linalg.inv(precision)
         if self._totals.lags:
             self._take_scale(replace(self.scale_, delay_s=max(float(p[-1]), EARLIEST_S)))
@@ -286,7 +298,7 @@ class TotalFit:
         parts = self._parts(log_contact)
         slopes = [np.ones_like(parts), log_contact, b * by_series, b * self._turn]
         if self._wires is not None:
-            slopes += list(b * steeper * self._wires.slopes)
+            slopes += list(b * steeper * self._wires.slopes / self._changed())
         columns = [(parts * slope).sum(axis=1) for slope in slopes]
         columns.insert(4, totals.margin)
         shown = self._shown(np.column_stack([*columns, parts, parts * log_contact]))

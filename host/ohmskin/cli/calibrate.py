@@ -20,6 +20,7 @@ from ohmskin.calibrate.guide import Press, still_wanted
 from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cells_differ, check_enough
+from ohmskin.calibrate.scale import printed_s
 from ohmskin.calibrate.sessions import joined, session_paths
 from ohmskin.calibrate.tables import (
     ForceLog,
@@ -30,6 +31,7 @@ from ohmskin.calibrate.tables import (
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
 from ohmskin.cli.knead import kneaded
 from ohmskin.cli.record import (
+    TRUTH,
     ForceBaud,
     ForceColumn,
     ForceScale,
@@ -293,6 +295,8 @@ def _log_in(given: Recording, *, any_zero: bool = False) -> ForceLog:
     """The forces in a recording; the scans have the same clock."""
     samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
     time_s, force_n = samples.T
+    if not {sample.source for sample in given.forces} & {WEIGHTS, TRUTH}:
+        time_s = printed_s(time_s)
     return ForceLog(time_s, force_n, any_zero=any_zero)
 
 

@@ -13,13 +13,13 @@ from rich.live import Live
 from rich.text import Text
 
 import ohmskin
-from ohmskin.calibrate.coverage import KNOWN_LOG, LiveCoverage
+from ohmskin.calibrate.coverage import KNOWN_LOG, LEAST_N, LiveCoverage
 from ohmskin.calibrate.sessions import joined, session_paths
 from ohmskin.cli.board import TERMINAL, asked_for
 from ohmskin.cli.record import FORCE_TARE_S, with_truth
 from ohmskin.cli.stream import cell_table
 from ohmskin.ctrl_c import until_ctrl_c
-from ohmskin.errors import DeviceLost
+from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
@@ -41,6 +41,10 @@ class KneadMap:
     def look(self, scan: Scan) -> None:
         """At a scan that was recorded."""
         self._coverage.look(scan, self._recorder.tare, self._recorder.force)
+        moved_n = self._coverage.moved_n
+        if self._recorder.tare is not None and moved_n > LEAST_N:
+            remedy = "touch nothing for the first seconds, and say it again"
+            raise TareRefused(f"the force moved by {moved_n:.1f} N at rest", remedy)
         if not TERMINAL.is_terminal and scan.host_time_s - self._said_s >= _SAY_EVERY_S:
             self._said_s = scan.host_time_s
             TERMINAL.print(f"{scan.host_time_s - self._began_s:.0f} s: {self.words()}")
@@ -86,6 +90,9 @@ def kneaded(
         if not coverage.known.all():
             try:
                 _knead(skin, path, sensor_of(skin), coverage, seconds)
+            except TareRefused:
+                path.unlink()
+                raise
             except DeviceLost as exc:
                 raise DeviceLost(f"{exc} (the same command goes on from {path})") from exc
             recordings.append(load_recording(path))

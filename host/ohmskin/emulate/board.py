@@ -93,7 +93,8 @@ class EmulatedBoard:
     says: fields of `hello` that the board says in place of the truth.
 
     The attribute `settings` has what is set now: the fields of `configure` and `set_unit_id`. A
-    test of a host may change it, and `says`, at any time.
+    test of a host may change it, and `says`, at any time. `on_start` is called with the time [s]
+    when scans begin.
 
     :raises ValueError: a board cannot do that.
     """
@@ -114,6 +115,7 @@ class EmulatedBoard:
         self._ratio_at = ratio_at
         self._sampled = sampled
         self._skin_shape = (settings.rows, settings.columns)
+        self.on_start: Callable[[float], None] = lambda now_s: None
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
         self._random = np.random.default_rng(seed)
         self._defaults = _defaults(settings)
@@ -203,6 +205,7 @@ class EmulatedBoard:
                 self.settings.update(values)
             case "start" if not scanning:
                 self._started_s, self._scan = self.now_s, 0
+                self.on_start(self.now_s)
             case "stop" if scanning:
                 self._started_s = None
             case "set_unit_id":

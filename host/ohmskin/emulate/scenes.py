@@ -107,8 +107,9 @@ SCENES: Final = {
     f"{_MOVING_PERIOD_S:g} s",
     "presses": f"after {_ROBOT_BEGIN_S:g} s, a robot presses cell after cell {ROBOT_PRESSES} times "
     f"with {_ROBOT_PEAK_N[0]:g} to {_ROBOT_PEAK_N[1]:g} N, which takes some 4.5 s a cell",
-    "knead": f"after {_ROBOT_BEGIN_S:g} s, one fingertip after another with {_TIP_N[0]:g} to "
-    f"{_TIP_N[1]:g} N, which moves while it presses; over the whole skin, again and again",
+    "knead": f"{_ROBOT_BEGIN_S:g} s after scans begin, one fingertip after another with "
+    f"{_TIP_N[0]:g} to {_TIP_N[1]:g} N, which moves while it presses; over the whole skin, again "
+    "and again",
     "weights": "the weights that 'ohmskin calibrate weights' asks for",
 }
 
@@ -147,7 +148,8 @@ class Scene:
         self.rows = rows
         self.columns = columns
         self.moves = name in ("corners", "moving", "presses", "knead", "weights")
-        self.begin_s = _BEGIN_S.get(name, BEGIN_S) if begin_s is None else begin_s
+        self._waits_s = _BEGIN_S.get(name, BEGIN_S) if begin_s is None else begin_s
+        self.begin_s = self._waits_s
         if not self.begin_s >= 0:
             raise ValueError(f"begin must be 0 s or later, not {begin_s}")
         self.faults = faults or SkinFaults()
@@ -183,6 +185,11 @@ class Scene:
         """Every resistance of the skin at a time."""
         touched = replace(self.rest, cell_siemens=self.rest.cell_siemens + self._touch(time_s))
         return self.faults.damaged(touched)
+
+    def wait(self, start_s: float) -> None:
+        """Scans begin at this time: fingertips that knead wait until then, as people do."""
+        if self.name == "knead":
+            self.begin_s = start_s + self._waits_s
 
     def force_n(self, time_s: float) -> Float:
         """The true force on each cell at a time, (rows, columns) [N]: (touch / k)^(1 / b)."""

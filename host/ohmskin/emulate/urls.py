@@ -104,6 +104,7 @@ def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
             sampled=faults.sampled,
             says={"layout_crc": LAYOUT_CRC ^ url.number("foreign", 0)},
         )
+        board.on_start = scene.wait
         return board, scene, faults_of(LineFaults, url.options, seed=seed)
 
 

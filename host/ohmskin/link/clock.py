@@ -243,15 +243,23 @@ class ScanClock:
 def scan_times_s(scans: list[Scan]) -> Float:
     """Times of recorded scans on the host's clock [s], (n,), without the jitter of their arrival.
 
-    All are late by about a scan. Here, unlike in `BoardClock`, a line can be fitted to what came
-    later as well. At every half `FIT_WINDOW_S` of the board's clock there is a knot, whose time is
-    by the line that fits the window around it. Between knots, times are interpolated. A board that
-    is reset begins its clock anew, so scans before and after a reset are taken separately; and so
-    are those before and after a pause of a window, across which no line is fitted. Therefore there
-    are no more than two knots a scan, whatever the times are.
+    All are late by about a scan. Scans before and after a reset are taken separately, because the
+    board begins its clock anew.
     """
     host_s = np.array([scan.host_time_s for scan in scans])
-    board_s = 1e-6 * np.array([scan.time_us for scan in scans])
+    return without_delays_s(1e-6 * np.array([scan.time_us for scan in scans]), host_s)
+
+
+def without_delays_s(board_s: Float, host_s: Float) -> Float:
+    """When something was by the host's clock [s], (n,), that was at times (n,) of a board's [s].
+
+    host_s: when the host knew of it, (n,) [s]. Here, unlike in `BoardClock`, a line can be fitted
+    to what came later as well. At every half `FIT_WINDOW_S` of the board's clock there is a knot,
+    whose time is by the line that fits the window around it. Between knots, times are interpolated.
+    What comes before and after a step back is taken separately, and so is what comes before and
+    after a pause of a window, across which no line is fitted. Therefore there are no more than two
+    knots for each time, whatever the times are.
+    """
     times_s, half_s = np.empty_like(host_s), FIT_WINDOW_S / 2
     steps_s = np.diff(board_s)
     breaks = np.flatnonzero((steps_s <= 0) | (steps_s > FIT_WINDOW_S)) + 1
