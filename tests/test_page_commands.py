@@ -75,6 +75,8 @@ NOT_RUN = {
     "make bench-quick": "takes minutes; tests/benchmarks runs a part of it",
     "make bench-tables": "takes minutes; tests/benchmarks has a quick run of it",
     "ohmskin flash uno --port /dev/ttyACM0": "needs a boot loader; tests/cli/test_flash.py has one",
+    "ohmskin flash pico": "needs a drive; tests/cli/test_flash_pico.py has one",
+    "pio run -e uno_arduino -t upload": "needs a board; tests/firmware has one",
     "ohmskin calibrate scale /dev/ttyUSB0 --grams 200,500": "asks for weights; "
     "tests/record/test_force_sensor.py puts them on",
     "ohmskin calibrate knead /dev/ttyACM0 skin.json --force-port /dev/ttyUSB0": "ends when a skin "

@@ -6,8 +6,8 @@
 #include "core/scanner.h"
 
 // The whole hardware contract: what a board has to offer. board_avr.cpp implements it for the Uno
-// and the Mega 2560, firmware/pico for an RP2040, firmware/test/fake_board.h for the unit tests.
-// Nothing here blocks.
+// and the Mega 2560, firmware/pico for an RP2040, board_arduino.cpp for what has Arduino's calls,
+// firmware/test/fake_board.h for the unit tests. Nothing here blocks.
 namespace ohmskin {
 namespace board {
 

@@ -1,0 +1,164 @@
+// SPDX-License-Identifier: Apache-2.0
+// The board contract by Arduino's own calls, for whatever board has them. It is slow: analogRead()
+// takes 112 us on an Uno, where the registers' way takes none of the processor's time. Slots are
+// made in passes of the main loop; one that comes late is left out with its scan, and counted, so
+// that what comes is stamped right. docs/other-boards.md says what each board can do.
+#include <Arduino.h>
+
+#include "board.h"
+#include "wiring.h"
+#if defined(E2END)  // boards with an EEPROM; on others `save` answers eeprom_failed
+#include <EEPROM.h>
+#endif
+
+namespace ohmskin {
+namespace board {
+
+#if defined(__AVR_ATmega2560__)
+const frames::Board KIND = frames::Board::Megaatmega2560;
+#else
+const frames::Board KIND = frames::Board::Uno;
+#endif
+const uint32_t CLOCK_HZ = 16000000;  // what plans count in, whatever the chip's clock is
+const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
+const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
+Scanner scanner;
+
+namespace {
+constexpr uint8_t CYCLES_PER_US = 16;
+// A slot may come so late [us], and its scan still counts. Chosen: what stamps may be off.
+constexpr uint16_t LATE_US = 1000;
+// From the pins' change to the conversion [us], at the least. Chosen as SETTLE_US of scan_plan.h.
+constexpr uint16_t SETTLE_US = 20;
+// Bytes for the line in a pass of the main loop. Chosen: a scan brings 1.3 a slot.
+constexpr uint8_t BYTES_A_PASS = 4;
+constexpr uint8_t ANALOG_PINS[] = {A0, A1, A2, A3, A4, A5};
+
+bool slots_run, converted_before;
+bool pins_are_set;  // for the slot at hand
+uint16_t slot_cycles, code_before;
+uint32_t due_us;   // when the slot at hand is due
+uint8_t due_rest;  // clock cycles beyond due_us
+Selection selected;
+ReadingDefinition selected_reading;
+uint32_t selected_us;
+uint8_t bytes_left;
+
+void write_number(const uint8_t *pins, uint8_t number, uint8_t changed) {
+    for (uint8_t i = 0; i < 4; i++)
+        if (changed >> i & 1)
+            digitalWrite(pins[i], number >> i & 1);
+}
+
+ReadingDefinition reading_at(const Selection &selection) {
+    constexpr uint8_t PER_CELL = frames::READINGS_PER_CELL;
+    return READING_DEFINITIONS[static_cast<uint8_t>(
+        reading_of(selection.pattern_entry / PER_CELL, selection.pattern_entry % PER_CELL))];
+}
+
+// Sets what has changed, or all: digitalWrite() takes microseconds.
+void select(const Selection &next, bool all) {
+    write_number(wiring::ROW_PINS, next.row, all ? 15 : next.row ^ selected.row);
+    write_number(wiring::COLUMN_PINS, next.column, all ? 15 : next.column ^ selected.column);
+    const ReadingDefinition reading = reading_at(next);
+    if (all || reading.drive != selected_reading.drive) {
+        digitalWrite(wiring::DRIVE_TOP_PIN, reading.drive == Drive::Top);
+        digitalWrite(wiring::DRIVE_BOTTOM_PIN, reading.drive == Drive::Bottom);
+    }
+    selected = next;
+    selected_reading = reading;
+    selected_us = micros();
+}
+
+// The end of a slot, with its code or without one.
+void end_slot(uint16_t code, bool converted) {
+    scanner.step(code_before, converted_before);
+    code_before = code;
+    converted_before = converted;
+    due_rest = static_cast<uint8_t>(due_rest + slot_cycles % CYCLES_PER_US);
+    due_us += slot_cycles / CYCLES_PER_US + due_rest / CYCLES_PER_US;
+    due_rest %= CYCLES_PER_US;
+}
+
+void make_slot() {
+    while (micros() - selected_us < SETTLE_US) {
+    }
+    const uint8_t input = wiring::SENSE_INPUTS[static_cast<uint8_t>(selected_reading.sense)];
+    const uint16_t code = static_cast<uint16_t>(analogRead(ANALOG_PINS[input]));
+    select(scanner.selection(), false);
+    end_slot(code, pins_are_set);
+    pins_are_set = true;
+}
+
+// Leaves slots out, which takes little time, until the board is on time again.
+void catch_up() {
+    while (static_cast<int32_t>(micros() - due_us) > 0)
+        end_slot(0, false);
+    pins_are_set = false;
+}
+}  // namespace
+
+void begin() {
+    for (uint8_t pin : wiring::PINS)
+        pinMode(pin, OUTPUT);
+#if !defined(__AVR__)
+    analogReadResolution(frames::ADC_BITS);
+#endif
+    serial_speed(frames::BAUD_DEFAULT);
+}
+uint8_t reset_cause() { return 0; }  // Arduino has no call that says so
+void keep_alive() {
+    bytes_left = BYTES_A_PASS;
+    const int32_t late_us = static_cast<int32_t>(micros() - due_us);
+    if (slots_run && late_us >= 0)
+        late_us > LATE_US ? catch_up() : make_slot();
+}
+uint32_t now_us() { return micros(); }
+void mark_pass(bool) {}
+
+void start_slots(const ScanPlan &plan, uint8_t) {
+    slot_cycles = plan.slot_cycles;
+    select(scanner.selection(), true);
+    pins_are_set = true;
+    converted_before = false;
+    due_us = micros();
+    due_rest = 0;
+    slots_run = true;
+}
+void stop_slots() {
+    slots_run = false;
+    digitalWrite(wiring::DRIVE_TOP_PIN, LOW);
+    digitalWrite(wiring::DRIVE_BOTTOM_PIN, LOW);
+}
+
+bool serial_speed_known(uint32_t baud) {
+    return baud == frames::BAUD_DEFAULT || baud == frames::BAUD_FAST;
+}
+void serial_speed(uint32_t baud) { Serial.begin(baud); }
+// A few bytes a pass: more would make a slot late.
+bool serial_can_write() { return bytes_left != 0 && Serial.availableForWrite() > 0; }
+void serial_write(uint8_t octet) {
+    bytes_left--;
+    Serial.write(octet);
+}
+bool serial_idle() {
+    Serial.flush();
+    return true;
+}
+bool serial_has_byte() { return Serial.available() > 0; }
+bool serial_read(uint8_t *octet) {
+    *octet = static_cast<uint8_t>(Serial.read());
+    return true;
+}
+
+#if defined(E2END)
+uint8_t eeprom_read(uint16_t address) { return EEPROM.read(address); }
+void eeprom_write(uint16_t address, uint8_t octet) { EEPROM.write(address, octet); }
+#else
+uint8_t eeprom_read(uint16_t) { return 0xFF; }
+void eeprom_write(uint16_t, uint8_t) {}
+#endif
+bool eeprom_busy() { return false; }
+
+}  // namespace board
+}  // namespace ohmskin

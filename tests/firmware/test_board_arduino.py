@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The board by Arduino's own calls, built for an Uno: slow, but what it sends is right."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from firmware_helpers import CYCLES_PER_US, assert_whole
+from lockstep import LockstepSim, Rig, elf_of
+
+pytestmark = [
+    pytest.mark.simavr,
+    pytest.mark.skipif(not elf_of("uno_arduino").exists(), reason="needs 'make firmware'"),
+]
+KEPT_MHZ = 17_000  # at 8x8
+
+
+@pytest.fixture
+def rig(rng: np.random.Generator) -> Iterator[Rig]:
+    with Rig("uno", LockstepSim("uno", elf_of("uno_arduino"))) as rig:
+        rig.run(0.05)
+        rig.randomize(rng)
+        yield rig
+
+
+def stamp_errors_us(rig: Rig) -> np.ndarray:
+    """How far each scan's time is from its first hold, all boards' clocks apart."""
+    starts = rig.check().start_cycles[[scan.header["scan"] for scan in rig.scans]]
+    errors = np.array([scan.header["time_us"] for scan in rig.scans]) - starts / CYCLES_PER_US
+    return errors - np.median(errors)
+
+
+def test_codes_and_times_are_right(rig: Rig, rng: np.random.Generator) -> None:
+    rig.start_scan(rate_mhz=KEPT_MHZ)
+    for _ in range(6):
+        rig.run(0.2)
+        rig.randomize(rng)
+    rig.must("stop")
+    assert_whole(rig)
+    assert len(rig.scans) > 19
+    assert np.abs(stamp_errors_us(rig)).max() < 1000
+
+
+def test_far_ends_are_read_too(rig: Rig) -> None:
+    rig.start_scan(rate_mhz=20_000, rows=16, columns=3, mode="far")
+    rig.run(0.5)
+    rig.must("stop")
+    assert_whole(rig)
+
+
+def test_a_rate_that_it_cannot_keep_costs_scans_and_nothing_is_wrong(rig: Rig) -> None:
+    """Nothing comes late with another time; commands are answered meanwhile."""
+    for rate_mhz in (19_000, 30_000, 90_000):
+        rig.start_scan(rate_mhz=rate_mhz)
+        rig.run(0.5)
+        rig.must("get_hello")
+        rig.must("stop", limit_s=2)
+        if rig.scans:
+            assert rig.check().wrong == 0
+            assert np.abs(stamp_errors_us(rig)).max() < 1000
+            last = rig.scans[-1].header
+            assert last["scan"] + 1 == len(rig.scans) + last["dropped"]
+
+
+def test_settings_last(rig: Rig) -> None:
+    rig.must("set_unit_id", unit_id=77)
+    rig.must("save")
+    before = len(rig.frames("hello"))
+    rig.sim.reset()
+    rig.run(0.05)
+    (hello,) = rig.frames("hello")[before:]
+    assert (hello["unit_id"], hello["settings"]) == (77, "stored")
