@@ -68,6 +68,13 @@ def inverse(factor: Float) -> Float:
     return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
+def inverse_trace(factor: Float) -> float:
+    """The trace of (L L^T)^-1."""
+    lower, failed = lapack.dpotri(factor, lower=1)
+    _check(failed)
+    return float(lower.trace())
+
+
 def solve_lower(factor: Float, right: Float, *, transposed: bool = False) -> Float:
     """x of L x = right, or of L^T x = right."""
     solution, failed = lapack.dtrtrs(factor, right, lower=1, trans=int(transposed))

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
+from ohmskin.circuit.small import cholesky, gram, inverse_trace, solve, solve_lower
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
@@ -221,6 +221,17 @@ class FullFit:
     def misfit(self) -> float:
         """Chi-square per port: the mean square of that noise."""
         return float(self._weighted_residual @ self._weighted_residual) / self._current.size
+
+    @cached_property
+    def surprise(self) -> float:
+        """The misfit over what this model expects of it: about 1 or less if the model holds.
+
+        A residual of covariance S has a most probable noise, S^-1 times it, of covariance S^-1: the
+        mean square of that is the trace of S^-1. It is much less than 1 per port where cells and
+        wires are free to explain the readings, so the misfit itself says little.
+        """
+        expected = inverse_trace(self._factor) / self._current.size
+        return self.misfit / max(expected, 1e-12)
 
     def _conclude(self) -> None:
         """Posterior deviations of the cells: log_cells_std and wires_log_std, by the last J and S.

@@ -66,6 +66,17 @@ LEAK_FITS: Final = 8
 MOST_LEAK_US, LEAST_LEAK_US = 100.0, 1e-3
 # A leak differs from crossing to crossing, and dries: what is known of it, as a share. Chosen.
 LEAK_STD: Final = 0.2
+# A misfit that stays is a fault of the skin: the mean surprise of last frames is larger. Chosen:
+# dense touches of sound skins have up to 1.
+STAYING_SURPRISE: Final = 1.2
+STAYS: Final = "other frames fit no touches: is a line shorted, or a yarn broken? ask the doctor"
+# Share of a frame in that mean.
+SURPRISE_SHARE: Final = 0.1
+# A frame counts as no more, and as this if nothing explains it. Chosen: it takes more than half of
+# the frames to make a fault.
+MOST_SURPRISE: Final = 1.8
+# Skins of fewer ports are not judged so. Chosen: of 3x3, a few odd readings make a frame.
+LEAST_PORTS: Final = 16
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
 # by less than their rounding.
 LEAST_LEAD_OHM: Final = 20.0
@@ -117,6 +128,7 @@ class JointEstimator(Estimator):
         super().reset()
         self._cells_before: Float | None = None  # what `matrix` found in the last frame it started
         self._touches = 0  # of the last fit
+        self._surprise = 0.0  # the mean of those of the last fits
         # The last whole frame, for regions of the frames after it; and the last region.
         self._whole: FullFit | Touched | WholeFrame | None = None
         self._region: RegionFit | None = None
@@ -167,6 +179,11 @@ class JointEstimator(Estimator):
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
+        if not (ports.fault or again) and ports.current.size >= LEAST_PORTS:
+            surprise = MOST_SURPRISE if message else min(fit.surprise, MOST_SURPRISE)
+            self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
+        if not message and self._surprise > STAYING_SURPRISE:
+            message = STAYS
         # A crowded frame teaches nothing: other forces explain it as well as other wires do.
         if ports.fault or message or prior.is_crowded(fit.log_cells):
             again = False
@@ -204,8 +221,10 @@ class JointEstimator(Estimator):
         stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
-        # A model that misses the readings by more than their noise is wrong by as much more.
-        wider = max(1.0, fit.misfit) ** 0.5
+        # A model that misses the readings by more than their noise, or than it expects, is wrong by
+        # as much more.
+        surprise = fit.surprise if isinstance(fit, FullFit) else 0.0
+        wider = max(1.0, fit.misfit, surprise) ** 0.5
         return Solution(
             cell_siemens=np.exp(-fit.log_cells).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),

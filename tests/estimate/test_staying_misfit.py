@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A misfit that stays: what no touches explain, frame after frame, by a node Laplacian."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from network import SkinCircuit  # tests/helpers
+from ohmskin.circuit.skin import Skin
+from ohmskin.circuit.small import cholesky, inverse_trace
+from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.joint import STAYS
+from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.protocol import ENUMS, MODES
+from studies.trials import Trial, bent_trial, jump_trial, random_trial
+
+FRAMES = 50
+
+
+def led(skin: Skin) -> Skin:
+    """The same skin behind leads of 100 ohm."""
+    return replace(skin, lead_ohm=np.array(100.0))
+
+
+def estimates(
+    trial: Trial, method: str, mode: str = "near", short_ohm: float = 0.0, noise_lsb: float = 0.3
+) -> list[Estimate]:
+    """All frames; short_ohm: between rows 3 and 4, in front of their leads, after the tare."""
+    names = [ENUMS["reading"].values[name] for name in MODES[mode]]
+    short = (np.array([[3], [4]]), np.array([short_ohm])) if short_ohm else None
+    frames = [
+        SkinCircuit(led(skin), short).readings(skin.cell_siemens)[..., names]
+        for skin in trial.frames
+    ]
+    rest = SkinCircuit(led(trial.rest)).readings(trial.rest.cell_siemens)[..., names]
+    exact = np.array([*[rest] * 90, *frames])  # a tare is the mean of 90 scans
+    exact += noise_lsb / 1024 * np.random.default_rng(0).standard_normal(exact.shape)
+    ratios = ratio_from_codes(quantise(exact))
+    rest = ratios[:90].mean(axis=0)
+    shape = trial.rest.shape
+    known = SkinKnowledge(*shape, adc_bits=10, rest_ratio=rest, reading_names=MODES[mode])
+    estimator = make_estimator(method, known)
+    return [estimator.estimate(ratio) for ratio in ratios[90:]]
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str) -> None:
+    """A frame alone may be explained by touches that are not there."""
+    found = estimates(random_trial(8, 8, 8, FRAMES, 24001), method, short_ohm=20.0)
+    late = found[20:]
+    assert sum(one.converged for one in late) <= 6
+    assert sum(one.message == STAYS for one in late) >= 5  # that nothing else flags
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "trial",
+    [
+        random_trial(8, 8, 16, FRAMES, 1),
+        random_trial(3, 3, 3, FRAMES, 2),
+        random_trial(4, 4, 4, FRAMES, 5),
+        bent_trial(8, 8, 8, FRAMES, 3),
+        jump_trial(8, 8, 8, FRAMES, 4),
+    ],
+    ids=["dense", "small", "4x4", "bent", "jump"],
+)
+def test_a_sound_skin_is_never_said_to_be_damaged(trial: Trial, mode: str, method: str) -> None:
+    for noise_lsb in (0.3, 3.0):
+        found = estimates(trial, method, mode, noise_lsb=noise_lsb)
+        assert STAYS not in [one.message for one in found]
+
+
+def test_the_trace_of_an_inverse() -> None:
+    root = np.random.default_rng(0).standard_normal((6, 9))
+    system = root @ root.T
+    assert inverse_trace(cholesky(system)) == pytest.approx(np.trace(np.linalg.inv(system)))
