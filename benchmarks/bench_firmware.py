@@ -76,7 +76,7 @@ from second_simulator import SecondSim
 # simulator, which is slow. Chosen: a fault of one reading in so many would show.
 READINGS_WANTED, READINGS_WANTED_FAR, READINGS_WANTED_SECOND = 1_000_000, 500_000, 20_000
 LATE_CYCLES = (1, 2, 8, 32)  # by which conversions are late, of the converter's clock of 16 MHz
-ADC_CLOCKS = ("clock_500khz", "clock_250khz", "clock_125khz")
+ADC_CLOCKS = ("usual", "fine", "finest")
 # Three of a rectangle's corners at 5 kOhm, the rest at 1 MOhm, no wires.
 _CELLS = np.full((8, 8), 1e-6)
 _CELLS[[2, 2, 5], [2, 5, 2]] = 1 / 5e3
@@ -170,7 +170,7 @@ def _measure_late(board: str, rng: np.random.Generator) -> dict[str, int]:
     """Readings where conversions take longer than the data sheet says, and how many are wrong."""
     readings = wrong = 0
     scans: list[dict[str, Any]] = [{"rate_mhz": 90_000}]
-    scans += [{"rate_mhz": 0, "settle_us": 1, "adc_prescaler": clock} for clock in ADC_CLOCKS]
+    scans += [{"rate_mhz": 0, "settle_us": 1, "accuracy": clock} for clock in ADC_CLOCKS]
     for scan in scans:
         for late in LATE_CYCLES:
             with Rig(board) as rig:

@@ -6,27 +6,27 @@
 namespace ohmskin {
 namespace frames {
 
-constexpr uint16_t LAYOUT_CRC = 0x2FED;
+constexpr uint16_t LAYOUT_CRC = 0xEA8F;
 constexpr uint8_t DELIMITER = 0x00;
 constexpr uint16_t CRC_POLYNOMIAL = 0x1021;
 constexpr uint16_t CRC_INITIAL = 0xFFFF;
 
-// rows a board can scan: inputs of one CD74HC4067
-constexpr uint8_t ROWS_MAX = 16;
-// columns a board can scan
-constexpr uint8_t COLUMNS_MAX = 16;
+// rows that a mask has bits for; a board says in `hello` how many it can scan
+constexpr uint8_t ROWS_MAX = 32;
+// columns that a mask has bits for
+constexpr uint8_t COLUMNS_MAX = 32;
+// bytes of a name: ASCII, zeros behind it
+constexpr uint8_t NAME_SIZE = 16;
 // names in the enum `reading`
 constexpr uint8_t READINGS = 8;
-// readings of a cell in a scan: those of its mode, in its order
-constexpr uint8_t READINGS_PER_CELL = 4;
-// readings of a cell that follow each other; a scan passes over all cells for each such group
-constexpr uint8_t READINGS_PER_PASS = 2;
-// bits of one code; codes are packed without gaps, least significant bit first
-constexpr uint8_t ADC_BITS = 10;
+// readings of a cell in a scan, at most: those of its mode, in its order
+constexpr uint8_t READINGS_MAX = 4;
+// bits of one code, at most; a board says its own in `hello` and in each scan
+constexpr uint8_t ADC_BITS_MAX = 16;
 // slowest scan rate
 constexpr uint16_t RATE_MHZ_MIN = 1000;
-// fastest scan rate that can be asked for; what fits depends on the number of cells
-constexpr uint32_t RATE_MHZ_MAX = 2000000;
+// fastest scan rate that can be asked for; what fits depends on the readings of a scan, on line and processor
+constexpr uint32_t RATE_MHZ_MAX = 50000000;
 // longest settling time that can be asked for
 constexpr uint16_t SETTLE_US_MAX = 3000;
 // line speed after every reset, 8N1: some USB bridges lose bytes above about 47 kB/s
@@ -48,17 +48,12 @@ enum class Reading : uint8_t {
     H = 7,  // top pin low, bottom pin high: far end of the row
 };
 
-// which readings a scan takes of each cell, in scan order
+// which readings a scan takes of each cell, in scan order. A scan passes over all its cells, once or more often: `per_pass` readings of a cell follow each other, and the next ones come in the next pass
 enum class Mode : uint8_t {
     Near = 0,  // both near ends, under both drives
     Far = 1,  // both ends of row and column, under one drive; needs a second pair of multiplexers at the far ends
-};
-
-// what the firmware was built for
-enum class Board : uint8_t {
-    Uno = 1,  // Arduino Uno, ATmega328P
-    Megaatmega2560 = 2,  // Arduino Mega 2560
-    Emulated = 3,  // no hardware: the host's emulator
+    Half = 2,  // both near ends, under one drive: half the time of near, and offsets of the converter do not show
+    Quick = 3,  // the column's near end alone: a quarter of the time of near
 };
 
 // where the settings in force at boot came from
@@ -68,11 +63,11 @@ enum class Settings : uint8_t {
     DefaultsDamaged = 2,  // EEPROM holds no sound record, or a scan that does not fit: defaults, but for a unit id that is sound
 };
 
-// ADC clock divisor: a conversion takes 13 ADC clocks at 16 MHz / divisor
-enum class AdcPrescaler : uint8_t {
-    Clock500khz = 32,  // 26 us a conversion, the default
-    Clock250khz = 64,  // 52 us, less converter noise
-    Clock125khz = 128,  // 104 us, the data sheet's full 10-bit accuracy
+// how exact a conversion is, and so how long it takes
+enum class Accuracy : uint8_t {
+    Usual = 0,  // the default; 26 us a conversion on an Uno (ADC clock of 500 kHz)
+    Fine = 1,  // less noise of the converter; 52 us on an Uno (250 kHz)
+    Finest = 2,  // all that the converter's data sheet promises; 104 us on an Uno (125 kHz)
 };
 
 // answer to a command; anything but ok has changed nothing
@@ -80,16 +75,16 @@ enum class Result : uint8_t {
     Ok = 0,  // done
     UnknownCommand = 1,  // this firmware has no such command
     BadLength = 2,  // the payload has the wrong length
-    BadRows = 3,  // rows outside 1..16
-    BadColumns = 4,  // columns outside 1..16
-    BadRate = 5,  // rate neither 0 nor within 1000..2000000 mHz
+    BadRows = 3,  // rows outside 1 to the board's rows_max, or a mask that is empty or has bits beyond the rows
+    BadColumns = 4,  // columns outside 1 to the board's columns_max, or a mask that is empty or has bits beyond the columns
+    BadRate = 5,  // rate neither 0 nor within 1000..50000000 mHz
     BadSettle = 6,  // settle time above 3000 us
-    BadPrescaler = 7,  // no such ADC prescaler
+    BadAccuracy = 7,  // no such accuracy
     BadBaud = 8,  // no such line speed
-    TooFast = 9,  // the readings of a scan do not fit into its period: lower the rate, the settle time, the prescaler or the size
-    LineTooSlow = 10,  // not one whole scan could be buffered at this line speed: lower the rate or raise the speed
+    TooFast = 9,  // converter or processor cannot keep up with this rate: lower the rate, the settle time, the accuracy or the number of cells
+    LineTooSlow = 10,  // the line cannot keep up with this rate: lower the rate or the number of cells, or raise the speed of the line
     Scanning = 11,  // not while scanning: stop first
-    Busy = 12,  // the same command is still being carried out
+    Busy = 12,  // a command is still being carried out that this one would disturb: wait for its answer
     EepromFailed = 13,  // the EEPROM does not hold what was written
     BadMode = 14,  // no such mode
 };
@@ -118,10 +113,16 @@ enum class Finding : uint16_t {
     FarBottomOpen = 2048,  // far sense node of the columns follows no column: multiplexer, its wire or its connector open
 };
 
-// Readings of each mode, in scan order.
-constexpr Reading MODE_READINGS[][READINGS_PER_CELL] = {
-    {Reading::A, Reading::B, Reading::C, Reading::D},
-    {Reading::A, Reading::E, Reading::B, Reading::F},
+// Readings of each mode, in scan order: how many, how many a pass, and which.
+struct ModeReadings {
+    uint8_t count, per_pass;
+    Reading readings[READINGS_MAX];
+};
+constexpr ModeReadings MODE_READINGS[] = {
+    {4, 2, {Reading::A, Reading::B, Reading::C, Reading::D}},  // near
+    {4, 2, {Reading::A, Reading::E, Reading::B, Reading::F}},  // far
+    {2, 2, {Reading::A, Reading::B}},  // half
+    {1, 1, {Reading::B}},  // quick
 };
 
 enum class Type : uint8_t {
@@ -138,6 +139,7 @@ enum class Type : uint8_t {
     LoadDefaults = 0x87,
     SelfTest = 0x88,
     SetBaud = 0x89,
+    SetRegion = 0x8A,
 };
 
 // board to host: who the board is and how it scans: sent at boot and on request
@@ -146,49 +148,64 @@ struct __attribute__((packed)) Hello {
     uint8_t version_major;  // firmware version
     uint8_t version_minor;  // firmware version
     uint8_t version_patch;  // firmware version
-    uint8_t board;  // hardware the firmware was built for
+    char board[16];  // hardware the firmware was built for, as PlatformIO calls it; emulated: none
+    uint16_t wiring;  // CRC-16 of the board's table of pins, where it is not that of docs/build.md; 0: it is
     uint32_t unit_id;  // name of this skin, set by the user; 0: none yet
-    uint8_t rows;  // rows scanned
-    uint8_t columns;  // columns scanned
-    uint8_t readings_per_cell;  // readings of each cell
+    uint8_t rows_max;  // rows that this board can scan
+    uint8_t columns_max;  // columns that this board can scan
+    uint8_t rows;  // rows of the skin
+    uint8_t columns;  // columns of the skin
     uint8_t adc_bits;  // bits of one code
     uint32_t ref_top_ohm;  // [ohm] reference resistor of the row side
     uint32_t ref_bottom_ohm;  // [ohm] reference resistor of the column side
-    uint32_t rate_asked_mhz;  // [mHz] rate asked for; 0: as fast as the converter runs
+    uint32_t rate_asked_mhz;  // [mHz] rate asked for; 0: as fast as readings settle, and line and processor keep up
     uint32_t scan_cycles;  // [clock] clock cycles from one scan's start to the next: the rate that is kept
-    uint16_t slot_cycles;  // [clock] clock cycles from one reading of a scan to the next; what is left of the scan after its last reading is idle
+    uint32_t slot_cycles;  // [clock] clock cycles from one reading of a scan to the next; what is left of the scan after its last reading is idle
+    uint32_t whole_scan_cycles;  // [clock] clock cycles of a whole scan in between; 0: there is none
     uint32_t clock_hz;  // [Hz] clock of the board
     uint16_t settle_asked_us;  // [us] settle time asked for; 0: as long as the rate allows
-    uint16_t settle_us;  // [us] time from a multiplexer change to the hold, at least
-    uint8_t adc_prescaler;  // ADC clock divisor
+    uint16_t settle_us;  // [us] time to settle before a hold, at least, of the node and of the sample capacitor
+    uint8_t accuracy;  // of a conversion
     uint8_t mode;  // which readings a scan takes
+    uint32_t row_mask;  // rows that a scan reads, bit 0 for row 0
+    uint32_t column_mask;  // columns that a scan reads
+    uint8_t whole_mode;  // which readings a whole scan in between takes
+    uint16_t whole_every;  // each so many-th scan is a whole one, of all rows and columns; 0: none
     uint32_t baud;  // [baud] line speed in force
     uint8_t settings;  // where the settings at boot came from
     uint8_t reset_cause;  // why the board last started
     uint8_t scanning;  // 1 while scanning
+    uint16_t dropped;  // scans made but not sent since start, also where no scan comes; wraps
+    uint16_t late;  // readings lost since start because their conversion ended too late; wraps
 };
-static_assert(sizeof(Hello) == 49, "wire size");
+static_assert(sizeof(Hello) == 88, "wire size");
 
-// board to host: all readings of one scan. The codes follow the header: the mode's first two readings of each cell, cells in column-major order (rows run fastest), then its other two of each cell; adc_bits each, packed least significant bit first; 4 codes of 10 bits fill 5 bytes. The last byte is padded with zero bits.
+// board to host: all readings of one scan. The codes follow the header: the readings of the mode's first pass of each cell, cells in column-major order (rows run fastest), then those of its next pass of each cell; of the cells alone whose row and column are in the masks; adc_bits each, packed without gaps, least significant bit first. The last byte is padded with zero bits.
 struct __attribute__((packed)) Scan {
     uint32_t scan;  // number of the scan since start, dropped ones counted; wraps
     uint32_t time_us;  // [us] board time at which the scan started; wraps
-    uint16_t dropped;  // scans made but not sent since start, because the line was full; wraps
+    uint16_t dropped;  // scans made but not sent since start; wraps
     uint16_t rx_errors;  // damaged or overlong frames the board has received since boot; wraps
-    uint8_t rows;  // rows of this scan
-    uint8_t columns;  // columns of this scan
+    uint8_t rows;  // rows of the skin
+    uint8_t columns;  // columns of the skin
     uint8_t mode;  // which readings these are
-    // followed by codes: rows * columns * readings_per_cell codes
+    uint8_t adc_bits;  // bits of one code
+    uint32_t row_mask;  // rows that were read, bit 0 for row 0
+    uint32_t column_mask;  // columns that were read
+    uint16_t slot_cycles;  // [clock] clock cycles from one reading of this scan to the next; 0: as in hello
+    // followed by codes: of the cells that were read
 };
-static_assert(sizeof(Scan) == 15, "wire size");
+static_assert(sizeof(Scan) == 26, "wire size");
 
 // board to host: answer to one command; the only one, sent when the command has been carried out
 struct __attribute__((packed)) Ack {
     uint8_t command;  // type of the command answered
     uint8_t command_sequence;  // sequence number of the command answered
     uint8_t result;  // ok, or why not
+    uint32_t time_us;  // [us] board time at which the command's last byte was read; wraps
+    uint32_t rate_mhz;  // [mHz] of configure and set_region: the rate that is kept or, where it was too fast, the fastest that could be; else 0
 };
-static_assert(sizeof(Ack) == 3, "wire size");
+static_assert(sizeof(Ack) == 11, "wire size");
 
 // board to host: what the sense nodes read over all multiplexer inputs; comes before the ack of self_test
 struct __attribute__((packed)) SelfTestReport {
@@ -198,16 +215,20 @@ struct __attribute__((packed)) SelfTestReport {
 };
 static_assert(sizeof(SelfTestReport) == 34, "wire size");
 
-// host to board: how to scan; all of it or nothing. Refused while scanning
+// host to board: how to scan; all of it or nothing. Refused while scanning. What follows accuracy are the fields of set_region
 struct __attribute__((packed)) Configure {
-    uint8_t rows;  // rows to scan, 1..rows_max
-    uint8_t columns;  // columns to scan, 1..columns_max
-    uint32_t rate_mhz;  // [mHz] scans per 1000 s; 0: as fast as the converter runs
+    uint8_t rows;  // rows of the skin, 1 to the board's rows_max
+    uint8_t columns;  // columns of the skin, 1 to the board's columns_max
+    uint8_t accuracy;  // of a conversion
+    uint32_t row_mask;  // rows that a scan reads, bit 0 for row 0
+    uint32_t column_mask;  // columns that a scan reads
+    uint32_t rate_mhz;  // [mHz] scans per 1000 s; 0: as fast as readings settle, and line and processor keep up
     uint16_t settle_us;  // [us] least settle time, which then also is kept; 0: as long as the rate allows
-    uint8_t adc_prescaler;  // ADC clock divisor
     uint8_t mode;  // which readings a scan takes
+    uint8_t whole_mode;  // which readings a whole scan in between takes
+    uint16_t whole_every;  // each so many-th scan is a whole one, of all rows and columns, as fast as its readings settle; 0: none
 };
-static_assert(sizeof(Configure) == 10, "wire size");
+static_assert(sizeof(Configure) == 21, "wire size");
 
 // host to board: name this skin; `save` makes it last
 struct __attribute__((packed)) SetUnitId {
@@ -220,6 +241,18 @@ struct __attribute__((packed)) SetBaud {
     uint32_t baud;  // [baud] baud_default or baud_fast
 };
 static_assert(sizeof(SetBaud) == 4, "wire size");
+
+// host to board: which part of the skin to scan, and how; also while scanning. Answered when it is in force, from the next scan on
+struct __attribute__((packed)) SetRegion {
+    uint32_t row_mask;  // rows that a scan reads, bit 0 for row 0
+    uint32_t column_mask;  // columns that a scan reads
+    uint32_t rate_mhz;  // [mHz] as in configure
+    uint16_t settle_us;  // [us] as in configure
+    uint8_t mode;  // which readings a scan takes
+    uint8_t whole_mode;  // which readings a whole scan in between takes
+    uint16_t whole_every;  // as in configure; the count goes on over a change of region
+};
+static_assert(sizeof(SetRegion) == 18, "wire size");
 
 }  // namespace frames
 }  // namespace ohmskin

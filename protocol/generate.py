@@ -22,11 +22,12 @@ from ohmskin.link.protocol import (  # noqa: E402
     FRAMES,
     LAYOUT_CRC,
     MODES,
+    PER_PASS,
     Field,
     Frame,
 )
 
-C_TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t"}
+C_TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "text": "char"}
 
 
 def _camel(name: str) -> str:
@@ -64,14 +65,19 @@ def header() -> str:
         out.append(f"constexpr {_c_type(value)} {name.upper()} = {value};")
     for enum in ENUMS.values():
         width = _c_type(max(enum.values.values()))
-        out += ["", f"// {DEFINITION['enums'][enum.name]['doc']}"]
+        out += ["", f"// {' '.join(DEFINITION['enums'][enum.name]['doc'].split())}"]
         out.append(f"enum class {_camel(enum.name)} : {width} {{")
         out += [f"    {_camel(n)} = {v},  // {enum.docs[n]}" for n, v in enum.values.items()]
         out.append("};")
-    out += ["", "// Readings of each mode, in scan order."]
-    out.append("constexpr Reading MODE_READINGS[][READINGS_PER_CELL] = {")
-    for names in MODES.values():
-        out.append("    {" + ", ".join(f"Reading::{_camel(name)}" for name in names) + "},")
+    out += ["", "// Readings of each mode, in scan order: how many, how many a pass, and which."]
+    out.append("struct ModeReadings {")
+    out.append("    uint8_t count, per_pass;")
+    out.append("    Reading readings[READINGS_MAX];")
+    out.append("};")
+    out.append("constexpr ModeReadings MODE_READINGS[] = {")
+    for mode, names in MODES.items():
+        readings = ", ".join(f"Reading::{_camel(name)}" for name in names)
+        out.append(f"    {{{len(names)}, {PER_PASS[mode]}, {{{readings}}}}},  // {mode}")
     out.append("};")
     out += ["", "enum class Type : uint8_t {"]
     out += [f"    {_camel(f.name)} = {_hex(f.id)}," for f in FRAMES.values()]
@@ -125,15 +131,27 @@ def page() -> str:
             out += _rows(frame)
     out += ["", "## Enums"]
     for enum in ENUMS.values():
-        out += ["", f"### `{enum.name}`", "", DEFINITION["enums"][enum.name]["doc"] + ".", ""]
+        out += [
+            "",
+            f"### `{enum.name}`",
+            "",
+            " ".join(DEFINITION["enums"][enum.name]["doc"].split()) + ".",
+            "",
+        ]
         out += ["| value | name | meaning |", "|---|---|---|"]
         for n, v in enum.values.items():
-            readings = " ".join(MODES[n]) + ": " if enum.name == "mode" else ""
+            readings = _passes(n) + ": " if enum.name == "mode" else ""
             out.append(f"| {v} | `{n}` | {readings}{enum.docs[n]} |")
     out += ["", "## Constants", "", "| name | value | unit | meaning |", "|---|---|---|---|"]
     for name, entry in DEFINITION["constants"].items():
         out.append(f"| `{name}` | {entry['value']} | {entry.get('unit', '')} | {entry['doc']} |")
     return "\n".join(out) + "\n"
+
+
+def _passes(mode: str) -> str:
+    """The readings of a mode, a bar between its passes."""
+    names, size = MODES[mode], PER_PASS[mode]
+    return " / ".join(" ".join(names[i : i + size]) for i in range(0, len(names), size))
 
 
 def _size(frame: Frame) -> str:

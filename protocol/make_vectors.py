@@ -49,84 +49,114 @@ def valid(
     return {**entry, "content": content.hex(), "wire": wire(content).hex()}
 
 
+MODES = ("near", "far", "half", "quick")
+
+
 def scan(
     name: str, sequence: int, rows: int, columns: int, codes: list[int], mode: str = "near"
 ) -> dict[str, Any]:
-    header = struct.pack("<IIHHBBB", 70000, 777777777, 3, 1, rows, columns, mode == "far")
+    return region(name, sequence, ((1 << rows) - 1, (1 << columns) - 1), codes, mode)
+
+
+def region(
+    name: str, sequence: int, masks: tuple[int, int], codes: list[int], mode: str
+) -> dict[str, Any]:
+    """A scan of these rows and columns, of a skin that ends with the last of them."""
     fields = {
         "scan": 70000,
         "time_us": 777777777,
         "dropped": 3,
         "rx_errors": 1,
-        "rows": rows,
-        "columns": columns,
+        "rows": masks[0].bit_length(),
+        "columns": masks[1].bit_length(),
         "mode": mode,
+        "adc_bits": 10,
+        "row_mask": masks[0],
+        "column_mask": masks[1],
+        "slot_cycles": 688,
     }
+    values = [MODES.index(value) if name == "mode" else value for name, value in fields.items()]
+    header = struct.pack("<IIHHBBBBIIH", *values)
     return valid(name, bytes([0x02, sequence]) + header + pack10(codes), fields, codes)
 
 
 def all_valid() -> list[dict[str, Any]]:
-    hello = struct.pack(
-        "<HBBBBIBBBBIIIIHIHHBBIBBB",
-        *(0x3C72, 0, 1, 0, 1, 0xC0FFEE, 8, 8, 4, 10, 30000, 30000),
-        *(90000, 177762, 689, 16000000, 0, 36, 32, 1, 500000, 1, 2, 0),
-    )
     hello_fields = {
         "layout_crc": 0x3C72,
         "version_major": 0,
         "version_minor": 1,
         "version_patch": 0,
         "board": "uno",
+        "wiring": 0,
         "unit_id": 0xC0FFEE,
+        "rows_max": 16,
+        "columns_max": 16,
         "rows": 8,
         "columns": 8,
-        "readings_per_cell": 4,
         "adc_bits": 10,
         "ref_top_ohm": 30000,
         "ref_bottom_ohm": 30000,
         "rate_asked_mhz": 90000,
         "scan_cycles": 177762,
         "slot_cycles": 689,
+        "whole_scan_cycles": 176816,
         "clock_hz": 16000000,
         "settle_asked_us": 0,
         "settle_us": 36,
-        "adc_prescaler": "clock_500khz",
+        "accuracy": "usual",
         "mode": "far",
+        "row_mask": 0xFF,
+        "column_mask": 0x3C,
+        "whole_mode": "near",
+        "whole_every": 12,
         "baud": 500000,
         "settings": "defaults_blank",
         "reset_cause": ["external"],
         "scanning": 0,
+        "dropped": 513,
+        "late": 7,
     }
+    numbers = {"board": b"uno", "accuracy": 0, "mode": 1, "whole_mode": 0, "settings": 1}
+    numbers["reset_cause"] = 2
+    hello = struct.pack(
+        "<HBBB16sHIBBBBBIIIIIIIHHBBIIBHIBBBHH",
+        *(numbers.get(name, value) for name, value in hello_fields.items()),
+    )
     ramp = [(37 * i + 5) % 1024 for i in range(8 * 8 * 4)]
     report = struct.pack("<H16H", 0b100100100, *range(8), *range(1016, 1024))
-    configure = struct.pack("<BBIHBB", 8, 12, 90000, 20, 64, 1)
+    of_region = struct.pack("<IIIHBBH", 0xFE, 0x800, 90000, 20, 3, 0, 300)
+    region_fields = {
+        "row_mask": 0xFE,
+        "column_mask": 0x800,
+        "rate_mhz": 90000,
+        "settle_us": 20,
+        "mode": "quick",
+        "whole_mode": "near",
+        "whole_every": 300,
+    }
     return [
         valid("get_hello", bytes([0x81, 0]), {}),
         valid("start", bytes([0x83, 7]), {}),
         valid("stop, sequence 255", bytes([0x84, 255]), {}),
         valid(
             "configure",
-            bytes([0x82, 9]) + configure,
-            {
-                "rows": 8,
-                "columns": 12,
-                "rate_mhz": 90000,
-                "settle_us": 20,
-                "adc_prescaler": "clock_250khz",
-                "mode": "far",
-            },
+            bytes([0x82, 9, 8, 12, 1]) + of_region,
+            {"rows": 8, "columns": 12, "accuracy": "fine"} | region_fields,
         ),
+        valid("set_region", bytes([0x8A, 3]) + of_region, region_fields),
         valid("set_unit_id", bytes([0x85, 1]) + b"\xff\x00\xff\x00", {"unit_id": 0x00FF00FF}),
         valid("set_baud", bytes([0x89, 2]) + struct.pack("<I", 1000000), {"baud": 1000000}),
         valid(
             "ack ok",
-            bytes([0x03, 4, 0x83, 7, 0]),
-            {"command": 0x83, "command_sequence": 7, "result": "ok"},
+            bytes([0x03, 4, 0x83, 7, 0]) + struct.pack("<II", 123456789, 0),
+            {"command": 0x83, "command_sequence": 7, "result": "ok"}
+            | {"time_us": 123456789, "rate_mhz": 0},
         ),
         valid(
             "ack too_fast",
-            bytes([0x03, 5, 0x82, 9, 9]),
-            {"command": 0x82, "command_sequence": 9, "result": "too_fast"},
+            bytes([0x03, 5, 0x82, 9, 9]) + struct.pack("<II", 5, 90843),
+            {"command": 0x82, "command_sequence": 9, "result": "too_fast"}
+            | {"time_us": 5, "rate_mhz": 90843},
         ),
         valid("hello", bytes([0x01, 0]) + hello, hello_fields),
         valid(
@@ -142,6 +172,8 @@ def all_valid() -> list[dict[str, Any]]:
         scan("scan 2x3, all codes zero", 11, 2, 3, [0] * 24),
         scan("scan 3x1, all codes 1023", 12, 3, 1, [1023] * 12),
         scan("scan 8x8", 13, 8, 8, ramp, "far"),
+        scan("scan 5x2 half", 17, 5, 2, [(53 * i + 9) % 1024 for i in range(20)], "half"),
+        region("region of 2x3 quick", 18, (0b10100, 0b1011), [1, 1023, 0, 2, 512, 77], "quick"),
         # COBS's blocks end after 254 bytes without a zero: once past it, once exactly there.
         scan("scan 16x4, long run without zeros", 14, 16, 4, [1023] * 256),
         # The eighth byte of the codes is the last zero: 252 bytes and the CRC follow it.

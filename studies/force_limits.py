@@ -15,10 +15,10 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level
-from ohmskin.link import protocol
 from studies.force_experiment import FAST, REGRESSIONS, SLOW, TRUTH, learn, rises
 from studies.force_trial import Choreography, ForceTrial, OneFrameBoard, Plan, groups_of
 from studies.press import PressModel
@@ -202,7 +202,7 @@ def _levels(plan: Detection, forces_n: Float, seed: int, scene: str, cell: int) 
     board = OneFrameBoard(SHAPE, int(random.integers(1 << 32)))
     known = knowledge_of(board.rest_ratio(skin))
     mixed = random.permutation(len(target_n))
-    ratio = np.empty((*rise.shape, protocol.READINGS_PER_CELL))
+    ratio = np.empty((*rise.shape, READINGS_PER_CELL))
     for number, frame in enumerate(mixed):
         pressed = replace(skin, cell_siemens=skin.cell_siemens + rise[frame])
         ratio[frame] = board.read(10.0 + number, pressed)

@@ -162,7 +162,7 @@ def test_sdist_and_wheel_run_the_demo_with_what_they_require_alone(tmp_path: Pat
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         packed = archive.namelist()
-    assert "ohmskin/frames.toml" in packed
+    assert {"ohmskin/protocol/frames.toml", "ohmskin/protocol/layouts/2FED.toml"} <= set(packed)
     assert "ohmskin/view/page/index.html" in packed
     assert not any(name.startswith(("tests/", "docs/", "firmware/")) for name in packed)
 

@@ -20,7 +20,8 @@ using namespace rp2040;
 // Sense nodes: top on A0 (GP26), bottom on A1 (GP27), far end of the row on A2 (GP28), of the
 // column on A3 (GP29), which a Pico has not on its edge: other boards do. They float, as analog
 // inputs. All other pins keep the chip's pull-downs.
-const frames::Board KIND = frames::Board::Uno;  // until the protocol has a value of its own
+const char NAME[frames::NAME_SIZE] = "pico";
+const uint16_t WIRING = OHMSKIN_OWN_PINS;  // 0: that of docs/build.md
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 
@@ -66,7 +67,7 @@ constexpr uint32_t CRYSTAL_MHZ = 12;
 constexpr uint32_t CRYSTAL_STARTUP = 47;
 }  // namespace
 
-const uint32_t CLOCK_HZ = SYS_HZ / SLOT_CLOCK_DIVIDER;
+static_assert(CLOCK_HZ == SYS_HZ / SLOT_CLOCK_DIVIDER, "core/clock.h has that of a slot");
 
 namespace {
 
@@ -111,13 +112,14 @@ struct Registers {
     uint32_t drive;    // levels of the drive pins
     uint32_t channel;  // ADC_CS
 };
-Registers registers[PATTERNS * frames::READINGS_PER_CELL];
-uint32_t row_levels[frames::ROWS_MAX], column_levels[frames::COLUMNS_MAX];
+Registers registers[PATTERNS * frames::READINGS_MAX];
+uint32_t row_levels[ROWS_MAX], column_levels[COLUMNS_MAX];
+static_assert(ROWS_MAX <= 16 && COLUMNS_MAX <= 16, "four pins of address");
 
 void pins_begin() {
-    for (uint8_t n = 0; n < frames::ROWS_MAX; n++)
+    for (uint8_t n = 0; n < ROWS_MAX; n++)
         row_levels[n] = levels(ROW_PINS, n);
-    for (uint8_t n = 0; n < frames::COLUMNS_MAX; n++)
+    for (uint8_t n = 0; n < COLUMNS_MAX; n++)
         column_levels[n] = levels(COLUMN_PINS, n);
     for (uint8_t entry = 0; entry < sizeof registers / sizeof *registers; entry++) {
         const ReadingDefinition reading =
@@ -167,18 +169,21 @@ constexpr uint32_t CONVERSION_ASKED_MAX = 256;
 // Cycles of a slot's clock from start_slots() to the first conversion. Chosen, as on the AVR.
 constexpr uint16_t FIRST_AFTER = 8;
 // Bits of the converter that the protocol does not carry.
-constexpr uint8_t CODE_SHIFT = 12 - frames::ADC_BITS;
+constexpr uint8_t CODE_SHIFT = 12 - ADC_BITS;
 
 }  // namespace
 
 Scanner scanner;
+const uint8_t SLOTS_OF_NEW_LENGTH = 1;
 
 extern "C" void slot_interrupt() {
     // The channel has been set in the slot before, with the pins.
     set_bits(ADC_CS, ADC_START_ONCE);
     at(PWM_INTR) = WRAP;
     const Stand next = stand_of(scanner.selection());
-    scanner.step(code_before, converted_before);  // while the converter works
+    // While the converter works. The counter takes another end with the next slot.
+    if (scanner.step(code_before, converted_before))
+        at(PWM_TOP) = scanner.slot_cycles() - 1u;
     uint32_t asked = 0;
     while (!(at(ADC_CS) & ADC_READY) && asked < CONVERSION_ASKED_MAX)
         asked++;
@@ -187,11 +192,11 @@ extern "C" void slot_interrupt() {
     select(next);
 }
 
-void start_slots(const ScanPlan &plan, uint8_t) {
+void start_slots(uint16_t slot_cycles, uint8_t) {
     converted_before = false;
     select(stand_of(scanner.selection()));
-    at(PWM_TOP) = plan.slot_cycles - 1u;
-    at(PWM_CTR) = plan.slot_cycles - uint32_t{FIRST_AFTER};
+    at(PWM_TOP) = slot_cycles - 1u;
+    at(PWM_CTR) = slot_cycles - uint32_t{FIRST_AFTER};
     at(PWM_INTR) = WRAP;
     at(PWM_INTE) = WRAP;
     at(NVIC_ICPR) = INTERRUPT_PWM;

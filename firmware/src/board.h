@@ -12,8 +12,8 @@ namespace ohmskin {
 namespace board {
 
 // ---- what it is
-extern const frames::Board KIND;
-extern const uint32_t CLOCK_HZ;
+extern const char NAME[frames::NAME_SIZE];  // as PlatformIO calls it
+extern const uint16_t WIRING;               // hello.wiring
 extern const uint32_t REF_TOP_OHM;
 extern const uint32_t REF_BOTTOM_OHM;
 
@@ -30,9 +30,13 @@ void mark_pass(bool worked);
 
 // ---- scan
 // The board's slot interrupt calls scanner.step() once a slot (see core/scanner.h) from
-// start_slots() to stop_slots(), and puts pins and multiplexers where it says.
+// start_slots() to stop_slots(), puts pins and multiplexers where it says, and gives slots
+// the length that it says.
 extern Scanner scanner;
-void start_slots(const ScanPlan &plan, uint8_t adc_prescaler);
+// How many slots have the new length before the first reading of a scan whose slots are of another
+// one: 2 where the slot at hand takes it, 1 where the next one does.
+extern const uint8_t SLOTS_OF_NEW_LENGTH;
+void start_slots(uint16_t slot_cycles, uint8_t accuracy);
 void stop_slots();
 
 // ---- serial line

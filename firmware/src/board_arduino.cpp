@@ -15,17 +15,19 @@ namespace ohmskin {
 namespace board {
 
 #if defined(__AVR_ATmega2560__)
-const frames::Board KIND = frames::Board::Megaatmega2560;
+const char NAME[frames::NAME_SIZE] = "megaatmega2560";
+#elif defined(__AVR_ATmega328P__)
+const char NAME[frames::NAME_SIZE] = "uno";
 #else
-const frames::Board KIND = frames::Board::Uno;
+const char NAME[frames::NAME_SIZE] = "arduino";
 #endif
-const uint32_t CLOCK_HZ = 16000000;  // what plans count in, whatever the chip's clock is
+const uint16_t WIRING = OHMSKIN_OWN_PINS;  // 0: that of docs/build.md
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 Scanner scanner;
+const uint8_t SLOTS_OF_NEW_LENGTH = 2;
 
 namespace {
-constexpr uint8_t CYCLES_PER_US = 16;
 // A slot may come so late [us], and its scan still counts. Chosen: what stamps may be off.
 constexpr uint16_t LATE_US = 1000;
 // From the pins' change to the conversion [us], at the least. Chosen as SETTLE_US of scan_plan.h.
@@ -51,7 +53,7 @@ void write_number(const uint8_t *pins, uint8_t number, uint8_t changed) {
 }
 
 ReadingDefinition reading_at(const Selection &selection) {
-    constexpr uint8_t PER_CELL = frames::READINGS_PER_CELL;
+    constexpr uint8_t PER_CELL = frames::READINGS_MAX;
     return READING_DEFINITIONS[static_cast<uint8_t>(
         reading_of(selection.pattern_entry / PER_CELL, selection.pattern_entry % PER_CELL))];
 }
@@ -72,7 +74,8 @@ void select(const Selection &next, bool all) {
 
 // The end of a slot, with its code or without one.
 void end_slot(uint16_t code, bool converted) {
-    scanner.step(code_before, converted_before);
+    if (scanner.step(code_before, converted_before))
+        slot_cycles = scanner.slot_cycles();
     code_before = code;
     converted_before = converted;
     due_rest = static_cast<uint8_t>(due_rest + slot_cycles % CYCLES_PER_US);
@@ -102,7 +105,7 @@ void begin() {
     for (uint8_t pin : wiring::PINS)
         pinMode(pin, OUTPUT);
 #if !defined(__AVR__)
-    analogReadResolution(frames::ADC_BITS);
+    analogReadResolution(ADC_BITS);
 #endif
     serial_speed(frames::BAUD_DEFAULT);
 }
@@ -116,8 +119,8 @@ void keep_alive() {
 uint32_t now_us() { return micros(); }
 void mark_pass(bool) {}
 
-void start_slots(const ScanPlan &plan, uint8_t) {
-    slot_cycles = plan.slot_cycles;
+void start_slots(uint16_t cycles, uint8_t) {
+    slot_cycles = cycles;
     select(scanner.selection(), true);
     pins_are_set = true;
     converted_before = false;

@@ -21,9 +21,11 @@ namespace board {
 // serial line's RX has its pull-up on. Its TX is an output at 1, which holds the line idle while
 // the transmitter is off. Unused pins of the ports that each slot writes as a whole are outputs at
 // 0: connect nothing to them. All other unused pins are inputs with pull-ups.
-const uint32_t CLOCK_HZ = F_CPU;
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
+const uint16_t WIRING = OHMSKIN_OWN_PINS;  // 0: that of docs/build.md
+
+static_assert(ROWS_MAX <= 16 && COLUMNS_MAX <= 16, "the pins below have four bits of address");
 
 namespace {
 // Channels of the converter, by Sense, and their pins, as bits of port C (Uno) or F (Mega).
@@ -32,9 +34,9 @@ constexpr uint8_t CHANNEL_PINS = avr_pins::SENSE_BITS;
 }  // namespace
 
 #if defined(__AVR_ATmega328P__)
-const frames::Board KIND = frames::Board::Uno;
+const char NAME[frames::NAME_SIZE] = "uno";
 #elif defined(__AVR_ATmega2560__)
-const frames::Board KIND = frames::Board::Megaatmega2560;
+const char NAME[frames::NAME_SIZE] = "megaatmega2560";
 #else
 #error "no pin table for this chip"
 #endif
@@ -96,6 +98,7 @@ inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
 
 // ----------------------------------------------------------------------------------- slots
 Scanner scanner;
+const uint8_t SLOTS_OF_NEW_LENGTH = 2;
 
 namespace {
 
@@ -112,12 +115,35 @@ constexpr Registers registers_of(ReadingDefinition reading) {
 constexpr Registers registers_of(uint8_t pattern, uint8_t n) {
     return registers_of(READING_DEFINITIONS[static_cast<uint8_t>(reading_of(pattern, n))]);
 }
-static_assert(frames::READINGS_PER_CELL == 4 && PATTERNS == 4, "one entry a reading below");
+constexpr uint8_t entries(uint8_t pattern) { return PATTERN_DEFINITIONS[pattern].count; }
+static_assert(PATTERNS == 6 && entries(0) == 4 && entries(1) == 4 && entries(2) == 2 &&
+                  entries(3) == 1 && entries(4) == 4 && entries(5) == 4,
+              "one entry a reading below, and none that is used twice");
 constexpr Registers REGISTERS[] = {
-    registers_of(0, 0), registers_of(0, 1), registers_of(0, 2), registers_of(0, 3),
-    registers_of(1, 0), registers_of(1, 1), registers_of(1, 2), registers_of(1, 3),
-    registers_of(2, 0), registers_of(2, 1), registers_of(2, 2), registers_of(2, 3),
-    registers_of(3, 0), registers_of(3, 1), registers_of(3, 2), registers_of(3, 3),
+    registers_of(0, 0),
+    registers_of(0, 1),
+    registers_of(0, 2),
+    registers_of(0, 3),
+    registers_of(1, 0),
+    registers_of(1, 1),
+    registers_of(1, 2),
+    registers_of(1, 3),
+    registers_of(2, 0),
+    registers_of(2, 1),
+    {0, 0},
+    {0, 0},
+    registers_of(3, 0),
+    {0, 0},
+    {0, 0},
+    {0, 0},
+    registers_of(4, 0),
+    registers_of(4, 1),
+    registers_of(4, 2),
+    registers_of(4, 3),
+    registers_of(5, 0),
+    registers_of(5, 1),
+    registers_of(5, 2),
+    registers_of(5, 3),
 };
 
 // Timer 1 counts a slot. Its compare B triggers the converter. Its compare A makes the interrupt,
@@ -184,10 +210,13 @@ ISR(TIMER1_COMPA_vect) {
     // a conversion, and a conversion that ends just now would be followed by another one.
     const uint8_t status = ADCSRA;
     ADCSRA = static_cast<uint8_t>(status & ~_BV(ADSC));
-    scanner.step(ADC, status & _BV(ADIF));
+    // The counter is far from its end here, so that any new length of the slot is safe.
+    if (scanner.step(ADC, status & _BV(ADIF)))
+        ICR1 = static_cast<uint16_t>(scanner.slot_cycles() - 1);
 }
 
-void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
+void start_slots(uint16_t slot_cycles, uint8_t accuracy) {
+    const uint8_t adc_prescaler = timing::prescaler(accuracy);
     const uint8_t bits = prescaler_bits(adc_prescaler);
     select(scanner.selection());
     // The timer stands still until all is set, and its flags are cleared: a flag from before would
@@ -200,7 +229,7 @@ void start_slots(const ScanPlan &plan, uint8_t adc_prescaler) {
     // The mode in which the counter starts again after ICR1, which can be written in this mode
     // only.
     TCCR1B = _BV(WGM13) | _BV(WGM12);
-    ICR1 = plan.slot_cycles - 1;
+    ICR1 = static_cast<uint16_t>(slot_cycles - 1);
     OCR1B = TRIGGER_AT;
     OCR1A = interrupt_at(adc_prescaler);
     TCNT1 = 0;
@@ -250,7 +279,7 @@ void converter_begin() {
     ADMUX = REGISTERS[0].admux;
     // The first conversion after switching on takes 25 ADC clocks, for which a slot has no room. So
     // it is made now, and nobody reads it.
-    constexpr uint8_t PRESCALER = static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz);
+    constexpr uint8_t PRESCALER = timing::prescaler(static_cast<uint8_t>(frames::Accuracy::Usual));
     ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(PRESCALER));
     while (ADCSRA & _BV(ADSC)) {
     }

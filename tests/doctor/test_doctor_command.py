@@ -232,7 +232,7 @@ def test_the_board_is_left_as_it_was(end: type[BaseException] | None) -> None:
             return super().__iter__()
 
     bench = Watched(stepped_link("emulator://3x4"))
-    settings = {"adc_prescaler": "clock_250khz", "mode": "far"}
+    settings = {"accuracy": "fine", "mode": "far"}
     before = bench.configure(rate_hz=77.5, settle_us=120, **settings)
     with nullcontext() if end is None else pytest.raises(end):
         gather(bench, clocks=True)

@@ -64,7 +64,9 @@ def diagnosis_of(ratio: Float, noise_lsb: float, lead_ohm: float, scans: int = 2
     random = np.random.default_rng(1)
     noisy = ratio + noise_lsb / 1024 * random.standard_normal((scans, *ratio.shape))
     codes = quantise(np.clip(noisy, 0, 1)).mean(axis=0)
-    board = replace(stepped(FAR).info, rows=ratio.shape[0], columns=ratio.shape[1])
+    rows, columns = ratio.shape[:2]
+    masks = {"row_mask": (1 << rows) - 1, "column_mask": (1 << columns) - 1}
+    board = replace(stepped(FAR).info, rows=rows, columns=columns, **masks)
     seen_lsb = float(np.hypot(noise_lsb, 12**-0.5))
     told = WireOhm(lead=lead_ohm)
     rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0), told=told), Diagnosis()

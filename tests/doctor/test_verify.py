@@ -58,7 +58,7 @@ def test_a_sound_plate_passes(run: Run, write: Write, ohm: dict, noise: float) -
     assert told["measured"]["worst_cell_percent"] < 2
     assert told["measured"]["resistors_not_told"] == 0
     assert told["measured"]["reference_ohm"] == pytest.approx([30000, 30000], rel=0.004)
-    assert sorted(told["exam"]["noise_lsb"]) == ["clock_125khz", "clock_250khz", "clock_500khz"]
+    assert sorted(told["exam"]["noise_lsb"]) == ["finest", "fine", "usual"]
     for line in told["exam"]["lines"].values():
         assert abs(line["slope"] - 1) < 0.004
         assert line["residual_lsb"] < 1
@@ -232,13 +232,13 @@ def test_the_board_is_put_back(
 
     class Watched(SteppedSkin):
         def __iter__(self) -> Iterator[ohmskin.Scan]:
-            looks.append((self.info.settle_us, self.info.adc_prescaler))
+            looks.append((self.info.settle_us, self.info.accuracy))
             if end is not None and len(looks) == look:
                 raise end
             return super().__iter__()
 
     bench = Watched(stepped_link("emulator://8x8"))
-    before = bench.configure(rate_hz=31, settle_us=60, adc_prescaler="clock_250khz", rows=5)
+    before = bench.configure(rate_hz=31, settle_us=60, accuracy="fine", rows=5)
     monkeypatch.setattr(ohmskin, "open", lambda url, **_: bench)
     plate = write({(0, 0): 22e3, (1, 1): 47e3}, size=2)
     done = run("verify", "emulator://8x8", plate, "--seconds", "0.5")

@@ -2,7 +2,8 @@
 """The emulated board, sans-IO, and that it and the firmware answer alike."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from places import ROOT
 from stepped import stepped
 
 DEFAULT = {"rows": 8, "columns": 8, "rate_mhz": 90_000, "settle_us": 0}
-DEFAULT |= {"adc_prescaler": 32, "mode": 0}
+DEFAULT |= {"accuracy": 0, "mode": 0}
 
 
 class EmulatedSim:
@@ -67,10 +68,12 @@ def answer(rig: Rig, frame_type: int, payload: bytes) -> str:
     return result
 
 
-def asked_for(hello: Hello) -> dict[str, protocol.Value]:
-    prescaler = protocol.ENUMS["adc_prescaler"].values[hello.adc_prescaler]
-    mode = protocol.ENUMS["mode"].values[hello.mode]
-    return configuration(hello) | {"adc_prescaler": prescaler, "mode": mode}
+def asked_for(hello: Hello, of: Iterable[str] = DEFAULT) -> dict[str, Any]:
+    """What the board was asked for, in the integers of the line."""
+    asked = configuration(hello)
+    for name in ("accuracy", "mode"):
+        asked[name] = protocol.ENUMS[name].values[asked[name]]
+    return {name: asked[name] for name in of}
 
 
 # ------------------------------------------------------------------------------ sans-IO board
@@ -178,24 +181,30 @@ def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
     plan = "core/scan_plan.h"
     assert number(plan, "SLOT_ADC_CLOCKS_MIN") == emulator.SLOT_ADC_CLOCKS_MIN
     assert number(plan, "SLOT_CYCLES_MAX") == emulator.SLOT_CYCLES_MAX
-    near, far = number(plan, "SETTLE_US"), number(plan, "SETTLE_FAR_US")
-    assert {"near": near, "far": far} == emulator.SETTLE_US
+    (settle_us,) = re.findall(r"SETTLE_US\[\] = {(.*)};", source(plan))
+    assert [int(us) for us in settle_us.split(",")] == list(emulator.SETTLE_US.values())
+    for name in ("BUSY_A_SLOT", "BUSY_A_READING", "BUSY_A_SCAN"):
+        assert number(plan, name) == getattr(emulator, name)
+    assert number(plan, "LINE_IDLE_PART") == emulator.LINE_IDLE_PART
+    assert number(plan, "IDLE_TO_CHANGE") == emulator.IDLE_TO_CHANGE
+    assert f"OHMSKIN_ROWS_MAX {emulator.LINES_MAX}" in source("core/scan_sequence.h")
     assert emulator.HELD_ADC_CLOCKS == 11 + 1 / 2
     assert "return static_cast<uint16_t>(11u * prescaler + prescaler / 2);" in source(plan)
     told = source("core/settings.h").split("DEFAULT_SETTINGS = {")[1].split("};")[0]
     defaults = EmulatedBoard(Scene().ratio, BoardSettings()).settings
-    in_order = ("unit_id", "rows", "columns", "rate_mhz", "settle_us")
+    in_order = ("unit_id", "rows", "columns", "rate_mhz", "settle_us", "whole_every")
     numbers = re.findall(r"^ +(\d+),", told, re.MULTILINE)
     assert [str(defaults[name]) for name in in_order] == numbers
-    assert (defaults["adc_prescaler"], defaults["mode"]) == ("clock_500khz", "near")
-    assert re.findall(r"frames::(\w+::\w+)", told) == ["AdcPrescaler::Clock500khz", "Mode::Near"]
+    assert (defaults["accuracy"], defaults["mode"]) == ("usual", "near")
+    enums = ["Accuracy::Usual", "Mode::Near", "Mode::Near"]
+    assert re.findall(r"frames::(\w+::\w+)", told) == enums
 
 
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
         ("emulator://8x8?speed=2", "speed must be 1, or 0"),
-        ("emulator://8x8?rate=1000", "too_fast"),
+        ("emulator://8x8?rate=1000", "line_too_slow"),
         ("emulator://16x16?rate=90", "too_fast"),
         ("emulator://8x8?rate=0.5", "bad_rate"),
         ("emulator://8x8?rate=-1", "times a second"),
@@ -237,7 +246,7 @@ HOST_FRAMES = {
 }
 # Of types that are no command's, of commands with a byte too many or too few, and a bad speed.
 ODD_FRAMES: list[tuple[int, bytes]] = [
-    *((0x00, b""), (0x01, b""), (0x02, bytes(9)), (0x7F, b"abc"), (0x8A, b""), (0xFF, bytes(9))),
+    *((0x00, b""), (0x01, b""), (0x02, bytes(9)), (0x7F, b"abc"), (0x8B, b""), (0xFF, bytes(9))),
     *((frame_id, bytes(size + 1)) for frame_id, size in HOST_FRAMES.items()),
     *((frame_id, bytes(size - 1)) for frame_id, size in HOST_FRAMES.items() if size),
     (protocol.FRAMES["set_baud"].id, (9600).to_bytes(4, "little")),
@@ -246,7 +255,7 @@ ODD_FRAMES: list[tuple[int, bytes]] = [
 # Every one with 8x8, 90 Hz, no settle time and the default prescaler unless it says otherwise.
 # Fast scans that a line of 500 kbaud cannot carry are not among them: the emulator has no line.
 RATES_MHZ = (
-    *(0, 1, 999, 1000, 1001, 12_345, 140_000, 143_000, 144_000, 150_000, 2_000_000, 2_000_001),
+    *(0, 1, 999, 1000, 1001, 12_345, 140_000, 143_000, 144_000, 150_000, 50_000_000, 50_000_001),
     0xFFFFFFFF,
 )
 ALONE: dict[str, tuple[int, ...]] = {
@@ -254,8 +263,8 @@ ALONE: dict[str, tuple[int, ...]] = {
     "columns": (0, 17),
     "rate_mhz": RATES_MHZ,
     "settle_us": (1, 20, 36, 40, 100, 3000, 3001, 0xFFFF),
-    "adc_prescaler": (0, 16, 33, 64, 128, 255),
-    "mode": (1, 2, 255),
+    "accuracy": (1, 2, 3, 255),
+    "mode": (1, 2, 3, 4, 255),
 }
 SIZES_AND_RATES = [
     *((1, 1, 90_000), (1, 16, 90_000), (16, 1, 90_000), (3, 5, 90_000), (16, 16, 90_000)),
@@ -273,21 +282,27 @@ CONFIGURATIONS: list[dict[str, int]] = [
         {"settle_us": 500, "rows": 1, "columns": 2, "rate_mhz": rate}
         for rate in (100_000, 240_000, 250_000)
     ),
-    {"adc_prescaler": 64, "rate_mhz": 70_000},
-    {"adc_prescaler": 128, "rate_mhz": 30_000},
-    {"adc_prescaler": 64, "rate_mhz": 0},
+    {"accuracy": 1, "rate_mhz": 70_000},
+    {"accuracy": 2, "rate_mhz": 30_000},
+    {"accuracy": 1, "rate_mhz": 0},
     {"mode": 1, "rate_mhz": 0},
-    {"mode": 1, "adc_prescaler": 128, "rate_mhz": 0},
-    {"adc_prescaler": 128, "rate_mhz": 0, "settle_us": 200},
+    {"mode": 1, "accuracy": 2, "rate_mhz": 0},
+    {"mode": 2, "rate_mhz": 0},
+    {"mode": 3, "rate_mhz": 0},
+    {"mode": 3, "rate_mhz": 0, "rows": 3, "columns": 3},
+    {"row_mask": 0x18, "column_mask": 3, "mode": 3, "rate_mhz": 500_000, "whole_every": 50},
+    {"row_mask": 0},
+    {"column_mask": 0x100},
+    {"accuracy": 2, "rate_mhz": 0, "settle_us": 200},
     # With several faults, the first of the checks decides.
     {"rows": 0, "columns": 0},
     {"rows": 0, "rate_mhz": 1},
     {"columns": 99, "settle_us": 9999},
     {"rate_mhz": 1, "settle_us": 9999},
-    {"settle_us": 9999, "adc_prescaler": 1},
-    {"adc_prescaler": 1, "rate_mhz": 2_000_000},
-    {"mode": 2, "adc_prescaler": 1},
-    {"mode": 2, "rate_mhz": 2_000_000},
+    {"settle_us": 9999, "accuracy": 3},
+    {"accuracy": 3, "rate_mhz": 2_000_000},
+    {"mode": 4, "accuracy": 3},
+    {"mode": 4, "rate_mhz": 2_000_000},
 ]
 
 
@@ -303,18 +318,29 @@ def test_emulator_and_firmware_answer_alike(board: str) -> None:
             results[result] = results.get(result, 0) + 1
             kept, modelled = hello_of(real), hello_of(model)
             assert asked_for(kept) == asked_for(modelled)
-            assert (asked_for(kept) == wanted) >= (result == "ok"), change
+            assert (asked_for(kept, wanted) == wanted) >= (result == "ok"), change
             assert modelled.rate_hz == pytest.approx(kept.rate_hz, rel=0.002), change
             assert modelled.slot_cycles == pytest.approx(kept.slot_cycles, rel=0.05), change
             assert modelled.settle_us == pytest.approx(kept.settle_us, rel=0.05, abs=2), change
         print(f"{board}: {len(CONFIGURATIONS)} configurations: {results}")
         assert len(CONFIGURATIONS) >= 60
         assert {"ok", "bad_rows", "bad_columns", "bad_rate"} < set(results)
-        assert {"bad_settle", "bad_prescaler", "too_fast"} < set(results)
+        assert {"bad_settle", "bad_accuracy", "too_fast"} < set(results)
         for frame_type, payload in ODD_FRAMES:
             answers = [answer(rig, frame_type, payload) for rig in (real, model)]
             assert answers[0] == answers[1] != "ok", (frame_type, payload)
         both_in_every_state(real, model)
+
+
+REGION: dict[str, protocol.Value] = {
+    "row_mask": 6,
+    "column_mask": 5,
+    "rate_mhz": 300_000,
+    "settle_us": 0,
+    "mode": 3,
+    "whole_mode": 0,
+    "whole_every": 9,
+}
 
 
 def both_in_every_state(real: Rig, model: Rig) -> None:
@@ -324,6 +350,11 @@ def both_in_every_state(real: Rig, model: Rig) -> None:
         rig.must("configure", **(DEFAULT | {"rows": 4, "columns": 3}))
     commands: list[tuple[str, dict[str, protocol.Value]]] = [
         *(("stop", {}), ("start", {}), ("start", {})),
+        ("set_region", REGION | {"row_mask": 0}),
+        ("set_region", REGION | {"column_mask": 8}),
+        ("set_region", REGION | {"mode": 4}),
+        ("set_region", REGION),
+        ("set_region", REGION | {"mode": 0, "row_mask": 15, "column_mask": 7}),
         ("configure", DEFAULT | {"rows": 1}),
         ("configure", DEFAULT | {"rows": 0}),
         *(("load_defaults", {}), ("self_test", {}), ("set_baud", {"baud": 1_000_000})),
@@ -357,17 +388,17 @@ requests = st.fixed_dictionaries(
         "columns": st.one_of(st.integers(0, 18), u8),
         "rate_mhz": st.one_of(st.integers(0, 2_100_000), st.integers(0, 150_000), u32),
         "settle_us": st.one_of(st.integers(0, 3100), st.integers(0, 100), u16),
-        "adc_prescaler": st.one_of(st.sampled_from([32, 64, 128]), u8),
-        "mode": st.one_of(st.sampled_from([0, 1]), u8),
+        "accuracy": st.one_of(st.sampled_from([0, 1, 2]), u8),
+        "mode": st.one_of(st.sampled_from([0, 1, 2, 3]), u8),
     }
 )
 LIMITS = {
     "bad_rows": lambda asked: not 1 <= asked["rows"] <= 16,
     "bad_columns": lambda asked: not 1 <= asked["columns"] <= 16,
-    "bad_rate": lambda asked: asked["rate_mhz"] and not 1000 <= asked["rate_mhz"] <= 2_000_000,
+    "bad_rate": lambda asked: asked["rate_mhz"] and not 1000 <= asked["rate_mhz"] <= 50_000_000,
     "bad_settle": lambda asked: asked["settle_us"] > 3000,
-    "bad_prescaler": lambda asked: asked["adc_prescaler"] not in (32, 64, 128),
-    "bad_mode": lambda asked: asked["mode"] not in (0, 1),
+    "bad_accuracy": lambda asked: asked["accuracy"] not in (0, 1, 2),
+    "bad_mode": lambda asked: asked["mode"] not in (0, 1, 2, 3),
 }
 
 
@@ -380,7 +411,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 @settings(max_examples=500)
 @given(requests)
 @example(DEFAULT | {"rate_mhz": 0})
-@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 2_000_000})
+@example(DEFAULT | {"rows": 1, "columns": 1, "rate_mhz": 50_000_000})
 def test_any_configuration_is_taken_or_refused(rig: Rig, asked: dict[str, int]) -> None:
     """Refused for its first fault and without a consequence, or kept as asked for."""
     before = hello_of(rig)
@@ -397,8 +428,8 @@ def test_any_configuration_is_taken_or_refused(rig: Rig, asked: dict[str, int]) 
     if asked["rate_mhz"]:
         assert after.rate_hz == pytest.approx(asked["rate_mhz"] / 1000, rel=0.002)
     assert after.settle_us >= asked["settle_us"]
-    conversion_s = 13 * asked["adc_prescaler"] / 16e6
-    assert after.scan_cycles / 16e6 >= 4 * asked["rows"] * asked["columns"] * conversion_s
+    conversion_s = 13 * (32 << asked["accuracy"]) / 16e6
+    assert after.scan_cycles / 16e6 >= after.readings * conversion_s
 
 
 @settings(max_examples=200)

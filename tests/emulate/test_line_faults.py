@@ -26,7 +26,7 @@ from stepped import stepped, stepped_link
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
 
-ADC = "clock_250khz"
+ADC = "fine"
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_reset_of_the_firmware(baud: int, monkeypatch: pytest.MonkeyPatch) -> 
     link = simavr.SimavrLink("uno", Scene())
     with Session(link, baud) as skin:
         skin.start()
-        kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, adc_prescaler=ADC)
+        kept = skin.configure(rows=3, columns=7, rate_hz=110, settle_us=40, accuracy=ADC)
         scans = iter(skin)
         for _ in range(20):
             assert next(scans).codes.shape == (3, 7, 4)

@@ -19,22 +19,29 @@ pytestmark = pytest.mark.simavr
 HIGHEST = {"rate_mhz": 0, "settle_us": 1}
 SCANS = [
     {},
-    {"rate_mhz": 1_000_000, "rows": 1, "columns": 1},
-    {"rate_mhz": 400_000, "rows": 3, "columns": 5},
+    {"rate_mhz": 900_000, "rows": 1, "columns": 1},
+    {"rate_mhz": 380_000, "rows": 3, "columns": 5},
     {"rate_mhz": 30_000, "rows": 16, "columns": 16},
     {"rate_mhz": 300_000, "rows": 16, "columns": 1, "settle_us": 25},
     {"rate_mhz": 300_000, "rows": 1, "columns": 16, "settle_us": 20},
     {"rate_mhz": 0, "settle_us": 40},
-    {"rate_mhz": 60_000, "adc_prescaler": "clock_250khz"},
-    {"rate_mhz": 0, "adc_prescaler": "clock_250khz"},
-    {"rate_mhz": 30_000, "adc_prescaler": "clock_125khz"},
-    {"rate_mhz": 0, "adc_prescaler": "clock_125khz", "settle_us": 200},
+    {"rate_mhz": 60_000, "accuracy": "fine"},
+    {"rate_mhz": 0, "accuracy": "fine"},
+    {"rate_mhz": 30_000, "accuracy": "finest"},
+    {"rate_mhz": 0, "accuracy": "finest", "settle_us": 200},
     {"rate_mhz": 7_000, "rows": 2, "columns": 2, "settle_us": 3000},
-    {"rate_mhz": 1_000, "rows": 16, "columns": 16, "adc_prescaler": "clock_125khz"},
+    {"rate_mhz": 1_000, "rows": 16, "columns": 16, "accuracy": "finest"},
     {"mode": "far"},
     {"mode": "far", "rate_mhz": 0},
-    {"mode": "far", "rate_mhz": 400_000, "rows": 3, "columns": 5},
+    {"mode": "far", "rate_mhz": 380_000, "rows": 3, "columns": 5},
     {"mode": "far", "rate_mhz": 30_000, "rows": 16, "columns": 16},
+    {"mode": "half", "rate_mhz": 0},
+    {"mode": "half", "rate_mhz": 45_000, "rows": 16, "columns": 16},
+    {"mode": "half", "rate_mhz": 700_000, "rows": 3, "columns": 1},
+    {"mode": "quick", "rate_mhz": 0},
+    {"mode": "quick", "rate_mhz": 350_000, "settle_us": 20},
+    {"mode": "quick", "rate_mhz": 90_000, "rows": 16, "columns": 16},
+    {"mode": "quick", "rate_mhz": 500_000, "rows": 5, "columns": 1},
 ]
 
 
@@ -56,7 +63,7 @@ def test_codes_order_time_and_settling_are_exact(
     rig.must("stop", limit_s=2.5)
     assert_whole(rig)
     assert len(rig.scans) >= 4
-    shape = (hello["rows"], hello["columns"], protocol.READINGS_PER_CELL)
+    shape = (hello["rows"], hello["columns"], len(protocol.MODES[hello["mode"]]))
     assert {s.codes.shape for s in rig.scans} == {shape}
 
     starts = rig.check().start_cycles[: len(rig.scans)]
@@ -161,28 +168,31 @@ LOADS = [
     ((16, 10), 0),
     ((5, 3), 0),
     ((2, 2), 0),
-    ((16, 16), 32_000),
+    ((16, 16), 33_500),
     ((8, 8), 130_000),
-    ((10, 10), 80_000),
-    ((2, 2), 1_200_000),
+    ((10, 10), 90_000),
+    ((2, 2), 1_400_000),
 ]
 
 
 @pytest.mark.parametrize("ratio", [None, 0.0, 0.9999], ids=["random", "zeros", "ones"])
 def test_no_load_damages_a_frame(rig: Rig, ratio: float | None) -> None:
-    """At 500 kbaud these are more than line or chip carry; zeros and ones are COBS's extremes."""
+    """At 500 kbaud, as fast as line and chip carry; zeros and ones are COBS's extremes."""
     if ratio is not None:
         rig.set_codes(np.full(TABLE_SHAPE, int(ratio * CODES), np.uint16), np.random.default_rng(0))
     for (rows, columns), rate_mhz in LOADS:
-        rig.start_scan(rows=rows, columns=columns, rate_mhz=rate_mhz, settle_us=not rate_mhz)
+        scan = DEFAULT_SCAN | {"rows": rows, "columns": columns, "settle_us": int(not rate_mhz)}
+        refused = rig.command("configure", **(scan | {"rate_mhz": rate_mhz}))
+        if rate_mhz:  # each is more than can be carried, and is answered by what can be
+            assert refused in ("line_too_slow", "too_fast")
+            rate_mhz = rig.frames("ack")[-1]["rate_mhz"]
+        rig.start_scan(**(scan | {"rate_mhz": rate_mhz}))
         rig.run(0.15)
         rig.must("stop")
         assert rig.damaged == 0, (rows, columns, rate_mhz)
         assert rig.scans
         assert rig.check().wrong == 0
-        last = rig.scans[-1].header
-        # Scans dropped after the last one that came are told by none.
-        assert last["scan"] + 1 == len(rig.scans) + last["dropped"]
+        assert numbers(rig) == list(range(len(rig.scans)))
 
 
 @pytest.mark.parametrize("mode", ["near", "far"])
@@ -195,7 +205,7 @@ def test_settle_time_before_each_hold(rig: Rig, mode: str) -> None:
     rig.run(0.2)
     log = rig.holds()[-10 * slots_per_scan :]
     slots, since_change = np.divmod(log["settle_cycles"].astype(np.int64), slot_cycles)
-    assert since_change.min() == rig.sim.stats()["settle_cycles_min"]
+    assert 0 <= since_change.min() - rig.sim.stats()["settle_cycles_min"] <= 8
     assert np.ptp(since_change) <= 8  # the longest instruction that an interrupt waits for
     first_cell = (log["row"] == 0) & (log["column"] == 0)
     within = ~first_cell
@@ -206,38 +216,37 @@ def test_settle_time_before_each_hold(rig: Rig, mode: str) -> None:
     assert set(slots[first_cell]) == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize(("clock_khz", "adc_clock"), [(500, 32), (250, 64), (125, 128)])
-def test_pins_change_after_the_hold_and_not_before(
-    rig: Rig, clock_khz: int, adc_clock: int
-) -> None:
+@pytest.mark.parametrize(("accuracy", "adc_clock"), [("usual", 32), ("fine", 64), ("finest", 128)])
+def test_pins_change_after_the_hold_and_not_before(rig: Rig, accuracy: str, adc_clock: int) -> None:
     """The data sheet leaves some of an ADC clock open, and the compiler decides how soon it is."""
-    rig.start_scan(rate_mhz=0, adc_prescaler=f"clock_{clock_khz}khz")
+    rig.start_scan(rate_mhz=0, accuracy=accuracy)
     rig.sim.reset_stats()
     rig.run(0.1)
     spare = rig.sim.stats()["change_after_hold_cycles_min"] - adc_clock
-    print(f"{rig.board}, {clock_khz} kHz: {spare} cycles to spare (PINS_SPARE in board_avr.cpp)")
+    print(f"{rig.board}, {accuracy}: {spare} cycles to spare (PINS_SPARE in board_avr.cpp)")
     assert spare >= 0
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns", "carried"), [(1, 1, 0.75), (2, 1, 0.65), (3, 1, 0.55), (4, 3, 0.75)]
-)
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 1), (3, 1), (4, 3)])
 def test_small_scans_at_the_highest_rate_are_dropped_whole_and_carry_their_own_number(
-    rig: Rig, rng: np.random.Generator, rows: int, columns: int, carried: float
+    rig: Rig, rng: np.random.Generator, rows: int, columns: int
 ) -> None:
-    """Their line is too slow for all of them; the share that it carries arrives."""
+    """Answers take most of the line; a share of the scans still arrives."""
     rig.start_scan(**HIGHEST, rows=rows, columns=columns)
-    for _ in range(600):
+    for asked in range(600):
+        if asked % 3 == 0:
+            rig.send("get_hello")
         rig.run_cycles(int(rng.integers(1000, 5000)))
         rig.randomize(rng)
+    rig.run(0.05)
     rig.must("stop")
     assert rig.damaged == 0
     check = rig.check()
     assert check.wrong == 0  # a scan with another's number has another skin's codes
     missing = [scan.header["scan"] - i for i, scan in enumerate(rig.scans)]
     assert missing == [scan.header["dropped"] for scan in rig.scans]
-    assert missing[-1] > 10
-    assert len(rig.scans) > carried * len(check.start_cycles)
+    assert missing[-1] > 3
+    assert len(rig.scans) > 0.2 * len(check.start_cycles)
 
 
 def test_commands_back_to_back_at_the_highest_rate(rig: Rig, rng: np.random.Generator) -> None:
@@ -392,6 +401,7 @@ def test_nodes_of_a_few_us_settle_within_a_code_at_90_hz(rig: Rig, tau_us: float
 
 @pytest.mark.parametrize("tau_us", [6.0, 10.0])
 def test_a_shortfall_is_that_of_the_settle_time(rig: Rig, tau_us: float) -> None:
+    go_fast(rig)
     codes, stats = readings_with_time_constant(rig, tau_us, rate_mhz=130_000)
     slot = stats["trigger_gap_cycles_min"]
     # A and C come right after a change of row; B and D one slot later, of the other node. Each node

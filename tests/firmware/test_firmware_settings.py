@@ -15,7 +15,7 @@ pytestmark = pytest.mark.simavr
 
 
 def settings_in(hello: dict[str, Any]) -> dict[str, Any]:
-    names = ("rows", "columns", "rate_asked_mhz", "settle_asked_us", "adc_prescaler", "mode")
+    names = ("rows", "columns", "rate_asked_mhz", "settle_asked_us", "accuracy", "mode")
     return {name: hello[name] for name in (*names, "unit_id")}
 
 
@@ -64,8 +64,8 @@ def test_the_unit_id_outlives_protocol_and_scan(rig: Rig, at: int, head: bytes, 
     """
     for rows, source, kept in (200, "defaults_damaged", 8), (5, "stored", 5):
         wanted = DEFAULT_SCAN | {"rows": rows, "mode": mode or "near"}
-        scan = protocol.FRAMES["configure"].pack(**wanted)
-        record = head + struct.pack("<I", 5) + (scan if mode else scan[:-1])
+        scan = struct.pack("<BBIHB", rows, 8, wanted["rate_mhz"], 0, 32)
+        record = head + struct.pack("<I", 5) + scan + (b"\1" if mode else b"")
         rig.sim.write_eeprom(record + struct.pack("<H", protocol.crc16(record)), at)
         hello = reset(rig)
         assert (hello["settings"], hello["rows"], hello["unit_id"]) == (source, kept, 5)

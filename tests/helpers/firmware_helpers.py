@@ -13,13 +13,13 @@ BAUD_DEFAULT = protocol.CONSTANTS["baud_default"]
 BAUD_FAST = protocol.CONSTANTS["baud_fast"]
 VECTORS = json.loads((ROOT / "protocol" / "vectors.json").read_text(encoding="utf-8"))
 COMMANDS = [f.name for f in protocol.FRAMES.values() if f.sender == "host"]
-RECORD_AT, RECORD_SIZE = 32, 18  # of the first record of settings in EEPROM
+RECORD_AT, RECORD_SIZE = 32, 29  # of the first record of settings in EEPROM
 OTHER_SCAN = {
     "rows": 5,
     "columns": 3,
     "rate_mhz": 123_456,
     "settle_us": 60,
-    "adc_prescaler": "clock_250khz",
+    "accuracy": "fine",
     "mode": "far",
 }
 

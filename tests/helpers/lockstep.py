@@ -22,6 +22,7 @@ from places import ROOT
 from skins import scan_order
 
 CPU_HZ = 16_000_000
+CYCLES_PER_US = CPU_HZ // 1_000_000
 BOARDS = ("uno", "megaatmega2560")
 READINGS = tuple(protocol.ENUMS["reading"].values)
 CODES = 1 << protocol.ADC_BITS
@@ -31,7 +32,7 @@ DEFAULT_SCAN: dict[str, Any] = {
     "columns": 8,
     "rate_mhz": 90_000,
     "settle_us": 0,
-    "adc_prescaler": "clock_500khz",
+    "accuracy": "usual",
     "mode": "near",
 }
 
@@ -135,24 +136,54 @@ def elf_of(board: str) -> Path:
     return Path(built) / board / "firmware.elf"
 
 
+def whole_skin(scan: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `configure`; all lines and no whole scans if no region is given."""
+    masks = {
+        "row_mask": protocol.all_lines(scan["rows"]),
+        "column_mask": protocol.all_lines(scan["columns"]),
+    }
+    return masks | {"whole_mode": "near", "whole_every": 0} | scan
+
+
 def first_holds(holds: NDArray[np.void], mode: str = "near") -> NDArray[np.intp]:
-    """Where in a log of holds each scan begins.
+    """Where in a log of holds each scan of all rows and columns begins.
 
     The second reading of the first cell comes once a scan, right after the scan's first hold; idle
-    slots lie before that.
+    slots lie before that. In mode quick, the scan's first hold is the last of those of its cell.
     """
-    second_reading = READINGS.index(protocol.MODES[mode][1])
     first_cell = (holds["row"] == 0) & (holds["column"] == 0)
+    if len(protocol.MODES[mode]) == 1:
+        return np.flatnonzero(first_cell[:-1] & ~first_cell[1:])
+    second_reading = READINGS.index(protocol.MODES[mode][1])
     second = first_cell & (holds["configuration"] == second_reading)
     return np.flatnonzero(second) - 1
 
 
 @dataclass(frozen=True)
 class ReceivedScan:
-    """A `scan` frame: its header's fields, and its codes, shape (rows, columns, readings)."""
+    """A `scan` frame: its header's fields, and the codes of the cells that were read."""
 
     header: dict[str, Any]
     codes: NDArray[np.uint16]
+
+    def places(self) -> tuple[tuple[NDArray[Any], ...], *tuple[NDArray[Any], ...]]:
+        """Of codes in scan order: places in `codes`, rows, columns, and readings a to h."""
+        mode = self.header["mode"]
+        place = tuple(np.transpose(scan_order(*self.codes.shape[:2], mode)))
+        rows, columns = (
+            np.array([line for line in range(32) if self.header[mask] >> line & 1])
+            for mask in ("row_mask", "column_mask")
+        )
+        readings = np.array([READINGS.index(name) for name in protocol.MODES[mode]])
+        return place, rows[place[0]], columns[place[1]], readings[place[2]]
+
+
+def first_of(holds: NDArray[np.void], scan: ReceivedScan) -> int:
+    """The first hold of the first scan: idle slots before it stand at its first cell already.
+
+    Two slots come before it, in which the converter begins.
+    """
+    return 2
 
 
 @dataclass(frozen=True)
@@ -196,9 +227,12 @@ class Rig(Closing):
                 fields = kind.unpack(frame.payload)
                 if kind.name == "scan":
                     tail = frame.payload[kind.struct.size :]
-                    codes = protocol.unpack_codes(tail, fields["rows"], fields["columns"])
+                    lines = [fields[mask].bit_count() for mask in ("row_mask", "column_mask")]
+                    shape = (*lines, len(protocol.MODES[fields["mode"]]))
+                    per_pass = protocol.PER_PASS[fields["mode"]]
+                    codes = protocol.unpack_codes(tail, shape, per_pass, fields["adc_bits"])
                     self.scans.append(ReceivedScan(fields, codes))
-            except ValueError:  # a CRC that is right by chance
+            except (ValueError, KeyError):  # a CRC that is right by chance
                 self.malformed += 1
                 continue
             self.log.append((kind.name, fields))
@@ -224,6 +258,8 @@ class Rig(Closing):
         self._sequence = (self._sequence + 1) & 0xFF
         self._results.pop(self._sequence, None)
         frame = protocol.FRAMES[name]
+        if name == "configure":
+            fields = whole_skin(fields)
         return framing.encode(frame.id, self._sequence, frame.pack(**fields))
 
     def send(self, name: str, **fields: Any) -> int:
@@ -309,7 +345,7 @@ class Rig(Closing):
         self._holds.append(self.sim.drain_hold_log())
 
     def check(self) -> Check:
-        """Compare every received scan since `start_scan`; the scan's size must not have changed.
+        """Compare every received scan since `start_scan`: all whole ones of one mode.
 
         Which hold belongs to which reading follows from the order of a scan.
         """
@@ -319,14 +355,45 @@ class Rig(Closing):
         starts = holds["cycle"][first].astype(np.int64)
         if not self.scans:
             return Check(0, 0, starts)
-        size = self.scans[0].codes.size
-        rows, columns, _ = self.scans[0].codes.shape
         numbers = np.array([scan.header["scan"] for scan in self.scans])
-        cycles = holds["cycle"][first[numbers][:, None] + np.arange(size)].astype(np.int64)
-        # The simulator holds first where a hold and a new table fall on the same cycle.
-        table = np.searchsorted(np.array(self._table_cycles), cycles, side="left") - 1
-        place = tuple(np.transpose(scan_order(rows, columns)))
-        readings = np.array([READINGS.index(name) for name in protocol.MODES[mode]])
-        expected = np.stack(self._tables)[..., readings][(table, *place)]
-        received = np.stack([scan.codes[place] for scan in self.scans])
-        return Check(received.size, int((received != expected).sum()), starts)
+        wrong = self._wrong(holds, first[numbers])
+        return Check(sum(scan.codes.size for scan in self.scans), wrong, starts)
+
+    def check_regions(self) -> Check:
+        """Compare every received scan since `start_scan`, whatever rows, columns and modes it has.
+
+        A scan's hold is found by the scan's time, so that is compared, too: to half a slot.
+        """
+        holds = self.holds()
+        cycles = holds["cycle"].astype(np.int64)
+        ticks = np.array([scan.header["time_us"] for scan in self.scans], np.int64) * CYCLES_PER_US
+        # The board's clock and the simulator's begin at different times.
+        first = first_of(holds, self.scans[0])
+        due = ticks - ticks[0] + cycles[first]
+        nearest = np.clip(np.searchsorted(cycles, due), 1, len(cycles) - 1)
+        nearest -= due - cycles[nearest - 1] < cycles[nearest] - due
+        wrong = self._wrong(holds, nearest)
+        late = np.abs(cycles[nearest] - due).max()
+        assert late <= 2 * CYCLES_PER_US, f"a time stamp is off by {late} cycles"
+        return Check(sum(scan.codes.size for scan in self.scans), wrong, cycles[nearest])
+
+    def _wrong(self, holds: NDArray[np.void], first: NDArray[np.intp]) -> int:
+        """How many codes of the scans, whose first holds these are, are not those of the table.
+
+        A reading of another place than its scan's order says is wrong, too.
+        """
+        tables, table_cycles = np.stack(self._tables), np.array(self._table_cycles)
+        wrong = 0
+        for scan, begin in zip(self.scans, first, strict=True):
+            of_scan = holds[begin : begin + scan.codes.size]
+            place, row, column, reading = scan.places()
+            at_place = (
+                (of_scan["row"] == row)
+                & (of_scan["column"] == column)
+                & (of_scan["configuration"] == reading)
+            )
+            # The simulator holds first where a hold and a new table fall on the same cycle.
+            table = np.searchsorted(table_cycles, of_scan["cycle"], side="left") - 1
+            expected = tables[table, row, column, reading]
+            wrong += int((~at_place | (scan.codes[place] != expected)).sum())
+        return wrong

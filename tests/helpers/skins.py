@@ -53,16 +53,20 @@ def told(rest_ratio: Float, *, wires: bool = True) -> SkinKnowledge:
     )
 
 
-def scan_order(rows: int, columns: int) -> list[tuple[int, int, int]]:
+# Readings of each pass of a scan, by mode, as frames.toml says.
+PASSES = {"near": ((0, 1), (2, 3)), "far": ((0, 1), (2, 3)), "half": ((0, 1),), "quick": ((0,),)}
+
+
+def scan_order(rows: int, columns: int, mode: str = "near") -> list[tuple[int, int, int]]:
     """Row, column and reading of the codes of a scan, one after the other, as frames.toml says."""
     cells = [(row, column) for column in range(columns) for row in range(rows)]
-    return [(*cell, first + n) for first in (0, 2) for cell in cells for n in (0, 1)]
+    return [(*cell, n) for readings in PASSES[mode] for cell in cells for n in readings]
 
 
-def placed(in_order: list[int], rows: int, columns: int) -> NDArray[np.uint16]:
-    """Codes (rows, columns, 4) of a scan that come in this order."""
-    codes = np.empty((rows, columns, 4), np.uint16)
-    for place, code in zip(scan_order(rows, columns), in_order, strict=True):
+def placed(in_order: list[int], rows: int, columns: int, mode: str = "near") -> NDArray[np.uint16]:
+    """Codes (rows, columns, readings) of a scan that come in this order."""
+    codes = np.empty((rows, columns, sum(map(len, PASSES[mode]))), np.uint16)
+    for place, code in zip(scan_order(rows, columns, mode), in_order, strict=True):
         codes[place] = code
     return codes
 

@@ -27,7 +27,6 @@ from ohmskin.errors import CommandRefused, DeviceLost, PortError, ProtocolError
 from ohmskin.link import device, framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
-from ohmskin.link.protocol import MODES
 from ohmskin.link.session import Session
 from ports import Serve
 from stepped import stepped, stepped_link
@@ -163,8 +162,8 @@ def test_configure_while_scanning(url: str) -> None:
         assert_reads_the_scene(np.mean([scan.ratio for scan in found], axis=0), url)
         elapsed_us = found[-1].time_us - found[0].time_us
         assert 29e6 / elapsed_us == pytest.approx(120, rel=0.002)
-        kept = skin.configure(adc_prescaler="clock_250khz")
-        assert (kept.rows, kept.adc_prescaler, kept.settle_asked_us) == (3, "clock_250khz", 40)
+        kept = skin.configure(accuracy="fine")
+        assert (kept.rows, kept.accuracy, kept.settle_asked_us) == (3, "fine", 40)
         assert skin.latest().codes.shape == (3, 5, 4)
         assert skin.stats.missed == 0
 
@@ -190,15 +189,16 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"columns": 0}, "bad_columns"),
     ({"rate_hz": 0.9}, "bad_rate"),
     ({"settle_us": 3001}, "bad_settle"),
-    ({"adc_prescaler": 16}, "bad_prescaler"),
-    ({"rate_hz": 200}, "too_fast"),
+    ({"accuracy": 16}, "bad_accuracy"),
+    ({"rate_hz": 90, "rows": 16, "columns": 16}, "too_fast"),
+    ({"rate_hz": 200}, "line_too_slow"),
 ]
 IMPOSSIBLE: list[dict[str, Any]] = [
     *({"rows": rows} for rows in (-1, 256)),
     {"columns": 1000},
     *({"settle_us": settle_us} for settle_us in (-1, 65536)),
     *({"rate_hz": rate_hz} for rate_hz in (-1.0, 1e7, 0.0001, float("inf"), float("nan"))),
-    {"adc_prescaler": "fast"},
+    {"accuracy": "fast"},
     {"mode": "middle"},
     {"rows": 8.5},  # was taken for 8
     {"rows": "8"},
@@ -493,7 +493,9 @@ def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_mean_is_not_of_scans_of_two_modes() -> None:
     """Where somebody configures the board meanwhile, the mean is of the scans after that."""
-    near, far = (list(itertools.islice(stepped(f"{REST}&mode={mode}"), 9)) for mode in MODES)
+    near, far = (
+        list(itertools.islice(stepped(f"{REST}&mode={mode}"), 9)) for mode in ("near", "far")
+    )
     mean = device.mean_ratio([*near[:4], *far])
     np.testing.assert_allclose(mean, np.mean([scan.ratio for scan in far], axis=0))
     assert np.abs(mean - near[0].ratio).max() > 0.3
@@ -580,9 +582,10 @@ def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch)
 
 
 IMPOSSIBLE_HELLO = (
-    "rows 0, rows 17, rows 255, columns 0, columns 17, readings_per_cell 0, readings_per_cell 2, "
-    "adc_bits 12, ref_top_ohm 0, ref_bottom_ohm 0, clock_hz 0, scan_cycles 0, scan_cycles 1, "
-    "baud 0, scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, adc_prescaler 7, mode 2"
+    "rows 0, rows 17, rows 255, columns 0, columns 17, rows_max 0, columns_max 33, row_mask 0, "
+    "row_mask 256, column_mask 511, whole_mode 4, whole_scan_cycles 4294967295, adc_bits 0, "
+    "adc_bits 17, ref_top_ohm 0, ref_bottom_ohm 0, clock_hz 0, scan_cycles 0, scan_cycles 1, "
+    "baud 0, scan_cycles 4294967295, slot_cycles 0, slot_cycles 65535, accuracy 7, mode 4"
 )
 
 
@@ -590,7 +593,7 @@ IMPOSSIBLE_HELLO = (
 def test_a_board_that_says_what_cannot_be(said: str) -> None:
     name, value = said.split()
     text = {"scan_cycles 1": "slot_cycles "}
-    if name in ("adc_prescaler", "mode"):
+    if name in ("accuracy", "mode", "whole_mode"):
         text[said] = f"{name} unknown_{value}"
     with pytest.raises(ProtocolError, match=f"hello says {text.get(said, said)}"):
         stepped(EmulatedBoard(Scene().ratio, BoardSettings(), says={name: int(value)}))
@@ -607,14 +610,12 @@ def test_a_board_that_says_what_cannot_be_while_it_scans() -> None:
 
 
 def test_scans_of_another_size_than_hello_says() -> None:
-    link = stepped_link("emulator://4x4?rate=100")
-    with SteppedSkin(link) as skin:
-        scans = iter(skin)
-        skin.step(0.1)
-        link.board.settings["rows"] = 2
-        assert {scan.codes.shape for scan in take(scans, 10)} == {(4, 4, 4)}
-        with pytest.raises(ProtocolError, match="hello says 4x4 cells, its scans have 2x4"):
-            next(scans)
+    says = {"rows": 4, "row_mask": 15, "scan_cycles": 400_000}
+    with (
+        stepped(EmulatedBoard(Scene().ratio, BoardSettings(2, 4), says=says)) as skin,
+        pytest.raises(ProtocolError, match="hello says 4x4 cells, its scans have 2x4"),
+    ):
+        skin.latest()
 
 
 def test_a_defect_in_the_reading_thread_is_told_to_who_waits(

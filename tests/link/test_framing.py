@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from ohmskin.link import framing, protocol
 from ohmskin.link.framing import MAX_FRAME_BYTES, Decoder, RawFrame
 from ohmskin.link.messages import BoardDecoder, Scan
+from wire import scan_payload
 
 
 def textbook_crc(octets: bytes) -> int:
@@ -164,7 +165,8 @@ def test_an_endless_stretch_does_not_fill_the_memory(size: int, count: int) -> N
 def test_the_largest_frame_of_the_definition_fits() -> None:
     scan = protocol.FRAMES["scan"]
     limits = protocol.CONSTANTS
-    size = scan.struct.size + protocol.codes_size(limits["rows_max"], limits["columns_max"])
+    codes = limits["rows_max"] * limits["columns_max"] * limits["readings_max"]
+    size = scan.struct.size + protocol.codes_size(codes, limits["adc_bits_max"])
     for payload in (b"\x55" * size, bytes(size)):
         largest = RawFrame(scan.id, 0, payload)
         assert Decoder().feed(wire(largest)) == [largest]
@@ -200,10 +202,7 @@ def test_bit_errors_never_deliver_a_damaged_scan() -> None:
     delivered: list[Scan] = []
     hit = 0
     for number in range(count):
-        header = {"scan": number, "time_us": number * 11_111, "dropped": 0, "rx_errors": 0}
-        payload = kind.pack(**header, rows=8, columns=8, mode="near") + protocol.pack_codes(
-            sent[number]
-        )
+        payload = scan_payload(sent[number], scan=number, time_us=number * 11_111)
         octets = np.frombuffer(framing.encode(kind.id, number, payload), dtype=np.uint8)
         flips = np.packbits(random.random((octets.size, 8)) < error_rate, axis=1)[:, 0]
         hit += bool(flips.any())

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import wire
 from ohmskin.link import framing, protocol
 from ohmskin.link.messages import Ack, BoardDecoder, ForeignHello, Hello, Scan, SelfTestReport
 
@@ -14,16 +15,9 @@ SCAN = protocol.FRAMES["scan"]
 MINUTE_US = 60_000_000
 
 
-def scan_payload(
-    number: int,
-    time_us: int = 0,
-    dropped: int = 0,
-    rx_errors: int = 0,
-    mode: protocol.Value = "far",
-) -> bytes:
-    counters = {"scan": number, "time_us": time_us, "dropped": dropped, "rx_errors": rx_errors}
-    header = SCAN.pack(**counters, rows=1, columns=2, mode=mode)
-    return header + protocol.pack_codes(np.arange(8, dtype=np.uint16).reshape(1, 2, 4))
+def scan_payload(number: int, **header: Any) -> bytes:
+    codes = np.arange(8, dtype=np.uint16).reshape(1, 2, 4)
+    return wire.scan_payload(codes, **({"scan": number, "mode": "far"} | header))
 
 
 def scan_wire(number: int, **header: int) -> bytes:
@@ -33,8 +27,8 @@ def scan_wire(number: int, **header: int) -> bytes:
 def hello_payload(**changed: Any) -> bytes:
     values: dict[str, Any] = {f.name: 1 for f in protocol.FRAMES["hello"].fields}
     values |= {"layout_crc": protocol.LAYOUT_CRC, "board": "uno", "reset_cause": ("external",)}
-    values |= {"adc_prescaler": "clock_500khz", "mode": "far", "settings": "stored", "scanning": 0}
-    return protocol.FRAMES["hello"].pack(**(values | changed))
+    values |= {"accuracy": "usual", "mode": "far", "whole_mode": "near", "settings": "stored"}
+    return protocol.FRAMES["hello"].pack(**(values | {"scanning": 0} | changed))
 
 
 def hello_wire(**changed: Any) -> bytes:
@@ -150,7 +144,10 @@ STRANGE = {
     **{f"type {kind:#x}": (kind, b"abc") for kind in (0x00, 0x05, 0x40, 0x7F, 0xFF, 0x81, 0x89)},
     **{f"short {name}": (protocol.FRAMES[name].id, x[:-1]) for name, x in PAYLOADS.items()},
     **{f"long {name}": (protocol.FRAMES[name].id, x + b"\0") for name, x in PAYLOADS.items()},
-    "a scan of readings that nobody knows": (SCAN.id, scan_payload(5, mode=2)),
+    "a scan of readings that nobody knows": (SCAN.id, scan_payload(5, mode=4)),
+    "a scan of no rows": (SCAN.id, scan_payload(5, row_mask=0)),
+    "a scan of rows beyond the skin": (SCAN.id, scan_payload(5, row_mask=2)),
+    "a scan of codes of no bits": (SCAN.id, scan_payload(5)[:15] + b"\0" + scan_payload(5)[16:]),
     "an empty hello": (protocol.FRAMES["hello"].id, b""),
     "a hello without its layout": (protocol.FRAMES["hello"].id, b"\1"),
 }
@@ -167,9 +164,8 @@ def test_frames_of_unknown_type_or_wrong_length_are_counted(what: str) -> None:
 
 def test_a_scan_of_no_cells_does_no_harm() -> None:
     decoder = BoardDecoder()
-    header = {"scan": 0, "time_us": 0, "dropped": 0, "rx_errors": 0}
     for rows, columns in [(0, 0), (0, 8), (255, 255)]:
-        payload = SCAN.pack(**header, rows=rows, columns=columns, mode="near")
+        payload = SCAN.pack(**wire.scan_fields(rows, columns))
         decoder.feed(framing.encode(SCAN.id, 0, payload), 0.0)
     assert scans(decoder, scan_wire(0))[0].codes.shape == (1, 2, 4)
 
@@ -182,5 +178,5 @@ def test_a_message_has_the_fields_of_its_frame(message: type[Any], name: str) ->
 
 
 def test_values_of_a_newer_definition_have_a_name() -> None:
-    wire = framing.encode(protocol.FRAMES["ack"].id, 0, bytes([0x83, 7, 200]))
-    assert BoardDecoder().feed(wire, 0.0) == [Ack(0x83, 7, "unknown_200")]
+    octets = framing.encode(protocol.FRAMES["ack"].id, 0, bytes([0x83, 7, 200, *bytes(8)]))
+    assert BoardDecoder().feed(octets, 0.0) == [Ack(0x83, 7, "unknown_200", 0, 0)]

@@ -27,7 +27,7 @@ from ohmskin.link.messages import (
     SelfTestReport,
 )
 from places import ROOT
-from skins import placed
+from skins import PASSES, placed
 
 each_valid = pytest.mark.parametrize("vector", VECTORS["valid"], ids=lambda v: v["name"])
 each_damaged = pytest.mark.parametrize("vector", VECTORS["damaged"], ids=lambda v: v["name"])
@@ -36,6 +36,13 @@ each_damaged = pytest.mark.parametrize("vector", VECTORS["damaged"], ids=lambda 
 def expected_raw(vector: dict[str, Any]) -> framing.RawFrame:
     content = bytes.fromhex(vector["content"])
     return framing.RawFrame(content[0], content[1], content[2:])
+
+
+def codes_of(vector: dict[str, Any]) -> np.ndarray:
+    """The codes of the rows and columns that a scan has read."""
+    fields = vector["fields"]
+    lines = fields["row_mask"].bit_count(), fields["column_mask"].bit_count()
+    return placed(vector["codes"], *lines, fields["mode"])
 
 
 def python_values(fields: dict[str, Any]) -> dict[str, Any]:
@@ -54,7 +61,7 @@ def test_valid_vector_is_decoded_and_encoded(vector: dict[str, Any]) -> None:
     assert kind.unpack(raw.payload) == fields
     payload = kind.pack(**fields)
     if "codes" in vector:
-        payload += protocol.pack_codes(placed(vector["codes"], fields["rows"], fields["columns"]))
+        payload += protocol.pack_codes(codes_of(vector), protocol.PER_PASS[fields["mode"]])
     assert framing.encode(kind.id, raw.sequence, payload).hex() == vector["wire"]
 
 
@@ -91,7 +98,15 @@ def test_vectors_of_a_board_become_messages(kind: str, expected: type[Message]) 
             assert message.host_time_s == 12.5
             assert (message.rows, message.columns) == (fields["rows"], fields["columns"])
             codes = message.ratio * 1024 - 0.5
-            np.testing.assert_array_equal(codes, placed(vector["codes"], *codes.shape[:2]))
+            rows, columns = (
+                [line for line in range(32) if fields[mask] >> line & 1]
+                for mask in ("row_mask", "column_mask")
+            )
+            np.testing.assert_array_equal(codes[np.ix_(rows, columns)], codes_of(vector))
+            assert np.isfinite(codes).sum() == len(vector["codes"])
+            np.testing.assert_array_equal(message.read, np.isfinite(codes[..., 0]))
+            assert message.is_whole == message.read.all()
+            np.testing.assert_array_equal(message.codes_read, codes_of(vector))
         elif isinstance(message, ForeignHello):
             assert message.layout_crc == fields["layout_crc"]
         else:
@@ -121,26 +136,40 @@ def test_vectors_are_those_of_the_cobs_package(tmp_path: Path) -> None:
 
 
 @settings(max_examples=40)
-@given(st.integers(1, 16), st.integers(1, 16), st.randoms(use_true_random=False))
-def test_codes_are_packed_like_one_long_integer(rows: int, columns: int, random: Any) -> None:
-    in_order = [random.getrandbits(10) for _ in range(rows * columns * 4)]
-    number = sum(code << (10 * i) for i, code in enumerate(in_order))
-    packed = number.to_bytes((len(in_order) * 10 + 7) // 8, "little")
-    codes = placed(in_order, rows, columns)
-    assert protocol.codes_size(rows, columns) == len(packed)
-    assert protocol.pack_codes(codes) == packed
-    np.testing.assert_array_equal(protocol.unpack_codes(packed, rows, columns), codes)
+@given(
+    st.integers(1, 16),
+    st.integers(1, 16),
+    st.sampled_from(list(PASSES)),
+    st.sampled_from([10, 12, 14, 16]),
+    st.randoms(use_true_random=False),
+)
+def test_codes_are_packed_like_one_long_integer(
+    rows: int, columns: int, mode: str, bits: int, random: Any
+) -> None:
+    count = rows * columns * sum(map(len, PASSES[mode]))
+    in_order = [random.getrandbits(bits) for _ in range(count)]
+    number = sum(code << (bits * i) for i, code in enumerate(in_order))
+    packed = number.to_bytes((count * bits + 7) // 8, "little")
+    codes, per_pass = placed(in_order, rows, columns, mode), len(PASSES[mode][0])
+    assert protocol.codes_size(count, bits) == len(packed)
+    assert protocol.pack_codes(codes, per_pass, bits) == packed
+    unpacked = protocol.unpack_codes(packed, codes.shape, per_pass, bits)
+    np.testing.assert_array_equal(unpacked, codes)
 
 
 @pytest.mark.parametrize("octets", [0, 4, 6, 320])
 def test_codes_of_another_size_are_refused(octets: int) -> None:
-    with pytest.raises(ValueError, match="1x1"):
-        protocol.unpack_codes(bytes(octets), 1, 1)
+    with pytest.raises(ValueError, match="1 x 1 x 4 codes of 10 bits"):
+        protocol.unpack_codes(bytes(octets), (1, 1, 4))
 
 
 def test_a_code_beyond_ten_bits_is_refused() -> None:
     with pytest.raises(ValueError, match="1023"):
         protocol.pack_codes(np.full((2, 2, 4), 1024, dtype=np.uint16))
+
+
+NO_TIME = {"time_us": 0, "rate_mhz": 0}
+HELLO = python_values(next(v for v in VECTORS["valid"] if v["name"] == "hello")["fields"])
 
 
 @pytest.mark.parametrize(
@@ -150,7 +179,8 @@ def test_a_code_beyond_ten_bits_is_refused() -> None:
         ("set_unit_id", {"unit_id": 1, "more": 2}, "more"),
         ("set_unit_id", {"unit_id": -1}, "unit_id is -1"),
         ("set_unit_id", {"unit_id": 1 << 32}, "4294967295"),
-        ("ack", {"command": 1, "command_sequence": 0, "result": "perhaps"}, "perhaps"),
+        ("ack", {"command": 1, "command_sequence": 0, "result": "perhaps"} | NO_TIME, "perhaps"),
+        ("hello", {**HELLO, "board": "a board of seventeen"}, "16 letters at most"),
         ("start", {"now": 1}, "now"),
     ],
 )
@@ -228,7 +258,7 @@ CHANGES_OF_MEANING = {
     "a frame's name": ('name = "self_test"\n', 'name = "test_self"\n'),
     "a frame's sender": ('id = 0x84\nfrom = "host"', 'id = 0x84\nfrom = "board"'),
     "a field's name": ('name = "settle_asked_us"', 'name = "settle_wanted_us"'),
-    "a field's type": ('name = "dropped", type = "u16"', 'name = "dropped", type = "u32"'),
+    "a field's type": ('name = "rx_errors", type = "u16"', 'name = "rx_errors", type = "u32"'),
     "a field's count": (
         'name = "code_min", type = "u16", count = "readings"',
         'name = "code_min", type = "u16"',
@@ -241,8 +271,11 @@ CHANGES_OF_MEANING = {
 }
 CHANGES_OF_TEXT = {
     "a frame's doc": ('doc = "ask for `hello`"', 'doc = "another text"'),
-    "a field's doc": ('doc = "rows scanned"', 'doc = "another text"'),
-    "an enum's doc": ('doc = "what the firmware was built for"', 'doc = "another text"'),
+    "a field's doc": ('doc = "rows that this board can scan"', 'doc = "another text"'),
+    "an enum's doc": (
+        'doc = "how exact a conversion is, and so how long it takes"',
+        'doc = "another text"',
+    ),
     "a member's doc": ('doc = "supply came up"', 'doc = "another text"'),
     "a constant's doc": ('doc = "slowest scan rate"', 'doc = "another text"'),
     "a comment": ("# The whole link between", "# Everything between"),

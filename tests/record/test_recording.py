@@ -176,7 +176,7 @@ def test_the_record_loop(
     def scanned() -> Iterator[Scan]:
         for each in given[:scans]:
             if each.number == 10:
-                board.info = replace(hello, rows=2)
+                board.info = replace(hello, rows=2, row_mask=3)
             yield each
 
     with Recorder(path, hello) as recorder:
@@ -270,7 +270,7 @@ def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
 def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) -> None:
     scans = [scan(n, rows=3 if n < 5 else 2) for n in range(10)]
     tare = Tare(np.full((3, 4, 4), 0.25), 1.0)
-    write_recording(path, hello, [tare, *scans[:5], replace(hello, rows=2), *scans[5:]])
+    write_recording(path, hello, [tare, *scans[:5], replace(hello, rows=2, row_mask=3), *scans[5:]])
     with ohmskin.open(f"replay://{path}?speed=0") as skin:
         played = list(skin)
         assert_same(played, scans, host_time=False)

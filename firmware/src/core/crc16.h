@@ -12,6 +12,10 @@ static_assert(frames::CRC_POLYNOMIAL == 0x1021, "Crc16::add() holds this polynom
 // AVR shifts bytes: 16 instructions a byte.
 class Crc16 {
   public:
+    constexpr Crc16() : Crc16(frames::CRC_INITIAL & 0xFF, frames::CRC_INITIAL >> 8) {}
+    // Of no use before another is assigned. It is all zeros, so that static objects that hold one
+    // take no flash for their initial values.
+    static constexpr Crc16 none() { return Crc16(0, 0); }
     void add(uint8_t octet) {
         uint8_t x = high_ ^ octet;
         x ^= x >> 4;
@@ -22,8 +26,8 @@ class Crc16 {
     uint8_t high() const { return high_; }
 
   private:
-    uint8_t low_ = frames::CRC_INITIAL & 0xFF;
-    uint8_t high_ = frames::CRC_INITIAL >> 8;
+    constexpr Crc16(uint8_t low, uint8_t high) : low_(low), high_(high) {}
+    uint8_t low_, high_;
 };
 
 }  // namespace ohmskin

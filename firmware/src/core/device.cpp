@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/device.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "board.h"
@@ -12,8 +13,10 @@ using frames::Result;
 using frames::Type;
 
 void Device::begin() {
-    settings_source_ = load_settings(&settings_);
-    plan_scan(settings_.request, board::CLOCK_HZ, &plan_);
+    baud_ = frames::BAUD_DEFAULT;
+    baud_confirmed_ = true;
+    settings_source_ = load_settings(&settings_, cycles_per_byte());
+    plan(settings_.request, &next_);
     hello_pending_ = attention_ = true;
 }
 
@@ -28,6 +31,11 @@ bool Device::poll() {
         take_group();
         return true;
     }
+    // Where no conversion ends in time, no group comes; the scans are counted before their number
+    // wraps.
+    if (activity_ == Activity::Scanning &&
+        static_cast<uint8_t>(board::scanner.scans() - scan_number_) > Scanner::SCAN_NUMBERS / 2)
+        count_silent_scans();
     // Codes cannot wait, because the queue is short. Everything else can.
     if (attention_ || board::scanner.parked())
         worked |= attend();
@@ -41,12 +49,12 @@ bool Device::attend() {
         worked = poll_save();
     if (activity_ != Activity::Idle && board::scanner.parked() && !board::scanner.has_group())
         finish_slots();
-    if (groups_left_ == 0)
+    if (codes_left_ == 0)
         send_pending();
     watch_baud();
     // Answers that wait for the end of a scan frame need no pass before it: take_group() sets
     // attention_ there, and begin_scan() sends them if the next scan comes first.
-    attention_ = (answers_wait() && groups_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
+    attention_ = (answers_wait() && codes_left_ == 0) || baud_next_ != 0 || !baud_confirmed_ ||
                  !settings_writer_.idle();
     return worked;
 }
@@ -68,6 +76,7 @@ void Device::receive() {
     if (!board::serial_read(&octet))
         reader_.line_error();
     if (reader_.feed(octet)) {
+        heard_us_ = board::now_us();
         attention_ = true;
         execute();
     }
@@ -97,7 +106,10 @@ void Device::send_pending() {
             acks_[still_waiting++] = ack;
             continue;
         }
-        const frames::Ack frame = {ack.command, ack.sequence, static_cast<uint8_t>(ack.result)};
+        const bool asks = ack.command == static_cast<uint8_t>(Type::Configure) ||
+                          ack.command == static_cast<uint8_t>(Type::SetRegion);
+        const frames::Ack frame = {ack.command, ack.sequence, static_cast<uint8_t>(ack.result),
+                                   ack.time_us, asks ? rate_mhz_ : 0};
         writer_.begin(Type::Ack);
         writer_.put(&frame, sizeof frame);
         writer_.end();
@@ -144,6 +156,7 @@ constexpr Command COMMANDS[] = {
     {Type::LoadDefaults, 0, false},
     {Type::SelfTest, 0, false},
     {Type::SetBaud, sizeof(frames::SetBaud), false},
+    {Type::SetRegion, sizeof(RegionRequest), true},
 };
 
 // The fields of a payload, whose size refusal() has checked. It is copied, because the reader's
@@ -212,22 +225,47 @@ void Device::carry_out() {
         return begin_self_test();
     case Type::SetBaud:
         return answer(set_baud(fields_of<frames::SetBaud>(payload).baud));
+    case Type::SetRegion:
+        return set_region(fields_of<RegionRequest>(payload));
     default:
         return answer(Result::UnknownCommand);
     }
 }
 
+// Clock cycles in which the line carries a byte: start bit, eight data bits, stop bit.
+uint16_t Device::cycles_per_byte() const {
+    constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
+    return static_cast<uint16_t>(CLOCK_HZ / baud_ * BITS_PER_BYTE_8N1);
+}
+
+// What can be kept of a request, or why it cannot. The answer at hand says the rate.
+Result Device::plan(const ScanRequest &request, Routes *routes) {
+    return plan_scan(request, cycles_per_byte(), routes, &rate_mhz_);
+}
+
 // Takes all of the request or nothing.
 Result Device::configure(const ScanRequest &request) {
-    ScanPlan plan;
-    const Result result = plan_scan(request, board::CLOCK_HZ, &plan);
-    if (result != Result::Ok)
-        return result;
-    if (ring_limit(request, plan, baud_) == 0)
-        return Result::LineTooSlow;
-    settings_.request = request;
-    plan_ = plan;
-    return Result::Ok;
+    const Result result = plan(request, &next_);
+    if (result == Result::Ok)
+        settings_.request = request;
+    return result;
+}
+
+// Takes all of the request or nothing. While scanning, it is answered by take_change(), when the
+// scanner has begun the first scan of it.
+void Device::set_region(const RegionRequest &region) {
+    if (activity_ == Activity::Stopping || changing_)
+        return answer(Result::Busy);
+    ScanRequest request = settings_.request;
+    static_assert(sizeof request == offsetof(ScanRequest, row_mask) + sizeof region,
+                  "the fields of set_region are the last ones of configure");
+    memcpy(&request.row_mask, &region, sizeof region);
+    const Result result = configure(request);
+    if (result != Result::Ok || activity_ == Activity::Idle)
+        return answer(result);
+    board::scanner.change(next_);
+    changing_ = true;
+    defer();
 }
 
 Result Device::start() {
@@ -236,12 +274,17 @@ Result Device::start() {
     if (activity_ == Activity::Stopping)
         return Result::Busy;
     // Settings may have been made and saved at a faster line.
-    ring_limit_ = ring_limit(settings_.request, plan_, baud_);
-    if (ring_limit_ == 0)
-        return Result::LineTooSlow;
+    const Result result = plan(settings_.request, &next_);
+    if (result != Result::Ok)
+        return result;
+    routes_ = next_;
+    turns_.begin();
+    whole_ = turns_.next_is_whole(routes_.whole_every);
     scan_number_ = 0;
+    seen_ = false;
     dropped_ = 0;
-    begin_slots(settings_.request, settings_.request.mode, plan_);
+    board::scanner.begin(routes_);
+    begin_slots(route().plan, settings_.request.accuracy);
     activity_ = Activity::Scanning;
     return Result::Ok;
 }
@@ -282,38 +325,42 @@ void Device::begin_self_test() {
 Result Device::set_baud(uint32_t baud) {
     if (!board::serial_speed_known(baud))
         return Result::BadBaud;
-    if (ring_limit(settings_.request, plan_, baud) == 0)
-        return Result::LineTooSlow;
     baud_next_ = baud;
     return Result::Ok;
 }
 
 // --------------------------------------------------------------------- what commands begin
 
-// pattern: which readings the scans take (scan_sequence.h).
-void Device::begin_slots(const ScanRequest &request, uint8_t pattern, const ScanPlan &plan) {
-    groups_left_ = 0;
-    board::scanner.begin(request.rows, request.columns, pattern, plan.idle_slots);
-    const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
+// The scanner has begun.
+void Device::begin_slots(const ScanPlan &plan, uint8_t accuracy) {
+    codes_left_ = 0;
     // Cycles from now to the first reading. Small slow scans have slots for which 16 bits are few.
     const uint32_t ahead = uint32_t{plan.slot_cycles} * Scanner::FIRST_SLOT;
-    scan_time_us_ = board::now_us() + ahead / cycles_per_us;
-    scan_time_rest_ = static_cast<uint8_t>(ahead % cycles_per_us);
-    board::start_slots(plan, request.adc_prescaler);
+    scan_time_us_ = board::now_us() + ahead / CYCLES_PER_US;
+    scan_time_rest_ = static_cast<uint8_t>(ahead % CYCLES_PER_US);
+    board::start_slots(plan.slot_cycles, accuracy);
 }
 
 void Device::begin_self_test_scan() {
-    const ScanRequest request = SelfTest::request();
-    ScanPlan plan;
-    plan_scan(request, board::CLOCK_HZ, &plan);
-    begin_slots(request, self_test_.pattern(), plan);
+    const Route route = self_test_.route(cycles_per_byte());
+    board::scanner.begin(route);
+    begin_slots(route.plan, static_cast<uint8_t>(frames::Accuracy::Usual));
+}
+
+// The region that was asked for while scanning is in force.
+void Device::take_change() {
+    routes_ = next_;
+    changing_ = false;
+    resolve(Type::SetRegion, Result::Ok);
 }
 
 // The slots' last scan is over, and all its codes are taken.
 void Device::finish_slots() {
     board::stop_slots();
-    if (groups_left_ != 0)
+    if (codes_left_ != 0)
         drop_open_scan();
+    if (changing_)
+        take_change();
     if (activity_ == Activity::SelfTesting) {
         if (self_test_.next())
             return begin_self_test_scan();
@@ -342,32 +389,45 @@ bool Device::poll_save() {
 }
 
 void Device::send_hello() {
-    const frames::Hello hello = {
+    if (activity_ == Activity::Scanning)
+        count_silent_scans();
+    const ScanRequest &asked = settings_.request;
+    frames::Hello hello = {
         frames::LAYOUT_CRC,
         VERSION_MAJOR,
         VERSION_MINOR,
         VERSION_PATCH,
-        static_cast<uint8_t>(board::KIND),
+        {},  // the board's name
+        board::WIRING,
         settings_.unit_id,
-        settings_.request.rows,
-        settings_.request.columns,
-        frames::READINGS_PER_CELL,
-        frames::ADC_BITS,
+        ROWS_MAX,
+        COLUMNS_MAX,
+        asked.rows,
+        asked.columns,
+        ADC_BITS,
         board::REF_TOP_OHM,
         board::REF_BOTTOM_OHM,
-        settings_.request.rate_mhz,
-        plan_.scan_cycles(),
-        plan_.slot_cycles,
-        board::CLOCK_HZ,
-        settings_.request.settle_us,
-        settle_us(plan_, settings_.request.adc_prescaler, board::CLOCK_HZ),
-        settings_.request.adc_prescaler,
-        settings_.request.mode,
+        asked.rate_mhz,
+        next_.region.plan.scan_cycles(),
+        next_.region.plan.slot_cycles,
+        next_.whole_every != 0 ? next_.whole.plan.scan_cycles() : 0,
+        CLOCK_HZ,
+        asked.settle_us,
+        settle_us(next_.region.plan, asked.accuracy),
+        asked.accuracy,
+        asked.mode,
+        asked.row_mask,
+        asked.column_mask,
+        asked.whole_mode,
+        asked.whole_every,
         baud_,
         static_cast<uint8_t>(settings_source_),
         board::reset_cause(),
         static_cast<uint8_t>(activity_ == Activity::Scanning),
+        dropped_,
+        board::scanner.late_codes(),
     };
+    memcpy(hello.board, board::NAME, sizeof hello.board);
     writer_.begin(Type::Hello);
     writer_.put(&hello, sizeof hello);
     writer_.end();
@@ -377,7 +437,7 @@ void Device::send_hello() {
 
 // Answers the command that has arrived.
 void Device::answer(Result result) {
-    acks_[ack_count_++] = Ack{reader_.type(), reader_.sequence(), result, true};
+    acks_[ack_count_++] = Ack{reader_.type(), reader_.sequence(), result, true, heard_us_};
 }
 
 // Leaves the answer to resolve(). Its place is taken now, because the reader forgets the command.

@@ -9,37 +9,13 @@ using frames::Type;
 
 namespace {
 
-// Start bit, eight data bits, stop bit.
-constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
-
 // Bytes of a group: four codes of 10 bits.
 constexpr uint8_t GROUP_BYTES = 5;
-
-// Bytes of the ring that scans leave free, for a hello and its ack. Answers may be sent only
-// between two scans. If scans filled the ring to its end, an answer would find no room at that
-// moment, and might wait for ever. (A report of the self-test is sent while no scans are.)
-constexpr uint16_t ANSWERS_SPACE =
-    FrameWriter::line_bytes(sizeof(frames::Hello)) + FrameWriter::line_bytes(sizeof(frames::Ack));
+static_assert(ADC_BITS == 10 && Scanner::GROUP == 4, "the shifts of put_group()");
 
 // Bytes that the last group of a frame may take: its own, the lengths of two blocks, CRC,
 // delimiter.
 constexpr uint16_t GROUP_SPACE = GROUP_BYTES + 2 + 2 + 1;
-
-// The main loop feeds the line somewhat slower than the line could go, at most by this part, an
-// eighth: with the shortest slots, interrupts leave it that little time. Chosen: with it, no load
-// of tests/firmware (test_no_load_damages_a_frame) tears a frame.
-constexpr uint8_t LINE_IDLE_PART = 8;
-
-// Bytes of a scan frame's payload.
-uint16_t scan_payload(uint8_t rows, uint8_t columns) {
-    return static_cast<uint16_t>(sizeof(frames::Scan) +
-                                 (readings_in(rows, columns) * uint32_t{frames::ADC_BITS} + 7) / 8);
-}
-
-// Clock cycles in which the line carries a byte.
-uint16_t cycles_per_byte(uint32_t baud) {
-    return static_cast<uint16_t>(board::CLOCK_HZ / baud * BITS_PER_BYTE_8N1);
-}
 
 }  // namespace
 
@@ -52,99 +28,120 @@ void Device::take_group() {
     } else {
         if (scanner.starts_scan())
             begin_scan();
-        if (groups_left_ != 0 && writer_.space() < GROUP_SPACE)
+        if (codes_left_ != 0 && writer_.space() < GROUP_SPACE)
             drop_open_scan();
-        if (groups_left_ != 0) {
-            put_group(scanner.group());
-            if (--groups_left_ == 0) {
+        if (codes_left_ != 0) {
+            const uint8_t count =
+                codes_left_ < Scanner::GROUP ? static_cast<uint8_t>(codes_left_) : Scanner::GROUP;
+            put_group(scanner.group(), count);
+            codes_left_ = static_cast<uint16_t>(codes_left_ - count);
+            if (codes_left_ == 0) {
                 writer_.end();
-                attention_ = true;
+                if (answers_wait())
+                    attention_ = true;
             }
         }
     }
     scanner.release_group();
 }
 
+// The oldest group starts a scan: moves on to this scan's number, time and route.
 void Device::begin_scan() {
-    if (groups_left_ != 0)
+    if (codes_left_ != 0)
         drop_open_scan();  // its last codes were lost
-    account_for_lost_scans();
+    // Answers first, if they find room: before the line's time is spent on a new scan.
+    account_for_lost_scans(board::scanner.scan_number());
     if (answers_wait())
         send_pending();
-    const ScanRequest &scan = settings_.request;
-    if (writer_.used() <= ring_limit_) {
-        const frames::Scan header = {scan_number_, scan_time_us_, dropped_, reader_.errors(),
-                                     scan.rows,    scan.columns,  scan.mode};
+    const Route &now = route();
+    if (writer_.used() <= now.ring_limit) {
+        const frames::Scan header = {scan_number_,
+                                     scan_time_us_,
+                                     dropped_,
+                                     reader_.errors(),
+                                     settings_.request.rows,
+                                     settings_.request.columns,
+                                     now.pattern,
+                                     ADC_BITS,
+                                     now.rows,
+                                     now.columns,
+                                     now.plan.slot_cycles};
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
-        groups_left_ = static_cast<uint16_t>(scan.rows * scan.columns);
+        codes_left_ = now.plan.readings;
     } else {
         dropped_++;
     }
-    count_scan();
+    seen_ = true;
 }
 
-// The main loop was too late for the slots or for the line. plan_scan() and ring_limit() refuse
+// The main loop was too late for the slots or for the line. plan_scan() refuses
 // scans with which that could happen; if it does happen, the scan is lost as a whole.
 void Device::drop_open_scan() {
     writer_.abandon();
-    groups_left_ = 0;
+    codes_left_ = 0;
     dropped_++;
 }
 
-// Counts scans that never reached the queue, so that scan numbers and times stay right.
-void Device::account_for_lost_scans() {
-    const uint8_t number = board::scanner.scan_number();
+// Goes on to the scan of this number (modulo Scanner::SCAN_NUMBERS), and counts those before it
+// that never reached the queue, so that scan numbers and times stay right.
+void Device::account_for_lost_scans(uint8_t number) {
     while (static_cast<uint8_t>((number - scan_number_) & (Scanner::SCAN_NUMBERS - 1)) != 0) {
-        dropped_++;
+        if (!seen_)
+            dropped_++;
+        seen_ = false;
         count_scan();
     }
 }
 
-// Moves number and time on to the next scan. The rest is carried along, so that times do not drift.
-void Device::count_scan() {
-    const uint8_t cycles_per_us = static_cast<uint8_t>(board::CLOCK_HZ / 1000000);
-    const uint32_t cycles = plan_.scan_cycles() + scan_time_rest_;
-    scan_number_++;
-    scan_time_us_ += cycles / cycles_per_us;
-    scan_time_rest_ = static_cast<uint8_t>(cycles % cycles_per_us);
+// Counts scans that have begun and of which no code has come, but for the last one: it may come
+// yet.
+void Device::count_silent_scans() {
+    const uint8_t begun = board::scanner.scans();
+    if (begun != static_cast<uint8_t>(scan_number_) && !board::scanner.has_group())
+        account_for_lost_scans(static_cast<uint8_t>(begun - 1));
 }
 
-// Packs a group's four codes of 10 bits into five bytes, least significant bit first. Only a scan's
-// first code has more than its 10 bits set (Scanner::starts_scan()), so code[0] alone is masked.
-void Device::put_group(const uint16_t *code) {
-    static_assert(frames::ADC_BITS == 10 && frames::READINGS_PER_CELL == 4, "the shifts below");
+// Moves number, time and route on to the next scan. The rest of the time is carried along, so that
+// times do not drift.
+void Device::count_scan() {
+    const ScanPlan before = route().plan;
+    uint16_t slots = before.slots();
+    scan_number_++;
+    if (changing_ && !board::scanner.change_waits() &&
+        board::scanner.changed_at() == static_cast<uint8_t>(scan_number_)) {
+        if (before.idle_slots == 0)
+            slots = static_cast<uint16_t>(slots + IDLE_TO_CHANGE);
+        take_change();
+        turns_.change(routes_.whole_every);
+    }
+    whole_ = turns_.next_is_whole(routes_.whole_every);
+    // The last slots before a scan have the length of its own (scanner.h).
+    const int32_t longer = int32_t{route().plan.slot_cycles} - before.slot_cycles;
+    const uint32_t cycles = uint32_t{before.slot_cycles} * slots +
+                            static_cast<uint32_t>(board::SLOTS_OF_NEW_LENGTH * longer) +
+                            scan_time_rest_;
+    scan_time_us_ += cycles / CYCLES_PER_US;
+    scan_time_rest_ = static_cast<uint8_t>(cycles % CYCLES_PER_US);
+}
+
+// Packs a group's codes of 10 bits, four into five bytes, least significant bit first. The last
+// group of a scan may have fewer: the bits behind them are 0.
+void Device::put_group(const uint16_t *code, uint8_t count) {
+    uint16_t last[Scanner::GROUP];
+    if (count != Scanner::GROUP) {
+        for (uint8_t n = 0; n < Scanner::GROUP; n++)
+            last[n] = n < count ? code[n] : 0;
+        code = last;
+    }
     const uint8_t octets[GROUP_BYTES] = {
         static_cast<uint8_t>(code[0]),
-        static_cast<uint8_t>((code[0] & Scanner::CODE) >> 8 | static_cast<uint8_t>(code[1]) << 2),
+        static_cast<uint8_t>(code[0] >> 8 | static_cast<uint8_t>(code[1]) << 2),
         static_cast<uint8_t>(code[1] >> 6 | static_cast<uint8_t>(code[2]) << 4),
         static_cast<uint8_t>(code[2] >> 4 | static_cast<uint8_t>(code[3]) << 6),
         static_cast<uint8_t>(code[3] >> 2),
     };
-    // The chip holds two bytes for the line, which at 500 kbaud leave within 640 cycles, and the
-    // work on a group takes longer. So the line is fed in between, too: it would idle otherwise.
-    writer_.put(octets, 3);
-    transmit();
-    writer_.put(octets + 3, GROUP_BYTES - 3);
-}
-
-// How full the ring may be where a scan begins; 0: the scan never fits.
-//
-// The bytes of a scan come in at a known pace and leave at a known pace. So the most that the ring
-// can hold during a scan is known when it begins: what it holds then, or one open block that cannot
-// leave yet, and what comes in faster than it leaves. A scan begins only where that fits, hence no
-// scan is torn.
-uint16_t Device::ring_limit(const ScanRequest &request, const ScanPlan &plan, uint32_t baud) const {
-    const uint16_t frame = FrameWriter::line_bytes(scan_payload(request.rows, request.columns));
-    const uint32_t duration =
-        static_cast<uint32_t>(plan.slot_cycles) * readings_in(request.rows, request.columns);
-    uint32_t leaves = duration / cycles_per_byte(baud);
-    leaves -= leaves / LINE_IDLE_PART;
-    const uint32_t excess = frame > leaves ? frame - leaves : 0;
-    const uint16_t most = FrameWriter::SIZE - 1 - ANSWERS_SPACE;
-    if (excess + FrameWriter::LONGEST_BLOCK > most)
-        return 0;
-    return static_cast<uint16_t>(most - excess);
+    writer_.put(octets, static_cast<uint8_t>(count + 1));
 }
 
 }  // namespace ohmskin

@@ -41,7 +41,7 @@ bool FrameReader::finish() {
     // A delimiter alone is how a host flushes the line: not an error.
     if (!valid && !empty)
         errors_++;
-    frame_size_ = valid ? size_ : FRAME_BYTES_MIN;
+    payload_size_ = valid ? static_cast<uint8_t>(size_ - FRAME_BYTES_MIN) : 0;
     size_ = code_ = left_ = 0;
     damaged_ = false;
     return valid;

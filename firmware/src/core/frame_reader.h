@@ -12,7 +12,7 @@ namespace ohmskin {
 class FrameReader {
   public:
     // Bytes of the longest payload that is taken. Chosen: more than any command has.
-    static constexpr uint8_t PAYLOAD_MAX = 16;
+    static constexpr uint8_t PAYLOAD_MAX = 24;
 
     // Feeds one byte from the line; true when it completes a valid frame, which stays readable
     // until the next call.
@@ -24,7 +24,7 @@ class FrameReader {
     uint8_t type() const { return content_[0]; }
     uint8_t sequence() const { return content_[1]; }
     const uint8_t *payload() const { return content_ + HEADER_BYTES; }
-    uint8_t payload_size() const { return static_cast<uint8_t>(frame_size_ - FRAME_BYTES_MIN); }
+    uint8_t payload_size() const { return payload_size_; }
     uint16_t errors() const { return errors_; }
     void count_error() { errors_++; }
 
@@ -40,11 +40,11 @@ class FrameReader {
     void store(uint8_t octet);
 
     uint8_t content_[CONTENT_MAX] = {};
-    uint8_t size_ = 0;                      // bytes of content_ decoded so far
-    uint8_t frame_size_ = FRAME_BYTES_MIN;  // bytes of the last valid frame, CRC included
-    uint8_t code_ = 0;                      // length byte of the open COBS block; 0: none yet
-    uint8_t left_ = 0;                      // bytes of the open block still to come
-    bool damaged_ = false;  // the frame that is being received, by the line or by its length
+    uint8_t size_ = 0;          // bytes of content_ decoded so far
+    uint8_t payload_size_ = 0;  // of the last valid frame
+    uint8_t code_ = 0;          // length byte of the open COBS block; 0: none yet
+    uint8_t left_ = 0;          // bytes of the open block still to come
+    bool damaged_ = false;      // the frame that is being received, by the line or by its length
     uint16_t errors_ = 0;
 };
 

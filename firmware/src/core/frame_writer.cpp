@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/frame_writer.h"
 
+#include "board.h"
+
 namespace ohmskin {
 
 constexpr uint16_t FrameWriter::SIZE;
@@ -27,6 +29,10 @@ void FrameWriter::put(const void *octets, uint8_t size) {
     uint16_t write = write_;
     uint8_t length = length_;
     for (; size != 0; size--, octet++) {
+        // The chip holds two bytes for the line, and a frame's bytes take longer than these two
+        // need to leave. So the line is fed meanwhile: it would idle otherwise.
+        if (board::serial_can_write() && has_byte())
+            board::serial_write(next_byte());
         crc.add(*octet);
         if (length == 0) {
             block_ = write;

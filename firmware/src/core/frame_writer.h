@@ -57,7 +57,7 @@ class FrameWriter {
     uint16_t block_ = 0;      // where the open block's length goes
     uint8_t length_ = 0;      // of the open block, its own byte included; 0: none is open
     uint8_t sequence_ = 0;
-    Crc16 crc_;
+    Crc16 crc_ = Crc16::none();
 };
 
 }  // namespace ohmskin

@@ -3,20 +3,70 @@
 #include <stdint.h>
 
 #include "core/attributes.h"
+#include "core/clock.h"
+#include "core/scan_sequence.h"
 #include "frames.h"
 
 namespace ohmskin {
 
-// How to scan, as asked for: the fields of the command `configure`.
+// How to scan, as asked for: the fields of the command `configure`. The last of them are those of
+// `set_region`, which changes them alone.
 using ScanRequest = frames::Configure;
+using RegionRequest = frames::SetRegion;
 
-// How the board keeps a request: slots of equal length, one conversion each, a whole number of them
-// a scan.
+// Idle slots between scans of two kinds, at least. In the last but one of them the interrupt takes
+// the other kind's steps: with three, no code comes in that slot, which would cost time, too.
+constexpr uint8_t IDLE_TO_CHANGE = 3;
+
+// How the board keeps the times of a scan: slots of equal length, one conversion each, a whole
+// number of them a scan.
 struct ScanPlan {
-    uint16_t slot_cycles;     // clock cycles of a slot
-    uint16_t slots_per_scan;  // idle ones included
-    uint16_t idle_slots;      // those after the last reading: they fill up the scan's period
-    uint32_t scan_cycles() const { return static_cast<uint32_t>(slot_cycles) * slots_per_scan; }
+    uint16_t slot_cycles;  // clock cycles of a slot
+    uint16_t readings;     // slots with a reading
+    uint16_t idle_slots;   // those after the last reading: they fill up the scan's period
+    uint16_t slots() const { return static_cast<uint16_t>(readings + idle_slots); }
+    uint32_t scan_cycles() const { return static_cast<uint32_t>(slot_cycles) * slots(); }
+};
+
+// One kind of scan: the cells that it visits, the readings that it takes there, and its times.
+struct Route {
+    LineMask rows, columns;
+    uint8_t pattern;  // which readings (scan_sequence.h)
+    ScanPlan plan;
+    uint16_t ring_limit;  // ring use up to which a scan may begin and is sure to fit; 0: none is
+};
+
+// The two kinds of scans that take turns: those of the region, and whole ones in between.
+struct Routes {
+    Route region, whole;
+    uint16_t whole_every;  // each so many-th scan is a whole one; 0: none
+};
+
+// Whose turn it is. The interrupt and the main loop each have one of these, and step it once a
+// scan, so that they need not tell each other.
+class Turns {
+  public:
+    void begin() { left_ = 0; }
+    // The count goes on when another region comes, so that whole scans stay as frequent as asked
+    // however often the region changes.
+    void change(uint16_t every) {
+        if (left_ >= every)
+            left_ = every ? static_cast<uint16_t>(every - 1) : 0;
+    }
+    // Whether the next scan is a whole one.
+    bool next_is_whole(uint16_t every) {
+        if (every == 0)
+            return false;
+        if (left_ == 0) {
+            left_ = static_cast<uint16_t>(every - 1);
+            return true;
+        }
+        left_--;
+        return false;
+    }
+
+  private:
+    uint16_t left_ = 0;  // scans of the region until the next whole one
 };
 
 // What the converter and the timer make of a slot. An ADC clock is `prescaler` clock cycles. (Data
@@ -24,6 +74,8 @@ struct ScanPlan {
 // ends 13.5 ADC clocks and 3 clock cycles after its trigger, and holds its sample 2 ADC clocks and
 // 3 clock cycles after it.)
 namespace timing {
+// The prescaler of each accuracy: 500, 250 and 125 kHz at 16 MHz.
+constexpr uint8_t prescaler(uint8_t accuracy) { return static_cast<uint8_t>(32 << accuracy); }
 // ADC clocks of the shortest slot. A trigger that comes before the conversion's end is ignored, and
 // its reading is lost. So a slot leaves the converter 1.5 ADC clocks to spare, at least 45
 // clock cycles. Chosen: tests and `make bench-firmware` let conversions be up to 32 cycles late.
@@ -35,32 +87,47 @@ constexpr uint16_t slot_min(uint8_t prescaler) { return SLOT_ADC_CLOCKS_MIN * pr
 constexpr uint16_t held_cycles(uint8_t prescaler) {
     return static_cast<uint16_t>(11u * prescaler + prescaler / 2);
 }
-// What a slot leaves for settling [us] where a request names neither rate nor settle time: 14 pF of
-// sample capacitor and 100 pF at a node of 30 kOhm then come to half a code. docs/timing.md,
-// "Settle time", has the formula.
-constexpr uint16_t SETTLE_US = 20;
-// The same in mode far [us], where the far node's 100 pF and the line's 30 pF come on top.
-constexpr uint16_t SETTLE_FAR_US = 35;
+// What a slot leaves for settling [us] where a request names neither rate nor settle time, by mode.
+// Near: 14 pF of sample capacitor and 100 pF at a node of 30 kOhm then come to half a code.
+// docs/timing.md, "Settle time", has the formula. Far: the far node's 100 pF and the line's 30 pF
+// come on top. Half and quick: lines that charge through the cells are not seen, and do not cancel,
+// without the other drive; docs/timing.md, "Fewer readings", has the errors by settle time.
+constexpr uint16_t SETTLE_US[] = {20, 35, 20, 20};
+static_assert(sizeof SETTLE_US / sizeof *SETTLE_US == MODES, "one a mode");
 // Clock cycles of the longest slot: timer 1 has 16 bits. Chosen below 65536, because divide()
 // rounds a slot's length up.
 constexpr uint16_t SLOT_CYCLES_MAX = 60000;
+// The main loop feeds the line somewhat slower than the line could go, at most by this part, an
+// eighth: with the shortest slots, interrupts leave it that little time. Chosen: with it, no load
+// of tests/firmware (test_no_load_damages_a_frame) tears a frame.
+constexpr uint8_t LINE_IDLE_PART = 8;
+// Clock cycles of the processor for the interrupt of an idle slot; for a reading besides (taking
+// and packing its code); and for a scan's header and end: at most. Measured: tests/firmware,
+// test_the_rate_that_is_said_is_the_rate_that_comes, fails where they are too small.
+constexpr uint16_t BUSY_A_SLOT = 165, BUSY_A_READING = 240, BUSY_A_SCAN = 5000;
 }  // namespace timing
 
-// The plan for a request, or why there is none. With settle_us 0 the slots fill the period;
-// otherwise they are as short as the settle time allows and the rest of the period is idle. Rate 0:
-// as fast as the settle time allows.
-OHMSKIN_RARE frames::Result plan_scan(const ScanRequest &request, uint32_t clock_hz,
-                                      ScanPlan *plan);
+// The plan for a request, or why there is none; `routes` changes only where there is one. With
+// settle_us 0 the slots fill the period; otherwise they are as short as the settle time allows and
+// the rest of the period is idle. Rate 0: as fast as the settle time allows, and as line and
+// processor keep up. cycles_per_byte: clock cycles in which the line carries a byte. rate_mhz: the
+// rate that is kept; where it is too fast, the fastest that could be; else 0.
+OHMSKIN_RARE frames::Result plan_scan(const ScanRequest &request, uint16_t cycles_per_byte,
+                                      Routes *routes, uint32_t *rate_mhz);
 
-// Readings of a scan.
-inline uint16_t readings_in(uint8_t rows, uint8_t columns) {
-    return static_cast<uint16_t>(rows * columns * frames::READINGS_PER_CELL);
+// The whole skin, in one pattern, as fast as the settle time allows: a scan of the self-test.
+OHMSKIN_RARE Route plan_whole(uint8_t rows, uint8_t columns, uint8_t pattern, uint16_t settle,
+                              uint16_t cycles_per_byte);
+
+// Bytes of a scan frame's payload with so many readings.
+constexpr uint16_t scan_payload(uint16_t readings) {
+    return static_cast<uint16_t>(sizeof(frames::Scan) + (uint32_t{readings} * ADC_BITS + 7) / 8);
 }
 
 // Time that a plan leaves to pins and sample capacitor for settling, at least [us].
-inline uint16_t settle_us(const ScanPlan &plan, uint8_t prescaler, uint32_t clock_hz) {
-    return static_cast<uint16_t>((plan.slot_cycles - timing::held_cycles(prescaler)) /
-                                 static_cast<uint16_t>(clock_hz / 1000000));
+inline uint16_t settle_us(const ScanPlan &plan, uint8_t accuracy) {
+    return static_cast<uint16_t>(
+        (plan.slot_cycles - timing::held_cycles(timing::prescaler(accuracy))) / CYCLES_PER_US);
 }
 
 }  // namespace ohmskin

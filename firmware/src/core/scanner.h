@@ -2,7 +2,7 @@
 #pragma once
 #include <stdint.h>
 
-#include "core/scan_sequence.h"
+#include "core/scan_plan.h"
 
 namespace ohmskin {
 
@@ -18,61 +18,89 @@ namespace ohmskin {
 // beyond the last reading of a scan are idle: they fill up the scan's period. A slot whose
 // conversion is missing, because the converter was late, ends the scan.
 //
-// Codes reach the main loop four at a time, through a queue. The interrupt alone moves write_, the
-// main loop alone moves read_, and an AVR reads and writes such 8-bit indices in one instruction.
-// So the queue needs no lock, and no interrupt is ever held off.
+// Two kinds of scans take turns: those of a region, and whole ones. Between two of different kinds,
+// or where the region changes, there is at least one idle slot, in which step() takes the other
+// kind's steps and slot length. (A slot that gets longer or shorter then is idle, or its reading
+// has been held already; and the slot before the next reading has the new length, so it settles.)
+//
+// Codes reach the main loop four at a time, through a queue. A scan begins a group of its own; its
+// last group may be filled up with old codes. The interrupt alone moves write_, the main loop alone
+// moves read_, and an AVR reads and writes such 8-bit indices in one instruction. So the queue
+// needs no lock, and no interrupt is ever held off. The steps of a new region get to the interrupt
+// in the same way: they are in a bank that it does not use, until it sees change_waits_ and takes
+// them.
 class Scanner {
   public:
-    // Codes of a group. Four codes of 10 bits fill whole bytes, and a scan has as many groups as
-    // there are cells.
-    static constexpr uint8_t GROUP = frames::READINGS_PER_CELL;
-
-    // A queued code is 16 bits: the code, and in the first code of a scan also the scan's number
-    // and a mark. These are the code's bits.
-    static constexpr uint16_t CODE = 0x03FF;
-    // Scans are numbered modulo this: the five bits that are left between the code and the mark.
-    static constexpr uint8_t SCAN_NUMBERS = 32;
-    static_assert(CODE == (1u << frames::ADC_BITS) - 1, "above it: the scan's number, and FIRST");
+    // Codes of a group. Four codes of 10 bits fill whole bytes.
+    static constexpr uint8_t GROUP = 4;
+    // Scans are numbered modulo this, where a group says so: its mark has seven bits for it.
+    static constexpr uint8_t SCAN_NUMBERS = 128;
     // Slots from begin() to that of the first reading: the first step() decides for the slot after
     // next (see the diagram).
     static constexpr uint8_t FIRST_SLOT = 2;
 
-    // To be called while no slots run. pattern: which readings (scan_sequence.h). idle_slots: how
-    // many follow each scan.
-    void begin(uint8_t rows, uint8_t columns, uint8_t pattern, uint16_t idle_slots) {
-        sequence_.begin(rows, columns, pattern);
-        idle_slots_ = idle_slots;
+    // To be called while no slots run.
+    void begin(const Routes &routes) {
+        bank_ = 0;
+        banks_[0].set(routes);
+        whole_lines_.set(routes.whole.rows, routes.whole.columns);
+        turns_.begin();
+        alternates_ = routes.whole_every != 0;
+        begin_scan(banks_[0], alternates_);
         idle_left_ = LEAD_IN;
         idling_ = true;
         kinds_ = 0;
         write_ = read_ = 0;
-        scan_ = 0;
+        begun_ = 0;
+        scans_ = 0;
+        late_codes_ = 0;
         skipping_ = true;
-        stopping_ = parked_ = late_ = false;
+        change_waits_ = stopping_ = parked_ = false;
+        on_time_ = 0;
     }
+    void begin(const Route &only) { begin(Routes{only, only, 0}); }
 
-    // Both once a slot, from the interrupt: first the pins are set to selection(), then step()
-    // takes a code and moves selection() on. converted: whether a conversion has ended since the
-    // interrupt before; if not, `code` is an old one.
+    // Other routes, from the scan after the one in progress on. Not while a change waits.
+    void change(const Routes &routes) {
+        banks_[bank_ ^ 1].set(routes);
+        __atomic_signal_fence(
+            __ATOMIC_SEQ_CST);  // the steps are there before change_waits_ says so
+        change_waits_ = true;
+    }
+    bool change_waits() const { return change_waits_; }
+    // The number of the scan, modulo 256, from which on the last change is in force.
+    uint8_t changed_at() const { return changed_at_; }
+
+    // Once a slot, from the interrupt: first the pins are set to selection(), then step() takes a
+    // code and moves selection() on. converted: 0 if no conversion has ended since the interrupt
+    // before; then `code` is an old one. True where the slot at hand, and those after it, last
+    // slot_cycles() from now on.
     const Selection &selection() const { return sequence_.at(); }
-    void step(uint16_t code, bool converted) {
-        const uint8_t kinds = kinds_;
+    bool step(uint16_t code, uint8_t converted) {
+        uint8_t kinds = kinds_;
         const uint8_t held = kinds & HELD;
         if (held != 0)
             push(code, held, converted);
-        late_ = !converted;
-        kinds_ = static_cast<uint8_t>(kinds << KIND_BITS | next_kind());
+        else
+            write_ = whole_groups(write_);
+        on_time_ = converted;
+        bool other_slots = false;
+        const uint8_t next = next_kind(kinds, &other_slots);
+        kinds = static_cast<uint8_t>(kinds << KIND_BITS);
+        kinds_ = kinds | next;
+        return other_slots;
     }
+    uint16_t slot_cycles() const { return slot_cycles_; }
 
     // ---- main loop's side
     bool has_group() const { return static_cast<uint8_t>((write_ - read_) & QUEUE_MASK) >= GROUP; }
 
-    // The oldest group's codes, until release_group(); to be masked with CODE.
+    // The oldest group's codes, until release_group().
     const uint16_t *group() const { return queue_ + read_; }
-    bool starts_scan() const { return queue_[read_] & FIRST; }
+    bool starts_scan() const { return marks_[read_ / GROUP] != 0; }
     // The number of the scan that this group starts, modulo SCAN_NUMBERS. Where the main loop was
     // so late that the start of a scan was lost, it sees the gap in these numbers.
-    uint8_t scan_number() const { return (queue_[read_] >> frames::ADC_BITS) & (SCAN_NUMBERS - 1); }
+    uint8_t scan_number() const { return marks_[read_ / GROUP] & (SCAN_NUMBERS - 1); }
     void release_group() {
         __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the codes have been read by now
         read_ = static_cast<uint8_t>((read_ + GROUP) & QUEUE_MASK);
@@ -82,9 +110,20 @@ class Scanner {
     // The last scan is over, and every code of it is in the queue.
     bool parked() const { return parked_; }
 
+    // Scans since begin() whose first reading was due, modulo 256.
+    uint8_t scans() const { return scans_; }
+    // Readings since begin() whose conversion ended too late; wraps. The interrupt may change it
+    // between its two bytes, so it is read until it stays.
+    uint16_t late_codes() const {
+        uint16_t seen = late_codes_, again;
+        while ((again = late_codes_) != seen)
+            seen = again;
+        return seen;
+    }
+
   private:
-    // The mark of a scan's first code.
-    static constexpr uint16_t FIRST = 0x8000;
+    // The mark of a group that a scan begins with, beside the scan's number.
+    static constexpr uint8_t FIRST = SCAN_NUMBERS;
     // Codes that the queue holds: whole groups, so that no group wraps. 16 of them are chosen: the
     // main loop may be 15 groups late, 1.8 ms with the shortest slots.
     static constexpr uint8_t QUEUE_SIZE = 16 * GROUP;
@@ -115,30 +154,83 @@ class Scanner {
     static constexpr uint8_t HELD_SHIFT = 2 * KIND_BITS;
     static constexpr uint8_t HELD = 3 << HELD_SHIFT;
 
-    // Moves on to the slot after next, and says what it is for.
-    uint8_t next_kind() {
+    // Both kinds of scans, and when each has its turn. Whole scans have the same lines until
+    // begin().
+    struct Bank {
+        Lines lines;
+        Steps region, whole;
+        uint16_t whole_every;
+        void set(const Routes &routes) {
+            lines.set(routes.region.rows, routes.region.columns);
+            region.set(routes.region);
+            whole.set(routes.whole);
+            whole_every = routes.whole_every;
+        }
+    };
+
+    // Moves on to the slot after next, and says what it is for. kinds: before it.
+    uint8_t next_kind(uint8_t kinds, bool *other_slots) {
         if (idling_)
-            return idle();
+            return idle(kinds, other_slots);
         if (!sequence_.next())
             return READING;
-        if (idle_slots_ == 0 && !stopping_)
-            return STARTS_SCAN;
-        idle_left_ = idle_slots_ ? idle_slots_ : 1;
+        uint16_t idle_slots = idle_slots_;
+        if (idle_slots == 0) {
+            if (!stopping_ && !change_waits_) {
+                begun_++;
+                return STARTS_SCAN;
+            }
+            idle_slots = IDLE_TO_CHANGE;
+        }
+        idle_left_ = idle_slots;
         idling_ = true;
         return IDLE;
     }
 
-    uint8_t idle() {
+    uint8_t idle(uint8_t kinds, bool *other_slots) {
         if (stopping_) {
-            // Not yet, if a slot whose code is still to come is in kinds_. The code of HELD has
-            // just been taken. (Bits 7 and 6 only make it a slot later.)
-            parked_ = (kinds_ & ~HELD) == 0;
+            // Not yet, if a slot whose code is still to come is in kinds_, or one whose code has
+            // just been taken: then its group may have to be ended.
+            parked_ = kinds == 0;
             return IDLE;
         }
-        if (--idle_left_ != 0)
+        const uint16_t left = static_cast<uint16_t>(idle_left_ - 1);
+        idle_left_ = left;
+        if (left != 0)
             return IDLE;
         idling_ = false;
+        if (alternates_ || change_waits_)
+            *other_slots = choose();
+        begun_++;
         return STARTS_SCAN;
+    }
+
+    // Takes the steps of the scan that begins.
+    bool choose() {
+        uint8_t at = bank_;
+        if (change_waits_) {
+            at ^= 1;
+            bank_ = at;
+            turns_.change(banks_[at].whole_every);
+            alternates_ = banks_[at].whole_every != 0;
+            changed_at_ = begun_;
+            __atomic_signal_fence(__ATOMIC_SEQ_CST);  // it is told before the other bank is free
+            change_waits_ = false;
+        }
+        begin_scan(banks_[at], turns_.next_is_whole(banks_[at].whole_every));
+        return true;
+    }
+
+    void begin_scan(const Bank &bank, bool whole) {
+        const Steps &steps = whole ? bank.whole : bank.region;
+        sequence_.begin(whole ? whole_lines_ : bank.lines, steps);
+        idle_slots_ = steps.idle_slots;
+        slot_cycles_ = steps.slot_cycles;
+    }
+
+    // The end of the last group, which counts as full: its scan is over.
+    static uint8_t whole_groups(uint8_t at) {
+        return static_cast<uint8_t>((at + GROUP - 1) & ~(GROUP - 1) & QUEUE_MASK);
     }
 
     // Puts a code into the queue, or leaves the rest of its scan out: where the queue has no room
@@ -146,20 +238,31 @@ class Scanner {
     // never one with a hole. Room is looked for once a group, at its first code.
     //
     // A conversion that ends late gives its code in the next slot's interrupt. If that slot starts
-    // a scan, late_ keeps the code from being taken for the scan's first: that scan is left out,
+    // a scan, on_time_ keeps the code from being taken for the scan's first: that scan is left out,
     // too.
-    void push(uint16_t code, uint8_t held, bool converted) {
-        const uint8_t at = write_;
+    void push(uint16_t code, uint8_t held, uint8_t converted) {
+        uint8_t at = write_;
+        uint8_t mark = 0;
         if (held == STARTS_SCAN << HELD_SHIFT) {
-            code |= FIRST | (scan_++ & (SCAN_NUMBERS - 1)) << frames::ADC_BITS;
-            skipping_ = late_;
+            at = whole_groups(at);
+            write_ = at;
+            mark = scans_;
+            scans_ = static_cast<uint8_t>(mark + 1);
+            mark |= FIRST;
+            skipping_ = !on_time_;
         }
+        const uint8_t of_group = at & (GROUP - 1);
         if (!converted) {
+            late_codes_ = static_cast<uint16_t>(late_codes_ + 1);
             skipping_ = true;
-            write_ = static_cast<uint8_t>(at & ~(GROUP - 1));
-        } else if (!(at & (GROUP - 1)) &&
-                   static_cast<uint8_t>((at + GROUP) & QUEUE_MASK) == read_) {
-            skipping_ = true;
+            write_ = at ^ of_group;
+            return;
+        }
+        if (of_group == 0) {
+            const uint8_t end = static_cast<uint8_t>((at + GROUP) & QUEUE_MASK);
+            if (end == read_)
+                skipping_ = true;
+            marks_[at / GROUP] = mark;
         }
         if (skipping_)
             return;
@@ -169,17 +272,28 @@ class Scanner {
     }
 
     uint16_t queue_[QUEUE_SIZE] = {};  // not volatile: write_ and read_ say who may touch what
+    uint8_t marks_[QUEUE_SIZE / GROUP] = {};  // of each group: FIRST and the scan's number, or 0
+    Lines whole_lines_ = {};
+    Bank banks_[2] = {};  // not volatile: bank_ and change_waits_ say who may
     volatile uint8_t write_ = 0;
     volatile uint8_t read_ = 0;
     volatile bool stopping_ = false;
     volatile bool parked_ = false;
-    bool skipping_ = true;     // codes are left out until the next scan starts
-    bool late_ = false;        // no conversion had ended by the interrupt before
-    bool idling_ = true;       // the slot that selection() is for is idle
-    uint8_t kinds_ = 0;        // of the last slots, see above
-    uint8_t scan_ = 0;         // number of the next scan
-    uint16_t idle_slots_ = 0;  // after each scan
-    uint16_t idle_left_ = 0;   // still to come before the next scan
+    volatile bool change_waits_ = false;
+    volatile uint8_t changed_at_ = 0;
+    uint8_t bank_ = 0;            // whose steps are in force; moved by the interrupt
+    bool skipping_ = false;       // codes are left out until the next scan starts
+    uint8_t on_time_ = 0;         // 0: no conversion had ended by the interrupt before
+    bool alternates_ = false;     // whole scans and those of a region take turns
+    bool idling_ = false;         // the slot that selection() is for is idle
+    uint8_t kinds_ = 0;           // of the last slots, see above
+    uint8_t begun_ = 0;           // number of the next scan to be decided on, modulo 256
+    volatile uint8_t scans_ = 0;  // number of the next scan whose codes come
+    volatile uint16_t late_codes_ = 0;
+    uint16_t idle_slots_ = 0;   // after each scan
+    uint16_t idle_left_ = 0;    // still to come before the next scan
+    uint16_t slot_cycles_ = 0;  // of the slot at hand and those after it
+    Turns turns_;
     ScanSequence sequence_;
 };
 

@@ -6,7 +6,7 @@ namespace ohmskin {
 namespace {
 
 // The largest code.
-constexpr uint16_t FULL_SCALE = (1u << frames::ADC_BITS) - 1;
+constexpr uint16_t FULL_SCALE = (1u << ADC_BITS) - 1;
 // Codes that are surely below and above half of Vdd: 1/16 of the scale apart from it. If the larger
 // reference resistor is a quarter above the smaller one, the half moves by 1/18. Chosen: that is
 // more than resistors of a kit differ, and faults move a node to a rail.
@@ -45,7 +45,7 @@ void SelfTest::begin(const ScanRequest &skin) {
     // pass begins, and takes that of this pass from the sample capacitor bit by bit. After a
     // column's inputs, two readings a group, it has it. Where the skin has one column alone, no
     // other inputs are connected, and none can be left out.
-    ignored_ = skin.columns > 1 ? frames::ROWS_MAX / 2 : 0;
+    ignored_ = skin.columns > 1 ? ROWS_MAX / 2 : 0;
     pattern_ = 0;
     groups_ = 0;
 }
@@ -57,18 +57,18 @@ bool SelfTest::next() {
 }
 
 void SelfTest::take(const uint16_t *codes) {
-    // A group has the two readings of this pass of one cell, and those of the next cell.
-    constexpr uint16_t GROUPS_PER_PASS = frames::ROWS_MAX * frames::COLUMNS_MAX / 2;
+    // All patterns here have two passes. A group has the two readings of this pass of one cell, and
+    // those of the next cell.
+    static_assert(PATTERN_DEFINITIONS[0].per_pass == 2 && PATTERN_DEFINITIONS[0].count == 4, "two");
+    constexpr uint16_t GROUPS_PER_PASS = ROWS_MAX * COLUMNS_MAX / 2;
     const bool second = groups_ >= GROUPS_PER_PASS;
     const uint16_t of_this_pass = second ? groups_ - GROUPS_PER_PASS : groups_;
     groups_++;
     if (pattern_ >= MODES && of_this_pass < ignored_)
         return;
     for (uint8_t n = 0; n < Scanner::GROUP; n++) {
-        const uint8_t of_pass = n & (frames::READINGS_PER_PASS - 1);
-        const uint8_t i =
-            index(reading_of(pattern_, second ? of_pass + frames::READINGS_PER_PASS : of_pass));
-        const uint16_t code = codes[n] & Scanner::CODE;
+        const uint8_t i = index(reading_of(pattern_, (n & 1) + (second ? 2 : 0)));
+        const uint16_t code = codes[n];
         if (code < min_[i])
             min_[i] = code;
         if (code > max_[i])

@@ -20,18 +20,10 @@ namespace ohmskin {
 class SelfTest {
   public:
     OHMSKIN_RARE void begin(const ScanRequest &skin);
-    // Takes all inputs, whatever the skin's size: a wire may be in the wrong one.
-    static ScanRequest request() {
-        return ScanRequest{frames::ROWS_MAX,
-                           frames::COLUMNS_MAX,
-                           0,  // rate: as fast as the settle time allows
-                           SETTLE_US,
-                           static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz),
-                           static_cast<uint8_t>(frames::Mode::Near)};
+    // How the next scan takes all inputs, whatever the skin's size: a wire may be in the wrong one.
+    Route route(uint16_t cycles_per_byte) const {
+        return plan_whole(ROWS_MAX, COLUMNS_MAX, pattern_, SETTLE_US, cycles_per_byte);
     }
-    // Which readings the next scan takes (scan_sequence.h): pattern() goes beyond the request's
-    // mode.
-    uint8_t pattern() const { return pattern_; }
     OHMSKIN_RARE void take(const uint16_t *codes);  // the scan's groups, in order
     OHMSKIN_RARE bool next();                       // to the next scan; false: it was the last one
     OHMSKIN_RARE frames::SelfTestReport report() const;

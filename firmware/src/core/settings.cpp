@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/settings.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "board.h"
@@ -35,8 +36,12 @@ Crc16 crc_of(Record *record, uint8_t size) {
     return crc;
 }
 
+// Older records are read as well, and never written. Each is the beginning of the record of now,
+// with its CRC behind it; but in place of an accuracy, they have the converter's prescaler.
+constexpr uint8_t VERSION_WITHOUT_REGION = 2, VERSION_WITHOUT_MODE = 1;
+
 bool known(uint8_t version) {
-    return version == Record::VERSION || version == Record::VERSION_WITHOUT_MODE;
+    return version >= VERSION_WITHOUT_MODE && version <= Record::VERSION;
 }
 
 // Reads a record; false where its CRC is wrong.
@@ -44,13 +49,27 @@ bool read(uint8_t at, Record *record) {
     uint8_t *bytes = bytes_of(record);
     for (uint8_t i = 0; i < sizeof *record; i++)
         bytes[i] = board::eeprom_read(at + i);
-    // A record without mode is a byte shorter, so its CRC lies where the mode would be.
-    const bool has_mode = at != OLD_AT && record->version != Record::VERSION_WITHOUT_MODE;
-    const uint8_t size = has_mode ? sizeof *record : sizeof *record - 1;
+    const bool has_mode = at != OLD_AT && record->version != VERSION_WITHOUT_MODE;
+    const bool has_region = has_mode && record->version != VERSION_WITHOUT_REGION;
+    const uint8_t size = has_region ? sizeof *record
+                                    : static_cast<uint8_t>(offsetof(Record, row_mask) + CRC_BYTES -
+                                                           (has_mode ? 0 : sizeof record->mode));
     const Crc16 crc = crc_of(record, size);
     const bool sound = bytes[size - 2] == crc.low() && bytes[size - 1] == crc.high();
+    if (has_region)
+        return sound;
+    const uint8_t near = static_cast<uint8_t>(frames::Mode::Near);
     if (!has_mode)
-        record->mode = static_cast<uint8_t>(frames::Mode::Near);
+        record->mode = near;
+    uint8_t accuracy = 0;
+    while (accuracy < static_cast<uint8_t>(frames::Accuracy::Finest) &&
+           record->accuracy != timing::prescaler(accuracy))
+        accuracy++;
+    record->accuracy = accuracy;
+    record->row_mask = (uint32_t{1} << record->rows % 32) - 1;
+    record->column_mask = (uint32_t{1} << record->columns % 32) - 1;
+    record->whole_mode = near;
+    record->whole_every = 0;
     return sound;
 }
 
@@ -86,16 +105,18 @@ bool foreign(uint8_t at) {
 
 }  // namespace
 
-frames::Settings load_settings(Settings *settings) {
+frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte) {
     *settings = DEFAULT_SETTINGS;
     Record record;
     if (read_newest(&record) == NOWHERE && !read(OLD_AT, &record))
         return all_blank() ? frames::Settings::DefaultsBlank : frames::Settings::DefaultsDamaged;
     settings->unit_id = record.unit_id;
-    const ScanRequest request = {record.rows,      record.columns,       record.rate_mhz,
-                                 record.settle_us, record.adc_prescaler, record.mode};
-    ScanPlan plan;
-    if (plan_scan(request, board::CLOCK_HZ, &plan) != frames::Result::Ok)
+    const ScanRequest request = {
+        record.rows,     record.columns,   record.accuracy, record.row_mask,   record.column_mask,
+        record.rate_mhz, record.settle_us, record.mode,     record.whole_mode, record.whole_every};
+    Routes routes;
+    uint32_t rate_mhz;
+    if (plan_scan(request, cycles_per_byte, &routes, &rate_mhz) != frames::Result::Ok)
         return frames::Settings::DefaultsDamaged;
     settings->request = request;
     return frames::Settings::Stored;
@@ -106,9 +127,9 @@ void SettingsWriter::begin(const Settings &settings) {
     const uint8_t newest = read_newest(&last);
     const ScanRequest &scan = settings.request;
     // The sequence and the CRC of the last record, for the comparison below.
-    record_ = {Record::VERSION, last.sequence, settings.unit_id, scan.rows,
-               scan.columns,    scan.rate_mhz, scan.settle_us,   scan.adc_prescaler,
-               scan.mode,       last.crc_low,  last.crc_high};
+    record_ = {Record::VERSION,  last.sequence,   settings.unit_id, scan.rows,    scan.columns,
+               scan.rate_mhz,    scan.settle_us,  scan.accuracy,    scan.mode,    scan.row_mask,
+               scan.column_mask, scan.whole_mode, scan.whole_every, last.crc_low, last.crc_high};
     state_ = State::Writing;
     at_ = newest;
     left_ = 0;

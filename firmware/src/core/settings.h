@@ -18,20 +18,22 @@ constexpr Settings DEFAULT_SETTINGS = {
     0,  // unit id: none yet
     {
         8,
-        8,      // rows and columns. Chosen: the size of skin that docs/ reckons with
-        90000,  // rate [mHz]. Chosen: the fastest round one that leaves 8x8 cells SETTLE_US
+        8,  // rows and columns. Chosen: the size of skin that docs/ reckons with
+        static_cast<uint8_t>(frames::Accuracy::Usual),
+        0xFF,
+        0xFF,   // rows and columns to read: all
+        90000,  // rate [mHz]. Chosen: the fastest round one that leaves 8x8 cells 20 us to settle
         0,      // settle time: as long as the rate allows
-        static_cast<uint8_t>(frames::AdcPrescaler::Clock500khz),
         static_cast<uint8_t>(frames::Mode::Near),
+        static_cast<uint8_t>(frames::Mode::Near),
+        0,  // no whole scans in between: all are whole
     }};
 
 // Settings as the EEPROM holds them. The fields are the record's own, not the protocol's, so that a
 // change of the protocol forgets nothing. A change of the fields needs a new VERSION; `version` and
 // `sequence` stay the first two bytes.
 struct __attribute__((packed)) SettingsRecord {
-    static constexpr uint8_t VERSION = 2;  // of the record's fields
-    // A record of before there were modes. It is still read: the mode is near.
-    static constexpr uint8_t VERSION_WITHOUT_MODE = 1;
+    static constexpr uint8_t VERSION = 3;  // of the record's fields
 
     uint8_t version;
     uint8_t sequence;  // one more than that of the record written before; wraps
@@ -40,16 +42,20 @@ struct __attribute__((packed)) SettingsRecord {
     uint8_t columns;
     uint32_t rate_mhz;
     uint16_t settle_us;
-    uint8_t adc_prescaler;
+    uint8_t accuracy;
     uint8_t mode;
+    uint32_t row_mask;
+    uint32_t column_mask;
+    uint8_t whole_mode;
+    uint16_t whole_every;
     uint8_t crc_low, crc_high;  // over all before
 };
-static_assert(sizeof(SettingsRecord) == 18, "no padding; a change needs a new VERSION");
+static_assert(sizeof(SettingsRecord) == 29, "no padding; a change needs a new VERSION");
 
 // Loads settings from EEPROM. Without a sound record of this version it yields the defaults. Where
-// this firmware cannot make the record's scan, the unit id stays and the scan is the default. The
-// result says which.
-OHMSKIN_RARE frames::Settings load_settings(Settings *settings);
+// this firmware cannot make the record's scan with this line, the unit id stays and the scan is the
+// default. The result says which.
+OHMSKIN_RARE frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte);
 
 // Writes settings to EEPROM one byte at a time without waiting, so that the scan goes on. A reset
 // at any moment leaves the old settings or the new ones.

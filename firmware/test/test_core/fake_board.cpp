@@ -10,11 +10,12 @@ namespace board {
 
 using fake::state;
 
-const frames::Board KIND = frames::Board::Emulated;
-const uint32_t CLOCK_HZ = 16000000;
+const char NAME[frames::NAME_SIZE] = "fake";
+const uint16_t WIRING = 0x1234;
 const uint32_t REF_TOP_OHM = 30000;
 const uint32_t REF_BOTTOM_OHM = 29000;
 Scanner scanner;
+const uint8_t SLOTS_OF_NEW_LENGTH = 2;
 
 void begin() {}
 uint8_t reset_cause() { return static_cast<uint8_t>(frames::ResetCause::External); }
@@ -22,8 +23,8 @@ void keep_alive() {}
 uint32_t now_us() { return state.now_us; }
 void mark_pass(bool) {}
 
-void start_slots(const ScanPlan &plan, uint8_t) {
-    state.plan = plan;
+void start_slots(uint16_t slot_cycles, uint8_t) {
+    state.slot_cycles = slot_cycles;
     state.slots_running = true;
 }
 void stop_slots() { state.slots_running = false; }

@@ -12,7 +12,7 @@ namespace fake {
 struct State {
     uint32_t now_us;
     bool slots_running;
-    ohmskin::ScanPlan plan;
+    uint16_t slot_cycles;
     uint8_t eeprom[96];
     uint16_t eeprom_wear[96];  // writes of each byte
     int eeprom_busy_polls;     // polls until a write is finished

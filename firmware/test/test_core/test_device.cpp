@@ -3,6 +3,7 @@
 #ifndef __AVR_ATmega328P__  // 2 KiB of RAM do not hold the device, its board and its host
 #include "../check.h"
 #include "fake_board.h"
+#include "requests.h"
 
 #include "core/device.h"
 #include "core/frame_writer.h"
@@ -37,7 +38,7 @@ class Host {
         if (size)
             writer.put(payload, size);
         writer.end();
-        uint8_t wire[32], n = 0;
+        uint8_t wire[40], n = 0;
         while (writer.has_byte())
             wire[n++] = writer.next_byte();
         fake::receive(wire, n);
@@ -129,7 +130,7 @@ struct Bench {
             const uint16_t code = result;
             result = code_of(pins);
             pins = board::scanner.selection();
-            board::scanner.step(code, true);
+            board::scanner.step(code, 1);
             host.work(2);
         }
         host.work();
@@ -178,14 +179,17 @@ TEST(boot_sends_hello_with_defaults_from_a_blank_eeprom) {
     CHECK_EQ(90000, hello.rate_asked_mhz);
     CHECK_EQ(689, hello.slot_cycles);
     CHECK_EQ(258 * 689UL, hello.scan_cycles);
-    CHECK_EQ(4, hello.readings_per_cell);
+    CHECK_EQ(0xFF, hello.row_mask);
+    CHECK_EQ(0x1234, hello.wiring);
+    CHECK_BYTES("fake", hello.board, 5);
+    CHECK_EQ(16, hello.rows_max);
     CHECK_EQ(29000, hello.ref_bottom_ohm);
     CHECK(!host.next(&frame));
 }
 
 TEST(mode_far_reads_both_ends_under_one_drive) {
     const char *const orders[] = {"abcd", "aebf"};
-    for (uint8_t mode = 0; mode < MODES; mode++)
+    for (uint8_t mode = 0; mode < 2; mode++)
         for (uint8_t n = 0; n < 4; n++) {
             const char name = orders[mode][n];
             const uint8_t reading = static_cast<uint8_t>(reading_of(mode, n));
@@ -201,38 +205,35 @@ TEST(mode_far_reads_both_ends_under_one_drive) {
 }
 
 TEST(mode_far_leaves_35_us_at_rate_zero) {
-    const uint8_t prescalers[] = {32, 64, 128};
-    for (uint8_t prescaler : prescalers) {
-        ScanPlan plan;
-        const ScanRequest far = {8, 8, 0, 0, prescaler, 1};
-        CHECK_EQ(Result::Ok, plan_scan(far, 16000000, &plan));
-        CHECK_EQ(prescaler * 23 / 2 + 560, plan.slot_cycles);
-        const ScanRequest unknown = {8, 8, 0, 0, prescaler, 2};
-        CHECK_EQ(Result::BadMode, plan_scan(unknown, 16000000, &plan));
+    for (uint8_t accuracy = 0; accuracy < 3; accuracy++) {
+        const ScanPlan plan = plan_of(scan_request(8, 8, 0, 0, accuracy, 1));
+        CHECK_EQ((32 << accuracy) * 23 / 2 + 560, plan.slot_cycles);
+        ScanPlan none;
+        CHECK_EQ(Result::BadMode, plan_of(scan_request(8, 8, 0, 0, accuracy, 4), &none));
     }
 }
 
 TEST(configure_changes_all_or_nothing) {
     Host &host = fresh().host;
-    const frames::Configure good = {4, 6, 120000, 0, 64, 0};
+    const frames::Configure good = scan_request(4, 6, 120000, 0, 1);
     CHECK_EQ(Result::Ok, host.answer_to(Type::Configure, &good, sizeof good));
     const frames::Hello before = host.hello();
     CHECK_EQ(4, before.rows);
     CHECK_EQ(6, before.columns);
-    CHECK_EQ(64, before.adc_prescaler);
+    CHECK_EQ(1, before.accuracy);
     const struct {
         frames::Configure request;
         Result result;
     } bad[] = {
-        {{0, 6, 120000, 0, 64, 0}, Result::BadRows},
-        {{17, 6, 120000, 0, 64, 0}, Result::BadRows},
-        {{4, 0, 120000, 0, 64, 0}, Result::BadColumns},
-        {{4, 17, 120000, 0, 64, 0}, Result::BadColumns},
-        {{4, 6, 999, 0, 64, 0}, Result::BadRate},
-        {{4, 6, 2000001, 0, 64, 0}, Result::BadRate},
-        {{4, 6, 120000, 3001, 64, 0}, Result::BadSettle},
-        {{4, 6, 120000, 0, 31, 0}, Result::BadPrescaler},
-        {{16, 16, 90000, 0, 32, 0}, Result::TooFast},
+        {scan_request(0, 6, 120000, 0, 1), Result::BadRows},
+        {scan_request(17, 6, 120000, 0, 1), Result::BadRows},
+        {scan_request(4, 0, 120000, 0, 1), Result::BadColumns},
+        {scan_request(4, 17, 120000, 0, 1), Result::BadColumns},
+        {scan_request(4, 6, 999, 0, 1), Result::BadRate},
+        {scan_request(4, 6, 50000001, 0, 1), Result::BadRate},
+        {scan_request(4, 6, 120000, 3001, 1), Result::BadSettle},
+        {scan_request(4, 6, 120000, 0, 3), Result::BadAccuracy},
+        {scan_request(16, 16, 90000), Result::TooFast},
     };
     for (const auto &b : bad) {
         CHECK_EQ(b.result, host.answer_to(Type::Configure, &b.request, sizeof b.request));
@@ -250,14 +251,14 @@ TEST(configure_changes_all_or_nothing) {
 
 TEST(a_scan_frame_holds_every_code_in_order) {
     Bench &bench = fresh();
-    const frames::Configure size = {3, 1, 90000, 0, 32, 0};  // 12 codes: 15 bytes
+    const frames::Configure size = scan_request(3, 1, 90000);  // 12 codes: 15 bytes
     CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &size, sizeof size));
     fake::state.now_us = 5000;
     CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
     CHECK(fake::state.slots_running);
     bench.host.rewind();
-    bench.slots(2 + 2 * 12 + fake::state.plan.idle_slots + 1, ramp);
-    const ScanPlan plan = fake::state.plan;
+    bench.slots(2 + 2 * 12 + plan_of(size).idle_slots + 1, ramp);
+    const ScanPlan plan = plan_of(size);
     for (uint8_t scan = 0; scan < 2; scan++) {
         Frame frame;
         if (!CHECK(bench.host.next(&frame)))
@@ -281,7 +282,7 @@ TEST(a_scan_frame_holds_every_code_in_order) {
 
 TEST(stop_is_answered_after_the_last_whole_scan) {
     Bench &bench = fresh();
-    const frames::Configure size = {1, 2, 90000, 0, 32, 0};
+    const frames::Configure size = scan_request(1, 2, 90000);
     bench.host.answer_to(Type::Configure, &size, sizeof size);
     bench.host.answer_to(Type::Start);
     bench.host.rewind();
@@ -305,17 +306,17 @@ TEST(time_stamps_of_small_skins_are_exact_at_any_rate) {
     const uint8_t sizes[][2] = {{1, 1}, {1, 2}, {2, 2}};
     Bench &bench = fresh();
     for (const auto &size : sizes)
-        for (uint32_t rate = 1000; rate <= 2000000; rate = rate * 3 / 2 + 7) {
-            const frames::Configure request = {size[0], size[1], rate, 0, 32, 0};
+        for (uint32_t rate = 1000; rate <= 700000; rate = rate * 3 / 2 + 7) {
+            const frames::Configure request = scan_request(size[0], size[1], rate);
             bench.host.rewind();
             CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &request, sizeof request));
             const uint32_t started_us = fake::state.now_us = rate * 977;  // wraps now and then
             bench.host.answer_to(Type::Start);
-            const ScanPlan plan = fake::state.plan;
-            const uint16_t readings = readings_in(size[0], size[1]);
-            bench.slots(static_cast<uint16_t>(2 + readings + plan.slots_per_scan), ramp);
+            const ScanPlan plan = plan_of(request);
+            const uint16_t readings = static_cast<uint16_t>(4 * size[0] * size[1]);
+            bench.slots(static_cast<uint16_t>(2 + readings + plan.slots()), ramp);
             bench.host.send(Type::Stop);
-            bench.slots(static_cast<uint16_t>(2 * plan.slots_per_scan + 4), ramp);
+            bench.slots(static_cast<uint16_t>(2 * plan.slots() + 4), ramp);
             // The first reading is held in the third slot, and the next scan a period later.
             uint64_t cycles = 2ull * plan.slot_cycles;
             uint8_t scans = 0;
@@ -335,7 +336,7 @@ TEST(time_stamps_of_small_skins_are_exact_at_any_rate) {
 
 TEST(commands_that_would_tear_a_scan_are_refused) {
     Bench &bench = fresh();
-    const frames::Configure size = {1, 1, 90000, 0, 32, 0};
+    const frames::Configure size = scan_request(1, 1, 90000);
     bench.host.answer_to(Type::Configure, &size, sizeof size);
     bench.host.answer_to(Type::Start);
     const frames::SetBaud baud = {frames::BAUD_FAST};
@@ -348,12 +349,12 @@ TEST(commands_that_would_tear_a_scan_are_refused) {
 
 TEST(a_line_that_takes_nothing_drops_whole_scans_and_counts_them) {
     Bench &bench = fresh();
-    const frames::Configure size = {4, 4, 90000, 0, 32, 0};
+    const frames::Configure size = scan_request(4, 4, 90000);
     bench.host.answer_to(Type::Configure, &size, sizeof size);
     bench.host.answer_to(Type::Start);
     bench.host.rewind();
     fake::state.line_stuck = true;
-    const uint16_t slots = 64 + fake::state.plan.idle_slots;
+    const uint16_t slots = 64 + plan_of(size).idle_slots;
     bench.slots(20 * slots, ramp);
     fake::state.line_stuck = false;
     bench.slots(3 * slots, ramp);
@@ -378,7 +379,7 @@ TEST(a_line_that_takes_nothing_drops_whole_scans_and_counts_them) {
 
 TEST(settings_survive_a_restart_and_damage_is_named) {
     Bench &bench = fresh();
-    const frames::Configure size = {5, 7, 60000, 0, 32, 0};
+    const frames::Configure size = scan_request(5, 7, 60000);
     const frames::SetUnitId id = {0xABCD1234};
     bench.host.answer_to(Type::Configure, &size, sizeof size);
     bench.host.answer_to(Type::SetUnitId, &id, sizeof id);
@@ -402,7 +403,7 @@ TEST(settings_survive_a_restart_and_damage_is_named) {
 
 TEST(load_defaults_keeps_the_eeprom) {
     Bench &bench = fresh();
-    const frames::Configure size = {5, 7, 60000, 0, 32, 0};
+    const frames::Configure size = scan_request(5, 7, 60000);
     bench.host.answer_to(Type::Configure, &size, sizeof size);
     bench.host.answer_to(Type::Save);
     CHECK_EQ(Result::Ok, bench.host.answer_to(Type::LoadDefaults));
@@ -483,7 +484,7 @@ TEST(scans_that_never_fit_the_line_are_refused) {
     Bench &bench = fresh();
     // 16x16 in a burst of 27 ms needs 50 kB/s and more ring than there is at half that speed; at
     // 500 kbaud it just fits, and so does everything smaller.
-    const frames::Configure largest = {16, 16, 0, 0, 32, 0};
+    const frames::Configure largest = scan_request(16, 16, 0);
     CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &largest, sizeof largest));
     CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
 }

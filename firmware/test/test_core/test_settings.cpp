@@ -13,15 +13,20 @@ using Source = frames::Settings;
 namespace {
 
 // Nearly every byte differs.
-const Settings ONE = {0x11121314, {1, 2, 0x00015F90, 0x0141, 32, 0}};
-const Settings TWO = {0x21222324, {3, 4, 0x00001203, 0x0242, 64, 1}};
-const Settings THREE = {0x31323334, {5, 6, 0x00001504, 0x0303, 128, 0}};
+const Settings ONE = {0x11121314, {6, 7, 0, 0x05, 0x48, 0x00015F90, 0x0041, 0, 2, 0x0102}};
+const Settings TWO = {0x21222324, {7, 8, 1, 0x62, 0x81, 0x00001203, 0x0142, 1, 3, 0x0304}};
+const Settings THREE = {0x31323334, {8, 6, 2, 0x93, 0x24, 0x00001504, 0x0203, 2, 1, 0x0506}};
 
 // Made with Python's struct and a textbook CRC: version, sequence, settings, CRC.
-const uint8_t RECORD[] = {0x02, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
-                          0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x01, 0xEB, 0x0B};
-const uint8_t OF_LATER_VERSION[] = {0x03, 0x09, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
-                                    0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x01, 0x28, 0x73};
+const uint8_t RECORD[] = {0x03, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60, 0xEA,
+                          0x00, 0x00, 0x14, 0x00, 0x01, 0x03, 0x12, 0x00, 0x00, 0x00,
+                          0x60, 0x00, 0x00, 0x00, 0x02, 0x07, 0x09, 0xA6, 0xA2};
+const uint8_t OF_LATER_VERSION[] = {0x04, 0x09, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60, 0xEA,
+                                    0x00, 0x00, 0x14, 0x00, 0x01, 0x03, 0x12, 0x00, 0x00, 0x00,
+                                    0x60, 0x00, 0x00, 0x00, 0x02, 0x07, 0x09, 0x0F, 0xE3};
+// Of the version before there were regions.
+const uint8_t WITHOUT_REGION[] = {0x02, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
+                                  0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x01, 0xEB, 0x0B};
 // Of the version before there were modes, one after the other.
 const uint8_t WITHOUT_MODE[] = {0x01, 0xC8, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
                                 0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x8F, 0x61};
@@ -30,8 +35,9 @@ const uint8_t EARLIER_WITHOUT_MODE[] = {0x01, 0xC7, 0x74, 0x73, 0x72, 0x71, 0x06
 // With some protocol's layout CRC at its start, and at address 0.
 const uint8_t OLD_RECORD[] = {0xBE, 0xEF, 0x34, 0x12, 0xCD, 0xAB, 0x05, 0x07, 0x60,
                               0xEA, 0x00, 0x00, 0x14, 0x00, 0x40, 0x18, 0x54};
-const Settings RECORDED = {0xABCD1234, {5, 7, 60000, 20, 64, 1}};
-const Settings RECORDED_NEAR = {0xABCD1234, {5, 7, 60000, 20, 64, 0}};
+const Settings RECORDED = {0xABCD1234, {5, 7, 1, 0x12, 0x60, 60000, 20, 3, 2, 0x0907}};
+const Settings RECORDED_FAR = {0xABCD1234, {5, 7, 1, 0x1F, 0x7F, 60000, 20, 1, 0, 0}};
+const Settings RECORDED_NEAR = {0xABCD1234, {5, 7, 1, 0x1F, 0x7F, 60000, 20, 0, 0, 0}};
 // 16x16 at 90 Hz, which does not fit.
 const uint8_t IMPOSSIBLE[] = {0x01, 0x03, 0x4D, 0x00, 0x00, 0x00, 0x10, 0x10, 0x90,
                               0x5F, 0x01, 0x00, 0x00, 0x00, 0x20, 0xB4, 0xB5};
@@ -46,7 +52,7 @@ bool same(const Settings &a, const Settings &b) {
 
 Settings loaded(Source *source = nullptr) {
     Settings settings;
-    const Source from = load_settings(&settings);
+    const Source from = load_settings(&settings, 320);
     if (source)
         *source = from;
     return settings;
@@ -119,7 +125,7 @@ TEST(a_save_cut_at_any_byte_leaves_the_old_settings_or_the_new) {
                 static uint8_t left[sizeof fake::state.eeprom];
                 memcpy(left, fake::state.eeprom, sizeof left);
                 const Settings &next = start & 1 ? ONE : TWO;
-                for (uint8_t again = 1; again < 19; again++) {
+                for (uint8_t again = 1; again < 30; again++) {
                     memcpy(fake::state.eeprom, left, sizeof left);
                     const bool next_done = save_cut(next, again);
                     const Settings last = loaded();
@@ -137,6 +143,20 @@ TEST(a_record_is_read_whatever_the_protocol_has_become) {
     Source source;
     CHECK(same(RECORDED, loaded(&source)));
     CHECK_EQ(Source::Stored, source);
+}
+
+TEST(a_record_without_region_is_of_the_whole_skin) {
+    const uint8_t places[] = {32, 64};
+    for (uint8_t at : places) {
+        fake::reset();
+        put(at, WITHOUT_REGION);
+        Source source;
+        CHECK(same(RECORDED_FAR, loaded(&source)));
+        CHECK_EQ(Source::Stored, source);
+        CHECK_EQ(State::Done, save(RECORDED));
+        CHECK(same(RECORDED, loaded()));
+        CHECK_BYTES(WITHOUT_REGION, fake::state.eeprom + at, sizeof WITHOUT_REGION);
+    }
 }
 
 TEST(a_record_without_mode_is_of_mode_near_until_another_is_saved) {

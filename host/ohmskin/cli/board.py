@@ -131,7 +131,7 @@ def _board_in_words(board: Hello) -> dict[str, str]:
         "mode": f"{board.mode}: readings {' '.join(MODES[board.mode])} of each cell",
         "rate": f"{board.rate_hz:.2f} Hz (asked: {rate})",
         "settle time": f"{board.settle_us} us or more (asked: {settle})",
-        "converter": f"{board.adc_bits} bits, {board.adc_prescaler}",
+        "converter": f"{board.adc_bits} bits, {board.accuracy}",
         "references": f"{board.ref_top_ohm} Ohm top, {board.ref_bottom_ohm} Ohm bottom",
         "line": f"{board.baud} baud",
         "settings": ENUMS["settings"].docs.get(board.settings, board.settings),
@@ -147,8 +147,8 @@ def configure(
     settle_us: Annotated[
         int | None, Option("--settle", help="least settle time in us; 0: as long as the rate lets")
     ] = None,
-    adc_prescaler: Annotated[
-        str | None, Option("--adc", help=" | ".join(ENUMS["adc_prescaler"].values))
+    accuracy: Annotated[
+        str | None, Option("--adc", help=" | ".join(ENUMS["accuracy"].values))
     ] = None,
     mode: Annotated[str | None, Option(help=" | ".join(MODES))] = None,
     unit_id: Annotated[int | None, Option(help="name this skin")] = None,
@@ -164,7 +164,7 @@ def configure(
             columns=columns,
             rate_hz=rate_hz,
             settle_us=settle_us,
-            adc_prescaler=adc_prescaler,
+            accuracy=accuracy,
             mode=mode,
         )
         if unit_id is not None:

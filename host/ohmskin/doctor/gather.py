@@ -15,8 +15,8 @@ from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, NOISE_S, REST_S, SETTLED_S
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
-from ohmskin.link.device import Device, configuration, scans_for
-from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.device import Device, scans_for
+from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import ENUMS
 from ohmskin.link.serial_port import latency_timer
 
@@ -86,10 +86,10 @@ def gather(
                 report(Step.LONGER_SETTLING, None)
                 far = evidence.board.mode == "far"
                 evidence.settled = _look(device, FAR_S if far else SETTLED_S, settling)
-            for clock in ENUMS["adc_prescaler"].values if clocks else ():
+            for clock in ENUMS["accuracy"].values if clocks else ():
                 report(Step.ADC_CLOCK, clock)
                 # As fast as it can: a slow clock does not reach the rate of the board.
-                settings = {"adc_prescaler": clock, "rate_hz": 0}
+                settings = {"accuracy": clock, "rate_hz": 0}
                 evidence.clocks.append(_look(device, NOISE_S, settings))
         if presses is not None:
             evidence.presses = presses
@@ -101,8 +101,10 @@ def gather(
             if presses.done and settling is not None:
                 report(Step.PRESSED_SETTLING, None)
                 with suppress(CommandRefused), put_back(device):
-                    for settings in TURNS * (_settings(board), settling):
-                        evidence.pressed.append(_look(device, TURN_S, settings))
+                    rate_hz, settle_us = board.rate_asked_mhz / 1000, board.settle_asked_us
+                    usual = {"rate_hz": rate_hz, "settle_us": settle_us}
+                    for turn in TURNS * (usual, settling):
+                        evidence.pressed.append(_look(device, TURN_S, turn))
     except RecordingEnded:
         pass  # all of the recording was read
     except DeviceLost as exc:
@@ -130,21 +132,14 @@ def put_back(device: Device) -> Iterator[None]:
 
     A board that is lost cannot be put back. This raises nothing: who reads it next gets an error.
     """
-    settings = _settings(device.info)
+    before = device.info
     device.stop()
     try:
         yield
     finally:
         with suppress(DeviceLost):
             device.stop()
-            device.configure(**settings)
-
-
-def _settings(board: Hello) -> dict[str, Any]:
-    """What `Device.configure` must be given for a board to scan as this one does."""
-    settings: dict[str, Any] = configuration(board)
-    settings["rate_hz"] = settings.pop("rate_mhz") / 1000
-    return settings
+            device.configure_as(before)
 
 
 def _look(device: Device, seconds: float, settings: dict[str, Any]) -> Look | None:

@@ -146,7 +146,7 @@ class PlateExam:
                 lit = np.abs(look.mean - FULL_LSB / 2) < FULL_LSB / 2 - self.tolerance.offset_lsb
                 variance = noise_variance(look.codes)[lit]
                 noise_lsb = float(np.mean(variance)) ** 0.5 if lit.any() else 0.0
-                self.noise_lsb.setdefault(look.board.adc_prescaler, noise_lsb)
+                self.noise_lsb.setdefault(look.board.accuracy, noise_lsb)
         most_lsb = self.tolerance.noise_lsb
         loud = {clock: lsb for clock, lsb in self.noise_lsb.items() if lsb > most_lsb}
         if loud:

@@ -390,7 +390,7 @@ def second_look(board: Hello) -> dict[str, Any] | None:
     one, at which no mains is seen at almost 0 Hz. So it also shows a hum that the first look cannot
     show. If no longer settle time is possible, and no hum was hidden, it would show nothing new.
     """
-    readings = board.rows * board.columns * board.readings_per_cell
+    readings = board.readings
     # A longer settle time makes slots longer, and so scans slower: this much is left for it.
     spare_us = 1e6 / (readings * min(board.rate_hz, LEAST_LOOK_HZ)) - 1e6 * slot_s(board)
     most_us = min(CONSTANTS["settle_us_max"], int(board.settle_us + spare_us))

@@ -29,7 +29,7 @@ from ohmskin.link import framing, protocol
 from ohmskin.link.codes import quantise
 from ohmskin.version import VERSION
 
-# Readings of the skin: (time since the board was switched on [s], mode) -> (rows, columns, 4).
+# Readings of the skin: (time since the board was switched on [s], mode) -> (rows, columns, n).
 RatioAt = Callable[[float, str], Float]
 # What the converter makes of them: (readings, start of the scan [s], slot [s], settle time [s],
 # mode) -> readings. A scan takes one reading a slot, each that settle time after the pins changed.
@@ -54,16 +54,28 @@ SLOT_ADC_CLOCKS_MIN: Final = 15
 HELD_ADC_CLOCKS: Final = 11.5
 # A slot leaves this time for settling [us] if neither rate nor settle time is asked for, by mode
 # (scan_plan.h).
-SETTLE_US: Final = {"near": 20, "far": 35}
+SETTLE_US: Final = dict(zip(protocol.MODES, (20, 35, 20, 20), strict=True))
+# What the processor needs for a slot, for a reading besides, and for a scan [cycles] (scan_plan.h).
+BUSY_A_SLOT, BUSY_A_READING, BUSY_A_SCAN = 165, 240, 5000
+# The line is fed so much slower than it could go, an eighth (scan_plan.h).
+LINE_IDLE_PART: Final = 8
+# Slots that are idle between scans of two kinds, at least (scan_plan.h).
+IDLE_TO_CHANGE: Final = 3
+# Rows and columns that the multiplexers have (scan_sequence.h).
+LINES_MAX: Final = 16
+# A byte takes so many bits on the line, 8N1.
+_BITS_PER_BYTE: Final = 10
 # The pins change at most this time after the hold of a reading [cycles] (docs/timing.md).
 SELECT_CYCLES: Final = 120
 
 _CONSTANTS: Final = protocol.CONSTANTS
-_PRESCALERS: Final = protocol.ENUMS["adc_prescaler"].values
+# Clock cycles of an ADC clock, by accuracy (scan_plan.h).
+_PRESCALERS: Final = {name: 32 << n for name, n in protocol.ENUMS["accuracy"].values.items()}
 _REASONS: Final = protocol.ENUMS["result"].docs
 _SCAN: Final = protocol.FRAMES["scan"]
 # Settings that hello says by the same name.
-_OF_HELLO: Final = ("unit_id", "rows", "columns", "mode", "adc_prescaler")
+_ASKED: Final = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
+_OF_HELLO: Final = ("unit_id", *(f.name for f in protocol.FRAMES["configure"].fields))
 
 
 @dataclass(frozen=True)
@@ -84,7 +96,7 @@ class BoardSettings:
 
 
 class EmulatedBoard:
-    """A board whose skin reads `ratio_at(seconds, mode)`, shape (rows, columns, 4).
+    """A board whose skin reads `ratio_at(seconds, mode)`, shape (rows, columns, readings).
 
     settings: those of the start. The skin keeps their rows and columns, whatever a host configures.
     noise_lsb: standard deviation of the converter's noise, before rounding [LSB].
@@ -130,10 +142,14 @@ class EmulatedBoard:
         self._settings_source = "stored" if self._stored else "defaults_blank"
         self._reset_cause = cause
         self.boot_s = self.now_s
-        self._plan = _scan_plan(self.settings)
         self._baud = _CONSTANTS["baud_default"]
+        self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
         self._sequence = 0
+        self._rate_mhz = 0  # for the answer to the command at hand
         self._scan = 0
+        self._first = 0  # of the scans whose length is that of the one in progress
+        self._whole = False
+        self._until_whole = 0  # scans
         self._started_s: float | None = None
         self._out = bytearray()
         self._send_hello()
@@ -143,11 +159,16 @@ class EmulatedBoard:
         """When the scan in progress ends [s]; None if there is none."""
         if self._started_s is None:
             return None
-        return self._started_s + (self._scan + 1) * self._period_s
+        return self._started_s + (self._scan - self._first + 1) * self._period_s
 
     @property
     def _period_s(self) -> float:
-        return self._plan["scan_cycles"] / CLOCK_HZ
+        return self._plan.cycles / CLOCK_HZ
+
+    @property
+    def _plan(self) -> "ScanPlan":
+        """That of the scan in progress."""
+        return self._plans[self._whole]
 
     def advance(self, now_s: float) -> bytes:
         """Let time pass until `now_s`. Returns what the board has sent since the last call."""
@@ -165,14 +186,14 @@ class EmulatedBoard:
         return faults.apply(self.advance(now_s), now_s)
 
     def codes_at(self, time_s: float, mode: str = "") -> NDArray[np.uint16]:
-        """Codes of a scan, shape (rows, columns, 4); lines beyond the skin are open."""
+        """Codes of a scan, shape (rows, columns, readings); lines beyond the skin are open."""
         rows, columns = self.settings["rows"], self.settings["columns"]
-        mode = mode or self.settings["mode"]
+        mode = mode or self._plan.mode
         ratio = np.tile([float(n in "aceg") for n in protocol.MODES[mode]], (rows, columns, 1))
         have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
         ratio[: have[0], : have[1]] = self._ratio_at(time_s, mode)[: have[0], : have[1]]
         if self._sampled is not None:
-            slot_s = self._plan["slot_cycles"] / CLOCK_HZ
+            slot_s = self._plan.slot_cycles / CLOCK_HZ
             ratio = self._sampled(ratio, time_s, slot_s, slot_s - SELECT_CYCLES / CLOCK_HZ, mode)
         if self._noise_ratio:
             ratio += self._noise_ratio * self._random.standard_normal(ratio.shape)
@@ -182,13 +203,16 @@ class EmulatedBoard:
         """Take bytes from the host."""
         for raw in self._decoder.feed(octets):
             frame = protocol.FRAMES_BY_ID.get(raw.type)
+            self._rate_mhz = 0
             if frame is None or frame.sender != "host":
                 result = "unknown_command"
             elif len(raw.payload) != frame.struct.size:
                 result = "bad_length"
             else:
                 result = self._execute(frame.name, frame.unpack(raw.payload))
-            self._send("ack", command=raw.type, command_sequence=raw.sequence, result=result)
+            which = {"command": raw.type, "command_sequence": raw.sequence}
+            told = {"time_us": self._time_us(self.now_s), "rate_mhz": self._rate_mhz}
+            self._send("ack", **which, **told, result=result)
 
     def _execute(self, name: str, values: dict[str, Any]) -> str:
         scanning = self._started_s is not None
@@ -197,14 +221,12 @@ class EmulatedBoard:
         match name:
             case "get_hello":
                 self._send_hello()
-            case "configure":
-                try:
-                    self._plan = _scan_plan(values)
-                except _Refused as refusal:
-                    return str(refusal)
-                self.settings.update(values)
+            case "configure" | "set_region":
+                return self._configure(self.settings | values)
             case "start" if not scanning:
-                self._started_s, self._scan = self.now_s, 0
+                self._started_s, self._scan, self._first = self.now_s, 0, 0
+                self._until_whole = 0
+                self._take_turn()
                 self.on_start(self.now_s)
             case "stop" if scanning:
                 self._started_s = None
@@ -214,7 +236,7 @@ class EmulatedBoard:
                 self._stored = dict(self.settings)
             case "load_defaults":
                 self.settings = dict(self._defaults)
-                self._plan = _scan_plan(self.settings)
+                self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
             case "self_test":
                 self._send_self_test_report()
             case "set_baud":
@@ -223,13 +245,41 @@ class EmulatedBoard:
                 self._baud = values["baud"]
         return "ok"
 
+    def _configure(self, wanted: dict[str, Any]) -> str:
+        """Take what is wanted, from the next scan on; or say why not, and change nothing."""
+        try:
+            self._next_plans = _scan_plans(wanted, self._baud)
+        except _Refused as refusal:
+            self._rate_mhz = refusal.rate_mhz
+            return refusal.result
+        self.settings = wanted
+        self._rate_mhz = _rate_mhz(self._next_plans[0].cycles)
+        if self._started_s is None:
+            self._plans = self._next_plans
+        return "ok"
+
+    def _take_turn(self) -> None:
+        """Decide on the scan that begins: of the region, or a whole one in between."""
+        before, self._plans = self._plan, self._next_plans
+        every = self.settings["whole_every"]
+        self._until_whole = min(self._until_whole, max(every - 1, 0))
+        self._whole = every > 0 and self._until_whole == 0
+        self._until_whole = every - 1 if self._whole else max(self._until_whole - 1, 0)
+        if self._plan.cycles != before.cycles and self._started_s is not None:
+            # Scans of one length are counted from their first one, so that errors do not add up.
+            self._started_s += (self._scan - self._first) * before.cycles / CLOCK_HZ
+            self._first = self._scan
+
+    def _time_us(self, time_s: float) -> int:
+        return round((time_s - self.boot_s) * 1e6) % _SCAN.span("time_us")
+
     def _send_self_test_report(self) -> None:
         """Say the least and the largest code of each reading, over all cells."""
         # As the firmware says a reading that it has not taken: the least is above the largest.
         not_taken = ((1 << protocol.ADC_BITS) - 1, 0)
         bounds = dict.fromkeys(protocol.ENUMS["reading"].values, not_taken)
         for mode in ("near", self.settings["mode"]):
-            codes = self.codes_at(self.now_s, mode).reshape(-1, protocol.READINGS_PER_CELL)
+            codes = self.codes_at(self.now_s, mode).reshape(-1, len(protocol.MODES[mode]))
             of_mode = zip(codes.min(0).tolist(), codes.max(0).tolist(), strict=True)
             bounds.update(zip(protocol.MODES[mode], of_mode, strict=True))
         least, largest = zip(*bounds.values(), strict=True)
@@ -241,91 +291,171 @@ class EmulatedBoard:
         self._sequence += 1
 
     def _send_scan(self, start_s: float) -> None:
+        plan = self._plan
+        lines = protocol.lines_of(plan.row_mask), protocol.lines_of(plan.column_mask)
         codes = self.codes_at(start_s)
         self._send(
             "scan",
-            protocol.pack_codes(codes),
+            protocol.pack_codes(codes[np.ix_(*lines)], protocol.PER_PASS[plan.mode]),
             scan=self._scan % _SCAN.span("scan"),
-            time_us=round((start_s - self.boot_s) * 1e6) % _SCAN.span("time_us"),
+            time_us=self._time_us(start_s),
             dropped=0,
             rx_errors=self._decoder.stats.damaged % _SCAN.span("rx_errors"),
             rows=codes.shape[0],
             columns=codes.shape[1],
-            mode=self.settings["mode"],
+            mode=plan.mode,
+            adc_bits=protocol.ADC_BITS,
+            row_mask=plan.row_mask,
+            column_mask=plan.column_mask,
+            slot_cycles=plan.slot_cycles,
         )
         self._scan += 1
+        self._take_turn()
 
     def _send_hello(self) -> None:
+        region, whole = self._next_plans
         truth: dict[str, protocol.Value] = {
-            **{name: self.settings[name] for name in _OF_HELLO},
-            **self._plan,
+            **{name: self.settings[name] for name in _OF_HELLO if name not in _ASKED},
+            **{said: self.settings[name] for name, said in _ASKED.items()},
             **_VERSION,
             "layout_crc": protocol.LAYOUT_CRC,
             "board": "emulated",
-            "readings_per_cell": protocol.READINGS_PER_CELL,
+            "wiring": 0,
+            "rows_max": LINES_MAX,
+            "columns_max": LINES_MAX,
             "adc_bits": protocol.ADC_BITS,
             "ref_top_ohm": round(DEFAULT_REF_OHM),
             "ref_bottom_ohm": round(DEFAULT_REF_OHM),
-            "rate_asked_mhz": self.settings["rate_mhz"],
+            "scan_cycles": region.cycles,
+            "slot_cycles": region.slot_cycles,
+            "settle_us": region.settle_us,
+            "whole_scan_cycles": whole.cycles if self.settings["whole_every"] else 0,
             "clock_hz": CLOCK_HZ,
-            "settle_asked_us": self.settings["settle_us"],
             "baud": self._baud,
             "settings": self._settings_source,
             "reset_cause": (self._reset_cause,),
             "scanning": int(self._started_s is not None),
+            "dropped": 0,
+            "late": 0,
         }
         self._send("hello", **(truth | self.says))
 
 
 class _Refused(Exception):
-    """Carries the name of a `result`."""
+    """Carries the name of a `result`, and the rate that could be kept [mHz]; 0: none is known."""
+
+    def __init__(self, result: str, rate_mhz: int = 0) -> None:
+        super().__init__(result)
+        self.result, self.rate_mhz = result, rate_mhz
 
 
 def _defaults(settings: BoardSettings) -> dict[str, Any]:
     """The fields of `configure` and `set_unit_id` of a board that nobody has configured."""
     rate_hz = DEFAULT_RATE_HZ if settings.rate_hz is None else settings.rate_hz
-    pace = {"rate_mhz": protocol.rate_mhz(rate_hz), "settle_us": 0, "adc_prescaler": "clock_500khz"}
-    defaults = {n: value for n, value in asdict(settings).items() if n != "rate_hz"} | pace
+    pace = {"rate_mhz": protocol.rate_mhz(rate_hz), "settle_us": 0, "accuracy": "usual"}
+    whole = {"whole_mode": "near", "whole_every": 0}
+    masks = {
+        "row_mask": protocol.all_lines(settings.rows),
+        "column_mask": protocol.all_lines(settings.columns),
+    }
+    defaults = {n: v for n, v in asdict(settings).items() if n != "rate_hz"} | pace | whole | masks
+    baud = _CONSTANTS["baud_default"]
     try:
-        _scan_plan(defaults)
+        _scan_plans(defaults, baud)
     except _Refused as refusal:
-        if settings.rate_hz is not None or str(refusal) != "too_fast":
-            raise ValueError(f"{refusal}: {_REASONS[str(refusal)]}") from None
+        if settings.rate_hz is not None or refusal.result not in ("too_fast", "line_too_slow"):
+            reason = _REASONS[refusal.result]
+            raise ValueError(f"{refusal.result}: {reason}") from None
         defaults["rate_mhz"] = 0
     return defaults
 
 
-def _scan_plan(wanted: dict[str, Any]) -> dict[str, int]:
-    """How the firmware would scan: `scan_cycles`, `slot_cycles` and `settle_us` of `hello`.
+@dataclass(frozen=True)
+class ScanPlan:
+    """One kind of scan: the lines and readings of it, and its times.
+
+    row_mask, column_mask: the lines. mode: the readings of each cell.
+    cycles: clock cycles from its start to that of the next scan.
+    slot_cycles: clock cycles of a reading. settle_us: what these leave for settling, at least [us].
+    """
+
+    row_mask: int
+    column_mask: int
+    mode: str
+    cycles: int
+    slot_cycles: int
+    settle_us: int
+
+
+def _rate_mhz(cycles: int) -> int:
+    return round(1000 * CLOCK_HZ / cycles)
+
+
+def _scan_plans(wanted: dict[str, Any], baud: int) -> tuple[ScanPlan, ScanPlan]:
+    """How the firmware would scan: a region, and whole scans in between.
 
     It is core/scan_plan.cpp without the search for the number of slots that keeps the rate best.
     """
-    rate, settle = wanted["rate_mhz"], wanted["settle_us"]
+    _check_limits(wanted)
+    whole = {
+        "row_mask": protocol.all_lines(wanted["rows"]),
+        "column_mask": protocol.all_lines(wanted["columns"]),
+        "mode": wanted["whole_mode"],
+        "rate_mhz": 0,
+        "settle_us": 0,
+    }
+    return _scan_plan(wanted, baud), _scan_plan(wanted | whole, baud)
+
+
+def _check_limits(wanted: dict[str, Any]) -> None:
+    rate = wanted["rate_mhz"]
     limits = {
-        "bad_rows": 1 <= wanted["rows"] <= _CONSTANTS["rows_max"],
-        "bad_columns": 1 <= wanted["columns"] <= _CONSTANTS["columns_max"],
+        "bad_rows": 1 <= wanted["rows"] <= LINES_MAX
+        and 0 < wanted["row_mask"] <= protocol.all_lines(wanted["rows"]),
+        "bad_columns": 1 <= wanted["columns"] <= LINES_MAX
+        and 0 < wanted["column_mask"] <= protocol.all_lines(wanted["columns"]),
         "bad_rate": not rate or _CONSTANTS["rate_mhz_min"] <= rate <= _CONSTANTS["rate_mhz_max"],
-        "bad_settle": settle <= _CONSTANTS["settle_us_max"],
-        "bad_prescaler": wanted["adc_prescaler"] in _PRESCALERS,
-        "bad_mode": wanted["mode"] in protocol.MODES,
+        "bad_settle": wanted["settle_us"] <= _CONSTANTS["settle_us_max"],
+        "bad_accuracy": wanted["accuracy"] in _PRESCALERS,
+        "bad_mode": {wanted["mode"], wanted["whole_mode"]} <= protocol.MODES.keys(),
     }
     for result, kept in limits.items():
         if not kept:
             raise _Refused(result)
-    prescaler = _PRESCALERS[wanted["adc_prescaler"]]
-    readings = wanted["rows"] * wanted["columns"] * protocol.READINGS_PER_CELL
+
+
+def _scan_plan(wanted: dict[str, Any], baud: int) -> ScanPlan:
+    """One kind of scan. Raises _Refused if it is too fast."""
+    masks, mode = (wanted["row_mask"], wanted["column_mask"]), wanted["mode"]
+    prescaler = _PRESCALERS[wanted["accuracy"]]
+    readings = math.prod(mask.bit_count() for mask in masks) * len(protocol.MODES[mode])
+    least = readings + IDLE_TO_CHANGE * (wanted["whole_every"] > 0)  # slots
+    rate, settle = wanted["rate_mhz"], wanted["settle_us"]
     slot, held = SLOT_ADC_CLOCKS_MIN * prescaler, int(HELD_ADC_CLOCKS * prescaler)
     if settle or not rate:
-        slot = max(slot, (settle or SETTLE_US[wanted["mode"]]) * CLOCK_HZ // 1_000_000 + held)
+        slot = max(slot, (settle or SETTLE_US[mode]) * CLOCK_HZ // 1_000_000 + held)
+    by_line = _line_cycles(readings, baud)
+    busy = BUSY_A_SCAN + BUSY_A_READING * readings
+    slots_busy = least if rate and not settle else busy // (slot - BUSY_A_SLOT)
+    fastest = max(slot * least, busy + BUSY_A_SLOT * slots_busy)
+    result = "line_too_slow" if by_line > fastest else "too_fast"
+    fastest = max(fastest, by_line)
     if not rate:
-        shortest = CLOCK_HZ * 1000 / _CONSTANTS["rate_mhz_max"]
-        period = slot * max(readings, math.ceil(shortest / slot))
+        period = slot * -(-fastest // slot)
     else:
         period = round(CLOCK_HZ * 1000 / rate)
-        if period < slot * readings:
-            raise _Refused("too_fast")
+        if period < fastest:
+            raise _Refused(result, 1000 * CLOCK_HZ // fastest)
         # Equal slots fill the period: as short as the settle time lets them be, or long ones.
-        slots = period // slot if settle else max(readings, -(-period // SLOT_CYCLES_MAX))
+        slots = period // slot if settle else max(least, -(-period // SLOT_CYCLES_MAX))
         slot = period // slots
-    settle_us = (slot - held) * 1_000_000 // CLOCK_HZ
-    return {"scan_cycles": period, "slot_cycles": slot, "settle_us": settle_us}
+    return ScanPlan(*masks, mode, period, slot, (slot - held) * 1_000_000 // CLOCK_HZ)
+
+
+def _line_cycles(readings: int, baud: int) -> int:
+    """Clock cycles in which the line carries a scan."""
+    content = _SCAN.struct.size + protocol.codes_size(readings)
+    # As core/frame_writer.h counts: type, sequence, CRC and delimiters, and the blocks of COBS.
+    octets = content + 6 + 1 + (content + 6) // (framing.MAX_BLOCK_BYTES - 1)
+    cycles = octets * (CLOCK_HZ // baud * _BITS_PER_BYTE)
+    return cycles + cycles // (LINE_IDLE_PART - 1)

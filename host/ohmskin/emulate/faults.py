@@ -31,7 +31,7 @@ from ohmskin.circuit.skin import (
     leak_admittance,
     readings,
 )
-from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, from_scan_order, in_scan_order
+from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, PER_PASS, from_scan_order, in_scan_order
 
 # An open wire, and a cell without contact, have this resistance [ohm]. Chosen: a million times that
 # of a cell at rest, so that no code shows its current; a number at all, so that the network of
@@ -238,11 +238,12 @@ class SkinFaults:
         reaches v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau). The scan before this one is taken
         to be equal. Hum adds hum_lsb sin(2 pi hum t) at the reading's own time t.
         """
-        read = in_scan_order(ratio)
+        per_pass = PER_PASS[mode]
+        read = in_scan_order(ratio, per_pass)
         if self.tau_us:
             kept = float(np.exp(-settle_s / (1e-6 * self.tau_us)))
             names = MODES[mode]
-            which = in_scan_order(np.broadcast_to(np.arange(len(names)), ratio.shape))
+            which = in_scan_order(np.broadcast_to(np.arange(len(names)), ratio.shape), per_pass)
             for k, name in enumerate(names):
                 node = next(node for node in _NODES if name in node)
                 # The drive of each slot sets the node, whichever node is read in it.
@@ -252,7 +253,7 @@ class SkinFaults:
         if self.hum:
             time_s = start_s + slot_s * np.arange(len(read))
             read = read + self.hum_lsb / 2**ADC_BITS * np.sin(2 * np.pi * self.hum * time_s)
-        return from_scan_order(read, *ratio.shape[:2])
+        return from_scan_order(read, ratio.shape, per_pass)
 
 
 SKIN_FAULTS: Final = {name: text for name, (_, text) in _options(SkinFaults).items()}

@@ -14,14 +14,14 @@ import numpy as np
 
 from ohmskin.circuit.plate import load_plate
 from ohmskin.circuit.skin import Skin
-from ohmskin.emulate.board import BoardSettings, EmulatedBoard
+from ohmskin.emulate.board import LINES_MAX, BoardSettings, EmulatedBoard
 from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS, LineFaults, SkinFaults, faults_of
 from ohmskin.emulate.scale import DEFAULTS, SCALE_OPTIONS, EmulatedScale
 from ohmskin.emulate.scenes import LEAD_OHM, Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
-from ohmskin.link.protocol import CONSTANTS, LAYOUT_CRC
+from ohmskin.link.protocol import LAYOUT_CRC
 from ohmskin.link.session import Session
 from ohmskin.link.url import PortUrl
 
@@ -132,9 +132,8 @@ def _scene(url: PortUrl, size: str, faults: SkinFaults | None = None) -> Scene:
     """The scene that a URL asks for, on a skin of a size as "8x8". Raises ValueError as `Scene`."""
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", size)
     rows, columns = map(int, match.groups()) if match else (0, 0)
-    most_rows, most_columns = CONSTANTS["rows_max"], CONSTANTS["columns_max"]
-    if not (1 <= rows <= most_rows and 1 <= columns <= most_columns):
-        raise ValueError(f"a size is as 8x8, from 1x1 to {most_rows}x{most_columns}, not '{size}'")
+    if not (1 <= rows <= LINES_MAX and 1 <= columns <= LINES_MAX):
+        raise ValueError(f"a size is as 8x8, from 1x1 to {LINES_MAX}x{LINES_MAX}, not '{size}'")
     name, begin_s = url.options.get("scene", "rest"), url.number_if_given("begin")
     seed = url.number("seed", 0)
     scene = Scene(name, rows, columns, seed=seed, faults=faults, begin_s=begin_s)

@@ -75,9 +75,14 @@ def slot_s(board: Hello) -> float:
     return board.slot_cycles / board.clock_hz
 
 
-def scan_s(board: Hello) -> float:
-    """Time from a scan's first reading to its end [s]; idle slots come after that."""
-    return board.rows * board.columns * board.readings_per_cell * slot_s(board)
+def scan_s(board: Hello, scan: Scan | None = None) -> float:
+    """Time from a scan's first reading to its end [s]; idle slots come after that.
+
+    scan: the one that is meant, which may be of a part of the skin; None: one as `board` says.
+    """
+    if scan is None:
+        return board.readings * slot_s(board)
+    return scan.codes_read.size * (scan.slot_cycles or board.slot_cycles) / board.clock_hz
 
 
 def line_delay_s(scan: Scan, board: Hello) -> float:
@@ -96,14 +101,14 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     """
     if board.board == "emulated":
         # An emulated board sends a whole scan at the end of its period.
-        return 1 / board.rate_hz - scan_s(board)
+        return 1 / board.rate_hz - scan_s(board, scan)
     # Any counters will do: zeros among them end blocks that are known before the scan ends.
     header = b"\x01" * (2 + protocol.FRAMES["scan"].struct.size)
-    codes = protocol.pack_codes(scan.codes)
+    codes = protocol.pack_codes(scan.codes_read, protocol.PER_PASS[scan.mode], scan.adc_bits)
     # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
     wire = cobs_encode(header + codes + b"\x01\x01")
     byte_on_line_s = _BITS_PER_BYTE / board.baud
-    byte_of_scan_s = scan_s(board) / len(codes)
+    byte_of_scan_s = scan_s(board, scan) / len(codes)
     delay_s, begin, unknown = 0.0, 0, len(header) + len(codes)  # bytes of content not known yet
     while begin < len(wire):
         # A block has as many bytes as it stands for: it has its length, and lacks the zero at its
@@ -235,7 +240,7 @@ class ScanClock:
 
         It is late by the delay that USB has for all scans alike, which no host can see.
         """
-        took_us = 1e6 * scan_s(board)
+        took_us = 1e6 * scan_s(board, scan)
         self._clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
         return self._epoch_ns + round(1e9 * self._clock.host_s(scan.time_us + took_us / 2))
 

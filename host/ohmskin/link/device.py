@@ -6,9 +6,9 @@ import threading
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 from weakref import WeakValueDictionary
 
@@ -35,6 +35,43 @@ QUEUE_SCANS: Final = 1024
 # in a hundred loses three in a row once in a million.
 COMMAND_TRIES: Final = 3
 _S = TypeVar("_S", bound=Scan)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of a skin, and how to scan it.
+
+    rows, columns: which ones; None: all.
+    mode: which readings a scan takes, a name of the enum `mode`.
+    rate_hz: scans a second; 0: as fast as readings settle, and as line and processor keep up.
+    settle_us: least settle time; 0: as long as the rate allows.
+    whole_every: each so many-th scan is a whole one, of all cells; 0: none is.
+    whole_mode: which readings a whole scan takes.
+    """
+
+    rows: Collection[int] | None = None
+    columns: Collection[int] | None = None
+    mode: str = "quick"
+    rate_hz: float = 0.0
+    settle_us: int = 0
+    whole_every: int = 0
+    whole_mode: str = "near"
+
+    def fields(self, board: Hello) -> dict[str, protocol.Value]:
+        """The fields of the command `set_region`. Raises ValueError for what cannot be sent."""
+        masks = {}
+        for name, lines, count in (
+            ("row_mask", self.rows, board.rows),
+            ("column_mask", self.columns, board.columns),
+        ):
+            masks[name] = protocol.all_lines(count) if lines is None else 0
+            for line in lines or ():
+                if not 0 <= line < count:
+                    raise ValueError(f"no {name.partition('_')[0]} {line}: there are {count}")
+                masks[name] |= 1 << line
+        same = ("settle_us", "mode", "whole_every", "whole_mode")
+        of_same = {name: getattr(self, name) for name in same}
+        return masks | of_same | {"rate_mhz": protocol.rate_mhz(self.rate_hz)}
 
 
 class Device(Closing):
@@ -191,14 +228,15 @@ class Device(Closing):
         columns: int | None = None,
         rate_hz: float | None = None,
         settle_us: int | None = None,
-        adc_prescaler: str | None = None,
+        accuracy: str | None = None,
         mode: str | None = None,
     ) -> Hello:
         """Change how the board scans; what is not given stays. Returns what the board now keeps.
 
         rate_hz: scans per second; 0: as fast as readings settle. settle_us: least time from a
-        multiplexer change to the sample; 0: as long as the rate allows. adc_prescaler: a name of
-        the enum `adc_prescaler`. mode: which readings a scan takes, a name of the enum `mode`.
+        multiplexer change to the sample; 0: as long as the rate allows. accuracy: a name of
+        the enum `accuracy`. mode: which readings a scan takes, a name of the enum `mode`. A region
+        (`set_region`) stays, unless rows or columns are given.
 
         :raises ValueError: a value that no board could be sent.
         :raises CommandRefused: a value out of range, or too much for the rate; nothing changes.
@@ -210,16 +248,42 @@ class Device(Closing):
             "settle_us": settle_us,
             "mode": mode,
             "rate_mhz": None if rate_hz is None else protocol.rate_mhz(rate_hz),
-            "adc_prescaler": adc_prescaler,
+            "accuracy": accuracy,
         }
         changes = {name: value for name, value in given.items() if value is not None}
+        for lines, mask in (("rows", "row_mask"), ("columns", "column_mask")):
+            count = changes.get(lines)
+            if isinstance(count, int) and count > 0:  # the region was one of other cells
+                changes[mask] = protocol.all_lines(count)
+        return self._configure(configuration(self.info) | changes)
+
+    def configure_as(self, board: Hello) -> Hello:
+        """Scan as a board did that said `board`. Returns and raises as `configure`."""
+        return self._configure(configuration(board))
+
+    def _configure(self, wanted: dict[str, protocol.Value]) -> Hello:
         with self._paused():
-            wanted = configuration(self.info) | changes
             self._command("configure", **wanted)
             self._wanted = wanted
             self._refresh()
             self._restore()
             return self.info
+
+    def set_region(self, region: Region) -> Hello:
+        """Scan a part of the skin, from the next scan on. Returns what the board now keeps.
+
+        The board goes on scanning. Scans say which cells they have read (`Scan.read`). A board that
+        is reset comes back to the region.
+
+        :raises ValueError: a value that no board could be sent.
+        :raises CommandRefused: the region is empty or beyond the skin, or it is too much for the
+            rate; nothing changes. Firmware of before there were regions refuses all of them.
+        """
+        with self._commands:
+            asked = region.fields(self.info)
+            self._command("set_region", **asked)
+            self._wanted = configuration(self.info) | asked
+            return self._refresh()
 
     def set_unit_id(self, unit_id: int) -> None:
         """Name this skin; `save` makes the name last."""
@@ -353,10 +417,13 @@ class Device(Closing):
         return ready()
 
 
+_CONFIGURE: Final = tuple(field.name for field in protocol.FRAMES["configure"].fields)
+
+
 def configuration(board: Hello) -> dict[str, protocol.Value]:
     """The fields of the command `configure` that make a board scan as this one does."""
     asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
-    same = ("rows", "columns", "adc_prescaler", "mode")
+    same = (name for name in _CONFIGURE if name not in asked)
     return asked | {name: getattr(board, name) for name in same}
 
 

@@ -11,6 +11,7 @@ is, this byte included, and bytes other than zero. In the content a zero follows
 the last one, nor a block of the largest length.
 """
 
+import math
 import struct
 from dataclasses import dataclass
 
@@ -28,7 +29,10 @@ SEQUENCE_SPAN = protocol.FRAMES["ack"].span("command_sequence")
 _MAX_CONTENT_BYTES = (
     _HEADER.size
     + protocol.FRAMES["scan"].struct.size
-    + protocol.codes_size(protocol.CONSTANTS["rows_max"], protocol.CONSTANTS["columns_max"])
+    + protocol.codes_size(
+        math.prod(protocol.CONSTANTS[f"{what}_max"] for what in ("rows", "columns", "readings")),
+        protocol.CONSTANTS["adc_bits_max"],
+    )
     + _CRC.size
 )
 # The longest stretch between two delimiters that can be a frame: COBS adds a byte, and one for each

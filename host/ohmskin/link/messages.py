@@ -6,6 +6,7 @@
 a board time that does not wrap.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import FULL_SCALE_USIEMENS, heat_map
-from ohmskin.link import protocol
-from ohmskin.link.codes import ratio_from_codes
+from ohmskin.link import layouts, protocol
+from ohmskin.link.codes import check_adc_bits, ratio_from_codes
 from ohmskin.link.framing import Decoder, DecoderStats, RawFrame
 
 _SCAN = protocol.FRAMES["scan"]
@@ -46,25 +47,34 @@ class Hello:
     version_minor: int
     version_patch: int
     board: str
+    wiring: int
     unit_id: int
+    rows_max: int
+    columns_max: int
     rows: int
     columns: int
-    readings_per_cell: int
     adc_bits: int
     ref_top_ohm: int
     ref_bottom_ohm: int
     rate_asked_mhz: int
     scan_cycles: int
     slot_cycles: int
+    whole_scan_cycles: int
     clock_hz: int
     settle_asked_us: int
     settle_us: int
-    adc_prescaler: str
+    accuracy: str
     mode: str
+    row_mask: int
+    column_mask: int
+    whole_mode: str
+    whole_every: int
     baud: int
     settings: str
     reset_cause: tuple[str, ...]
     scanning: int
+    dropped: int
+    late: int
 
     @property
     def version(self) -> str:
@@ -76,29 +86,46 @@ class Hello:
         """Scan rate that the board keeps [Hz]: clock_hz / scan_cycles."""
         return self.clock_hz / self.scan_cycles
 
+    @property
+    def readings_per_cell(self) -> int:
+        """Readings that a scan takes of each cell."""
+        return len(protocol.MODES[self.mode])
+
+    @property
+    def readings(self) -> int:
+        """Readings of a scan, those of a whole one in between left out."""
+        return self.row_mask.bit_count() * self.column_mask.bit_count() * self.readings_per_cell
+
     def impossible(self) -> str:
         """A field and what no board of this protocol says in it, ``"rows 0"``; ``""`` for none.
 
         Whoever gets a hello asks this first. The rest of the host divides by these numbers and
         makes arrays of these sizes, whatever a broken board or a hostile file says.
         """
-        limits, slots = protocol.CONSTANTS, self.rows * self.columns * self.readings_per_cell
+        limits, modes = protocol.CONSTANTS, protocol.MODES
+        all_rows, all_columns = map(protocol.all_lines, (self.rows, self.columns))
+        known = self.mode in modes and self.whole_mode in modes
         can_be = {
-            "rows": 1 <= self.rows <= limits["rows_max"],
-            "columns": 1 <= self.columns <= limits["columns_max"],
-            "readings_per_cell": self.readings_per_cell == protocol.READINGS_PER_CELL,
-            "adc_bits": self.adc_bits == protocol.ADC_BITS,
+            "rows_max": 1 <= self.rows_max <= limits["rows_max"],
+            "columns_max": 1 <= self.columns_max <= limits["columns_max"],
+            "rows": 1 <= self.rows <= self.rows_max,
+            "columns": 1 <= self.columns <= self.columns_max,
+            "row_mask": 0 < self.row_mask <= all_rows,
+            "column_mask": 0 < self.column_mask <= all_columns,
+            "adc_bits": 1 <= self.adc_bits <= limits["adc_bits_max"],
             "ref_top_ohm": 0 < self.ref_top_ohm <= _MAX_REF_OHM,
             "ref_bottom_ohm": 0 < self.ref_bottom_ohm <= _MAX_REF_OHM,
             "baud": self.baud > 0,
             "clock_hz": self.clock_hz > 0,
+            "mode": self.mode in modes,
+            "whole_mode": self.whole_mode in modes,
             "scan_cycles": 0 < self.scan_cycles <= _MAX_SCAN_S * self.clock_hz,
-            "slot_cycles": 0 < self.slot_cycles * slots <= self.scan_cycles,
-            "adc_prescaler": self.adc_prescaler in protocol.ENUMS["adc_prescaler"].values,
-            "mode": self.mode in protocol.MODES,
-            "board": len(self.board) <= _MOST_LETTERS,
+            "whole_scan_cycles": self.whole_scan_cycles <= _MAX_SCAN_S * self.clock_hz,
+            "slot_cycles": known and 0 < self.slot_cycles * self.readings <= self.scan_cycles,
+            "accuracy": self.accuracy in protocol.ENUMS["accuracy"].values,
             "settings": len(self.settings) <= _MOST_LETTERS,
             "reset_cause": len("".join(self.reset_cause)) <= _MOST_LETTERS,
+            "board": len(self.board) <= _MOST_LETTERS,
         }
         odd = [f"{name} {getattr(self, name)!s:.40}" for name, can in can_be.items() if not can]
         return odd[0] if odd else ""
@@ -118,11 +145,16 @@ class Ack:
     command: id of the command's frame.
     command_sequence: sequence number of the command's frame.
     result: name of a member of the enum `result`.
+    time_us: board time at which the command's last byte was read [us]; wraps. None: it is not said,
+        by boards of before there was this field.
+    rate_mhz: where the command asked for a rate, the one that is kept or could be [mHz]; else 0.
     """
 
     command: int
     command_sequence: int
     result: str
+    time_us: int | None
+    rate_mhz: int
 
 
 @dataclass(frozen=True)
@@ -141,9 +173,9 @@ class SelfTestReport:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """All readings of a skin at one time.
+    """The readings of a skin, or of a region of it, at one time.
 
-    codes: ADC codes of `reading_names`, shape (rows, columns, 4).
+    codes: ADC codes of `reading_names`, shape (rows, columns, readings); 0 where nothing was read.
     number: of the scan since the board was started.
     time_us: board time at the scan's start [us], from the board's start, without wraps.
     host_time_s: `time.monotonic()` when the scan's last byte was read [s].
@@ -151,6 +183,9 @@ class Scan:
         were damaged on the way.
     mode: which readings these are, a name of the enum `mode`.
     time_ns: when the middle of the scan was, since 1970 [ns], by `ScanClock`; 0: nobody asked it.
+    adc_bits: of a code.
+    row_mask, column_mask: which rows and columns were read, bit 0 for the first; 0: all.
+    slot_cycles: time from one reading to the next [clock cycles of the board]; 0: that of `board`.
     rest_ratio: of a recording that is played, the tare in force (rows, columns, 4); else None.
     board: what the board had last said of itself when a `Device` got the scan; else None.
     """
@@ -162,6 +197,10 @@ class Scan:
     missed: int
     mode: str = field(default="near", kw_only=True)
     time_ns: int = field(default=0, kw_only=True)
+    adc_bits: int = field(default=protocol.ADC_BITS, kw_only=True)
+    row_mask: int = field(default=0, kw_only=True)
+    column_mask: int = field(default=0, kw_only=True)
+    slot_cycles: int = field(default=0, kw_only=True)
     rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
     board: Hello | None = field(default=None, kw_only=True)
 
@@ -177,8 +216,41 @@ class Scan:
 
     @property
     def ratio(self) -> NDArray[np.float64]:
-        """Sense-node voltages over Vdd, (code + 0.5) / 2^bits, shape (rows, columns, 4)."""
-        return ratio_from_codes(self.codes, protocol.ADC_BITS)
+        """Sense-node voltages over Vdd, (code + 0.5) / 2^bits, shape (rows, columns, readings).
+
+        NaN where nothing was read.
+        """
+        ratio = ratio_from_codes(self.codes, self.adc_bits)
+        if not self.is_whole:
+            ratio[~self.read] = np.nan
+        return ratio
+
+    @property
+    def read(self) -> NDArray[np.bool_]:
+        """Which cells were read, shape (rows, columns)."""
+        read = np.zeros(self.codes.shape[:2], dtype=np.bool_)
+        read[self._lines()] = True
+        return read
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all cells were read."""
+        all_rows, all_columns = map(protocol.all_lines, (self.rows, self.columns))
+        return self.row_mask in (0, all_rows) and self.column_mask in (0, all_columns)
+
+    @property
+    def codes_read(self) -> NDArray[np.uint16]:
+        """Codes of the rows and columns that were read, shape (their rows, columns, readings)."""
+        codes: NDArray[np.uint16] = self.codes[self._lines()]
+        return codes
+
+    def _lines(self) -> tuple[NDArray[Any], ...]:
+        """Indices of the rows and columns that were read."""
+        rows, columns = (
+            protocol.lines_of(mask or protocol.all_lines(count))
+            for mask, count in ((self.row_mask, self.rows), (self.column_mask, self.columns))
+        )
+        return np.ix_(rows, columns)
 
     @property
     def reading_names(self) -> tuple[str, ...]:
@@ -229,6 +301,30 @@ class BoardStats:
     overflowed: int = 0
 
 
+def _codes(
+    values: dict[str, Any], packed: bytes, per_pass: Mapping[str, int]
+) -> NDArray[np.uint16]:
+    """Codes (rows, columns, readings) of a scan whose header has these values.
+
+    :raises ValueError: the header says what cannot be, or `packed` has the wrong length for it.
+    """
+    mode, rows, columns = values["mode"], values["rows"], values["columns"]
+    if mode not in per_pass:
+        raise ValueError(f"no mode {mode}")
+    bits, readings = check_adc_bits(values["adc_bits"]), len(protocol.MODES[mode])
+    read = protocol.lines_of(values["row_mask"]), protocol.lines_of(values["column_mask"])
+    if not all(read) or read[0][-1] >= rows or read[1][-1] >= columns:
+        raise ValueError(f"no lines, or lines beyond {rows}x{columns} cells")
+    of_lines = protocol.unpack_codes(
+        packed, (len(read[0]), len(read[1]), readings), per_pass[mode], bits
+    )
+    if of_lines.shape[:2] == (rows, columns):
+        return of_lines
+    codes = np.zeros((rows, columns, readings), np.uint16)
+    codes[np.ix_(*read)] = of_lines
+    return codes
+
+
 class BoardDecoder:
     """Messages from a board's bytes. `feed` takes any chunk and never raises for what is in it.
 
@@ -237,6 +333,8 @@ class BoardDecoder:
 
     def __init__(self) -> None:
         self._frames = Decoder()
+        # What the board was built from. Its hello says that, and comes first.
+        self._definition = protocol.NOW
         self.stats = BoardStats(line=self._frames.stats)
         # Number of the last scan. -1: none since the board was started; None: not known.
         self._number: int | None = None
@@ -254,37 +352,37 @@ class BoardDecoder:
 
     def _message(self, raw: RawFrame, host_time_s: float) -> Message | None:
         """The message of a frame; None if this host does not know it."""
-        frame = protocol.FRAMES_BY_ID.get(raw.type)
+        if raw.type == protocol.FRAMES["hello"].id:
+            return self._hello(raw.payload)
+        frame = self._definition.frames_by_id.get(raw.type)
         if frame is None or frame.sender != "board":
             return None
-        if frame.name == "hello":
-            return self._hello(frame, raw.payload)
         try:
-            values = frame.unpack(raw.payload)
+            values = layouts.today(frame.name, frame.unpack(raw.payload))
             if frame.name == "scan":
                 return self._scan(values, raw.payload[frame.struct.size :], host_time_s)
         except ValueError:
             return None
         return Ack(**values) if frame.name == "ack" else SelfTestReport(**values)
 
-    def _hello(self, frame: protocol.Frame, payload: bytes) -> Message | None:
+    def _hello(self, payload: bytes) -> Message | None:
         # The first field stays what it is in every definition, so that this host can say which one
         # a board has whose other fields it cannot read.
-        size = frame.fields[0].size
+        size = protocol.FRAMES["hello"].fields[0].size
         if len(payload) < size:
             return None
         layout_crc = int.from_bytes(payload[:size], "little")
-        if layout_crc != protocol.LAYOUT_CRC or len(payload) != frame.struct.size:
+        definition = protocol.definition(layout_crc)
+        if definition is None or len(payload) != definition.frames["hello"].struct.size:
             return ForeignHello(layout_crc)
-        hello = Hello(**frame.unpack(payload))
+        self._definition = definition
+        hello = Hello(**layouts.today("hello", definition.frames["hello"].unpack(payload)))
         if not hello.scanning:
             self._number = -1  # the next scan is the first since a start, with the number 0
         return hello
 
     def _scan(self, values: dict[str, Any], packed: bytes, host_time_s: float) -> Scan:
-        if values["mode"] not in protocol.MODES:
-            raise ValueError(f"no mode {values['mode']}")
-        codes = protocol.unpack_codes(packed, values["rows"], values["columns"])
+        codes = _codes(values, packed, self._definition.per_pass)
         number, dropped = values["scan"], values["dropped"]
         step = 1 if self._number is None else (number - self._number) % _NUMBER_SPAN
         # A step above half of the span is one back: the board was started anew, and nobody saw it.
@@ -303,7 +401,9 @@ class BoardDecoder:
         stats.board_rx_errors = values["rx_errors"]
         self._number, self._dropped = number, dropped
         self._host_time_s = host_time_s
-        return Scan(codes, number, self._time_us, host_time_s, missed, mode=values["mode"])
+        same = ("mode", "adc_bits", "row_mask", "column_mask", "slot_cycles")
+        of_scan = {name: values[name] for name in same}
+        return Scan(codes, number, self._time_us, host_time_s, missed, **of_scan)
 
     def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
         """Board time of the first scan since a start [us].

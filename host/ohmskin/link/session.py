@@ -21,7 +21,7 @@ from ohmskin.errors import (
     ProtocolError,
     ProtocolMismatch,
 )
-from ohmskin.link import framing, protocol
+from ohmskin.link import framing, layouts, protocol
 from ohmskin.link.clock import ScanClock
 from ohmskin.link.device import COMMAND_TRIES, LOG, Device, configuration
 from ohmskin.link.messages import (
@@ -73,7 +73,13 @@ _SPEED_LOST_S = 2.5
 # A silent board is asked again after so long. Chosen: the Mega's boot loader, if it took the
 # question for an upload, waits for 5 s (see `ATTEMPTS_AFTER_RESET`), and then the firmware starts.
 _ASK_AGAIN_S = 6.5
+# A board has taken its new speed this long after its answer came. Chosen: a command that came too
+# early would be lost, and the next one would come after the board has returned to its old speed.
+_SPEED_CHANGE_S: Final = 0.02
 _BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
+
+
+_FLASH: Final = "flash it with 'ohmskin flash'"
 
 
 def _size(of: Hello | Scan) -> str:
@@ -109,6 +115,8 @@ class Session(Device):
             if baud is not None and baud != self.info.baud:
                 self._command("set_baud", baud=baud)
                 link.set_baud(baud)
+                with self._changed:  # the board changes when its answer has left: be later
+                    self._wait(lambda: False, _SPEED_CHANGE_S)
                 self._refresh()
         except BaseException:
             self.close()
@@ -145,12 +153,17 @@ class Session(Device):
 
     def _send(self, name: str, **values: protocol.Value) -> int:
         """Send a command and return its sequence number; nothing waits for the answer."""
-        frame = protocol.FRAMES[name]
+        layout_crc = self._hello.layout_crc if self._hello else protocol.LAYOUT_CRC
+        definition = protocol.definition(layout_crc) or protocol.NOW
+        taken = layouts.asked(definition, name, values)
+        if taken is None:
+            raise CommandRefused(name, "unknown_command", f"its firmware is too old: {_FLASH}")
+        frame = definition.frames[name]
         with self._changed:
             self._wait(lambda: False, 0.0)  # raises what has ended it, such as close()
             sequence = self._sequence = (self._sequence + 1) % framing.SEQUENCE_SPAN
             self._acks.pop(sequence, None)
-        self._link.write(framing.encode(frame.id, sequence, frame.pack(**values)))
+        self._link.write(framing.encode(frame.id, sequence, frame.pack(**taken)))
         return sequence
 
     def _command(self, name: str, **values: protocol.Value) -> None:
@@ -171,6 +184,8 @@ class Session(Device):
                 raise DeviceLost(f"{self.name} does not answer '{name}': unplug and plug it again")
         if ack.result != "ok":
             reason = protocol.ENUMS["result"].docs.get(ack.result, "reason of a newer firmware")
+            if ack.rate_mhz:
+                reason += f" (at most {ack.rate_mhz / 1000:g} scans/s)"
             raise CommandRefused(name, ack.result, reason)
 
     def _read(self) -> None:
@@ -226,4 +241,4 @@ class Session(Device):
             case ForeignHello():
                 layouts = f"0x{message.layout_crc:04X}, this host 0x{protocol.LAYOUT_CRC:04X}"
                 problem = f"{self.name}: board speaks layout {layouts}"
-                raise ProtocolMismatch(problem, "flash it with 'ohmskin flash'")
+                raise ProtocolMismatch(problem, _FLASH)

@@ -48,12 +48,13 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READINGS_PER_CELL
 from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, require_file, stored_bytes
+from ohmskin.link import layouts
 from ohmskin.link.clock import ScanClock
+from ohmskin.link.codes import check_adc_bits
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import LARGEST_CODE, MODES
+from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import check_size
 
 # Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
@@ -160,6 +161,10 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
         "host_time_s": _HOST_TIME,
         "missed": _is("integer", "scans before this one that never came"),
         "mode": _is("string", f"readings of each cell, by mode: {MODES}"),
+        "adc_bits": _is("integer", "of a code"),
+        "row_mask": _is("integer", "rows that were read, bit 0 for the first"),
+        "column_mask": _is("integer", "columns that were read, bit 0 for the first"),
+        "slot_cycles": _is("integer", "from one reading to the next [clock]; 0: that of hello"),
         **_SIZE,
         "codes": _is("array", f"ADC codes: {_ORDER}", items={"type": "integer"}),
     },
@@ -360,14 +365,17 @@ def _message(name: str, octets: bytes) -> Recorded:
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
     content.setdefault("mode", "near")  # recordings from before there was another do not say it
+    content = layouts.today(name, content)  # of boards of then
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
     if name == "hello":
         return _hello(values)
     for of_cells in {"codes", "rest_ratio"} & values.keys():
-        shape = values.pop("rows"), values.pop("columns"), READINGS_PER_CELL
+        shape = values.pop("rows"), values.pop("columns"), len(MODES[values["mode"]])
         values[of_cells] = _cells(of_cells, values[of_cells], shape)
+        if of_cells == "codes" and values["codes"].max() >> check_adc_bits(values["adc_bits"]):
+            raise ValueError("codes: one is out of range")
     return KINDS[name](**values)
 
 
@@ -391,10 +399,7 @@ def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
         raise ValueError(f"{name}: one is out of range") from None
     if len(readings) != math.prod(shape):
         raise ValueError(f"{len(readings)} {name} do not make {rows}x{columns} cells")
-    cells = np.array(readings).reshape(shape)
-    if name == "codes" and cells.max() > LARGEST_CODE:
-        raise ValueError("codes: one is out of range")
-    return cells
+    return np.array(readings).reshape(shape)
 
 
 def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
