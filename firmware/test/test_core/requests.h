@@ -6,9 +6,9 @@
 
 constexpr uint16_t CYCLES_PER_BYTE = 320;  // at 16 MHz
 
-inline ohmskin::ScanRequest scan_request(uint8_t rows, uint8_t columns, uint32_t rate_mhz,
-                                         uint16_t settle_us = 0, uint8_t accuracy = 0,
-                                         uint8_t mode = 0) {
+OHMSKIN_APART inline ohmskin::ScanRequest scan_request(uint8_t rows, uint8_t columns,
+                                                       uint32_t rate_mhz, uint16_t settle_us = 0,
+                                                       uint8_t accuracy = 0, uint8_t mode = 0) {
     return ohmskin::ScanRequest{rows,
                                 columns,
                                 accuracy,
@@ -21,8 +21,8 @@ inline ohmskin::ScanRequest scan_request(uint8_t rows, uint8_t columns, uint32_t
                                 0};
 }
 
-inline ohmskin::frames::Result plan_of(const ohmskin::ScanRequest &request,
-                                       ohmskin::ScanPlan *plan) {
+OHMSKIN_APART inline ohmskin::frames::Result plan_of(const ohmskin::ScanRequest &request,
+                                                     ohmskin::ScanPlan *plan) {
     ohmskin::Routes routes;
     uint32_t rate_mhz;
     const auto result = ohmskin::plan_scan(request, CYCLES_PER_BYTE, &routes, &rate_mhz);
@@ -38,8 +38,8 @@ inline ohmskin::ScanPlan plan_of(const ohmskin::ScanRequest &request) {
 }
 
 // A route of all cells, for the scanner alone.
-inline ohmskin::Route whole_route(uint8_t rows, uint8_t columns, uint8_t pattern,
-                                  uint16_t idle_slots) {
+OHMSKIN_APART inline ohmskin::Route whole_route(uint8_t rows, uint8_t columns, uint8_t pattern,
+                                                uint16_t idle_slots) {
     const uint8_t count = ohmskin::PATTERN_DEFINITIONS[pattern].count;
     const uint16_t readings = static_cast<uint16_t>(rows * columns * count);
     return ohmskin::Route{static_cast<ohmskin::LineMask>((uint32_t{1} << rows) - 1),

@@ -50,7 +50,7 @@ bool same(const Settings &a, const Settings &b) {
     return a.unit_id == b.unit_id && memcmp(&a.request, &b.request, sizeof a.request) == 0;
 }
 
-Settings loaded(Source *source = nullptr) {
+OHMSKIN_APART Settings loaded(Source *source = nullptr) {
     Settings settings;
     const Source from = load_settings(&settings, 320);
     if (source)
@@ -58,7 +58,7 @@ Settings loaded(Source *source = nullptr) {
     return settings;
 }
 
-State save(const Settings &settings) {
+OHMSKIN_APART State save(const Settings &settings) {
     SettingsWriter writer;
     writer.begin(settings);
     for (uint16_t polls = 0; polls < 500; polls++) {
@@ -102,15 +102,27 @@ void start_from(uint8_t start) {
 
 }  // namespace
 
+// Of the second saves, so many are left out each time where the processor is a slow one.
+#ifdef __AVR__
+constexpr uint8_t AGAIN_STEP = 13;
+#else
+constexpr uint8_t AGAIN_STEP = 1;
+#endif
+
 TEST(a_save_cut_at_any_byte_leaves_the_old_settings_or_the_new) {
-    uint8_t (*const torn[])(uint8_t, uint8_t) = {erased, not_begun, half_erased, half_written,
+    uint8_t (*const torn[])(uint8_t, uint8_t) = {half_written, erased, not_begun, half_erased,
                                                  written};
+#ifdef __AVR__
+    constexpr uint8_t KINDS = 1;  // a slow processor; all of them are tried natively
+#else
+    constexpr uint8_t KINDS = sizeof torn / sizeof *torn;
+#endif
     for (uint8_t start = 0; start < 7; start++)
-        for (const auto each : torn) {
+        for (uint8_t kind = 0; kind < KINDS; kind++) {
             uint8_t cuts = 0;
             for (;; cuts++) {
                 start_from(start);
-                fake::state.eeprom_torn = each;
+                fake::state.eeprom_torn = torn[kind];
                 const Settings old = loaded();
                 const bool done = save_cut(THREE, cuts + 1);
                 Source source;
@@ -125,7 +137,8 @@ TEST(a_save_cut_at_any_byte_leaves_the_old_settings_or_the_new) {
                 static uint8_t left[sizeof fake::state.eeprom];
                 memcpy(left, fake::state.eeprom, sizeof left);
                 const Settings &next = start & 1 ? ONE : TWO;
-                for (uint8_t again = 1; again < 30; again++) {
+                for (uint8_t again = 1; again < 30;
+                     again = static_cast<uint8_t>(again + AGAIN_STEP)) {
                     memcpy(fake::state.eeprom, left, sizeof left);
                     const bool next_done = save_cut(next, again);
                     const Settings last = loaded();
