@@ -102,8 +102,13 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     if board.board == "emulated":
         # An emulated board sends a whole scan at the end of its period.
         return 1 / board.rate_hz - scan_s(board, scan)
+    kind = protocol.FRAMES["scan"]
     # Any counters will do: zeros among them end blocks that are known before the scan ends.
-    header = b"\x01" * (2 + protocol.FRAMES["scan"].struct.size)
+    values = {field.name: 1 for field in kind.fields}
+    masks = (scan.row_mask, scan.rows), (scan.column_mask, scan.columns)
+    row_mask, column_mask = (mask or protocol.all_lines(count) for mask, count in masks)
+    values |= {"row_mask": row_mask, "column_mask": column_mask, "dropped": 0, "rx_errors": 0}
+    header = bytes([kind.id, 1]) + kind.pack(**values)
     codes = protocol.pack_codes(scan.codes_read, protocol.PER_PASS[scan.mode], scan.adc_bits)
     # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
     wire = cobs_encode(header + codes + b"\x01\x01")
