@@ -77,24 +77,23 @@ GAIN_CELLS: Final = 4.0
 EXPONENT, EXPONENT_STD = 0.67, 0.3
 # Deviation of cells' exponents about b. Chosen: as those of single presses.
 BEND_STD: Final = 0.02
-# c. Chosen: 350 ohm at 280 microsiemens.
-SERIES: Final = 0.1
+# c. Chosen: 350 ohm at 140 microsiemens, a hard x1 of fingertips.
+SERIES: Final = 0.05
 # A cell turns within this log of x. Chosen: noise of a pressed cell is less.
 TURN_LOG: Final = 0.1
 # So much of a rise at least is left with other wires.
 LEAST_LEFT: Final = 0.2
 # Deviations of k, b, c, h and v [N] before anything is known. Chosen: k is free, half of the cells
 # have no series to speak of, and 0.1 N on one cell is seen.
-FIRST_STD: Final = (10.0, EXPONENT_STD, 0.1, 0.1, 0.1)
+FIRST_STD: Final = (10.0, EXPONENT_STD, 0.05, 0.1, 0.1)
 # Least and most of b, c, h. Chosen: no fit gets there but by going astray; others end at 0 by their
 # priors, because a limit at 0 would pull what goes with it.
 LIMITS: Final = ((MIN_EXPONENT, -0.4, -0.2), (MAX_EXPONENT, 0.8, 0.2))
 # Prior deviation of the scale's delay from that of the step before, and step of its slopes [s].
 DELAY_STD_S, DELAY_STEP_S = 0.1, 0.005
-# The power law of the model is that of rises from the first to the second of these, times the
-# largest ones, which are this quantile. Chosen: from a tenth of the force that presses had on one
-# cell, to half as much again.
-LEAST_RISE, MOST_RISE, MOST_RISE_QUANTILE = 0.03, 2.0, 0.999
+# The power law of the model is that of rises from so small a share of the largest ones, which are
+# this quantile, on. Chosen: from a tenth of the force; what lies beyond the largest is not known.
+LEAST_RISE, MOST_RISE_QUANTILE = 0.03, 0.999
 # x1 is this quantile of all rises.
 HARD_QUANTILE: Final = 0.99
 # A contact seems worse by its series by at most this factor.
@@ -424,7 +423,7 @@ class TotalFit:
         """Level and steepness of the line that is most like log(x' / x0) by log(x / x0)."""
         rises = self._totals.rise[self._on]
         top = float(np.quantile(rises, MOST_RISE_QUANTILE))
-        x = top * np.geomspace(LEAST_RISE, MOST_RISE, 50)
+        x = top * np.geomspace(LEAST_RISE, 1.0, 50)
         log_contact = np.log(x / self._unit / self._loss(x / self._hard))
         force = np.exp(self._p[1] * log_contact)
         weight = force / np.hypot(force, 0.1 * force[-1])
