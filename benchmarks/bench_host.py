@@ -41,6 +41,7 @@ from ohmskin.link import framing, protocol
 from ohmskin.link.messages import BoardDecoder, Scan
 from ohmskin.record.recorder import Recorder
 from served import Load, serve, served  # beside this file
+from wire import scan_payload
 
 RATE_HZ = round(DEFAULT_RATE_HZ)
 # These are chosen: so much that two runs on a quiet machine differ little.
@@ -88,10 +89,8 @@ def decode_rate(codes: NDArray[np.uint16]) -> float:
     kind = protocol.FRAMES["scan"]
     stream = bytearray()
     for number in range(DECODED_SCANS):
-        counters = {"scan": number, "time_us": 11_111 * number, "dropped": 0, "rx_errors": 0}
-        header = kind.pack(**counters, rows=8, columns=8, mode="near")
-        tail = protocol.pack_codes(codes[number % len(codes)])
-        stream += framing.encode(kind.id, number, header + tail)
+        payload = scan_payload(codes[number % len(codes)], scan=number, time_us=11_111 * number)
+        stream += framing.encode(kind.id, number, payload)
     chunks = [bytes(stream[i : i + CHUNK_BYTES]) for i in range(0, len(stream), CHUNK_BYTES)]
     rates = []
     for _ in range(DECODE_RUNS):

@@ -87,12 +87,16 @@ def scan_rates() -> dict[str, list[float]]:
     cells = np.array([n * n for n in SIZES])
     octets = np.array(
         [
-            len(framing.encode(scan.id, 1, b"\1" * (scan.struct.size + protocol.codes_size(n, n))))
+            len(
+                framing.encode(
+                    scan.id, 1, b"\1" * (scan.struct.size + protocol.codes_size(4 * n * n))
+                )
+            )
             for n in SIZES
         ]
     )
-    readings = protocol.READINGS_PER_CELL * cells
-    settle_us = _constant("core/scan_plan.h", r"SETTLE_US = (\d+);")
+    readings = len(protocol.MODES["near"]) * cells
+    settle_us = _constant("core/scan_plan.h", r"SETTLE_US\[\] = \{(\d+),")
     rates = {"converter": CLOCK_HZ / ((HELD_CYCLES + settle_us * CLOCK_HZ / 1e6) * readings)}
     for name in ("baud_default", "baud_fast"):
         rates[name] = protocol.CONSTANTS[name] / BITS_PER_BYTE / octets
