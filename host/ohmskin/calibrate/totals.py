@@ -85,7 +85,7 @@ TURN_LOG: Final = 0.1
 LEAST_LEFT: Final = 0.2
 # Deviations of k, b, c, h and v [N] before anything is known. Chosen: k is free, half of the cells
 # have no series to speak of, and 0.1 N on one cell is seen.
-FIRST_STD: Final = (10.0, EXPONENT_STD, 0.05, 0.1, 0.1)
+FIRST_STD: Final = (10.0, EXPONENT_STD, 0.1, 0.1, 0.1)
 # Least and most of b, c, h. Chosen: no fit gets there but by going astray; others end at 0 by their
 # priors, because a limit at 0 would pull what goes with it.
 LIMITS: Final = ((MIN_EXPONENT, -0.4, -0.2), (MAX_EXPONENT, 0.8, 0.2))
