@@ -38,7 +38,12 @@ def open(url: PathName, *, start: bool = True) -> Device: ...
 
 @overload
 def open(
-    url: PathName, *, start: bool = True, calibration: CalibrationLike, force: bool = False
+    url: PathName,
+    *,
+    start: bool = True,
+    calibration: CalibrationLike,
+    force: bool = False,
+    focus: bool = False,
 ) -> CalibratedSkin: ...
 
 
@@ -48,11 +53,13 @@ def open(
     start: bool = True,
     calibration: CalibrationLike | None = None,
     force: bool = False,
+    focus: bool = False,
 ) -> Device | CalibratedSkin:
     """Connect to a board, and start scanning unless told otherwise.
 
     calibration: a `Calibration` or the path of its file; scans then carry forces. force: take it
-    even if it is of another unit.
+    even if it is of another unit. focus: while somebody iterates, a region around the contacts is
+    read, a thousand times a second or more, and the whole skin `focus.WHOLE_HZ` times.
 
     >>> with open("emulator://8x8?scene=ghost") as skin:
     ...     skin.latest().ratio.shape
@@ -69,7 +76,9 @@ def open(
     of_skin = None if calibration is None else loaded(calibration)
     with ExitStack() as opened:
         device = opened.enter_context(_device(os.fspath(url)))
-        skin = device if of_skin is None else CalibratedSkin(device, of_skin, force=force)
+        skin = (
+            device if of_skin is None else CalibratedSkin(device, of_skin, force=force, focus=focus)
+        )
         if start:
             device.start()
         opened.pop_all()

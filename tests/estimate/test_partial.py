@@ -187,6 +187,17 @@ def test_methods_that_need_all_readings_say_so(method: str) -> None:
         estimator.estimate(of_region(frames[0], slice(None), slice(None), READ["half"]))
 
 
+def test_a_frame_may_have_fewer_readings_than_the_skin() -> None:
+    _, rest, frames = trial("touches")
+    estimators = [make_estimator("joint", knowledge(rest)) for _ in range(2)]
+    every = slice(None)
+    named = estimators[0].estimate(frames[2][..., [1]], ("b",))
+    padded = estimators[1].estimate(of_region(frames[2], every, every, (1,)))
+    np.testing.assert_array_equal(named.cell_siemens, padded.cell_siemens)
+    with pytest.raises(ValueError, match=r"these readings are .* this skin"):
+        estimators[0].estimate(frames[2], ("a", "e", "b", "f"))
+
+
 def test_what_no_board_leaves_out_is_refused() -> None:
     """A hole amid what was read; nothing at all; rest of some cells only."""
     _, rest, frames = trial("touches")

@@ -36,7 +36,7 @@ factorised is 1 + sqrt(g) K sqrt(g), because that needs no special value for ope
 for wires of zero ohm.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Final
@@ -530,6 +530,11 @@ def node_ratio(ratio: Float, reading_names: Sequence[str], node: str) -> Float:
             f"readings {' '.join(reading_names)}: neither {node} nor {EXCHANGED[node]}"
         )
     return np.asarray(sum(high + low) / len(high + low), dtype=np.float64)
+
+
+def is_near(reading_names: Iterable[str]) -> bool:
+    """Whether these are readings at near ends, some of a to d: all say the same of a skin."""
+    return set(reading_names) <= set(NEAR)
 
 
 def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:

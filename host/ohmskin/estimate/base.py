@@ -7,6 +7,7 @@ which cells are touched happen here, so that all methods do them alike.
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ohmskin.arrays import FULL_SCALE_USIEMENS, Bool, Float, heat_map
-from ohmskin.circuit.skin import NEAR, ratio_from_current
+from ohmskin.circuit.skin import NEAR, is_near, ratio_from_current
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.port_readings import PortReader, PortReadings
@@ -173,11 +174,12 @@ class Estimator(ABC):
             raise ValueError("the readings of the untouched skin are not known")
         return self._level(self.knowledge.rest_ratio, rest)[0]
 
-    def estimate(self, ratio: ArrayLike) -> Estimate:
+    def estimate(self, ratio: ArrayLike, reading_names: Sequence[str] = ()) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
         Readings that were not taken are NaN: those of some configurations, or of cells outside of a
         region of rows and columns. Their ports are as they were, and less certain with each frame.
+        reading_names: of this frame, if they are others than those of the skin: some of a to d.
 
         A cell is touched if its conductance g has risen, and by more than noise,
 
@@ -198,7 +200,10 @@ class Estimator(ABC):
         """
         knowledge = self.knowledge
         shape = knowledge.rows, knowledge.columns
-        readings = check_ratio(ratio, *shape, of=knowledge.reading_names)
+        names = tuple(reading_names) or knowledge.reading_names
+        if names != knowledge.reading_names and not is_near({*names, *knowledge.reading_names}):
+            raise ValueError(f"these readings are {names}, this skin's {knowledge.reading_names}")
+        readings = check_ratio(ratio, *shape, of=names)
         if not self.takes_partial and np.isnan(readings).any():
             raise ValueError(f"'{self.name}' takes whole scans of a b c d: use 'joint' or 'touch'")
         self.rest()

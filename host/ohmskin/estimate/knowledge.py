@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM, MAX_OHM, NEAR, check_references, current_std
+from ohmskin.circuit.skin import (
+    DEFAULT_REF_OHM,
+    MAX_OHM,
+    NEAR,
+    check_references,
+    current_std,
+    is_near,
+)
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
@@ -129,7 +136,7 @@ class SkinKnowledge:
     @property
     def checked_names(self) -> tuple[str, ...]:
         """The names of the readings that `check_ratio` returns: some of a to d are all of them."""
-        return NEAR if set(self.reading_names) <= set(NEAR) else self.reading_names
+        return NEAR if is_near(self.reading_names) else self.reading_names
 
     @property
     def ratio_std(self) -> float:
@@ -157,17 +164,17 @@ def check_ratio(
     crossings of some rows with some columns.
     """
     readings = np.asarray(ratio, dtype=np.float64)
-    is_near = set(of) <= set(NEAR)
-    shapes = [(rows, columns, len(of)), *([(rows, columns, len(NEAR))] if is_near else [])]
+    of_near = is_near(of)
+    shapes = [(rows, columns, len(of)), *([(rows, columns, len(NEAR))] if of_near else [])]
     if readings.shape not in shapes:
         raise ValueError(f"{name} has shape {readings.shape}, this skin {shapes[0]}")
-    if is_near and readings.shape[-1] < len(NEAR):
+    if of_near and readings.shape[-1] < len(NEAR):
         some, readings = readings, np.full(shapes[1], np.nan)
         readings[..., [NEAR.index(each) for each in of]] = some
         of = NEAR
     # Written so that NaN fails too.
     good = (readings >= 0) & (readings <= 1)
-    if is_near and not good.all():
+    if of_near and not good.all():
         good |= np.isnan(readings) & ~_read_of_lines(readings)
     if not good.all():
         row, column, k = (int(index) for index in np.argwhere(~good)[0])

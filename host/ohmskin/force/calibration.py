@@ -46,7 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READINGS_PER_CELL
+from ohmskin.circuit.skin import READINGS_PER_CELL, is_near
 from ohmskin.estimate.knowledge import (
     NO_WIRES,
     WIRE_FIELDS,
@@ -183,7 +183,7 @@ class Calibration:
         if (board.rows, board.columns) != (self.rows, self.columns):
             sizes = f"{self.rows}x{self.columns} skin, the board scans {board.rows}x{board.columns}"
             raise ValueError(f"this calibration is of a {sizes}: calibrate this skin")
-        if board.mode != self.mode:
+        if board.mode != self.mode and not is_near((*MODES[board.mode], *MODES[self.mode])):
             remedy = f"'ohmskin configure PORT --mode {self.mode}', or calibrate this skin anew"
             raise ValueError(f"this calibration is of mode {self.mode}, not {board.mode}: {remedy}")
         if board.unit_id != self.unit_id and not force:

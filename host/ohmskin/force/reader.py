@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ohmskin.arrays import FULL_SCALE_N, Bool, Float, heat_map
+from ohmskin.circuit.skin import is_near
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge
@@ -28,10 +29,12 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
+from ohmskin.force.focus import Focus
 from ohmskin.force.geometry import Geometry
 from ohmskin.link.codes import quantise
 from ohmskin.link.device import Device, in_threads
 from ohmskin.link.messages import BoardStats, Hello, Scan
+from ohmskin.link.protocol import MODES
 
 if TYPE_CHECKING:
     from ohmskin.record.recording import Tare
@@ -255,8 +258,11 @@ class SkinReader:
         return Tare(rest_ratio, time.monotonic(), self.board.mode)
 
     def check_mode(self, mode: str) -> None:
-        """Raise ValueError if the board scans in another mode now."""
-        if mode != self.board.mode:
+        """Raise ValueError if the board scans now what the estimator does not take.
+
+        Near ends are read in several modes, and a rest of one of them serves all.
+        """
+        if mode != self.board.mode and not is_near((*MODES[mode], *MODES[self.board.mode])):
             raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
 
     def read(self, scan: Scan) -> ForceScan:
@@ -266,7 +272,7 @@ class SkinReader:
             self._shared.take_recorded(scan.rest_ratio)
         if self._made_for != (self._wanted, self.rest):  # rests are equal if they are the same one
             self._make()
-        frame = self._estimator.estimate(scan.ratio)
+        frame = self._estimator.estimate(scan.ratio, scan.reading_names)
         self._shared.last_estimator = self._estimator
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(frame.level) if self._rest_level is None else self._rest_level
@@ -312,14 +318,23 @@ class CalibratedSkin(Closing):
     """A device whose scans carry forces, and which can be tared. Made by ``ohmskin.open``.
 
     device: the board or recording alone, with all its commands. force: take the calibration of
-    another unit. Iterating and `latest` are those of `Device`, with forces. Where another unit
-    comes behind the same line, they end by DeviceLost.
+    another unit. focus: scans follow the contacts while somebody iterates (`focus`). Iterating and
+    `latest` are those of `Device`, with forces. Where another unit comes behind the same line, they
+    end by DeviceLost.
 
     :raises ValueError: the calibration is of another unit or geometry.
     """
 
-    def __init__(self, device: Device, calibration: Calibration, *, force: bool = False) -> None:
+    def __init__(
+        self,
+        device: Device,
+        calibration: Calibration,
+        *,
+        force: bool = False,
+        focus: bool = False,
+    ) -> None:
         self.device = device
+        self._focus = Focus(device) if focus else None
         self.name = device.name
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
@@ -368,7 +383,12 @@ class CalibratedSkin(Closing):
 
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, with its forces."""
-        return map(self.new_reader().read, self.device)
+        reader = self.new_reader()
+        for scan in self.device:
+            read = reader.read(scan)
+            if self._focus is not None:
+                self._focus.follow(read.estimate.touched, len(read.contacts), scan)
+            yield read
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
         """The same for ``async for``."""

@@ -196,7 +196,8 @@ class Device(Closing):
         untouched = list(scans_for(self, seconds))
         if not untouched:
             raise DeviceLost(f"{self.name} gives no more scans")
-        return mean_ratio(untouched)
+        # While a region is read, the rest is that of the whole scans in between.
+        return mean_ratio([scan for scan in untouched if scan.is_whole] or untouched)
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already."""

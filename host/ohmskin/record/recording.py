@@ -48,6 +48,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.skin import is_near
 from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, require_file, stored_bytes
 from ohmskin.link import layouts
@@ -102,8 +103,9 @@ class Tare:
     mode: str = "near"
 
     def is_of(self, scan: Scan) -> bool:
-        """Whether it is the rest of such scans: of the same cells and mode."""
-        return (self.rest_ratio.shape, self.mode) == scan.kind
+        """Whether it is the rest of such scans: of the same cells, read at the same ends."""
+        same_ends = self.mode == scan.mode or is_near((*MODES[self.mode], *scan.reading_names))
+        return same_ends and self.rest_ratio.shape[:2] == scan.codes.shape[:2]
 
 
 @dataclass(frozen=True)

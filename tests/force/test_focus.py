@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where reading goes after each scan."""
+
+import numpy as np
+import pytest
+
+import ohmskin
+from calibrations import of_scene
+from ohmskin.arrays import Bool
+from ohmskin.force.focus import Lines, wanted_lines
+from studies.judge import STATED_STDS
+
+
+def touched(*cells: tuple[int, int], shape: tuple[int, int] = (8, 8)) -> Bool:
+    found = np.zeros(shape, dtype=bool)
+    for cell in cells:
+        found[cell] = True
+    return found
+
+
+def test_nothing_touched_is_read_whole() -> None:
+    assert wanted_lines(touched(), None) is None
+    assert wanted_lines(touched(), Lines(range(3), range(3))) is None
+
+
+@pytest.mark.parametrize(
+    ("cells", "rows", "columns"),
+    [
+        ([(3, 4)], range(2, 5), range(3, 6)),
+        ([(0, 7)], range(2), range(6, 8)),
+        ([(2, 2), (3, 4)], range(1, 5), range(1, 6)),
+    ],
+)
+def test_a_region_has_a_margin_where_there_are_lines(
+    cells: list[tuple[int, int]], rows: range, columns: range
+) -> None:
+    assert wanted_lines(touched(*cells), None) == Lines(rows, columns)
+
+
+def test_two_touches_far_apart_are_read_whole() -> None:
+    assert wanted_lines(touched((0, 0), (7, 7)), None) is None
+
+
+def test_a_region_stays_while_it_holds_what_is_touched_and_little_more() -> None:
+    before = Lines(range(2, 6), range(3, 6))
+    assert wanted_lines(touched((3, 4)), before) == before
+    assert wanted_lines(touched((4, 4)), before) == before
+    # A finger that comes near its edge moves it; one that became small shrinks it.
+    assert wanted_lines(touched((5, 4)), before) == Lines(range(4, 7), range(3, 6))
+    wide = Lines(range(1, 6), range(3, 6))
+    assert wanted_lines(touched((3, 4)), wide) == Lines(range(2, 5), range(3, 6))
+
+
+def test_a_region_follows_the_contacts_of_an_emulated_board() -> None:
+    """Its time is stepped, so that no busy machine matters."""
+    of_skin = of_scene("single")
+    url = "emulator://8x8?scene=single&seed=1&begin=0&speed=0"
+    small, whole, first = [], [], None
+    with ohmskin.open(url, calibration=of_skin, focus=True) as skin:
+        for scan in skin:
+            first = scan.time_us if first is None else first
+            (whole if scan.is_whole else small).append(scan)
+            if scan.time_us - first > 2e6:
+                break
+        assert skin.device.stats.missed == 0
+    assert {scan.mode for scan in whole} == {"near"}
+    assert {scan.mode for scan in small} == {"quick"}
+    assert len(small) > 5 * len(whole)
+    # Whole scans still come often.
+    times_s = 1e-6 * np.array([scan.time_us for scan in whole])
+    assert np.diff(times_s).max() < 0.1
+    # A region shows what the whole scan before it has shown.
+    touched = [scan for scan in small if scan.contacts]
+    assert len(touched) > 0.9 * len(small)
+    for scan in touched:
+        before = max((one for one in whole if one.number < scan.number), key=lambda one: one.number)
+        off_n = np.abs(scan.force_n - before.force_n)[scan.read]
+        std_n = np.hypot(scan.force_n_std, before.force_n_std)[scan.read]
+        assert (off_n <= STATED_STDS * std_n + 0.05 * before.force_n[scan.read] + 0.05).all()
