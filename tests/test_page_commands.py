@@ -72,6 +72,8 @@ NOT_RUN = {
     "make ablate": "takes minutes; tests/studies runs small ones of its kind",
     "make far": "takes minutes; tests/studies runs small ones of its kind",
     "make experiments": "takes minutes; tests/studies runs small ones of its kind",
+    "make test-world": "installs packages",
+    "make test-lerobot": "installs packages",
     "make bench-quick": "takes minutes; tests/benchmarks runs a part of it",
     "make bench-tables": "takes minutes; tests/benchmarks has a quick run of it",
     "ohmskin flash uno --port /dev/ttyACM0": "needs a boot loader; tests/cli/test_flash.py has one",
