@@ -150,7 +150,7 @@ experiments: setup ## the paper's experiments with force, simulated: docs/force-
 
 BENCH := $(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks
 
-bench-firmware: setup firmware sim ## measure the firmware in the simulator
+bench-firmware: setup firmware pico sim ## measure the firmware in the simulator
 	$(BENCH)/bench_firmware.py
 
 bench-import: setup-host ## measure what importing the package and asking for its help cost
@@ -207,7 +207,7 @@ bench-largest: setup-host ## measure what the largest skins that files may have 
 bench-boards: setup-host ## measure one process that reads eight boards at once: five minutes
 	$(BENCH)/bench_boards.py
 
-bench-quick: setup firmware sim ## see that all benchmarks run, in minutes: the figures mean nothing
+bench-quick: setup firmware pico sim ## see that all benchmarks run, in minutes: the figures mean nothing
 	for file in benchmarks/bench_*.py; do \
 		echo $$file; $(BENCH)/$${file##*/} --quick || exit; \
 	done

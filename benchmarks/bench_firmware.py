@@ -4,7 +4,8 @@ machine's speed, and two runs give the same numbers.
 
     make bench-firmware
 
-The JSON object has an entry for each board. What is measured how:
+The JSON object has an entry for each board; other_boards.py beside this file says what `pico`,
+`arduino` and `pins` have. What is measured how:
 
 scan_hz, jitter_us    from the instants at which the converter holds the first reading of a scan,
                       at the 90 Hz setting, 8x8. Jitter is the largest deviation from a grid of
@@ -70,6 +71,7 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.link import protocol
 from ohmskin.link.session import Session
+from other_boards import measure_arduino, measure_pico, measure_pins  # beside this file
 from second_simulator import SecondSim
 
 # Readings that are wanted: at 90 Hz, and with the shortest slots; in mode far; in the second
@@ -327,7 +329,25 @@ BARS = (
     at_most("damaged_frames", 0),
     at_most("unanswered_commands", 0),
 )
+PICO_BARS = (
+    at_most("wrong", 0),
+    at_least("readings", 2_000_000),
+    at_least("max_scan_hz", 170),
+    at_least("scan_hz_16x16", 42),
+    at_most("saves_lost", 0),
+    at_most("storms_failed", 0),
+    at_most("flash_bytes", 40_000),
+)
+ARDUINO_BARS = (at_most("wrong", 0), at_least("scan_hz", 16.99), at_most("stamp_error_ms", 1))
+PINS_BARS = (at_most("wrong", 0), at_least("maps", 6), at_least("readings", 2_400_000))
 UNO_BARS = (at_most("flash_bytes", 12288), at_most("ram_bytes", 1228))
+
+
+OTHERS = {
+    "arduino": (measure_arduino, ARDUINO_BARS),
+    "pins": (measure_pins, PINS_BARS),
+    "pico": (measure_pico, PICO_BARS),
+}
 
 
 def main() -> int:
@@ -341,6 +361,10 @@ def main() -> int:
     for board, measured in figures.items():
         print(f"\n{board}")
         all_met &= report(measured, (*BARS, *UNO_BARS) if board == "uno" else BARS)
+    for name, (measure_other, bars) in OTHERS.items():
+        print(f"\n{name}", flush=True)
+        figures[name] = measure_other(part)
+        all_met &= report(figures[name], bars)
     print(json.dumps(figures))
     return 0 if all_met or part is QUICK else 1
 
