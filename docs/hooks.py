@@ -26,6 +26,7 @@ OUTSIDE = {
         f"integrations/{path.parent.name}/README.md": f"integrations/{path.parent.name}.md"
         for path in ROOT.glob("integrations/*/README.md")
     },
+    "integrations/notebook/skin.ipynb": "integrations/notebook/skin.ipynb",
 }
 _INSIDE = {uri: path for path, uri in OUTSIDE.items()}
 _LINK = re.compile(r"(\]\()([^)#\s:]+)((?:#[^)\s]*)?\))")

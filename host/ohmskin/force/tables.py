@@ -69,7 +69,8 @@ def export_forces(
 
     watch: is told how many bytes of the recording were read. Returns what was written.
 
-    :raises RecordingError, ValueError: as `load_forces`; `out` cannot be written.
+    :raises RecordingError: as `load_forces`.
+    :raises ValueError: as `load_forces`; or `out` cannot be written.
     :raises OhmskinError: pyarrow is missing.
     """
     if out.suffix not in FORMATS:
