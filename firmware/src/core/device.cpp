@@ -342,9 +342,9 @@ void Device::begin_slots(const ScanPlan &plan, uint8_t accuracy) {
 }
 
 void Device::begin_self_test_scan() {
-    const Route route = self_test_.route(cycles_per_byte());
-    board::scanner.begin(route);
-    begin_slots(route.plan, static_cast<uint8_t>(frames::Accuracy::Usual));
+    const Route of_test = self_test_.route(cycles_per_byte());
+    board::scanner.begin(of_test);
+    begin_slots(of_test.plan, static_cast<uint8_t>(frames::Accuracy::Usual));
 }
 
 // The region that was asked for while scanning is in force.

@@ -122,12 +122,12 @@ class Planner {
         const uint32_t by_line = line_cycles(plan.readings);
         // The processor has what the interrupts of all slots leave, which are few where slots are
         // as long as may be.
-        const bool long_slots = rate_mhz != 0 && settle == 0;
         uint32_t by_processor =
             timing::BUSY_A_SCAN + uint32_t{timing::BUSY_A_READING} * plan.readings;
-        by_processor += long_slots
-                            ? uint32_t{timing::BUSY_A_SLOT} * least
-                            : by_processor * timing::BUSY_A_SLOT / (slot_min - timing::BUSY_A_SLOT);
+        if (rate_mhz != 0 && settle == 0)
+            by_processor += uint32_t{timing::BUSY_A_SLOT} * least;
+        else
+            by_processor += by_processor * timing::BUSY_A_SLOT / (slot_min - timing::BUSY_A_SLOT);
         fastest_ = uint32_t{slot_min} * least;
         if (fastest_ < by_processor)
             fastest_ = by_processor;
@@ -169,9 +169,9 @@ class Planner {
     // that cannot leave yet, and what comes in faster than it leaves. A scan begins only where that
     // fits, hence no scan is torn.
     Result limited(Route *route) const {
-        const ScanPlan &plan = route->plan;
-        const uint16_t frame = FrameWriter::line_bytes(scan_payload(plan.readings));
-        uint32_t leaves = uint32_t{plan.slot_cycles} * plan.readings / cycles_per_byte_;
+        const ScanPlan &of_route = route->plan;
+        const uint16_t frame = FrameWriter::line_bytes(scan_payload(of_route.readings));
+        uint32_t leaves = uint32_t{of_route.slot_cycles} * of_route.readings / cycles_per_byte_;
         leaves -= leaves / timing::LINE_IDLE_PART;
         const uint32_t excess = frame > leaves ? frame - leaves : 0;
         const uint16_t most = FrameWriter::SIZE - 1 - ANSWERS_SPACE;

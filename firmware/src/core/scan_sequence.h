@@ -132,7 +132,7 @@ class Lines {
     // The bit of the last line.
     static constexpr LineMask TOP = LineMask{1} << (OHMSKIN_LINES_MAX - 1);
 
-    Pair next_[OHMSKIN_LINES_MAX];
+    Pair next_[OHMSKIN_LINES_MAX] = {};
 };
 
 // What the interrupt needs to know of a kind of scan besides.
