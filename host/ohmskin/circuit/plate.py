@@ -15,7 +15,7 @@ from ohmskin.arrays import Float
 from ohmskin.files import PathName, naming, read_bounded
 from ohmskin.link.protocol import CONSTANTS
 
-# Largest file that is read. Chosen: 16 x 16 numbers are 5 kB, so a larger file is no plate.
+# Largest file that is read. Chosen: 32 x 32 numbers are 20 kB, so a larger file is no plate.
 MAX_FILE_BYTES: Final = 100_000
 # Least resistor of a plate. Chosen: beside references of 30 kOhm, it differs from a short by less
 # than a code of 10 bits. So a lower number is in another unit.
@@ -30,8 +30,9 @@ def load_plate(path: PathName) -> Float:
         text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
         lines = [fields for fields in csv.reader(text.splitlines()) if fields]
         columns = len(lines[0]) if lines else 0
-        if not (1 <= len(lines) <= CONSTANTS["rows_max"] and columns <= CONSTANTS["columns_max"]):
-            raise ValueError("a plate has 1 to 16 lines, of 1 to 16 fields each")
+        most = CONSTANTS["rows_max"], CONSTANTS["columns_max"]
+        if not (1 <= len(lines) <= most[0] and columns <= most[1]):
+            raise ValueError("a plate has 1 to {} lines, of 1 to {} fields each".format(*most))
         plate = np.zeros((len(lines), columns))
         for row, fields in enumerate(lines):
             if len(fields) != columns:

@@ -76,7 +76,7 @@ SURPRISE_SHARE: Final = 0.1
 # the frames to make a fault.
 MOST_SURPRISE: Final = 1.8
 # Skins of fewer ports are not judged so. Chosen: of 3x3, a few odd readings make a frame.
-LEAST_PORTS: Final = 16
+LEAST_STAYING_PORTS: Final = 16
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
 # by less than their rounding.
 LEAST_LEAD_OHM: Final = 20.0
@@ -179,7 +179,7 @@ class JointEstimator(Estimator):
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
         self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
-        if not (ports.fault or again) and ports.current.size >= LEAST_PORTS:
+        if not (ports.fault or again) and ports.current.size >= LEAST_STAYING_PORTS:
             surprise = MOST_SURPRISE if message else min(fit.surprise, MOST_SURPRISE)
             self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
         if not message and self._surprise > STAYING_SURPRISE:
