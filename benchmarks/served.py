@@ -45,7 +45,9 @@ def served(script: str, count: int = 1) -> Iterator[Served]:
     """A process that runs ``SCRIPT --serve``, until the body ends."""
     command = [sys.executable, script, "--serve"]
     pipe = subprocess.PIPE
-    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+    # It imports what this process can.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
     assert process.stdout is not None
     boards = Served([process.stdout.readline().strip() for _ in range(count)])
     try:
