@@ -38,7 +38,6 @@ from studies.trials import (
     Trial,
     finger_trial,
     random_trial,
-    rounded,
 )
 
 SEED, SKINS, FRAMES, REST_SCANS = 7000, 5, 40, 90
@@ -147,7 +146,8 @@ def of_region(part: Part) -> dict[str, float]:
 def of_large(part: Part) -> dict[str, float]:
     """joint_16x16_*."""
     frames, seeds = WARM_UP + part.of(60), range(SEED, SEED + part.of(4))
-    readings = [rounded(finger_trial(16, 16, frames, seed).readings) for seed in seeds]
+    trials = (finger_trial(16, 16, frames, seed) for seed in seeds)
+    readings = [trial.rounded(ADC_BITS, wires_told=False) for trial in trials]
     seconds, _ = times_of("joint", readings)
     unit = unit_s(64)
     units = seconds / float(np.median([unit() for _ in range(part.of(200))]))
