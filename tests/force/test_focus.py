@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where reading goes after each scan."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import ohmskin
 from calibrations import of_scene
 from ohmskin.arrays import Bool
-from ohmskin.force.focus import Lines, wanted_lines
+from ohmskin.force.focus import Focus, Lines, wanted_lines
+from ohmskin.link.device import Region
 from studies.judge import STATED_STDS
 
 
@@ -49,6 +52,21 @@ def test_a_region_stays_while_it_holds_what_is_touched_and_little_more() -> None
     assert wanted_lines(touched((5, 4)), before) == Lines(range(4, 7), range(3, 6))
     wide = Lines(range(1, 6), range(3, 6))
     assert wanted_lines(touched((3, 4)), wide) == Lines(range(2, 5), range(3, 6))
+
+
+def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> None:
+    """It may be the ghost of touches outside of the region."""
+    asked: list[Region] = []
+    info = SimpleNamespace(slot_cycles=700, clock_hz=16_000_000, baud=500_000, rows=8, columns=8)
+    focus = Focus(SimpleNamespace(info=info, set_region=asked.append))
+    whole, some = SimpleNamespace(is_whole=True), SimpleNamespace(is_whole=False)
+    focus.follow(touched((3, 4)), 1, whole)
+    focus.follow(touched((3, 4)), 1, some)
+    assert [(region.rows, region.mode) for region in asked] == [(range(2, 5), "quick")]
+    focus.follow(touched((3, 4), (3, 6)), 2, some)
+    assert (asked[-1].rows, asked[-1].mode) == (None, "near")
+    focus.follow(touched((3, 4), (3, 6)), 2, whole)
+    assert (asked[-1].columns, asked[-1].mode) == (range(3, 8), "quick")
 
 
 def test_a_region_follows_the_contacts_of_an_emulated_board() -> None:
