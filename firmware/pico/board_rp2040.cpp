@@ -20,8 +20,7 @@ using namespace rp2040;
 // Sense nodes: top on A0 (GP26), bottom on A1 (GP27), far end of the row on A2 (GP28), of the
 // column on A3 (GP29), which a Pico has not on its edge: other boards do. They float, as analog
 // inputs. All other pins keep the chip's pull-downs.
-const char NAME[frames::NAME_SIZE] = "pico";
-const uint16_t WIRING = OHMSKIN_OWN_PINS;  // 0: that of docs/build.md
+const uint16_t WIRING = wiring::CRC;
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 
@@ -67,7 +66,7 @@ constexpr uint32_t CRYSTAL_MHZ = 12;
 constexpr uint32_t CRYSTAL_STARTUP = 47;
 }  // namespace
 
-static_assert(CLOCK_HZ == SYS_HZ / SLOT_CLOCK_DIVIDER, "core/clock.h has that of a slot");
+static_assert(CLOCK_HZ == SYS_HZ / SLOT_CLOCK_DIVIDER, "pico_numbers.h has that of a slot");
 
 namespace {
 
@@ -114,7 +113,6 @@ struct Registers {
 };
 Registers registers[PATTERNS * frames::READINGS_MAX];
 uint32_t row_levels[ROWS_MAX], column_levels[COLUMNS_MAX];
-static_assert(ROWS_MAX <= 16 && COLUMNS_MAX <= 16, "four pins of address");
 
 void pins_begin() {
     for (uint8_t n = 0; n < ROWS_MAX; n++)
@@ -168,8 +166,6 @@ constexpr uint32_t INTERRUPT_TIMER = 1u << 0, INTERRUPT_PWM = 1u << 4, INTERRUPT
 constexpr uint32_t CONVERSION_ASKED_MAX = 256;
 // Cycles of a slot's clock from start_slots() to the first conversion. Chosen, as on the AVR.
 constexpr uint16_t FIRST_AFTER = 8;
-// Bits of the converter that the protocol does not carry.
-constexpr uint8_t CODE_SHIFT = 12 - ADC_BITS;
 
 }  // namespace
 
@@ -187,7 +183,7 @@ extern "C" void slot_interrupt() {
     uint32_t asked = 0;
     while (!(at(ADC_CS) & ADC_READY) && asked < CONVERSION_ASKED_MAX)
         asked++;
-    code_before = static_cast<uint16_t>(at(ADC_RESULT) >> CODE_SHIFT);
+    code_before = static_cast<uint16_t>(at(ADC_RESULT));
     converted_before = asked < CONVERSION_ASKED_MAX;
     select(next);
 }

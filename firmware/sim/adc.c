@@ -11,7 +11,8 @@
  *   auto triggered      2      13.5
  *
  * The sample capacitor is joined to its channel from the last ADC clock of a conversion on, where
- * the channel is unlocked, until the next hold.
+ * the channel is unlocked, until the next hold. With track_late it is joined only when the next
+ * conversion begins: the data sheet does not say which.
  */
 #include "skinsim.h"
 
@@ -55,11 +56,17 @@ static bool multiplexer_is_free(void) {
     return adc.phase == IDLE || adc.phase == WAITING || adc.phase == TRACKING;
 }
 
+/* A moment at which the sample capacitor may join its channel: a conversion begins, or not. */
+static void may_join(bool begins, instant when) {
+    if (begins == (settings.track_late != 0))
+        skin_connect(adc.channel, when);
+}
+
 static void connect_channel(instant when) {
     if (selected_channel() == adc.channel)
         return;
     adc.channel = selected_channel();
-    skin_connect(adc.channel, when);
+    may_join(false, when);
     stats_channel_changed(when);
 }
 
@@ -135,6 +142,7 @@ static void on_event(instant due) {
         break;
     case WAITING:
         stats_conversion_started(due);
+        may_join(true, due);
         adc.phase = SAMPLING;
         events_set(EVENT_ADC, adc.start + (instant)(adc.hold_clocks * adc.divider));
         break;
@@ -145,7 +153,7 @@ static void on_event(instant due) {
         break;
     case HOLDING: /* a channel written meanwhile is connected in the conversion's last ADC clock */
         adc.phase = TRACKING;
-        skin_connect(adc.channel, due);
+        may_join(false, due);
         connect_channel(due);
         events_set(EVENT_ADC, adc.end);
         break;

@@ -25,6 +25,7 @@ static const struct setting {
     {"cell_pf", &settings.cell_pf, 0, 1e6, false},
     {"half_code", &settings.half_code, 0, 1, false},
     {"far_open", &settings.far_open, 0, 1, false},
+    {"track_late", &settings.track_late, 0, 1, false},
     {"offset_lsb", settings.offset_lsb, -1024, 1024, true},
     {"gain_lsb", settings.gain_lsb, -1024, 1024, true},
     {"inl_lsb", settings.inl_lsb, -1024, 1024, true},

@@ -147,7 +147,7 @@ void modes_advance(const struct modes *modes, const double *ampere, double secon
 struct settings {
     double tau_us;
     double sample_pf, input_ohm, node_pf, line_pf, cell_pf;
-    double late_cycles, half_code, far_open;
+    double late_cycles, half_code, far_open, track_late;
     /* of the converter, by ADPS, which gives the ADC clock */
     double offset_lsb[8], gain_lsb[8], inl_lsb[8], noise_lsb[8];
     double seed;

@@ -5,15 +5,15 @@
 #include "core/scan_plan.h"
 #include "core/scanner.h"
 
-// The whole hardware contract: what a board has to offer. board_avr.cpp implements it for the Uno
-// and the Mega 2560, firmware/pico for an RP2040, board_arduino.cpp for what has Arduino's calls,
-// firmware/test/fake_board.h for the unit tests. Nothing here blocks.
+// The whole hardware contract: what a board has to offer, beside the numbers in board_numbers.h.
+// board_avr.cpp implements it for the Uno and the Mega 2560, firmware/pico for an RP2040,
+// board_arduino.cpp for what has Arduino's calls, firmware/test/fake_board.h for the unit tests.
+// Nothing here blocks.
 namespace ohmskin {
 namespace board {
 
 // ---- what it is
-extern const char NAME[frames::NAME_SIZE];  // as PlatformIO calls it
-extern const uint16_t WIRING;               // hello.wiring
+extern const uint16_t WIRING;  // hello.wiring
 extern const uint32_t REF_TOP_OHM;
 extern const uint32_t REF_BOTTOM_OHM;
 

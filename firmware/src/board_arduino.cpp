@@ -7,21 +7,19 @@
 
 #include "board.h"
 #include "wiring.h"
-#if defined(E2END)  // boards with an EEPROM; on others `save` answers eeprom_failed
+#if defined(E2END)
 #include <EEPROM.h>
+#else  // boards without one: `save` answers eeprom_failed
+struct {
+    uint8_t read(int) { return 0xFF; }
+    void write(int, uint8_t) {}
+} EEPROM;
 #endif
 
 namespace ohmskin {
 namespace board {
 
-#if defined(__AVR_ATmega2560__)
-const char NAME[frames::NAME_SIZE] = "megaatmega2560";
-#elif defined(__AVR_ATmega328P__)
-const char NAME[frames::NAME_SIZE] = "uno";
-#else
-const char NAME[frames::NAME_SIZE] = "arduino";
-#endif
-const uint16_t WIRING = OHMSKIN_OWN_PINS;  // 0: that of docs/build.md
+const uint16_t WIRING = wiring::CRC;
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 Scanner scanner;
@@ -36,14 +34,11 @@ constexpr uint16_t SETTLE_US = 20;
 constexpr uint8_t BYTES_A_PASS = 4;
 constexpr uint8_t ANALOG_PINS[] = {A0, A1, A2, A3, A4, A5};
 
-bool slots_run, converted_before;
-bool pins_are_set;  // for the slot at hand
+bool slots_run, converted_before, pins_are_set;  // the last: for the slot at hand
 uint16_t slot_cycles, code_before;
-uint32_t due_us;   // when the slot at hand is due
-uint8_t due_rest;  // clock cycles beyond due_us
+uint32_t due_us, selected_us;  // when the slot at hand is due, and when its pins were set
+UsRest due_rest;               // parts of a microsecond beyond due_us
 Selection selected;
-ReadingDefinition selected_reading;
-uint32_t selected_us;
 uint8_t bytes_left;
 
 void write_number(const uint8_t *pins, uint8_t number, uint8_t changed) {
@@ -52,52 +47,39 @@ void write_number(const uint8_t *pins, uint8_t number, uint8_t changed) {
             digitalWrite(pins[i], number >> i & 1);
 }
 
-ReadingDefinition reading_at(const Selection &selection) {
-    constexpr uint8_t PER_CELL = frames::READINGS_MAX;
+ReadingDefinition reading_at(uint8_t entry) {
     return READING_DEFINITIONS[static_cast<uint8_t>(
-        reading_of(selection.pattern_entry / PER_CELL, selection.pattern_entry % PER_CELL))];
+        reading_of(entry / frames::READINGS_MAX, entry % frames::READINGS_MAX))];
 }
 
 // Sets what has changed, or all: digitalWrite() takes microseconds.
 void select(const Selection &next, bool all) {
     write_number(wiring::ROW_PINS, next.row, all ? 15 : next.row ^ selected.row);
     write_number(wiring::COLUMN_PINS, next.column, all ? 15 : next.column ^ selected.column);
-    const ReadingDefinition reading = reading_at(next);
-    if (all || reading.drive != selected_reading.drive) {
-        digitalWrite(wiring::DRIVE_TOP_PIN, reading.drive == Drive::Top);
-        digitalWrite(wiring::DRIVE_BOTTOM_PIN, reading.drive == Drive::Bottom);
+    const Drive drive = reading_at(next.pattern_entry).drive;
+    if (all || drive != reading_at(selected.pattern_entry).drive) {
+        digitalWrite(wiring::DRIVE_TOP_PIN, drive == Drive::Top);
+        digitalWrite(wiring::DRIVE_BOTTOM_PIN, drive == Drive::Bottom);
     }
     selected = next;
-    selected_reading = reading;
     selected_us = micros();
 }
 
-// The end of a slot, with its code or without one.
-void end_slot(uint16_t code, bool converted) {
+// The end of a slot: of one that was made, with its code, or of one that is left out.
+void end_slot(uint16_t code, bool made) {
     if (scanner.step(code_before, converted_before))
         slot_cycles = scanner.slot_cycles();
     code_before = code;
-    converted_before = converted;
-    due_rest = static_cast<uint8_t>(due_rest + slot_cycles % CYCLES_PER_US);
-    due_us += slot_cycles / CYCLES_PER_US + due_rest / CYCLES_PER_US;
-    due_rest %= CYCLES_PER_US;
+    converted_before = made && pins_are_set;
+    pins_are_set = made;
+    due_us += us_of(slot_cycles, &due_rest);
 }
 
 void make_slot() {
-    while (micros() - selected_us < SETTLE_US) {
-    }
-    const uint8_t input = wiring::SENSE_INPUTS[static_cast<uint8_t>(selected_reading.sense)];
+    const uint8_t input = wiring::SENSE_INPUTS[uint8_t(reading_at(selected.pattern_entry).sense)];
     const uint16_t code = static_cast<uint16_t>(analogRead(ANALOG_PINS[input]));
     select(scanner.selection(), false);
-    end_slot(code, pins_are_set);
-    pins_are_set = true;
-}
-
-// Leaves slots out, which takes little time, until the board is on time again.
-void catch_up() {
-    while (static_cast<int32_t>(micros() - due_us) > 0)
-        end_slot(0, false);
-    pins_are_set = false;
+    end_slot(code, true);
 }
 }  // namespace
 
@@ -112,9 +94,12 @@ void begin() {
 uint8_t reset_cause() { return 0; }  // Arduino has no call that says so
 void keep_alive() {
     bytes_left = BYTES_A_PASS;
-    const int32_t late_us = static_cast<int32_t>(micros() - due_us);
-    if (slots_run && late_us >= 0)
-        late_us > LATE_US ? catch_up() : make_slot();
+    const int32_t late_us = slots_run ? static_cast<int32_t>(micros() - due_us) : -1;
+    if (late_us > LATE_US)  // leaves slots out, which takes little time
+        while (static_cast<int32_t>(micros() - due_us) > 0)
+            end_slot(0, false);
+    else if (late_us >= 0 && micros() - selected_us >= SETTLE_US)
+        make_slot();
 }
 uint32_t now_us() { return micros(); }
 void mark_pass(bool) {}
@@ -125,7 +110,6 @@ void start_slots(uint16_t cycles, uint8_t) {
     pins_are_set = true;
     converted_before = false;
     due_us = micros();
-    due_rest = 0;
     slots_run = true;
 }
 void stop_slots() {
@@ -154,13 +138,8 @@ bool serial_read(uint8_t *octet) {
     return true;
 }
 
-#if defined(E2END)
 uint8_t eeprom_read(uint16_t address) { return EEPROM.read(address); }
 void eeprom_write(uint16_t address, uint8_t octet) { EEPROM.write(address, octet); }
-#else
-uint8_t eeprom_read(uint16_t) { return 0xFF; }
-void eeprom_write(uint16_t, uint8_t) {}
-#endif
 bool eeprom_busy() { return false; }
 
 }  // namespace board

@@ -23,9 +23,7 @@ namespace board {
 // 0: connect nothing to them. All other unused pins are inputs with pull-ups.
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
-const uint16_t WIRING = OHMSKIN_OWN_PINS;  // 0: that of docs/build.md
-
-static_assert(ROWS_MAX <= 16 && COLUMNS_MAX <= 16, "the pins below have four bits of address");
+const uint16_t WIRING = wiring::CRC;
 
 namespace {
 // Channels of the converter, by Sense, and their pins, as bits of port C (Uno) or F (Mega).
@@ -33,11 +31,7 @@ constexpr const uint8_t (&CHANNELS)[4] = wiring::SENSE_INPUTS;
 constexpr uint8_t CHANNEL_PINS = avr_pins::SENSE_BITS;
 }  // namespace
 
-#if defined(__AVR_ATmega328P__)
-const char NAME[frames::NAME_SIZE] = "uno";
-#elif defined(__AVR_ATmega2560__)
-const char NAME[frames::NAME_SIZE] = "megaatmega2560";
-#else
+#if !defined(__AVR_ATmega328P__) && !defined(__AVR_ATmega2560__)
 #error "no pin table for this chip"
 #endif
 
@@ -216,7 +210,7 @@ ISR(TIMER1_COMPA_vect) {
 }
 
 void start_slots(uint16_t slot_cycles, uint8_t accuracy) {
-    const uint8_t adc_prescaler = timing::prescaler(accuracy);
+    const uint8_t adc_prescaler = prescaler(accuracy);
     const uint8_t bits = prescaler_bits(adc_prescaler);
     select(scanner.selection());
     // The timer stands still until all is set, and its flags are cleared: a flag from before would
@@ -279,7 +273,7 @@ void converter_begin() {
     ADMUX = REGISTERS[0].admux;
     // The first conversion after switching on takes 25 ADC clocks, for which a slot has no room. So
     // it is made now, and nobody reads it.
-    constexpr uint8_t PRESCALER = timing::prescaler(static_cast<uint8_t>(frames::Accuracy::Usual));
+    constexpr uint8_t PRESCALER = prescaler(static_cast<uint8_t>(frames::Accuracy::Usual));
     ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(PRESCALER));
     while (ADCSRA & _BV(ADSC)) {
     }

@@ -2,6 +2,8 @@
 #pragma once
 #include <stdint.h>
 
+#include "core/scan_sequence.h"
+
 // The one table of what is connected where: by Arduino's numbers of pins (D4 is 4; on an RP2040,
 // GP4 is 4) and of analog inputs (A0 is 0). The defaults are those of docs/build.md. A board that
 // is wired otherwise is told by build_flags in platformio.ini, any of these:
@@ -79,6 +81,8 @@ constexpr uint32_t REF_BOTTOM_OHM = OHMSKIN_REF_BOTTOM_OHM;
 
 static_assert(sizeof ROW_PINS == 4, "OHMSKIN_ROW_PINS: four pins, S0 to S3");
 static_assert(sizeof COLUMN_PINS == 4, "OHMSKIN_COLUMN_PINS: four pins, S0 to S3");
+static_assert(ROWS_MAX <= 1 << sizeof ROW_PINS && COLUMNS_MAX <= 1 << sizeof COLUMN_PINS,
+              "OHMSKIN_ROWS_MAX, OHMSKIN_COLUMNS_MAX: more lines than four pins of address select");
 static_assert(sizeof SENSE_INPUTS == 4, "OHMSKIN_SENSE_INPUTS: four inputs, the last two far");
 static_assert(REF_TOP_OHM >= 100 && REF_TOP_OHM <= 10000000 && REF_BOTTOM_OHM >= 100 &&
                   REF_BOTTOM_OHM <= 10000000,
@@ -88,6 +92,21 @@ static_assert(REF_TOP_OHM >= 100 && REF_TOP_OHM <= 10000000 && REF_BOTTOM_OHM >=
 constexpr uint8_t PINS[] = {OHMSKIN_ROW_PINS, OHMSKIN_COLUMN_PINS, OHMSKIN_DRIVE_TOP_PIN,
                             OHMSKIN_DRIVE_BOTTOM_PIN};
 constexpr uint8_t PIN_COUNT = sizeof PINS;
+
+// CRC-16/IBM-3740 of a list, after `crc`: what `hello` says of the wiring.
+constexpr uint16_t crc_of_bits(uint16_t crc, uint8_t bits) {
+    return bits == 0 ? crc
+                     : crc_of_bits(static_cast<uint16_t>(crc << 1 ^ (crc & 0x8000 ? 0x1021 : 0)),
+                                   bits - 1);
+}
+constexpr uint16_t crc_of(const uint8_t *list, uint8_t size, uint16_t crc) {
+    return size == 0 ? crc
+                     : crc_of(list + 1, size - 1,
+                              crc_of_bits(static_cast<uint16_t>(crc ^ list[0] << 8), 8));
+}
+// Of the pins above, in that order; 0: those of docs/build.md.
+constexpr uint16_t CRC =
+    OHMSKIN_OWN_PINS ? crc_of(SENSE_INPUTS, 4, crc_of(PINS, PIN_COUNT, 0xFFFF)) : 0;
 
 // How often a number is in a list.
 constexpr uint8_t count(const uint8_t *list, uint8_t size, uint8_t number) {

@@ -178,26 +178,25 @@ def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
         (digits,) = re.findall(rf"\b{name} = (\d+)", source(file))
         return int(digits)
 
-    plan = "core/scan_plan.h"
-    assert number(plan, "SLOT_ADC_CLOCKS_MIN") == emulator.SLOT_ADC_CLOCKS_MIN
+    plan, avr = "core/scan_plan.h", "avr_numbers.h"
     assert number(plan, "SLOT_CYCLES_MAX") == emulator.SLOT_CYCLES_MAX
     (settle_us,) = re.findall(r"SETTLE_US\[\] = {(.*)};", source(plan))
     assert [int(us) for us in settle_us.split(",")] == list(emulator.SETTLE_US.values())
     for name in ("BUSY_A_SLOT", "BUSY_A_READING", "BUSY_A_SCAN"):
-        assert number(plan, name) == getattr(emulator, name)
+        assert number(avr, name) == getattr(emulator, name)
     assert number(plan, "LINE_IDLE_PART") == emulator.LINE_IDLE_PART
     assert number(plan, "IDLE_TO_CHANGE") == emulator.IDLE_TO_CHANGE
     assert f"OHMSKIN_ROWS_MAX {emulator.LINES_MAX}" in source("core/scan_sequence.h")
-    assert emulator.HELD_ADC_CLOCKS == 11 + 1 / 2
-    assert "return static_cast<uint16_t>(11u * prescaler + prescaler / 2);" in source(plan)
-    told = source("core/settings.h").split("DEFAULT_SETTINGS = {")[1].split("};")[0]
+    slot_min, held = re.findall(r"\((\d+)u \* prescaler\(accuracy\)( / 2)?\)", source(avr))
+    assert slot_min == (str(emulator.SLOT_ADC_CLOCKS_MIN), "")
+    assert held == (str(round(2 * emulator.HELD_ADC_CLOCKS)), " / 2")
+    told = source("core/settings.cpp").split("Settings default_settings() {")[1].split("\n}")[0]
     defaults = EmulatedBoard(Scene().ratio, BoardSettings()).settings
-    in_order = ("unit_id", "rows", "columns", "rate_mhz", "settle_us", "whole_every")
-    numbers = re.findall(r"^ +(\d+),", told, re.MULTILINE)
-    assert [str(defaults[name]) for name in in_order] == numbers
+    for name in ("unit_id", "rows", "columns", "rate_mhz", "settle_us", "whole_every"):
+        (value,) = re.findall(rf"\b{name}(?: = [\w.]+)* = (\d+);", told)
+        assert int(value) == defaults[name]
     assert (defaults["accuracy"], defaults["mode"]) == ("usual", "near")
-    enums = ["Accuracy::Usual", "Mode::Near", "Mode::Near"]
-    assert re.findall(r"frames::(\w+::\w+)", told) == enums
+    assert re.findall(r"frames::(\w+::\w+)", told) == ["Accuracy::Usual", "Mode::Near"]
 
 
 @pytest.mark.parametrize(

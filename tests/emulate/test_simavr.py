@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ohmskin
 from avr import ECHO, FOREVER, SENDER, TRANSMITTER, Build, Simulate, sts
 from lockstep import LockstepSim
 from ohmskin.emulate import simavr
 from ohmskin.emulate.simavr import PROGRAM, SimulationError
+from ohmskin.errors import DeviceLost
 from waiting import until
 
 CRASHES = ["jmp 0x7FF0\n", "sts 0xFFFF, r16\n", "lds r16, 0xF000\n"]
@@ -132,3 +134,15 @@ def test_pty_without_a_reader_drops_bytes_and_goes_on(simulate: Simulate) -> Non
     sim = simulate(fastest, pty=True)
     sim.power_on()
     until(lambda: sim.stats()["pty_dropped"] > 20_000)  # the kernel buffers about 64 kB
+
+
+@pytest.mark.simavr
+def test_a_board_whose_converter_is_late_says_so_when_no_scan_comes() -> None:
+    """A silent board is asked for its hello, whose counter the host says in words."""
+    with ohmskin.open("simavr://uno?late_cycles=60") as skin:
+        skin.configure(rate_hz=0, settle_us=1)
+        with pytest.raises(
+            DeviceLost, match=r"no scan for 3\.0 s: \d+ conversions late: ask for a"
+        ):
+            skin.latest(3.0)
+        assert skin.info.late > 1000

@@ -294,6 +294,19 @@ def test_sample_capacitor_remembers_the_reading_before(
         assert sim.stats()["channel_settle_cycles_max"] == joined
 
 
+@pytest.mark.parametrize(("slot", "adc_clocks"), [(416, 1.5), (694, 2.0)])
+def test_a_late_sample_capacitor_joins_when_the_conversion_begins(
+    simulate: Simulate, slot: int, adc_clocks: float
+) -> None:
+    """As above, but it has only the ADC clocks before the hold, whatever the slot's length is."""
+    k = 14 / 114 * math.exp(-adc_clocks * 32 / (CPU_HZ * 30e3 * 114e-12))
+    sim = simulate(ALTERNATELY.replace("SLOT", str(slot)))
+    sim.set(sample_pf=14, node_pf=100, track_late=1)
+    sim.run_cycles(10_000)
+    codes = set(hold_log(sim, 10_000)["code"])
+    assert codes == {math.floor(1024 * k / (1 + k)), math.floor(1024 / (1 + k))}
+
+
 def test_gaps_between_changes_and_holds(simulate: Simulate) -> None:
     """Those of row, column and drive pins are told apart from those of the ADC's channel."""
     program = FREE_RUNNING + "ldi r16, 0x10\n out 0x0B, r16\n"  # row 1 at 11

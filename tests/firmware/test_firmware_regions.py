@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_helpers import go_fast, numbers
+from firmware_helpers import go_fast, numbers, random_region
 from lockstep import DEFAULT_SCAN, Rig
 from ohmskin.link import framing, protocol
 
@@ -21,19 +21,6 @@ REGION: dict[str, Any] = {
     "whole_mode": "near",
     "whole_every": 0,
 }
-
-
-def random_region(rng: np.random.Generator) -> dict[str, Any]:
-    """Any rows and columns of 8x8, in any mode, with whole scans now and then."""
-    return {
-        "row_mask": int(rng.integers(1, 256)),
-        "column_mask": int(rng.integers(1, 256)),
-        "rate_mhz": int(rng.choice([0, 0, 20_000])),
-        "settle_us": int(rng.choice([0, 15, 60])),
-        "mode": str(rng.choice(list(protocol.MODES))),
-        "whole_mode": str(rng.choice(list(protocol.MODES))),
-        "whole_every": int(rng.choice([0, 1, 2, 5])),
-    }
 
 
 def test_regions_that_change_while_scanning_are_read_as_their_scans_say(
@@ -130,6 +117,19 @@ def test_the_rate_that_is_said_is_the_rate_that_comes(rig: Rig, *, fast: bool) -
             kept_hz = rig.frames("ack")[-3]["rate_mhz"] / 1000
             took_s = 1e-6 * (rig.scans[-1].header["time_us"] - rig.scans[0].header["time_us"])
             assert (len(rig.scans) - 1) / took_s == pytest.approx(kept_hz, rel=1e-3)
+    assert rig.damaged == 0
+
+
+def test_small_regions_keep_their_rate_for_long(rig: Rig) -> None:
+    """A processor that is a little too slow drops the first scan after a quarter of a second."""
+    rate_hz = 1700 if rig.hello()["board"] == "uno" else 1675
+    go_fast(rig)
+    rig.start_scan()
+    rig.must("set_region", **(REGION | {"rate_mhz": 1000 * rate_hz}))
+    rig.run(0.7)
+    rig.must("stop")
+    assert rig.scans[-1].header["dropped"] == 0
+    assert len(rig.scans) > 0.6 * rate_hz
     assert rig.damaged == 0
 
 

@@ -55,10 +55,11 @@ def findings_on(rig: Rig, ratio: np.ndarray) -> tuple[str, ...]:
     rig.must("self_test", limit_s=1.0)
     assert [name for name, _ in rig.log[before:]] == ["self_test_report", "ack"]
     report = rig.frames("self_test_report")[-1]
-    codes = np.clip(np.floor(ratio * 1024), 0, 1023)
+    largest = (1 << rig.sim.adc_bits) - 1
+    codes = np.clip(np.floor(ratio * (largest + 1)), 0, largest)
     # Far nodes are judged from the second column on.
     far = codes[:, 1:, 4:]
-    least = (*codes[..., :4].min(axis=(0, 1)), *far.min(axis=(0, 1)), *([1023] * 4))
+    least = (*codes[..., :4].min(axis=(0, 1)), *far.min(axis=(0, 1)), *([largest] * 4))
     most = (*codes[..., :4].max(axis=(0, 1)), *far.max(axis=(0, 1)), *([0] * 4))
     assert (report["code_min"], report["code_max"]) == (least[:8], most[:8])
     return tuple(report["findings"])

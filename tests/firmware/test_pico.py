@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import test_firmware_commands as commands
+import test_firmware_regions as regions
 import test_firmware_scan as scans
 import test_firmware_self_test as self_test
 import test_firmware_settings as settings
@@ -17,6 +18,7 @@ from firmware_helpers import OTHER_SCAN, assert_whole, go_fast, reset
 from lockstep import DEFAULT_SCAN, Rig
 from pin_maps import PinMap
 from places import ROOT
+from ports import USB_IDS
 from second_simulator import PICO_ELF, PicoSim
 
 pytestmark = pytest.mark.pico
@@ -39,6 +41,10 @@ test_more_commands_than_can_wait = scans.test_more_commands_than_can_wait_do_not
 test_a_command_at_the_highest_rate = scans.test_a_command_at_the_highest_rate_loses_no_scan
 test_every_scan_arrives = scans.test_the_fast_line_carries_every_scan
 test_random_bytes = scans.test_random_bytes_change_nothing
+test_regions = regions.test_regions_that_change_while_scanning_are_read_as_their_scans_say
+test_second_scan = regions.test_the_second_scan_begun_after_the_command_has_the_new_region
+test_whole_scans = regions.test_whole_scans_come_in_between
+test_the_rate_that_is_said = regions.test_the_rate_that_is_said_is_the_rate_that_comes
 test_save_while_scanning = settings.test_save_while_scanning_loses_no_scan
 test_load_defaults = settings.test_load_defaults_leaves_the_eeprom_alone
 test_self_test = self_test.test_self_test_of_a_sound_board
@@ -89,12 +95,13 @@ def test_a_pico_that_is_wired_otherwise_reads_right(
     subprocess.run(command, check=True, capture_output=True)
     pins = (*pin_map.rows, *pin_map.columns, *pin_map.drive, *pin_map.sense)
     sim = PicoSim(tmp_path / "ohmskin.elf", ",".join(map(str, pins)))
-    with Rig("uno", sim) as rig:
+    with Rig("pico", sim) as rig:
         rig.run(sim.boot_s)
         rig.randomize(rng)
         rig.start_scan(mode="far", rows=16, columns=5)
         hello = rig.hello()
         assert (hello["ref_top_ohm"], hello["ref_bottom_ohm"]) == pin_map.ref_ohm
+        assert hello["wiring"] == pin_map.crc
         rig.run(0.05)
         rig.must("stop")
         assert_whole(rig)
@@ -104,6 +111,8 @@ def test_usb_keeps_to_the_rules(rig: Rig) -> None:
     assert isinstance(rig.sim, PicoSim)
     said = rig.sim.described()
     assert said["device"] == said["begin"]
+    ids = tuple(int.from_bytes(said["device"][at : at + 2], "little") for at in (8, 10))
+    assert ids == USB_IDS["pico"]  # by which the host finds it
     configuration = said["configuration"]
     assert int.from_bytes(configuration[2:4], "little") == len(configuration)
     assert said["serial_number"][2:].decode("utf-16-le") == "D0D1D2D3D4D5D6D7"

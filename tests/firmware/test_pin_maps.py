@@ -37,6 +37,7 @@ def test_a_board_that_is_wired_otherwise_reads_right(
             rig.start_scan(mode="far", rows=16, columns=5)
             hello = rig.hello()
             assert (hello["ref_top_ohm"], hello["ref_bottom_ohm"]) == pin_map.ref_ohm
+            assert hello["wiring"] == pin_map.crc
             for _ in range(4):
                 rig.run(0.03)
                 rig.randomize(rng)
@@ -56,6 +57,8 @@ REFUSED = {
     "-DOHMSKIN_DRIVE_TOP_PIN=15": "a pin drives and senses",
     "-DOHMSKIN_SENSE_INPUTS=0,1,2,2": "an input is used twice",
     "-DOHMSKIN_SENSE_INPUTS=0,1,2,6": "no such input",
+    "-DOHMSKIN_ROWS_MAX=32": "more lines than four pins of address select",
+    "-DOHMSKIN_COLUMNS_MAX=17": "more lines than four pins of address select",
     "-DOHMSKIN_REF_TOP_OHM=30": "in ohms, 30000 for 30 kOhm",
 }
 
@@ -65,8 +68,8 @@ def test_a_wiring_that_cannot_be_does_not_compile(flag: str, tmp_path: Path) -> 
     """By the header alone, with avr-gcc: a whole build takes seconds."""
     (tmp_path / "wired.cpp").write_text('#include "avr_pins.h"\n')
     command = ["avr-g++", "-std=gnu++11", "-mmcu=atmega328p", "-fsyntax-only", flag, "wired.cpp"]
-    include = f"-I{ROOT / 'firmware' / 'src'}"
-    done = subprocess.run([*command, include], cwd=tmp_path, capture_output=True, text=True)
+    include = [f"-I{ROOT / 'firmware' / 'src'}", f"-I{ROOT / 'protocol'}"]
+    done = subprocess.run([*command, *include], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 1
     assert re.search(f"static assertion failed: .*{REFUSED[flag]}", done.stderr)
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import test_firmware_commands as commands
+import test_firmware_regions as regions
 import test_firmware_scan as scans
 import test_firmware_self_test as self_test
 import test_firmware_settings as settings
@@ -28,6 +29,8 @@ test_saved_settings = settings.test_saved_settings_survive_a_reset
 test_save_while_scanning = settings.test_save_while_scanning_loses_no_scan
 test_self_test = self_test.test_self_test_of_a_sound_board
 test_self_test_of_far_nodes = self_test.test_self_test_judges_far_nodes
+test_regions = regions.test_regions_that_change_while_scanning_are_read_as_their_scans_say
+test_whole_scans_between = regions.test_whole_scans_come_in_between
 test_watchdog = scans.test_watchdog_restarts_a_hung_main_loop
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lockstep import Rig
+from lockstep import CPU_HZ, READINGS, Rig
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.doctor.examine import Evidence, examine
@@ -18,8 +18,9 @@ from ohmskin.doctor.wires import CornerScans, moved_across, suggested_corners
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Scan
+from ohmskin.link.protocol import MODES
 from stepped import stepped
-from studies.trials import skin_at_rest, touch
+from studies.trials import Trial, skin_at_rest, touch
 
 REST_SCANS, SCANS = 20, 3
 LOOK_SCANS = 60  # of the doctor
@@ -70,6 +71,54 @@ def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) 
             _show(rig, skin, mode)
             ratios.append(ratio_from_codes(_scans(rig, SCANS)))
     return DeskSkin(rest, rest_ratio, skins, ratios)
+
+
+@dataclass(frozen=True, eq=False)
+class PacedSkin:
+    """A trial, as a board on a desk reads it.
+
+    scans_hz: of its region, without whole scans in between. rest_ratio: mean of near scans.
+    ratios: of each frame, the scans up to the third one of the mode that was asked for, each
+    (R, C, 4); what was not read is NaN.
+    """
+
+    trial: Trial
+    scans_hz: float
+    rest_ratio: Float
+    ratios: list[list[Float]]
+
+
+def paced_skin(seed: int, trial: Trial, **scan: Any) -> PacedSkin:
+    """A trial of 8x8 cells on the desk of this seed, at rest in mode near at 90 Hz, then so."""
+    with _on_desk(seed) as (rig, _, _):
+        _show(rig, trial.rest, "near")
+        rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
+        rig.must("stop")
+        rig.start_scan(**scan)
+        rig.sim.hold_log(False)
+        scans_hz = CPU_HZ / rig.hello()["scan_cycles"]
+        ratios = []
+        for skin in trial.frames:
+            _show(rig, skin, "near")
+            rig.scans.clear()
+            ratios.append(list(_until_third(rig, scan["mode"])))
+    return PacedSkin(trial, scans_hz, rest_ratio, ratios)
+
+
+def _until_third(rig: Rig, mode: str) -> Iterator[Float]:
+    """Scans of the skin as it is, up to the third of this mode: those under way are left out."""
+    taken = 2
+    for _ in range(SCANS):
+        while True:
+            while len(rig.scans) <= taken:
+                rig.run(0.004)
+            scan, taken = rig.scans[taken], taken + 1
+            ratio = np.full((*scan.codes.shape[:2], 4), np.nan)
+            names = MODES[scan.header["mode"]]
+            ratio[..., [READINGS.index(name) for name in names]] = ratio_from_codes(scan.codes)
+            yield ratio
+            if scan.header["mode"] == mode:
+                break
 
 
 def examined(seed: int, nominal: tuple[float, float]) -> Diagnosis:

@@ -4,6 +4,8 @@
 import json
 from typing import Any
 
+import numpy as np
+
 from lockstep import CPU_HZ, Rig
 from ohmskin.link import protocol
 from places import ROOT
@@ -52,3 +54,16 @@ def assert_whole(rig: Rig) -> None:
     assert numbers(rig) == list(range(len(rig.scans)))
     assert {scan.header["dropped"] for scan in rig.scans} == {0}
     assert rig.check().wrong == 0
+
+
+def random_region(rng: np.random.Generator) -> dict[str, Any]:
+    """Any rows and columns of 8x8, in any mode, with whole scans now and then."""
+    return {
+        "row_mask": int(rng.integers(1, 256)),
+        "column_mask": int(rng.integers(1, 256)),
+        "rate_mhz": int(rng.choice([0, 0, 20_000])),
+        "settle_us": int(rng.choice([0, 15, 60])),
+        "mode": str(rng.choice(list(protocol.MODES))),
+        "whole_mode": str(rng.choice(list(protocol.MODES))),
+        "whole_every": int(rng.choice([0, 1, 2, 5])),
+    }

@@ -25,7 +25,6 @@ CPU_HZ = 16_000_000
 CYCLES_PER_US = CPU_HZ // 1_000_000
 BOARDS = ("uno", "megaatmega2560")
 READINGS = tuple(protocol.ENUMS["reading"].values)
-CODES = 1 << protocol.ADC_BITS
 TABLE_SHAPE = (16, 16, len(READINGS))
 DEFAULT_SCAN: dict[str, Any] = {
     "rows": 8,
@@ -56,6 +55,8 @@ class LockstepSim(SkinSim):
     """A board has said hello so long after a reset [s]."""
     jitter_cycles = 0
     """By so much a hold may come early or late."""
+    adc_bits = protocol.ADC_BITS
+    """Bits of its converter."""
 
     def run_cycles(self, cycles: int) -> bytes:
         """Run for `cycles` CPU cycles (16 MHz), to the end of the instruction that reaches them.
@@ -320,16 +321,17 @@ class Rig(Closing):
     def set_codes(self, codes: NDArray[np.uint16], rng: np.random.Generator) -> None:
         """Make the skin read `codes` (16, 16, 8): a third each at the step's edges and inside."""
         inside = rng.random(codes.shape)
-        upper_edge = np.nextafter((codes + 1.0) / CODES, 0)
+        steps = 1 << self.sim.adc_bits
+        upper_edge = np.nextafter((codes + 1.0) / steps, 0)
         where = rng.integers(3, size=codes.shape)
-        ratio = np.choose(where, [codes / CODES, upper_edge, (codes + inside) / CODES])
+        ratio = np.choose(where, [codes / steps, upper_edge, (codes + inside) / steps])
         self.sim.set_table(ratio)
         self._table_cycles.append(int(self.sim.stats()["cycles"]))
         self._tables.append(codes)
 
     def randomize(self, rng: np.random.Generator) -> NDArray[np.uint16]:
         """A new random skin, from this cycle on; the codes that it reads."""
-        codes = rng.integers(CODES, size=TABLE_SHAPE, dtype=np.uint16)
+        codes = rng.integers(1 << self.sim.adc_bits, size=TABLE_SHAPE, dtype=np.uint16)
         self.set_codes(codes, rng)
         return codes
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boards that are wired otherwise: their firmware, and the same wiring for the simulators."""
 
+import binascii
 import os
 import re
 import subprocess
@@ -38,6 +39,13 @@ class PinMap:
         }
         said = {name: ",".join(map(str, pins)) for name, pins in lists.items()} | numbers
         return " ".join(f"-DOHMSKIN_{name}={value}" for name, value in said.items())
+
+    @property
+    def crc(self) -> int:
+        """What `hello` says of it: binascii's CRC of its pins, in the order of wiring.h."""
+        return binascii.crc_hqx(
+            bytes((*self.rows, *self.columns, *self.drive, *self.sense)), 0xFFFF
+        )
 
     def pins(self, board: str) -> str:
         """The option --pins of both simulators."""

@@ -35,6 +35,7 @@ class PicoSim(LockstepSim):
     """Until the host has it: 10 ms of bus reset are the most of it."""
     jitter_cycles = 2
     """Its processor starts each conversion, up to some instructions late."""
+    adc_bits = 12
 
     def __init__(self, elf: Path = PICO_ELF, pins: str = "") -> None:
         with patch("ohmskin.emulate.simavr.PROGRAM", FOLDER / "second_sim.js"):

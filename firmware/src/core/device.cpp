@@ -140,24 +140,35 @@ void Device::watch_baud() {
 
 namespace {
 
-struct Command {
-    Type type;
-    uint8_t payload_size;
-    bool while_scanning;  // false: refused then, because it would tear a scan
-};
+// Bytes of a command's payload; NO_COMMAND where there is none of this type.
+constexpr uint8_t NO_COMMAND = 0xFF;
+uint8_t payload_size_of(Type command) {
+    switch (command) {
+    case Type::GetHello:
+    case Type::Start:
+    case Type::Stop:
+    case Type::Save:
+    case Type::LoadDefaults:
+    case Type::SelfTest:
+        return 0;
+    case Type::Configure:
+        return sizeof(frames::Configure);
+    case Type::SetUnitId:
+        return sizeof(frames::SetUnitId);
+    case Type::SetBaud:
+        return sizeof(frames::SetBaud);
+    case Type::SetRegion:
+        return sizeof(RegionRequest);
+    default:
+        return NO_COMMAND;
+    }
+}
 
-constexpr Command COMMANDS[] = {
-    {Type::GetHello, 0, true},
-    {Type::Configure, sizeof(frames::Configure), false},
-    {Type::Start, 0, true},
-    {Type::Stop, 0, true},
-    {Type::SetUnitId, sizeof(frames::SetUnitId), true},
-    {Type::Save, 0, true},
-    {Type::LoadDefaults, 0, false},
-    {Type::SelfTest, 0, false},
-    {Type::SetBaud, sizeof(frames::SetBaud), false},
-    {Type::SetRegion, sizeof(RegionRequest), true},
-};
+// Whether it would tear a scan in progress.
+bool tears_scan(Type command) {
+    return command == Type::Configure || command == Type::LoadDefaults ||
+           command == Type::SelfTest || command == Type::SetBaud;
+}
 
 // The fields of a payload, whose size refusal() has checked. It is copied, because the reader's
 // bytes need not lie where a field of several bytes may.
@@ -185,18 +196,16 @@ void Device::execute() {
 
 // Why the command that has arrived cannot be carried out now; Ok if it can.
 Result Device::refusal() const {
-    const Command *command = nullptr;
-    for (const Command &candidate : COMMANDS)
-        if (static_cast<uint8_t>(candidate.type) == reader_.type())
-            command = &candidate;
-    if (command == nullptr)
+    const Type command = static_cast<Type>(reader_.type());
+    const uint8_t size = payload_size_of(command);
+    if (size == NO_COMMAND)
         return Result::UnknownCommand;
-    if (reader_.payload_size() != command->payload_size)
+    if (reader_.payload_size() != size)
         return Result::BadLength;
-    if (activity_ == Activity::SelfTesting && command->type != Type::GetHello)
+    if (activity_ == Activity::SelfTesting && command != Type::GetHello)
         return Result::Busy;
     const bool scanning = activity_ == Activity::Scanning || activity_ == Activity::Stopping;
-    if (scanning && !command->while_scanning)
+    if (scanning && tears_scan(command))
         return Result::Scanning;
     return Result::Ok;
 }
@@ -232,11 +241,8 @@ void Device::carry_out() {
     }
 }
 
-// Clock cycles in which the line carries a byte: start bit, eight data bits, stop bit.
-uint16_t Device::cycles_per_byte() const {
-    constexpr uint8_t BITS_PER_BYTE_8N1 = 10;
-    return static_cast<uint16_t>(CLOCK_HZ / baud_ * BITS_PER_BYTE_8N1);
-}
+// Clock cycles in which the line carries a byte.
+uint16_t Device::cycles_per_byte() const { return board::cycles_per_byte(baud_); }
 
 // What can be kept of a request, or why it cannot. The answer at hand says the rate.
 Result Device::plan(const ScanRequest &request, Routes *routes) {
@@ -307,9 +313,10 @@ void Device::save() {
 }
 
 Result Device::load_defaults() {
-    if (configure(DEFAULT_SETTINGS.request) != Result::Ok)
+    const Settings defaults = default_settings();
+    if (configure(defaults.request) != Result::Ok)
         return Result::LineTooSlow;
-    settings_ = DEFAULT_SETTINGS;
+    settings_ = defaults;
     return Result::Ok;
 }
 
@@ -336,8 +343,8 @@ void Device::begin_slots(const ScanPlan &plan, uint8_t accuracy) {
     codes_left_ = 0;
     // Cycles from now to the first reading. Small slow scans have slots for which 16 bits are few.
     const uint32_t ahead = uint32_t{plan.slot_cycles} * Scanner::FIRST_SLOT;
-    scan_time_us_ = board::now_us() + ahead / CYCLES_PER_US;
-    scan_time_rest_ = static_cast<uint8_t>(ahead % CYCLES_PER_US);
+    scan_time_rest_ = 0;
+    scan_time_us_ = board::now_us() + us_of(ahead, &scan_time_rest_);
     board::start_slots(plan.slot_cycles, accuracy);
 }
 
@@ -404,7 +411,7 @@ void Device::send_hello() {
         COLUMNS_MAX,
         asked.rows,
         asked.columns,
-        ADC_BITS,
+        board::ADC_BITS,
         board::REF_TOP_OHM,
         board::REF_BOTTOM_OHM,
         asked.rate_mhz,
@@ -427,7 +434,8 @@ void Device::send_hello() {
         dropped_,
         board::scanner.late_codes(),
     };
-    memcpy(hello.board, board::NAME, sizeof hello.board);
+    static_assert(sizeof board::NAME <= sizeof hello.board, "a name");
+    memcpy(hello.board, board::NAME, sizeof board::NAME);
     writer_.begin(Type::Hello);
     writer_.put(&hello, sizeof hello);
     writer_.end();

@@ -124,8 +124,8 @@ class Device {
     Turns turns_{};
     uint32_t scan_number_ = 0;
     uint32_t scan_time_us_ = 0;
-    uint8_t scan_time_rest_ = 0;  // clock cycles beyond scan_time_us_
-    uint16_t dropped_ = 0;        // scans since the start that were made and not sent
+    UsRest scan_time_rest_ = 0;  // parts of a microsecond beyond scan_time_us_
+    uint16_t dropped_ = 0;       // scans since the start that were made and not sent
 
     // The line's speed. A new one is given up again unless the host confirms it by a command.
     uint32_t baud_ = 0;

@@ -9,13 +9,12 @@ using frames::Type;
 
 namespace {
 
-// Bytes of a group: four codes of 10 bits.
-constexpr uint8_t GROUP_BYTES = 5;
-static_assert(ADC_BITS == 10 && Scanner::GROUP == 4, "the shifts of put_group()");
+using Codes = Packing<board::ADC_BITS>;
+static_assert(Scanner::GROUP == Codes::CODES, "a group is packed at once");
 
 // Bytes that the last group of a frame may take: its own, the lengths of two blocks, CRC,
 // delimiter.
-constexpr uint16_t GROUP_SPACE = GROUP_BYTES + 2 + 2 + 1;
+constexpr uint16_t GROUP_SPACE = Codes::BYTES + 2 + 2 + 1;
 
 }  // namespace
 
@@ -55,17 +54,11 @@ void Device::begin_scan() {
         send_pending();
     const Route &now = route();
     if (writer_.used() <= now.ring_limit) {
-        const frames::Scan header = {scan_number_,
-                                     scan_time_us_,
-                                     dropped_,
-                                     reader_.errors(),
-                                     settings_.request.rows,
-                                     settings_.request.columns,
-                                     now.pattern,
-                                     ADC_BITS,
-                                     now.rows,
-                                     now.columns,
-                                     now.plan.slot_cycles};
+        const frames::Scan header = {
+            scan_number_,     scan_time_us_,          dropped_,
+            reader_.errors(), settings_.request.rows, settings_.request.columns,
+            now.pattern,      board::ADC_BITS,        now.rows,
+            now.columns,      now.plan.slot_cycles};
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
         codes_left_ = now.plan.readings;
@@ -119,14 +112,11 @@ void Device::count_scan() {
     // The last slots before a scan have the length of its own (scanner.h).
     const int32_t longer = int32_t{route().plan.slot_cycles} - before.slot_cycles;
     const uint32_t cycles = uint32_t{before.slot_cycles} * slots +
-                            static_cast<uint32_t>(board::SLOTS_OF_NEW_LENGTH * longer) +
-                            scan_time_rest_;
-    scan_time_us_ += cycles / CYCLES_PER_US;
-    scan_time_rest_ = static_cast<uint8_t>(cycles % CYCLES_PER_US);
+                            static_cast<uint32_t>(board::SLOTS_OF_NEW_LENGTH * longer);
+    scan_time_us_ += us_of(cycles, &scan_time_rest_);
 }
 
-// Packs a group's codes of 10 bits, four into five bytes, least significant bit first. The last
-// group of a scan may have fewer: the bits behind them are 0.
+// Packs a group's codes. The last group of a scan may have fewer: the bits behind them are 0.
 void Device::put_group(const uint16_t *code, uint8_t count) {
     uint16_t last[Scanner::GROUP];
     if (count != Scanner::GROUP) {
@@ -134,14 +124,9 @@ void Device::put_group(const uint16_t *code, uint8_t count) {
             last[n] = n < count ? code[n] : 0;
         code = last;
     }
-    const uint8_t octets[GROUP_BYTES] = {
-        static_cast<uint8_t>(code[0]),
-        static_cast<uint8_t>(code[0] >> 8 | static_cast<uint8_t>(code[1]) << 2),
-        static_cast<uint8_t>(code[1] >> 6 | static_cast<uint8_t>(code[2]) << 4),
-        static_cast<uint8_t>(code[2] >> 4 | static_cast<uint8_t>(code[3]) << 6),
-        static_cast<uint8_t>(code[3] >> 2),
-    };
-    writer_.put(octets, static_cast<uint8_t>(count + 1));
+    uint8_t octets[Codes::BYTES];
+    Codes::pack(code, octets);
+    writer_.put(octets, static_cast<uint8_t>((count * board::ADC_BITS + 7) / 8));
 }
 
 }  // namespace ohmskin

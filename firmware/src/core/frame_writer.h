@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "board_numbers.h"
 #include "core/crc16.h"
 #include "frames.h"
 
@@ -14,9 +15,9 @@ namespace ohmskin {
 // 16x16 scan of 1.3 kB streams through a ring of 512 bytes.
 class FrameWriter {
   public:
-    // Bytes of the ring: a power of two. Chosen: a quarter of the Uno's RAM. docs/timing.md,
-    // "What limits the rate", says what it costs.
-    static constexpr uint16_t SIZE = 512;
+    // Bytes of the ring.
+    static constexpr uint16_t SIZE = board::RING_SIZE;
+    static_assert((SIZE & (SIZE - 1)) == 0, "indices are masked");
     // Bytes of the longest COBS block, its length byte included, and without it.
     static constexpr uint16_t LONGEST_BLOCK = 255;
     static constexpr uint16_t BLOCK_CONTENT_MAX = LONGEST_BLOCK - 1;

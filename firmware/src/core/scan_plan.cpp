@@ -97,8 +97,7 @@ OHMSKIN_RARE void divide(uint32_t period, uint16_t first, int8_t step, uint16_t 
 class Planner {
   public:
     Planner(uint16_t cycles_per_byte, uint8_t accuracy, uint8_t idle_min)
-        : cycles_per_byte_(cycles_per_byte), prescaler_(timing::prescaler(accuracy)),
-          idle_min_(idle_min) {}
+        : cycles_per_byte_(cycles_per_byte), accuracy_(accuracy), idle_min_(idle_min) {}
 
     // `route` has all but its plan. Returns Ok or why not; fastest_cycles() is known then.
     OHMSKIN_RARE Result plan(Route *route, uint32_t rate_mhz, uint16_t settle) {
@@ -110,11 +109,10 @@ class Planner {
         uint16_t least_us = settle;
         if (rate_mhz == 0 && settle == 0)
             least_us = timing::SETTLE_US[route->pattern < MODES ? route->pattern : 0];
-        const uint32_t settled =
-            uint32_t{least_us} * CYCLES_PER_US + timing::held_cycles(prescaler_);
+        const uint32_t settled = cycles_of(least_us) + board::held_cycles(accuracy_);
         if (settled > timing::SLOT_CYCLES_MAX)
             return Result::BadSettle;
-        uint16_t slot_min = timing::slot_min(prescaler_);
+        uint16_t slot_min = board::slot_min(accuracy_);
         if (least_us != 0 && settled > slot_min)
             slot_min = static_cast<uint16_t>(settled);
         const uint16_t least = static_cast<uint16_t>(plan.readings + idle_min_);
@@ -123,11 +121,11 @@ class Planner {
         // The processor has what the interrupts of all slots leave, which are few where slots are
         // as long as may be.
         uint32_t by_processor =
-            timing::BUSY_A_SCAN + uint32_t{timing::BUSY_A_READING} * plan.readings;
+            board::BUSY_A_SCAN + uint32_t{board::BUSY_A_READING} * plan.readings;
         if (rate_mhz != 0 && settle == 0)
-            by_processor += uint32_t{timing::BUSY_A_SLOT} * least;
+            by_processor += uint32_t{board::BUSY_A_SLOT} * least;
         else
-            by_processor += by_processor * timing::BUSY_A_SLOT / (slot_min - timing::BUSY_A_SLOT);
+            by_processor += by_processor * board::BUSY_A_SLOT / (slot_min - board::BUSY_A_SLOT);
         fastest_ = uint32_t{slot_min} * least;
         if (fastest_ < by_processor)
             fastest_ = by_processor;
@@ -188,7 +186,7 @@ class Planner {
     }
 
     uint16_t cycles_per_byte_;
-    uint8_t prescaler_, idle_min_;
+    uint8_t accuracy_, idle_min_;
     uint32_t fastest_ = 0;
 };
 

@@ -4,6 +4,7 @@
 
 #include "core/attributes.h"
 #include "core/clock.h"
+#include "core/packing.h"
 #include "core/scan_sequence.h"
 #include "frames.h"
 
@@ -69,42 +70,21 @@ class Turns {
     uint16_t left_ = 0;  // scans of the region until the next whole one
 };
 
-// What the converter and the timer make of a slot. An ADC clock is `prescaler` clock cycles. (Data
-// sheets of ATmega328P and 2560, "Prescaling and Conversion Timing": a conversion that is triggered
-// ends 13.5 ADC clocks and 3 clock cycles after its trigger, and holds its sample 2 ADC clocks and
-// 3 clock cycles after it.)
 namespace timing {
-// The prescaler of each accuracy: 500, 250 and 125 kHz at 16 MHz.
-constexpr uint8_t prescaler(uint8_t accuracy) { return static_cast<uint8_t>(32 << accuracy); }
-// ADC clocks of the shortest slot. A trigger that comes before the conversion's end is ignored, and
-// its reading is lost. So a slot leaves the converter 1.5 ADC clocks to spare, at least 45
-// clock cycles. Chosen: tests and `make bench-firmware` let conversions be up to 32 cycles late.
-constexpr uint16_t SLOT_ADC_CLOCKS_MIN = 15;
-constexpr uint16_t slot_min(uint8_t prescaler) { return SLOT_ADC_CLOCKS_MIN * prescaler; }
-// Clock cycles from the hold to the end of the conversion: 11.5 ADC clocks. Only then does the
-// sample capacitor join the next channel, so the time to settle counts from there. The pins have
-// changed long before.
-constexpr uint16_t held_cycles(uint8_t prescaler) {
-    return static_cast<uint16_t>(11u * prescaler + prescaler / 2);
-}
 // What a slot leaves for settling [us] where a request names neither rate nor settle time, by mode.
 // Near: 14 pF of sample capacitor and 100 pF at a node of 30 kOhm then come to half a code.
 // docs/timing.md, "Settle time", has the formula. Far: the far node's 100 pF and the line's 30 pF
 // come on top. Half and quick: lines that charge through the cells are not seen, and do not cancel,
 // without the other drive; docs/timing.md, "Fewer readings", has the errors by settle time.
-constexpr uint16_t SETTLE_US[] = {20, 35, 20, 20};
+constexpr uint16_t SETTLE_US[] = {20, 35, 40, 101};
 static_assert(sizeof SETTLE_US / sizeof *SETTLE_US == MODES, "one a mode");
-// Clock cycles of the longest slot: timer 1 has 16 bits. Chosen below 65536, because divide()
-// rounds a slot's length up.
+// Clock cycles of the longest slot, which have 16 bits. Chosen below 65536, because divide() rounds
+// a slot's length up.
 constexpr uint16_t SLOT_CYCLES_MAX = 60000;
 // The main loop feeds the line somewhat slower than the line could go, at most by this part, an
 // eighth: with the shortest slots, interrupts leave it that little time. Chosen: with it, no load
 // of tests/firmware (test_no_load_damages_a_frame) tears a frame.
 constexpr uint8_t LINE_IDLE_PART = 8;
-// Clock cycles of the processor for the interrupt of an idle slot; for a reading besides (taking
-// and packing its code); and for a scan's header and end: at most. Measured: tests/firmware,
-// test_the_rate_that_is_said_is_the_rate_that_comes, fails where they are too small.
-constexpr uint16_t BUSY_A_SLOT = 165, BUSY_A_READING = 240, BUSY_A_SCAN = 5000;
 }  // namespace timing
 
 // The plan for a request, or why there is none; `routes` changes only where there is one. With
@@ -121,13 +101,14 @@ OHMSKIN_RARE Route plan_whole(uint8_t rows, uint8_t columns, uint8_t pattern, ui
 
 // Bytes of a scan frame's payload with so many readings.
 constexpr uint16_t scan_payload(uint16_t readings) {
-    return static_cast<uint16_t>(sizeof(frames::Scan) + (uint32_t{readings} * ADC_BITS + 7) / 8);
+    return static_cast<uint16_t>(sizeof(frames::Scan) +
+                                 Packing<board::ADC_BITS>::bytes_of(readings));
 }
 
 // Time that a plan leaves to pins and sample capacitor for settling, at least [us].
 inline uint16_t settle_us(const ScanPlan &plan, uint8_t accuracy) {
-    return static_cast<uint16_t>(
-        (plan.slot_cycles - timing::held_cycles(timing::prescaler(accuracy))) / CYCLES_PER_US);
+    UsRest rest = 0;
+    return static_cast<uint16_t>(us_of(plan.slot_cycles - board::held_cycles(accuracy), &rest));
 }
 
 }  // namespace ohmskin

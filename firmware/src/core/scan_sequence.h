@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "board_numbers.h"
 #include "frames.h"
 
 // Rows and columns that the board's multiplexers have: the address bits of its pins limit them.
@@ -17,8 +18,6 @@ namespace ohmskin {
 constexpr uint8_t ROWS_MAX = OHMSKIN_ROWS_MAX;
 constexpr uint8_t COLUMNS_MAX = OHMSKIN_COLUMNS_MAX;
 static_assert(ROWS_MAX <= frames::ROWS_MAX && COLUMNS_MAX <= frames::COLUMNS_MAX, "bits of masks");
-// Bits of the converter's codes.
-constexpr uint8_t ADC_BITS = 10;
 
 // A bit a row or column. The link's masks have 32 bits, of which this board needs no more.
 #if OHMSKIN_ROWS_MAX > 16 || OHMSKIN_COLUMNS_MAX > 16
@@ -103,13 +102,11 @@ class Lines {
             columns = static_cast<LineMask>(columns << 1);
         }
     }
-    uint8_t row_after(uint8_t row) const {
-        return static_cast<uint8_t>(next_[row] & ((1 << HALF) - 1));
-    }
+    uint8_t row_after(uint8_t row) const { return static_cast<uint8_t>(next_[row] & LOW_HALF); }
     uint8_t column_after(uint8_t column) const {
-        Pair pair = next_[column];
-        pair = static_cast<Pair>(pair >> HALF);  // a statement of its own: a swap of nibbles
-        return static_cast<uint8_t>(pair);
+        // A rotation by half is one instruction of an AVR; a shift of it would be eight.
+        const Pair pair = next_[column];
+        return static_cast<Pair>(pair << HALF | pair >> HALF) & LOW_HALF;
     }
     // The first line of a mask, which must have one.
     static uint8_t first(LineMask mask) {
@@ -128,6 +125,8 @@ class Lines {
     using Pair = uint8_t;
     static constexpr uint8_t HALF = 4;
 #endif
+
+    static constexpr Pair LOW_HALF = (1 << HALF) - 1;
 
     // The bit of the last line.
     static constexpr LineMask TOP = LineMask{1} << (OHMSKIN_LINES_MAX - 1);

@@ -6,7 +6,7 @@ namespace ohmskin {
 namespace {
 
 // The largest code.
-constexpr uint16_t FULL_SCALE = (1u << ADC_BITS) - 1;
+constexpr uint16_t FULL_SCALE = (1u << board::ADC_BITS) - 1;
 // Codes that are surely below and above half of Vdd: 1/16 of the scale apart from it. If the larger
 // reference resistor is a quarter above the smaller one, the half moves by 1/18. Chosen: that is
 // more than resistors of a kit differ, and faults move a node to a rail.
@@ -27,11 +27,40 @@ struct Node {
     bool is_open() const { return own_max < HALF_LOW && other_min > HALF_HIGH; }
 };
 
-uint16_t bit_if(bool condition, frames::Finding finding) {
-    return condition ? static_cast<uint16_t>(finding) : 0;
+uint8_t index(frames::Reading reading) { return static_cast<uint8_t>(reading); }
+
+// Nodes: top, bottom, far top, far bottom. The reading of each with its own pin high, and that with
+// the other one high.
+using frames::Finding;
+using frames::Reading;
+constexpr uint8_t NEAR_NODES = 2, NODES = 4;
+constexpr uint8_t own(uint8_t node) { return 2 * node; }
+constexpr uint8_t other(uint8_t node) { return own(node) ^ 3; }
+static_assert(own(1) == uint8_t(Reading::C) && other(1) == uint8_t(Reading::B) &&
+                  own(2) == uint8_t(Reading::E) && other(2) == uint8_t(Reading::H) &&
+                  own(3) == uint8_t(Reading::G) && other(3) == uint8_t(Reading::F),
+              "A and D, C and B, E and H, G and F");
+
+// Each node has three bits of the findings: stuck low, stuck high; and that a near node floats, or
+// that a far one is open.
+constexpr uint8_t BITS_A_NODE = 3;
+constexpr uint16_t STUCK = 3, LOOSE = 4;
+static_assert(uint16_t(Finding::TopStuckLow) == 1 && uint16_t(Finding::TopStuckHigh) == 2 &&
+                  uint16_t(Finding::TopReferenceMissing) == LOOSE &&
+                  uint16_t(Finding::BottomStuckLow) == 1 << BITS_A_NODE &&
+                  uint16_t(Finding::FarTopStuckLow) == 1 << 2 * BITS_A_NODE &&
+                  uint16_t(Finding::FarBottomOpen) == LOOSE << 3 * BITS_A_NODE,
+              "the order of nodes and bits");
+uint16_t findings_of(const Node &node, bool far) {
+    const bool loose = far ? node.is_open() : node.floats();
+    return static_cast<uint16_t>(node.stuck_low() | node.stuck_high() << 1 | loose << 2);
 }
 
-uint8_t index(frames::Reading reading) { return static_cast<uint8_t>(reading); }
+// What is looked for first. A node at a rail pulls others across half of Vdd: through a pressed
+// cell, or at the far end. So other faults count only where no near node is at a rail, then no far
+// node.
+constexpr uint16_t NEAR_STUCK = STUCK | STUCK << BITS_A_NODE;
+constexpr uint16_t ORDER[] = {NEAR_STUCK, NEAR_STUCK << NEAR_NODES * BITS_A_NODE, 0xFFFF};
 
 }  // namespace
 
@@ -77,32 +106,17 @@ void SelfTest::take(const uint16_t *codes) {
 }
 
 frames::SelfTestReport SelfTest::report() const {
-    using frames::Finding;
-    using frames::Reading;
-    const auto node = [this](Reading own, Reading other) {
-        return Node{min_[index(own)], max_[index(own)], min_[index(other)], max_[index(other)]};
-    };
-    const Node top = node(Reading::A, Reading::D), bottom = node(Reading::C, Reading::B);
-    const Node far_top = node(Reading::E, Reading::H), far_bottom = node(Reading::G, Reading::F);
+    uint16_t found = 0;
+    for (uint8_t n = far_ ? NODES : NEAR_NODES; n-- != 0;) {
+        const Node node = {min_[own(n)], max_[own(n)], min_[other(n)], max_[other(n)]};
+        found = static_cast<uint16_t>(found << BITS_A_NODE | findings_of(node, n >= NEAR_NODES));
+    }
     frames::SelfTestReport report;
-    report.findings = static_cast<uint16_t>(bit_if(top.stuck_low(), Finding::TopStuckLow) |
-                                            bit_if(top.stuck_high(), Finding::TopStuckHigh) |
-                                            bit_if(bottom.stuck_low(), Finding::BottomStuckLow) |
-                                            bit_if(bottom.stuck_high(), Finding::BottomStuckHigh));
-    // A node at a rail pulls others across half of Vdd: through a pressed cell, or at the far end.
-    // So other faults are looked for only where no near node is at a rail, then no far node.
-    if (report.findings == 0 && far_)
-        report.findings =
-            static_cast<uint16_t>(bit_if(far_top.stuck_low(), Finding::FarTopStuckLow) |
-                                  bit_if(far_top.stuck_high(), Finding::FarTopStuckHigh) |
-                                  bit_if(far_bottom.stuck_low(), Finding::FarBottomStuckLow) |
-                                  bit_if(far_bottom.stuck_high(), Finding::FarBottomStuckHigh));
-    if (report.findings == 0)
-        report.findings =
-            static_cast<uint16_t>(bit_if(top.floats(), Finding::TopReferenceMissing) |
-                                  bit_if(bottom.floats(), Finding::BottomReferenceMissing) |
-                                  bit_if(far_ && far_top.is_open(), Finding::FarTopOpen) |
-                                  bit_if(far_ && far_bottom.is_open(), Finding::FarBottomOpen));
+    for (uint8_t n = 0; n < sizeof ORDER / sizeof *ORDER; n++) {
+        report.findings = found & ORDER[n];
+        if (report.findings != 0)
+            break;
+    }
     for (uint8_t i = 0; i < frames::READINGS; i++) {
         report.code_min[i] = min_[i];
         report.code_max[i] = max_[i];

@@ -37,7 +37,8 @@ Crc16 crc_of(Record *record, uint8_t size) {
 }
 
 // Older records are read as well, and never written. Each is the beginning of the record of now,
-// with its CRC behind it; but in place of an accuracy, they have the converter's prescaler.
+// with its CRC behind it; but in place of an accuracy, they have the AVR's prescaler, 32, 64 or
+// 128.
 constexpr uint8_t VERSION_WITHOUT_REGION = 2, VERSION_WITHOUT_MODE = 1;
 
 bool known(uint8_t version) {
@@ -63,7 +64,7 @@ bool read(uint8_t at, Record *record) {
         record->mode = near;
     uint8_t accuracy = 0;
     while (accuracy < static_cast<uint8_t>(frames::Accuracy::Finest) &&
-           record->accuracy != timing::prescaler(accuracy))
+           record->accuracy != 32 << accuracy)
         accuracy++;
     record->accuracy = accuracy;
     record->row_mask = (uint32_t{1} << record->rows % 32) - 1;
@@ -105,8 +106,25 @@ bool foreign(uint8_t at) {
 
 }  // namespace
 
+// By assignments: of a constant object, an AVR would have a copy in RAM.
+Settings default_settings() {
+    Settings settings;
+    ScanRequest &scan = settings.request;
+    settings.unit_id = 0;  // none yet
+    // Chosen: the size of skin that docs/ reckons with.
+    scan.rows = scan.columns = 8;
+    scan.row_mask = scan.column_mask = 0xFF;
+    scan.accuracy = static_cast<uint8_t>(frames::Accuracy::Usual);
+    // Chosen: the fastest round one that leaves 8x8 cells 20 us to settle on an Uno.
+    scan.rate_mhz = 90000;
+    scan.settle_us = 0;  // as long as the rate allows
+    scan.mode = scan.whole_mode = static_cast<uint8_t>(frames::Mode::Near);
+    scan.whole_every = 0;  // no whole scans in between: all are whole
+    return settings;
+}
+
 frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte) {
-    *settings = DEFAULT_SETTINGS;
+    *settings = default_settings();
     Record record;
     if (read_newest(&record) == NOWHERE && !read(OLD_AT, &record))
         return all_blank() ? frames::Settings::DefaultsBlank : frames::Settings::DefaultsDamaged;

@@ -14,20 +14,7 @@ struct Settings {
 
 // How a board scans that nobody has configured. These numbers are the firmware's own. The protocol
 // says what may be asked for, not what a board begins with, and hosts read that from `hello`.
-constexpr Settings DEFAULT_SETTINGS = {
-    0,  // unit id: none yet
-    {
-        8,
-        8,  // rows and columns. Chosen: the size of skin that docs/ reckons with
-        static_cast<uint8_t>(frames::Accuracy::Usual),
-        0xFF,
-        0xFF,   // rows and columns to read: all
-        90000,  // rate [mHz]. Chosen: the fastest round one that leaves 8x8 cells 20 us to settle
-        0,      // settle time: as long as the rate allows
-        static_cast<uint8_t>(frames::Mode::Near),
-        static_cast<uint8_t>(frames::Mode::Near),
-        0,  // no whole scans in between: all are whole
-    }};
+OHMSKIN_RARE Settings default_settings();
 
 // Settings as the EEPROM holds them. The fields are the record's own, not the protocol's, so that a
 // change of the protocol forgets nothing. A change of the fields needs a new VERSION; `version` and

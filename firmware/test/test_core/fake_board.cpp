@@ -10,7 +10,6 @@ namespace board {
 
 using fake::state;
 
-const char NAME[frames::NAME_SIZE] = "fake";
 const uint16_t WIRING = 0x1234;
 const uint32_t REF_TOP_OHM = 30000;
 const uint32_t REF_BOTTOM_OHM = 29000;

@@ -181,7 +181,7 @@ TEST(boot_sends_hello_with_defaults_from_a_blank_eeprom) {
     CHECK_EQ(258 * 689UL, hello.scan_cycles);
     CHECK_EQ(0xFF, hello.row_mask);
     CHECK_EQ(0x1234, hello.wiring);
-    CHECK_BYTES("fake", hello.board, 5);
+    CHECK_BYTES(board::NAME, hello.board, sizeof board::NAME);
     CHECK_EQ(16, hello.rows_max);
     CHECK_EQ(29000, hello.ref_bottom_ohm);
     CHECK(!host.next(&frame));
