@@ -29,7 +29,7 @@ from bars import at_most, run_minutes  # beside this file
 from bench_force import board_8x8, calibration  # beside this file
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.force.reader import SkinReader
-from ohmskin.force.tables import export_forces
+from ohmskin.force.tables import export
 from ohmskin.link.codes import quantise
 from ohmskin.link.messages import Scan
 from ohmskin.record.recorder import Recorder
@@ -59,7 +59,7 @@ def measure(minutes: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as place:
         long, out = Path(place) / "long.mcap", Path(place) / "out.npz"
         recorded(long, round(60 * minutes * RATE_HZ))
-        export_forces(long, out, calibration(board, rest_ratio, "ohm"))
+        export(long, out, calibration(board, rest_ratio, "ohm"))
         most_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         of_skin = calibration(board, rest_ratio, "touch")
         short = recorded(Path(place) / "short.mcap", COMPARED)
@@ -72,7 +72,7 @@ def measure(minutes: float) -> dict[str, Any]:
             estimator.estimate(ratio)
         alone_s = time.process_time() - begin_s
         begin_s = time.process_time()
-        export_forces(short, out, of_skin)
+        export(short, out, of_skin)
         export_s = time.process_time() - begin_s
     return {
         "export_times": round(export_s / alone_s, 3),

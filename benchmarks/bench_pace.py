@@ -9,6 +9,13 @@ rest of 90 whole scans. Random touches (6 at most, each frame anew), fingertips;
 half_*, quick_*     two readings of each cell, a and b, and one, b: their median error over that of
                     all four (whichever scene is worse), and the share of pressed cells within four
                     stated deviations.
+desk_*              the same scenes on the desk of `make bench-desk`: the built firmware in simavr,
+                    lines that charge, converters that err, noise of 0.5 LSB. Modes half and quick
+                    at their default settle times, a near scan in thirty, against near at 90 Hz. A
+                    skin stays for three scans, of which the last is judged. *_over_near: the worse
+                    scene; desk_within_4: the least of both modes and scenes; desk_ghost_us: the
+                    largest ghost of a frame, 95th percentile, the worst of them; *_hz: scans a
+                    second between the near scans.
 partial_*           a region of 3x3 cells around one fingertip, b alone, after one whole frame in
                     thirty: time of its estimate over that of whole frames, and in units of `make
                     bench-estimators`.
@@ -20,23 +27,27 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from bars import Part, at_least, at_most, run  # beside this file
 from bench_estimators import times_of, unit_s
+from desk import paced_skin  # tests/helpers
 from ohmskin.arrays import Float
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
-from studies.judge import answers_of, judge, pooled
+from studies.judge import answers_of, judge, judge_trial, pooled
 from studies.trials import (
     NOISE_LSB,
     NOMINAL_WIRE_OHM,
     Trial,
     finger_trial,
+    knowledge_of,
     random_trial,
 )
 
@@ -113,6 +124,33 @@ def of_modes(part: Part) -> dict[str, float]:
     return figures
 
 
+def of_desk(part: Part) -> dict[str, float]:
+    """desk_*."""
+    count, frames = part.of(SKINS), part.of(FRAMES)
+    default: dict[str, Any] = {"rate_mhz": 0, "whole_every": WHOLE_EVERY}
+    over: dict[str, list[float]] = {}
+    within, ghosts, hz = [], [], {}
+    for scene in (partial(random_trial, 8, 8, 6), partial(finger_trial, 8, 8)):
+        errors = {}
+        for mode, pace in {"near": {}, "half": default, "quick": default}.items():
+            parts = []
+            for seed in range(count):
+                skin = paced_skin(seed, scene(frames, SEED + seed), mode=mode, **pace)
+                estimator = make_estimator("touch", knowledge_of(skin.rest_ratio))
+                found = [[estimator.estimate(each) for each in scans][-1] for scans in skin.ratios]
+                parts.append(judge_trial(answers_of(found), skin.trial))
+            errors[mode] = float(np.mean([one.error_percent() for one in parts]))
+            hz[mode] = skin.scans_hz
+            if mode != "near":
+                together = pooled(parts)
+                within.append(together.pressed_within_percent() / 100)
+                ghosts.append(together.ghost_us())
+                over.setdefault(mode, []).append(errors[mode] / errors["near"])
+    figures = {f"desk_{mode}_over_near": round(max(ratios), 2) for mode, ratios in over.items()}
+    figures |= {"desk_within_4": round(min(within), 4), "desk_ghost_us": round(max(ghosts), 2)}
+    return figures | {f"desk_{mode}_hz": round(hz[mode], 1) for mode in over}
+
+
 def of_region(part: Part) -> dict[str, float]:
     """partial_*."""
     trial = finger_trial(8, 8, part.of(40), SEED, sigma_cells=SMALL_FINGER)
@@ -160,7 +198,7 @@ def of_large(part: Part) -> dict[str, float]:
 
 def measure(part: Part) -> dict[str, float]:
     """All figures, as the JSON line has them."""
-    return of_modes(part) | of_region(part) | of_large(part)
+    return of_modes(part) | of_desk(part) | of_region(part) | of_large(part)
 
 
 BARS = [
@@ -168,6 +206,12 @@ BARS = [
     at_most("quick_over_near", 1.9),
     at_least("half_within_4", 0.98),
     at_least("quick_within_4", 0.98),
+    at_most("desk_half_over_near", 1.5),
+    at_most("desk_quick_over_near", 1.7),
+    at_least("desk_within_4", 0.95),
+    at_most("desk_ghost_us", 2),
+    at_least("desk_half_hz", 120),
+    at_least("desk_quick_hz", 120),
     at_most("partial_time_over_whole", 0.6),
     at_most("partial_3x3_units", 5),
     at_most("joint_16x16_finger_units", 115),

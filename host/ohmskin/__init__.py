@@ -8,29 +8,23 @@ with ohmskin.open("/dev/ttyACM0") as skin:
         print(scan.number, scan.ratio[0, 0])
 """
 
-from __future__ import annotations
-
-from importlib import import_module
-
-from ohmskin.errors import (
-    CommandRefused,
-    DeviceLost,
-    DeviceSilent,
-    OhmskinError,
-    PortError,
-    ProtocolError,
-    ProtocolMismatch,
-    RecordingEnded,
-    RecordingError,
-    TareRefused,
-)
-from ohmskin.version import VERSION
-
 TYPE_CHECKING = False  # for type checkers: to import typing takes longer than all of this
 if TYPE_CHECKING:
     from typing import Any
 
     from ohmskin.emulate.driver import SteppedSkin
+    from ohmskin.errors import (
+        CommandRefused,
+        DeviceLost,
+        DeviceSilent,
+        OhmskinError,
+        PortError,
+        ProtocolError,
+        ProtocolMismatch,
+        RecordingEnded,
+        RecordingError,
+        TareRefused,
+    )
     from ohmskin.estimate.base import Estimate, Estimator
     from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
     from ohmskin.estimate.methods import METHODS, make_estimator
@@ -46,6 +40,7 @@ if TYPE_CHECKING:
     from ohmskin.opening import open
     from ohmskin.record.recording import load_recording
     from ohmskin.several_boards import Boards, BoardScan, open_all
+    from ohmskin.version import __version__ as __version__
 
 __all__ = [
     "METHODS",
@@ -85,12 +80,16 @@ __all__ = [
     "open",
     "open_all",
 ]
-__version__ = VERSION
 
 # Public names by the module that has them. A module is imported when one of its names is first
-# asked for: a program that only reads a board need not wait for scipy.
+# asked for: a program that only reads a board need not wait for scipy. And while nothing is
+# imported, Ctrl-C finds no import of the package to show a traceback of.
 _MODULES = {
     "emulate.driver": ("SteppedSkin",),
+    "errors": (
+        *("CommandRefused", "DeviceLost", "DeviceSilent", "OhmskinError", "PortError"),
+        *("ProtocolError", "ProtocolMismatch", "RecordingEnded", "RecordingError", "TareRefused"),
+    ),
     "estimate.base": ("Estimate", "Estimator"),
     "estimate.knowledge": ("SkinKnowledge", "WireOhm"),
     "estimate.methods": ("METHODS", "make_estimator"),
@@ -106,10 +105,13 @@ _MODULES = {
     "opening": ("open",),
     "record.recording": ("load_recording",),
     "several_boards": ("BoardScan", "Boards", "open_all"),
+    "version": ("__version__",),
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
+    from importlib import import_module
+
     for module, names in _MODULES.items():
         if name in names:
             # Kept here, so that the name is looked up once.

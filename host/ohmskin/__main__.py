@@ -2,10 +2,11 @@
 """``ohmskin`` and ``python -m ohmskin``: the command line.
 
 Until it is imported, which takes half a second, Ctrl-C ends the process as it ends other programs:
-without the traceback that a KeyboardInterrupt amid an import shows.
+without the traceback that a KeyboardInterrupt amid an import shows. Therefore this module begins
+with what Python has built in: to import `signal` takes 10 ms, in which Ctrl-C would show one.
 """
 
-import signal
+import _signal as signal  # type: ignore[import-not-found]
 
 _before = signal.getsignal(signal.SIGINT)
 if _before is signal.default_int_handler:

@@ -20,7 +20,9 @@ shells say of a program that Ctrl-C has ended.
 
 import os
 import signal
+import sys
 import threading
+from _thread import interrupt_main
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +32,8 @@ from typing import Final, TypeVar
 _T = TypeVar("_T")
 # So long after Ctrl-C, `ends_in_time` ends the process [s]. Chosen: a person waits a second.
 PATIENCE_S: Final = 0.7
+# A Ctrl-C that was dropped comes again after so long [s]. Chosen: the callback is over by then.
+_AGAIN_S: Final = 0.01
 
 
 @contextmanager
@@ -54,6 +58,17 @@ def ctrl_c_kept() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         if raised:
             raise raised[0]
+
+
+def raise_again(dropped: "sys.UnraisableHookArgs") -> None:
+    """For `sys.unraisablehook`: a Ctrl-C that Python drops comes once more, and is not printed.
+
+    It drops what a destructor or a callback of a weak reference raises: each import has one.
+    """
+    if dropped.exc_type is KeyboardInterrupt:
+        threading.Timer(_AGAIN_S, interrupt_main).start()
+    else:
+        sys.__unraisablehook__(dropped)
 
 
 @contextmanager

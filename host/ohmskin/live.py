@@ -8,15 +8,20 @@ for the newest scan, which is there, or for all scans since it last asked.
 
 import threading
 from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from itertools import islice
-from typing import Final
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final
 
 from ohmskin import opening
-from ohmskin.errors import OhmskinError, RecordingEnded
+from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
-from ohmskin.force.reader import TARE_S, CalibratedSkin, ForceScan
-from ohmskin.link.device import LOG, QUEUE_SCANS, SILENCE_TIMEOUT_S, in_threads
+from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
+from ohmskin.link.device import LOG, QUEUE_SCANS, SILENCE_TIMEOUT_S, Device, in_threads
+from ohmskin.link.messages import Hello, Scan
+
+if TYPE_CHECKING:
+    from ohmskin.record.recording import Tare
 
 # A port that is not there is tried again after this time [s]. Chosen: somebody who plugs a board in
 # does not wait for long, and a system looks for its ports without effort.
@@ -24,13 +29,23 @@ AGAIN_S: Final = 1.0
 # A scan that has waited for longer [s] is passed over. Chosen: a machine that estimates more slowly
 # than the board scans then shows what is now, and a pause of a busy machine costs no scan.
 LATE_S: Final = 0.25
+# `close` waits so long for the thread [s]. Chosen: it ends in a tenth of that, unless its port
+# never answers, and such a port must not hold up the end of the program.
+_CLOSE_S: Final = 1.0
+# Boards that agree in all of these, and in whether they read far ends, read the same skin: method,
+# rest and tare stay good.
+_skin_of: Final = attrgetter(
+    "unit_id", "rows", "columns", "reads_far", "ref_top_ohm", "ref_bottom_ohm", "adc_bits"
+)
 
 
 class LiveSkin(Closing):
-    """A calibrated skin that is always read. All may be called from any thread.
+    """A skin that is always read. All may be called from any thread.
 
     port, calibration, force: as `ohmskin.open` takes them. A board that is not there, or goes away,
-    is opened again and again; the latest tare and the learned wires stay.
+    is opened again and again; the latest tare and the learned wires stay. every: False estimates
+    the newest scan whenever the one before is done, and no other: what only shows a skin is then
+    as soon as it can be, on a busy machine too.
 
     >>> with LiveSkin("/dev/ttyACM0", "skin.json") as skin:
     ...     count, scans = skin.since(0, timeout_s=5.0)  # all until now
@@ -41,7 +56,12 @@ class LiveSkin(Closing):
     """
 
     def __init__(
-        self, port: str, calibration: opening.CalibrationLike, *, force: bool = False
+        self,
+        port: str,
+        calibration: opening.CalibrationLike | None,
+        *,
+        force: bool = False,
+        every: bool = True,
     ) -> None:
         self.port = port
         self.failure: Exception | None = None
@@ -50,12 +70,19 @@ class LiveSkin(Closing):
         """How many scans were passed over, because this machine is too slow for all of them."""
         self.opened = 0
         """How often the port was opened."""
-        self._calibration, self._force = opening.loaded(calibration), force
-        self._skin: CalibratedSkin | None = None
+        self.ended = False
+        """Whether the thread has ended: a recording was played, `close` was called, or a defect."""
+        self.watchers: set[Callable[[], None]] = set()
+        """They are called when there is news, from the thread that reads: they must not wait."""
+        self.closing = threading.Event()
+        """Is set when `close` is called."""
+        self._calibration = None if calibration is None else opening.loaded(calibration)
+        self._force, self._every = force, every
+        self._device: Device | None = None
+        self._reader: SkinReader | None = None
         self._kept: deque[ForceScan] = deque(maxlen=QUEUE_SCANS)
         self._count = 0
         self._changed = threading.Condition()
-        self._closing, self._ended = threading.Event(), False
         # A port that never answers does not hold up the end of the program.
         self._thread = threading.Thread(target=self._work, name=f"live {port}", daemon=True)
         self._thread.start()
@@ -71,14 +98,14 @@ class LiveSkin(Closing):
         The newest `QUEUE_SCANS` are kept. timeout_s: waits so long [s] where there is none yet.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._count > count or self._ended, timeout_s)
+            self._changed.wait_for(lambda: self._count > count or self.ended, timeout_s)
             begin = max(len(self._kept) - max(self._count - count, 0), 0)
             return self._count, list(islice(self._kept, begin, None))
 
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, through all that is unplugged, until `close`."""
         count = self._count
-        while not self._ended:
+        while not self.ended:
             count, scans = self.since(count, SILENCE_TIMEOUT_S)
             yield from scans
 
@@ -86,57 +113,97 @@ class LiveSkin(Closing):
         """The same for ``async for``."""
         return in_threads(self)
 
-    @property
-    def skin(self) -> CalibratedSkin:
-        """The open skin. Raises what stands in the way where it is not open."""
-        skin = self._skin
-        if skin is None:
-            raise self.failure or OhmskinError(f"{self.port} is being opened")
-        return skin
+    def there(self) -> tuple[Device, SkinReader]:
+        """The open board, and the reader of its skin, which knows tares.
 
-    def tare(self, seconds: float = TARE_S, *, force: bool = False) -> None:
-        """`CalibratedSkin.tare`. Raises what that raises, and what `skin` raises."""
-        self.skin.tare(seconds, force=force)
+        :raises DeviceLost: it is not open.
+        """
+        device, reader, failure = self._device, self._reader, self.failure
+        if device is None or reader is None:
+            text = "is being opened" if failure is None else f"is not there: {failure}"
+            raise DeviceLost(f"{self.port} {text}")
+        return device, reader
+
+    def tare(self, seconds: float = TARE_S, *, force: bool = False) -> "Tare":
+        """As `CalibratedSkin.tare`. Raises what that raises, and what `there` raises."""
+        device, reader = self.there()
+        return reader.tare_by(device, seconds, force=force)
 
     def _work(self) -> None:
-        """The thread's work: read the port, and open it again whenever it goes away."""
-        while not self._closing.is_set():
-            try:
-                self._read()
-            except RecordingEnded:
-                break
-            except (OhmskinError, ValueError, OSError) as exc:
-                if self.failure is None and not self._closing.is_set():
-                    LOG.warning("%s", exc)
-                self.failure = exc
-            self._closing.wait(AGAIN_S)
+        """The thread's work: read the port, and open it again whenever it goes away.
+
+        A recording that has been played is at its end, and is not played again. A defect of ours
+        ends the thread, too.
+        """
+        try:
+            while not self.closing.is_set():
+                try:
+                    self._read()
+                except RecordingEnded as exc:
+                    self.failure = exc
+                    return
+                except (OhmskinError, ValueError, OSError) as exc:
+                    if self.failure is None and not self.closing.is_set():
+                        LOG.warning("%s", exc)
+                    self._say(exc)
+                self.closing.wait(AGAIN_S)
+        except Exception as exc:
+            self.failure = OhmskinError(f"a defect of this program: {exc!r}")
+            raise
+        finally:
+            self.ended = True
+            self._tell()
+
+    def _say(self, failure: Exception | None) -> None:
+        self.failure = failure
+        self._tell()
+
+    def _tell(self) -> None:
         with self._changed:
-            self._ended = True
             self._changed.notify_all()
+        for watcher in tuple(self.watchers):
+            watcher()
 
     def _read(self) -> None:
-        with opening.open(self.port, calibration=self._calibration, force=self._force) as skin:
-            self._skin, reader = skin, skin.new_reader()
-            self.opened += 1
-            try:
-                for scan in skin.device:
-                    if self._closing.is_set():
+        """Open the port, and take its scans until `close`. Raises what its device raises."""
+        try:
+            with opening.open(self.port, start=False) as device:
+                reader, board = self._reader, device.info
+                if reader is None or _skin_of(reader.board) != _skin_of(board):
+                    self._reader = reader = self._new_reader(board)
+                    reader.warm_up()
+                device.only_unit = board.unit_id  # another is opened anew, with its calibration
+                self._device = device
+                self.opened += 1
+                for scan in device if self._every else iter(device.latest, None):
+                    if self.closing.is_set():
                         return
-                    if skin.device.now_s - scan.host_time_s > LATE_S:
-                        self.skipped += 1
-                        continue
-                    read, self.failure = reader.read(scan), None
-                    with self._changed:
-                        self._kept.append(read)
-                        self._count += 1
-                        self._changed.notify_all()
-            finally:
-                self._skin, self._calibration = None, skin.calibration
-        raise RecordingEnded(f"{self.port} has been played to its end")
+                    self._take(scan, device, reader)
+                    self._say(None)
+            raise RecordingEnded(f"{self.port} has been played to its end")
+        finally:
+            self._device = None
+            self._gone()
+
+    def _new_reader(self, board: Hello) -> SkinReader:
+        return SkinReader(board, self._calibration, force=self._force)
+
+    def _take(self, scan: Scan, device: Device, reader: SkinReader) -> None:
+        if self._every and device.now_s - scan.host_time_s > LATE_S:
+            self.skipped += 1
+            return
+        read = reader.read(scan)
+        with self._changed:
+            self._kept.append(read)
+            self._count += 1
+
+    def _gone(self) -> None:
+        """Is called when the board is not open any more."""
 
     def close(self) -> None:
         """End reading. May be called again."""
-        self._closing.set()
-        if (skin := self._skin) is not None:
-            skin.close()
-        self._thread.join(SILENCE_TIMEOUT_S)
+        self.closing.set()
+        if (device := self._device) is not None:
+            device.close()
+        self._thread.join(_CLOSE_S)
+        self._tell()

@@ -101,6 +101,18 @@ def test_a_scale_that_prints_when_it_likes_keeps_its_times() -> None:
     np.testing.assert_array_equal(printed_s(arrival_s), arrival_s)
 
 
+def test_a_clock_that_jumps_takes_no_memory() -> None:
+    """A grid of 10 ms, and a zero every 15 s, took petabytes."""
+    time_s, press, force_n = presses(2, 40)
+    time_s[time_s.size // 2 :] += 1e9
+    shown = Scale(0.1, 0.1).shown(time_s, force_n, time_s)
+    assert np.isfinite(shown).all()
+    none = np.zeros_like(time_s)
+    rise = rises(force_n, np.ones(force_n.shape[1]))
+    found = TotalFit(Totals(time_s, rise, press, none, time_s, force_n.sum(axis=1)))
+    assert found.presses == 40
+
+
 @pytest.fixture(scope="module")
 def fit() -> tuple[TotalFit, Float, list[int]]:
     """Of a slow scale with a zero; every twelfth press is beside the skin, too."""

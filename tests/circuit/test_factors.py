@@ -28,8 +28,8 @@ def test_factors_solve_what_numpy_solves(order: str) -> None:
 def test_gram_adds_lower_triangles() -> None:
     random = np.random.default_rng(2)
     one, two = random.normal(size=(4, 6)), random.normal(size=(4, 3))
-    both = gram(two, -0.5, gram(one))
-    np.testing.assert_allclose(np.tril(both), np.tril(one @ one.T - 0.5 * two @ two.T))
+    both = gram(two, gram(one))
+    np.testing.assert_allclose(np.tril(both), np.tril(one @ one.T + two @ two.T))
 
 
 def test_a_matrix_that_rounding_made_indefinite_is_mended() -> None:

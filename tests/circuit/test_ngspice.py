@@ -74,13 +74,14 @@ def test_all_readings_agree_with_ngspice(name: str) -> None:
     refs = skin.ref_top_ohm, skin.ref_bottom_ohm
     leads = skin.lead_ohm if skin.lead_ohm.any() else None
     expected = solved(cell_ohm, skin.top_wire_ohm, skin.bottom_wire_ohm, refs, leads)
-    # Measured: 6e-13; where wires begin at 1 ohm 3e-12, by the Laplacian 6e-12: it and ngspice add
-    # conductances up in a diagonal, which costs the small ones digits.
+    # Measured: 6e-13; where wires begin at 1 ohm 3e-12.
     np.testing.assert_allclose(readings(skin), expected[..., :4], rtol=0, atol=2e-11)
     found = all_readings(skin, end_admittance(skin))
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-11)
     found = laplacian_readings(skin, names="abcdefgh")
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-11)
+    # The Laplacian adds a cell of 1 MOhm to the far end's 1 ohm in one diagonal, which leaves it 1e-10
+    # of itself. Measured: 6e-12 to 2.3e-11, by the processor for which LAPACK was built.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
 FINGER_CELLS = 0.7  # standard deviation of its pressure

@@ -133,6 +133,18 @@ def test_stream_json_is_one_object_a_scan(run: Run) -> None:
     assert set(json.loads(done.out)) == bare
 
 
+def test_stream_reads_contacts_often_if_it_shall(run: Run) -> None:
+    """JSON has no number for what was not read; the whole skin is read again in the end."""
+    url = "emulator://8x8?scene=single&begin=0&speed=0"
+    lines = well(run("stream", url, "--json", "--focus", "--seconds", "0.5")).out.splitlines()
+    scans = [json.loads(line, parse_constant=pytest.fail) for line in lines]
+    quick = [scan for scan in scans if scan["reading_names"] == ["b"]]
+    assert len(quick) > 4 * (len(scans) - len(quick)) > 0
+    assert quick[-1]["ratio"][0][0] == [None]
+    refused = run("stream", url, "--focus", "--method", "none")
+    assert_one_line(refused, "--method none")
+
+
 @pytest.mark.parametrize("method", ["none", "ohm", "matrix"])
 def test_stream_shows_a_table(run: Run, method: str) -> None:
     done = well(run("stream", EMULATED, "--seconds", "0.4", "--method", method))
@@ -266,7 +278,7 @@ def test_demo_shows_a_ghost_and_how_it_goes(run: Run, tmp_path: Path) -> None:
     done = run("demo", "--seconds", "0.5", "--picture", str(picture))
     assert done.code == 0
     assert done.out.startswith("scanning emulator://8x8?scene=ghost&seed=1&begin=0 for 0.5 s\n")
-    for word in ("truth", "ohm", "joint", "0 missed", "0 damaged"):
+    for word in ("truth", "ohm", "joint", "46 scans at 90.00 Hz", "0 missed", "0 damaged"):
         assert word in done.out
     verdicts = {
         line.split(":")[0].strip(): line for line in done.out.splitlines() if " ms a " in line
@@ -426,7 +438,8 @@ TAKES = {
     "info": "PORT --json --self-test",
     "configure": "PORT --rows --columns --rate --settle --adc --mode --unit-id --defaults --save",
     "flash": "BOARD --port",
-    "stream": "PORT --method --calibration --force --tare --ref-std --json --scans --seconds",
+    "stream": "PORT --method --calibration --force --tare --ref-std --focus --json --scans"
+    " --seconds",
     "view": "PORT --calibration --force --host --http-port --no-browser",
     "tare": "PORT CALIBRATION --seconds --undo --force",
     "skin": "FILE --pitch-mm --radius-mm --taxels --frame --picture",

@@ -13,7 +13,7 @@ from ohmskin.cli import board as flash_command
 from ohmskin.cli import pico
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
 from ohmskin.emulate.scenes import Scene
-from ports import Serve
+from ports import USB_IDS, Serve
 
 # As the chip's ROM has it (RP2040's data sheet, 2.8.4.2).
 INFO = "UF2 Bootloader v3.0\r\nModel: Raspberry Pi RP2\r\nBoard-ID: RPI-RP2\r\n"
@@ -40,8 +40,8 @@ def drive(media: Path, name: str, info: str = INFO) -> Path:
 
 def appear(monkeypatch: pytest.MonkeyPatch, *ports: tuple[str, str]) -> None:
     found = [ListPortInfo(path, skip_link_detection=True) for path, _ in ports]
-    for port, (_, description) in zip(found, ports, strict=True):
-        port.description = description
+    for port, (_, board) in zip(found, ports, strict=True):
+        port.vid, port.pid = USB_IDS[board]
     monkeypatch.setattr(list_ports, "comports", lambda: found)
 
 
@@ -52,7 +52,7 @@ def test_it_copies_and_hears_from_the_board(
     place = drive(media, "RPI-RP2")
     drive(media, "stick", "a stick of another kind")
     port = pty_board(EmulatedBoard(Scene().ratio, BoardSettings())).path
-    appear(monkeypatch, ("/dev/ttyS0", "n/a"), (port, "ohmskin pico - CDC"))
+    appear(monkeypatch, ("/dev/ttyS0", ""), (port, "pico"))
     done = well(run("flash", "pico", *(["--port", str(place)] if is_named else [])))
     assert (place / "pico.uf2").read_bytes() == FIRMWARE
     assert f"copied to {place}" in done.out
@@ -80,10 +80,10 @@ def test_a_board_that_does_not_come_back_is_said(
     media: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive(media, "RPI-RP2")
-    appear(monkeypatch, ("/dev/ttyS0", "n/a"))
+    appear(monkeypatch, ("/dev/ttyS0", ""))
     done = run("flash", "pico")
     assert done.code == 2
-    assert "no ports are called 'ohmskin pico'" in done.err
+    assert "no ports are those of a Pico" in done.err
 
 
 def test_a_package_without_the_firmware_says_so(media: Path, run: Run) -> None:

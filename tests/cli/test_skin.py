@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin skin``."""
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -34,9 +35,10 @@ def test_it_says_and_changes_where_cells_are(file: Path, run: Run) -> None:
 def test_it_draws_every_cell(file: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "skin.svg"
     well(run("skin", str(file), "--pitch-mm", "10,10", "--picture", str(out)))
-    drawn = ElementTree.parse(out)
-    assert len(drawn.findall("{*}circle")) == len(drawn.findall("{*}line")) == 64
-    assert {text.text for text in drawn.findall("{*}text")} >= {"0,0", "7,7", "3,5"}
+    assert ElementTree.parse(out).getroot().tag.endswith("svg")
+    # matplotlib draws letters as curves, and says in a comment which text they are.
+    texts = re.findall(r"<!-- (\d,\d) -->", out.read_text())
+    assert sorted(texts) == [f"{row},{column}" for row in range(8) for column in range(8)]
 
 
 def test_it_takes_a_file_of_taxels(file: Path, run: Run, tmp_path: Path) -> None:

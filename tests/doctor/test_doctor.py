@@ -6,10 +6,12 @@ else that is found besides is a failure, too.
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import ohmskin
 from ohmskin.circuit.skin import readings
 from ohmskin.cli.doctor_words import measured_in_words, named, verdict, words_of
 from ohmskin.doctor.circuit import examine_circuit
@@ -21,7 +23,9 @@ from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.codes import quantise
+from ohmskin.link.device import Region, scans_for
 from ohmskin.link.messages import BoardStats, DecoderStats, SelfTestReport
+from ohmskin.record.recorder import Recorder, record
 from stepped import evidence, stepped, stepped_link
 
 NOISES = (0.0, 0.1, 0.3, 0.5)
@@ -405,6 +409,38 @@ def test_findings_are_of_one_unit() -> None:
     found = gather(SteppedSkin(link), report)
     assert "unit 8 has come in place of unit 3" in found.lost
     assert "lost" in {finding.kind.id for finding in examine(found).findings}
+
+
+FAULTY = "emulator://4x4?open_row=3&seed=1"
+
+
+@pytest.mark.parametrize("mode", ["quick", "half"])
+def test_a_board_that_reads_little_is_examined_by_all_readings(mode: str) -> None:
+    skin = stepped(FAULTY)
+    skin.configure(mode=mode, rate_hz=200)
+    before = skin.set_region(Region(range(1, 3), range(2), mode=mode, whole_every=7))
+    found = examine(gather(skin)).findings
+    assert [each.kind.id for each in found] == ["open_row"]
+    assert (skin.info.row_mask, skin.info.mode, skin.info.whole_every) == (6, mode, 7)
+    assert skin.info.rate_hz == before.rate_hz
+
+
+def test_a_recording_is_examined_by_its_complete_scans(tmp_path: Path) -> None:
+    skin, path = stepped(FAULTY), tmp_path / "a.mcap"
+    with Recorder(path, skin.info, lambda: skin.now_s) as recorder:
+        record(skin, recorder, scans_for(skin, 1.0))
+        skin.set_region(Region(range(3), range(3)))
+        record(skin, recorder, scans_for(skin, 0.5))
+    with ohmskin.open(f"replay://{path}?speed=0") as replay:
+        assert [each.kind.id for each in examine(gather(replay)).findings] == ["open_row"]
+    few = tmp_path / "few.mcap"
+    with Recorder(few, skin.info, lambda: skin.now_s) as recorder:
+        record(skin, recorder, scans_for(skin, 0.5))
+    with (
+        ohmskin.open(f"replay://{few}?speed=0") as replay,
+        pytest.raises(ValueError, match="whole"),
+    ):
+        gather(replay)
 
 
 def test_scans_of_another_size_are_not_sound() -> None:

@@ -4,10 +4,12 @@
 import numpy as np
 import pytest
 
-from desk import DeskSkin, desk_skin
+from desk import DeskSkin, desk_skin, paced_skin
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.protocol import MODES
+from studies.judge import answers_of, judge_trial, pooled
+from studies.trials import knowledge_of, random_trial
 
 
 @pytest.fixture(scope="module")
@@ -70,3 +72,20 @@ def test_far_ends_need_no_wires(far_skins: list[DeskSkin], method: str) -> None:
     assert np.median(errors) < 0.01
     assert np.mean(errors < 4 * stds) > 0.98
     assert np.median(stds / errors) < 4
+
+
+@pytest.mark.parametrize("mode", ["half", "quick"])
+def test_fewer_readings_at_default_rates(mode: str) -> None:
+    """Lines that charge do not make ghosts, with near scans, which settle less, in between."""
+    parts = []
+    for seed in range(3):
+        trial = random_trial(8, 8, 6, 12, 7000 + seed)
+        skin = paced_skin(seed, trial, mode=mode, rate_mhz=0, whole_every=12)
+        assert skin.scans_hz > 120
+        estimator = make_estimator("touch", knowledge_of(skin.rest_ratio))
+        found = [[estimator.estimate(each) for each in scans][-1] for scans in skin.ratios]
+        parts.append(judge_trial(answers_of(found), trial))
+    judged = pooled(parts)
+    assert judged.error_percent() < 2
+    assert judged.pressed_within_percent() > 95
+    assert judged.ghost_us() < 2

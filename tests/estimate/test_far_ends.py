@@ -316,6 +316,29 @@ def test_far_ends_that_show_nothing_of_their_lines_are_named(
     assert name in found.message
 
 
+@pytest.mark.parametrize(("near", "far", "name"), [(0, 1, "far rows"), (2, 3, "far columns")])
+def test_far_ends_that_were_their_near_ends_at_rest_are_named_sooner(
+    near: int, far: int, name: str
+) -> None:
+    """The rest readings count as one frame, however often they are read."""
+    random = np.random.default_rng(20)
+    skin = skin_at_rest(8, 8, random)
+    exact = np.array([*90 * [seen(skin)], *(seen(touch(skin, 4, random)) for _ in range(20))])
+    noisy = exact + 0.3 / 1024 * random.standard_normal(exact.shape)
+    noisy[..., far] = noisy[..., near]
+    ratio = np.array([ten_bits(one) for one in noisy])
+    rest, frames = ratio[:90].mean(axis=0), ratio[90:]
+
+    def first_named(rest_reads: int) -> int:
+        reader = PortReader(knowledge(rest))
+        for _ in range(rest_reads):
+            reader.read(rest)
+        reader.reset()
+        return [name in reader.read(one, in_order=True).fault for one in frames].index(True)
+
+    assert first_named(0) > first_named(1) == first_named(2)
+
+
 def test_other_cells_may_carry_more_to_far_ends_than_the_ports_own() -> None:
     """Behind wires of 41 kOhm, the voltage between far ends may be below 0."""
     random = np.random.default_rng(21)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from network import SkinCircuit  # tests/helpers
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
     PortCircuit,
@@ -16,7 +17,7 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import (
@@ -27,8 +28,9 @@ from ohmskin.estimate.prior import (
     CellPrior,
 )
 from ohmskin.estimate.wire_belief import LearnedWires
+from ohmskin.link.codes import quantise, ratio_from_codes
 from skins import reference, ten_bits, told
-from studies.trials import random_trial, skin_at_rest, touch
+from studies.trials import finger_trial, random_trial, skin_at_rest, touch
 
 
 def estimates(name: str, bits: int | None) -> list[tuple[Estimate, dict[str, Float]]]:
@@ -194,3 +196,26 @@ def test_an_estimate_says_how_its_wires_are_known(method: str) -> None:
     told = replace(given.knowledge(0), nominal_wire_ohm=WireOhm(100.0, 200.0))
     assert make_estimator(method, told).estimate(given.ratio[0]).wires == "known"
     assert make_estimator("matrix", told).estimate(given.ratio[0]).wires == ""
+
+
+def test_the_deviation_covers_wires_of_1_kohm_that_nobody_told() -> None:
+    """By a node Laplacian: cells under a fingertip are off by up to 70 %, and stated to be."""
+    trial = finger_trial(
+        *(8, 8, 60, 24001), sigma_cells=(0.6, 1.0), peak_siemens=(3e-5, 3e-4), wire_ohm=(1e3, 1e3)
+    )
+    circuit = SkinCircuit(trial.rest)
+    rest, *frames = (
+        ratio_from_codes(quantise(circuit.readings(cells)))[..., :4]
+        for cells in (trial.rest.cell_siemens, *trial.cell_siemens[::4])
+    )
+    estimator = make_estimator("joint", SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest))
+    found = [estimator.estimate(frame) for frame in frames]
+    assert {one.wires for one in found} == {"assumed"}
+    siemens, std = (
+        np.array([getattr(one, name) for one in found])
+        for name in ("cell_siemens", "cell_siemens_std")
+    )
+    off = np.abs(siemens - trial.cell_siemens[::4])
+    is_off = off > np.maximum(0.5 * trial.cell_siemens[::4], 1e-5)
+    assert is_off.any()
+    assert (off < 4 * std)[is_off].all()

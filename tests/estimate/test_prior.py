@@ -50,6 +50,9 @@ def test_wires_of_unknown_length_make_a_cell_uncertain_upwards() -> None:
     up, down = siemens_std(np.log([1e-5]), part, part, none, wires, series_ohm)
     assert up[0] == pytest.approx(1e-5 * 0.01 * 3 / np.log(4.0), rel=0.02)
     assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
+    # Three of its deviations, where nobody told it, are a factor of eight.
+    up, _ = siemens_std(np.log([1e-5]), part, part, none, wires._replace(reach_stds=3), series_ohm)
+    assert up[0] == pytest.approx(1e-5 * 0.01 * 7 / np.log(8.0), rel=0.05)
 
 
 def test_leads_that_may_be_unusual_make_a_cell_uncertain_upwards() -> None:

@@ -99,6 +99,22 @@ def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
     assert not forces(replace(loaded, tare=None), before.rest.level).any()
 
 
+def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
+    """They had one deviation for the wires of both layers."""
+    path = tmp_path / "skin.json"
+    calibration().save(path)
+    content = json.loads(path.read_text())
+    for name in ("mode", "nominal_lead_ohm", "lead_std_ohm", "top_wire_log_std"):
+        del content[name]
+    del content["bottom_wire_log_std"]
+    path.write_text(json.dumps(content | {"wire_log_std": 0.125}))
+    loaded = load_calibration(path)
+    assert loaded.mode == "near"
+    wires = loaded.nominal_wire_ohm
+    assert (wires.lead, wires.lead_std_ohm) == (None, None)
+    assert (wires.top_log_std, wires.bottom_log_std) == (0.125, 0.125)
+
+
 def test_rest_is_what_the_method_reads() -> None:
     ratio = rest(2, "2025-03-01").ratio
     cell_siemens = 1e-6 * np.exp(0.1 * np.random.default_rng(2).standard_normal((2, 3)))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where reading goes after each scan."""
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,8 +11,11 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from ohmskin.arrays import Bool
+from ohmskin.errors import CommandRefused
 from ohmskin.force.focus import Focus, Lines, wanted_lines
-from ohmskin.link.device import Region
+from ohmskin.link.device import Region, scans_for
+from ohmskin.record.recorder import Recorder, record
+from stepped import stepped
 from studies.judge import STATED_STDS
 
 
@@ -57,8 +62,9 @@ def test_a_region_stays_while_it_holds_what_is_touched_and_little_more() -> None
 def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> None:
     """It may be the ghost of touches outside of the region."""
     asked: list[Region] = []
-    info = SimpleNamespace(slot_cycles=700, clock_hz=16_000_000, baud=500_000, rows=8, columns=8)
+    info = stepped("emulator://8x8").info
     focus = Focus(SimpleNamespace(info=info, set_region=asked.append))
+    assert (asked.pop().rows, asked) == (None, [])
     whole, some = SimpleNamespace(is_whole=True), SimpleNamespace(is_whole=False)
     focus.follow(touched((3, 4)), 1, whole)
     focus.follow(touched((3, 4)), 1, some)
@@ -67,6 +73,26 @@ def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> Non
     assert (asked[-1].rows, asked[-1].mode) == (None, "near")
     focus.follow(touched((3, 4), (3, 6)), 2, whole)
     assert (asked[-1].columns, asked[-1].mode) == (range(3, 8), "quick")
+
+
+def test_who_has_followed_contacts_leaves_the_board_as_it_was() -> None:
+    skin = stepped("emulator://8x8?scene=single&begin=0")
+    before = skin.configure(rate_hz=50, settle_us=30)
+    with Focus(skin) as focus:
+        focus.follow(touched((3, 4)), 1, next(iter(skin)))
+        assert (skin.info.mode, skin.info.row_mask) == ("quick", 0b11100)
+    focus.follow(touched((5, 4)), 1, next(iter(skin)))
+    assert skin.info == replace(before, scanning=1)
+
+
+def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="only near ends"):
+        Focus(stepped("emulator://8x8?mode=far"))
+    board = stepped("emulator://4x4")
+    with Recorder(tmp_path / "a.mcap", board.info, lambda: board.now_s) as recorder:
+        record(board, recorder, scans_for(board, 0.1))
+    with ohmskin.open(f"replay://{tmp_path / 'a.mcap'}") as played, pytest.raises(CommandRefused):
+        Focus(played)
 
 
 def test_a_region_follows_the_contacts_of_an_emulated_board() -> None:

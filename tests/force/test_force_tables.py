@@ -15,7 +15,7 @@ from calibrations import of_scene
 from command_line import Run, well
 from ohmskin.errors import OhmskinError
 from ohmskin.force.reader import ForceScan
-from ohmskin.force.tables import export_forces, load_forces
+from ohmskin.force.tables import export, load_forces
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
 from stepped import stepped
@@ -64,7 +64,7 @@ def test_arrays_are_those_of_a_replay(recorded: Path, played: list[ForceScan]) -
 
 
 def test_a_file_of_arrays_holds_the_same(recorded: Path, tmp_path: Path) -> None:
-    export_forces(recorded, tmp_path / "a.npz", of_scene("ghost"))
+    export(recorded, tmp_path / "a.npz", of_scene("ghost"))
     with np.load(tmp_path / "a.npz", allow_pickle=False) as file:
         arrays = load_forces(recorded, of_scene("ghost"))
         assert sorted(file) == sorted(arrays)
@@ -92,7 +92,7 @@ def test_parquet_is_read_by_its_library(
     recorded: Path, played: list[ForceScan], tmp_path: Path
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
-    export_forces(recorded, tmp_path / "a.parquet", of_scene("ghost"))
+    export(recorded, tmp_path / "a.parquet", of_scene("ghost"))
     table = parquet.read_table(tmp_path / "a.parquet")
     assert table["time_ns"].to_pylist() == [scan.time_ns for scan in played]
     force_n = np.array(table["force_n"].to_pylist(), dtype=np.float32).reshape(30, 8, 8)
@@ -126,10 +126,10 @@ def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: R
 
 def test_what_cannot_be_written(recorded: Path, tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(ValueError, match=r"there are \.npz, \.csv, \.parquet"):
-        export_forces(recorded, tmp_path / "a.xls", of_scene("ghost"))
+        export(recorded, tmp_path / "a.xls", of_scene("ghost"))
     with pytest.raises(ValueError, match="of unit 5"):
         load_forces(recorded, replace(of_scene("ghost"), unit_id=5))
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(OhmskinError, match="run pip install pyarrow"):
-        export_forces(recorded, tmp_path / "a.parquet", of_scene("ghost"))
+        export(recorded, tmp_path / "a.parquet", of_scene("ghost"))
     assert not list(tmp_path.iterdir())

@@ -68,6 +68,7 @@ def test_it_is_kept(tmp_path: Path) -> None:
         ({**FLAT, "pitch_m": [0.01, 1e9]}, "beyond 100"),
         ({**FLAT, "frame_id": "a\x1b[2J"}, "frame_id must be a name"),
         ({**CYLINDER, "radius_m": 0}, "radius_m is not above 0"),
+        ({**CYLINDER, "radius_m": 5e-324}, "radius_m is not above 0"),
         ({**FLAT, "kind": "table"}, "no field 'geometry.normal'"),
         ([], "geometry holds list"),
     ],
@@ -126,13 +127,16 @@ def test_urdf_is_read(tmp_path: Path) -> None:
     assert Geometry.of_file(path, 2, 3, "tip").position_m[1, 2] == pytest.approx([0.01, 0.006, 0])
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("<robot", "no XML"),
         ('<!DOCTYPE r [<!ENTITY a "b">]><robot>&a;</robot>', "declares types or entities"),
         ('<robot><taxel xyz="1 2"/></robot>', "is not 3 numbers"),
+        ('<robot><taxel rpy="0 inf 0"/></robot>', "is not 3 numbers"),
         ("nothing", "0 taxels"),
+        pytest.param("1" * 500 + "x", "0 taxels", id="a long number"),
         ("1 2 3 4 5 6e", "could not convert"),
     ],
 )

@@ -501,6 +501,17 @@ def test_a_mean_is_not_of_scans_of_two_modes() -> None:
     assert np.abs(mean - near[0].ratio).max() > 0.3
 
 
+def test_a_mean_is_not_of_regions_and_of_few_readings_where_there_are_more() -> None:
+    skin = stepped(REST)
+    skin.set_region(device.Region(range(2), range(2), whole_every=5))
+    scans = list(itertools.islice(skin, 20))
+    near = [scan.ratio for scan in scans if scan.is_complete]
+    assert 3 <= len(near) <= 4
+    np.testing.assert_array_equal(device.mean_ratio(scans), np.mean(near, axis=0))
+    with pytest.raises(DeviceLost, match="none of all cells"):
+        device.mean_ratio(scan for scan in scans if not scan.is_whole)
+
+
 @pytest.mark.parametrize(
     ("seconds", "times_s", "taken"),
     [

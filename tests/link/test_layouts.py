@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ohmskin
 from ohmskin.errors import CommandRefused
 from ohmskin.link import framing, layouts, protocol
 from ohmskin.link.device import Region
@@ -115,3 +116,15 @@ def test_frames_of_today_are_left_as_they_are() -> None:
         values = {field.name: field.name for field in frame.fields}
         assert layouts.today(name, values) == values
         assert layouts.asked(protocol.NOW, name, values) == values
+
+
+def test_a_recording_of_the_oldest_layout_plays() -> None:
+    """What the package of then has recorded, and its own export of it."""
+    with np.load(DATA / "recording_2FED.npz") as told:
+        ratio, numbers, time_us = (told[name] for name in ("ratio", "number", "time_us"))
+    with ohmskin.open(f"replay://{DATA / 'recording_2FED.mcap'}?speed=0") as skin:
+        assert skin.info.layout_crc == BEFORE
+        scans = list(skin)
+    np.testing.assert_array_equal([scan.ratio for scan in scans], ratio)
+    assert [scan.number for scan in scans] == numbers.tolist()
+    assert [scan.time_us for scan in scans] == time_us.tolist()

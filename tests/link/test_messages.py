@@ -148,6 +148,10 @@ STRANGE = {
     "a scan of no rows": (SCAN.id, scan_payload(5, row_mask=0)),
     "a scan of rows beyond the skin": (SCAN.id, scan_payload(5, row_mask=2)),
     "a scan of codes of no bits": (SCAN.id, scan_payload(5)[:15] + b"\0" + scan_payload(5)[16:]),
+    "one cell out of more than a board has": (
+        SCAN.id,
+        SCAN.pack(**wire.scan_fields(255, 255, row_mask=1, column_mask=1)) + bytes(5),
+    ),
     "an empty hello": (protocol.FRAMES["hello"].id, b""),
     "a hello without its layout": (protocol.FRAMES["hello"].id, b"\1"),
 }

@@ -7,7 +7,8 @@ import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from ohmskin.link.serial_port import SerialPort, latency_timer, serial_ports
+from ohmskin.link.serial_port import SerialPort, latency_timer, resets_board, serial_ports
+from ports import Attach
 
 
 def test_boards_are_told_by_their_usb_ids(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -17,6 +18,8 @@ def test_boards_are_told_by_their_usb_ids(monkeypatch: pytest.MonkeyPatch) -> No
         "/dev/ttyACM2": (0x2A03, 0x0043, "uno"),
         "/dev/ttyACM1": (0x2341, 0x0042, "megaatmega2560"),
         "/dev/ttyACM0": (0x2341, 0x0010, "megaatmega2560"),
+        "/dev/ttyACM4": (0x1209, 0x0001, "pico"),
+        "/dev/ttyACM5": (0x1209, 0x0043, ""),
         "/dev/ttyUSB0": (0x1A86, 0x7523, ""),
         "/dev/ttyS0": (None, None, ""),
     }
@@ -33,6 +36,14 @@ def test_boards_are_told_by_their_usb_ids(monkeypatch: pytest.MonkeyPatch) -> No
     }
     assert SerialPort("/dev/ttyACM3", "Uno R3", "uno") in found
     assert found[-1].description == ""
+
+
+def test_opening_a_pico_does_not_reset_it(tmp_path: Path, attach: Attach) -> None:
+    attach(("/dev/ttyACM0", "pico"), ("/dev/ttyACM1", "uno"))
+    by_id = tmp_path / "by-id"
+    by_id.symlink_to("/dev/ttyACM0")
+    ports = "/dev/ttyACM0", str(by_id), "/dev/pts/7", "/dev/ttyACM1", "/dev/ttyUSB0"
+    assert [resets_board(port) for port in ports] == [False, False, False, True, True]
 
 
 def test_the_latency_timer_of_a_bridge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

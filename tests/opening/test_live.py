@@ -2,6 +2,8 @@
 """A skin that is always read: what comes, once each, through everything that is unplugged."""
 
 import asyncio
+import threading
+import time
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -10,7 +12,9 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from ohmskin import live
-from ohmskin.errors import OhmskinError, PortError
+from ohmskin.errors import DeviceLost, OhmskinError
+from ohmskin.force.reader import SkinReader
+from ohmskin.link.messages import Scan
 from ohmskin.live import LiveSkin
 from ohmskin.record.recorder import Recorder
 
@@ -45,8 +49,8 @@ def test_it_goes_on_when_it_was_unplugged_20_times(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(live, "AGAIN_S", 0.01)
     count = 0
     with LiveSkin(f"{URL}&vanish=0.1", of_scene("ghost")) as skin:
-        for time in range(1, 21):
-            while skin.opened <= time:
+        for times in range(1, 21):
+            while skin.opened <= times:
                 count, scans = skin.since(count, ENOUGH_S)
                 assert scans, skin.failure
                 assert all(scan.contacts for scan in scans)
@@ -87,7 +91,7 @@ def test_a_program_waits_for_what_is_not_there(monkeypatch: pytest.MonkeyPatch) 
         assert skin.since(0)[0] == 0
         while skin.failure is None:
             skin.since(0, 0.01)
-        with pytest.raises(PortError, match="no port /dev/nothing"):
+        with pytest.raises(DeviceLost, match="is not there: no port /dev/nothing"):
             skin.tare()
     with pytest.raises(ValueError, match=r"no\.json: cannot be read"):
         LiveSkin(URL, "no.json")
@@ -100,6 +104,34 @@ def test_a_machine_that_is_too_slow_passes_scans_over(monkeypatch: pytest.Monkey
             skin.since(0, 0.01)
             assert not isinstance(skin.failure, OhmskinError)
         assert skin.newest() is None
+
+
+def test_what_only_shows_a_skin_gets_the_newest_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    read = SkinReader.read
+
+    def slowly(reader: SkinReader, scan: Scan) -> ohmskin.ForceScan:
+        time.sleep(0.1)  # nine scans come meanwhile
+        return read(reader, scan)
+
+    monkeypatch.setattr(SkinReader, "read", slowly)
+    told = threading.Event()
+    with LiveSkin(URL, of_scene("ghost"), every=False) as skin:
+        skin.watchers.add(told.set)
+        found = drained(skin, 5)
+        assert told.wait(ENOUGH_S)
+    assert all(b.number - a.number > 2 for a, b in pairwise(found))
+    with LiveSkin(URL, of_scene("ghost")) as skin:
+        found = drained(skin, 2)
+    assert found[1].number - found[0].number == 1
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_defect_ends_who_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SkinReader, "read", lambda reader, scan: 1 / 0)
+    monkeypatch.setattr(SkinReader, "warm_up", lambda reader: None)
+    with LiveSkin(URL, of_scene("ghost")) as skin:
+        assert list(skin) == []
+        assert "defect of this program: ZeroDivisionError" in str(skin.failure)
 
 
 def test_a_recording_ends(tmp_path: Path) -> None:

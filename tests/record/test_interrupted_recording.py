@@ -176,6 +176,8 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
     assert "directory" in outcome(tmp_path)
     head = {"number": 1, "time_us": 1, "host_time_s": 1, "missed": 0}
     known = {**asdict(hello), "host_time_s": 1}
+    of_region = {"row_mask": 1, "column_mask": 1, "adc_bits": 10, "slot_cycles": 0}
+    region = {**head, "rows": 1, "columns": 1, "codes": [1] * 4, **of_region}
     for topic, content, reason in (
         ("/camera", {}, "no recording of a skin"),
         ("/skin/mark", {"host_time_s": 1.0, "text": ""}, "no board says hello"),
@@ -188,6 +190,8 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
         ("/skin/hello", {**known, "rows": 10**9}, "hello says rows 1000000000"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [1] * 5}, "5 codes"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [-1] * 4}, "range"),
+        ("/skin/scan", {**region, "row_mask": 2}, "a mask has lines beyond the 1"),
+        ("/skin/scan", {**region, "column_mask": 10**18}, "a mask has lines beyond the 1"),
         ("/skin/scan", {**head, "rows": 10**9, "columns": 9, "codes": []}, "no skin has 10000"),
         ("/skin/scan", {**head, "rows": 1, "columns": 1, "codes": [10**30] * 4}, "range"),
         ("/skin/mark", {"host_time_s": 10**400, "text": ""}, "too large"),

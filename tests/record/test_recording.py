@@ -4,6 +4,7 @@
 Files are read here by the `mcap` library's own readers as well, not by ours alone.
 """
 
+import csv
 import json
 import os
 import signal
@@ -22,8 +23,10 @@ import ohmskin
 from command_line import Command, Done, Run, assert_one_line, finish, well
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
+from ohmskin.estimate.methods import make_estimator
+from ohmskin.force.tables import export
+from ohmskin.link.device import Region, mean_ratio, scans_for
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.record.export import export
 from ohmskin.record.readings import estimate_file, load_readings
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import (
@@ -63,8 +66,14 @@ def test_scans_keep_their_mode(tmp_path: Path, path: Path, hello: Hello) -> None
     assert [each.mode for each in load_recording(path).hellos] == ["near", "far"]
     for found in (load_recording(path).scans, replayed(path)):
         assert [each.mode for each in found] == modes
-    with pytest.raises(RecordingError, match=r"cells or mode change after 0\.005 s"):
-        export(path, tmp_path / "both.npz")
+    export(path, tmp_path / "both.npz")
+    both = np.load(tmp_path / "both.npz")
+    assert both["reading_names"].tolist() == list("abcdef")
+    np.testing.assert_array_equal(both["ratio"][:2, ..., :4], [each.ratio for each in scans[:2]])
+    far_ratio = both["ratio"][2:][..., [0, 4, 1, 5]]
+    np.testing.assert_array_equal(far_ratio, [each.ratio for each in scans[2:]])
+    assert np.isnan(both["ratio"][:2, ..., 4:]).all()
+    assert np.isnan(both["ratio"][2:, ..., 2:4]).all()
     for out in (tmp_path / "far.npz", tmp_path / "far.csv"):
         export(path, out, begin_s=0.004)
     readings = load_readings(tmp_path / "far.npz")
@@ -267,6 +276,78 @@ def test_a_recording_stays_as_it_is(path: Path, hello: Hello) -> None:
     assert numbers[-1] == 29
 
 
+@pytest.fixture
+def regions(path: Path) -> list[Scan]:
+    """A tare in mode near, a region of one reading and of two, and whole scans in between."""
+    skin = stepped("emulator://4x4?scene=single&begin=1&seed=1")
+    given: list[Scan] = []
+
+    def kept(seconds: float) -> Iterator[Scan]:
+        for each in scans_for(skin, seconds):
+            given.append(each)
+            yield each
+
+    with Recorder(path, skin.info, lambda: skin.now_s) as recorder:
+        record(skin, recorder, kept(1.5), tare_s=0.5)
+        for mode in ("quick", "half"):
+            skin.set_region(Region(range(1, 4), range(3), mode=mode, whole_every=10))
+            record(skin, recorder, kept(0.1))
+    return given
+
+
+def test_a_recording_keeps_what_was_read(path: Path, regions: list[Scan]) -> None:
+    assert {(each.mode, each.is_whole) for each in regions} == {
+        ("near", True),
+        ("quick", False),
+        ("half", False),
+    }
+    assert_same(load_recording(path).scans, regions)
+    for each, before in zip(replayed(path), regions, strict=True):
+        np.testing.assert_array_equal(each.read, before.read)
+        np.testing.assert_array_equal(each.ratio, before.ratio)
+        # A tare in mode near serves the others, too.
+        assert each.rest_ratio is None or each.rest_ratio.shape == (4, 4, 4)
+    assert each.rest_ratio is not None
+
+
+def test_regions_and_fewer_readings_are_exported(
+    tmp_path: Path, path: Path, regions: list[Scan]
+) -> None:
+    export(path, tmp_path / "all.npz")
+    readings = load_readings(tmp_path / "all.npz")
+    assert readings.reading_names == ("a", "b", "c", "d")
+    for ratio, each in zip(readings.ratio, regions, strict=True):
+        places = ["abcd".index(name) for name in each.reading_names]
+        np.testing.assert_array_equal(ratio[..., places], each.ratio)
+        assert np.isnan(np.delete(ratio, places, axis=-1)).all()
+    # What is estimated of the file is what is estimated of the scans.
+    found = estimate_file(readings, "joint")["cell_siemens"]
+    estimator = make_estimator("joint", readings.knowledge(0))
+    for cells, each in zip(found, regions, strict=True):
+        np.testing.assert_array_equal(cells, estimator.estimate(each.ratio).cell_siemens)
+    export(path, tmp_path / "all.csv")
+    with (tmp_path / "all.csv").open() as file:
+        for row, each in zip(csv.DictReader(file), regions, strict=True):
+            cells = np.ndindex(each.codes.shape)
+            codes = {f"r{i}c{j}{each.reading_names[k]}": each.codes[i, j, k] for i, j, k in cells}
+            read = {f"r{i}c{j}" for i, j in np.argwhere(each.read)}
+            for name, text in list(row.items())[4:]:
+                assert text == (str(codes[name]) if name in codes and name[:4] in read else "")
+
+
+def test_a_file_of_few_readings_has_the_rest_of_all(tmp_path: Path, path: Path) -> None:
+    """One reading of each cell, and a tare that was made in mode near."""
+    skin = stepped("emulator://3x3?scene=single&begin=0&seed=1")
+    near, board = mean_ratio(islice(skin, 20)), skin.configure(mode="quick")
+    with Recorder(path, board, lambda: skin.now_s) as recorder:
+        recorder.add(Tare(near, 0.0))
+        record(skin, recorder, scans_for(skin, 0.1))
+    export(path, tmp_path / "quick.npz")
+    readings = load_readings(tmp_path / "quick.npz")
+    np.testing.assert_array_equal(readings.rest_ratio, near)
+    assert np.isnan(readings.ratio).all(axis=(0, 1, 2)).tolist() == [True, False, True, True]
+
+
 def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) -> None:
     scans = [scan(n, rows=3 if n < 5 else 2) for n in range(10)]
     tare = Tare(np.full((3, 4, 4), 0.25), 1.0)
@@ -276,7 +357,7 @@ def test_a_change_of_size_is_replayed(tmp_path: Path, path: Path, hello: Hello) 
         assert_same(played, scans, host_time=False)
         assert [each.rest_ratio is None for each in played] == 5 * [False] + 5 * [True]
         assert skin.info.rows == 2
-    with pytest.raises(RecordingError, match="cells or mode change after "):
+    with pytest.raises(RecordingError, match="the cells change after "):
         export(path, tmp_path / "a.npz")
 
 
@@ -395,6 +476,18 @@ def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     with pytest.raises(ValueError, match="no format"):
         export(recorded, tmp_path / "b.txt")
     assert not list(tmp_path.glob("b*"))
+
+
+def test_cells_that_no_scan_has_read_are_exported_as_such(
+    tmp_path: Path, path: Path, hello: Hello
+) -> None:
+    """They were written as the ratio of code 0, which estimators took for readings."""
+    of_region = [replace(scan(n), row_mask=0b010, column_mask=0b0110) for n in (1, 2)]
+    write_recording(path, hello, of_region)
+    export(path, tmp_path / "region.npz")
+    ratio = load_readings(tmp_path / "region.npz").ratio
+    assert np.isfinite(ratio[:, 1, 1:3]).all()
+    assert np.isfinite(ratio).sum() == ratio[:, 1, 1:3].size
 
 
 def test_typed_lines_become_marks(path: Path, command: Command) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from calibrations import NEWTON_SIEMENS, of_scene
+from ohmskin import live
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
@@ -171,6 +172,30 @@ def test_far_ends_are_shown_beside_what_the_near_ends_read(tmp_path: Path) -> No
     assert [tare.mode for tare in recorded.tares] == ["far"]
 
 
+@pytest.mark.parametrize("mode", ["half", "quick"])
+def test_few_readings_are_shown(mode: str) -> None:
+    with served(f"{GHOST}&mode={mode}") as client, panel(client) as page:
+        page.scan(lambda scan: scan["touched"].sum() == 3)
+        assert set(page.state["methods"]) == {"ohm", "matrix", "touch", "joint"}
+
+
+def test_the_board_follows_contacts_if_it_shall(tmp_path: Path) -> None:
+    url = "emulator://8x8?scene=single&begin=0"
+    with served(url, folder=tmp_path) as client, panel(client) as page:
+        page.scan(lambda scan: scan["touched"].sum() == 1)
+        assert page.command(do="focus", on=True)["good"]
+        assert page.until_state(lambda state: state["focus"])
+        page.scan(lambda scan: scan["rate_hz"] > 300 and scan["touched"].sum() == 1)
+        assert page.command(do="record")["good"]
+        page.scan(lambda scan: scan["recorded"] > 60)
+        assert page.command(do="stop")["good"]
+        assert page.command(do="focus", on=False)["good"]
+        page.scan(lambda scan: scan["rate_hz"] < 91)
+        assert not page.state["focus"]
+    (path,) = tmp_path.glob("*.mcap")
+    assert {scan.mode for scan in load_recording(path).scans} == {"near", "quick"}
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_tare_is_refused_while_something_touches_the_skin(calibrated: bool) -> None:
     known = [of_scene("ghost")] if calibrated else []
@@ -285,7 +310,7 @@ def test_a_recording_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 def test_a_board_that_is_pulled_out_comes_back_by_itself(
     pty_board: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(boards, "AGAIN_S", 0.1)
+    monkeypatch.setattr(live, "AGAIN_S", 0.1)
     port = tmp_path / "skin"
     first = pty_board(REST)
     port.symlink_to(first.path)

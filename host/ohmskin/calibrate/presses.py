@@ -247,6 +247,8 @@ class Calibrator:
     force: bool = False
 
     def __post_init__(self) -> None:
+        if not self.board.is_complete:
+            raise ValueError("a skin is calibrated in mode near or far, all of it")
         self.found: FoundWires | None = None
         self._tell(self.nominal_wire_ohm)
         at_rest = make_estimator(DEFAULT_METHOD, self.knowledge).rest()

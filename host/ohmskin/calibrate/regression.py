@@ -300,7 +300,7 @@ class _Trial:
         curve = next((fit for fit in fits if fit is not None), None)
         if curve is None:
             return None
-        coefficients = 2 if curve.kind == POWER else 1
+        coefficients = 2 if curve.is_power else 1
         # Numbers are those of the module's list. 1: in s^2 times Student's factor, n - p cancels.
         freedom = rows.x.size - coefficients
         square = float(np.sum((rows.force - force_by(curve, rows.x)) ** 2 / v)) / (freedom - 2)

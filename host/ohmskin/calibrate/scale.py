@@ -36,6 +36,9 @@ LENGTHS_S: Final = (0.02, 0.1, 0.3)
 EARLIEST_S: Final = -0.1
 # Filters are computed on a grid of half a scan, or of this, the longer [s].
 LEAST_STEP_S: Final = 0.01
+# It has so many points for each scan at most, also where a pause or a jump of the clock is long.
+# Chosen: twenty times as many as scans without a pause have.
+MOST_POINTS: Final = 40
 
 
 # A scale that prints nothing for so long has made a pause [s].
@@ -96,7 +99,8 @@ class Scale:
         """y at some times (m,), of forces (n, k) at increasing times (n,): (m, k)."""
         from scipy.signal import lfilter
 
-        step_s = max(LEAST_STEP_S, 0.5 * float(np.median(np.diff(time_s))))
+        longest_s = float(time_s[-1] - time_s[0]) / (MOST_POINTS * time_s.size)
+        step_s = max(LEAST_STEP_S, 0.5 * float(np.median(np.diff(time_s))), longest_s)
         grid_s = np.arange(time_s[0], time_s[-1] + step_s, step_s)
         force = between(time_s, force_n, grid_s)
         if self.length_s < 1e-3:

@@ -101,6 +101,9 @@ LEAST_OF_SERIES: Final = 0.1
 # The zero is known at times so far apart [s], and wanders by so much from one to the next [N].
 # Chosen: a load cell that warms up drifts by a gram in seconds.
 KNOT_S, ZERO_STEP_N = 15.0, 0.05
+# There are so many of these times at most: those of an hour. What lasts longer has them farther
+# apart, so that a clock that jumps costs no more.
+MOST_KNOTS: Final = 240
 # The rows of a press count as so many; and while the wires are looked for. Chosen: from no force to
 # its highest and back; see the module.
 PRESS_ROWS, WIRE_PRESS_ROWS = 4.0, 1.0
@@ -195,7 +198,8 @@ class TotalFit:
             self._basis, self._zero_precision = np.zeros((totals.shown_n.size, 0)), np.zeros((0, 0))
             return
         first_s, last_s = totals.shown_s[[0, -1]]
-        knots_s = np.linspace(first_s, last_s, 2 + int((last_s - first_s) / KNOT_S))
+        steps = min((last_s - first_s) / KNOT_S, MOST_KNOTS)
+        knots_s = np.linspace(first_s, last_s, 2 + int(steps))
         hats = [np.interp(totals.shown_s, knots_s, one) for one in np.eye(knots_s.size)]
         self._basis = np.transpose(hats)
         steps = np.diff(np.eye(knots_s.size), axis=0) / ZERO_STEP_N

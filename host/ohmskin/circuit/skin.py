@@ -538,8 +538,8 @@ def is_near(reading_names: Iterable[str]) -> bool:
 
 
 def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
-    """Readings a to d (..., 4), of readings (..., n) of these names, which have both near ends."""
-    if tuple(reading_names) == NEAR:
+    """Readings a to d (..., 4), of some of both ends; of near ends alone they stay as they are."""
+    if is_near(reading_names):
         return ratio
     a, b = (node_ratio(ratio, reading_names, node) for node in "ab")
     return np.stack([a, b, 1 - b, 1 - a], axis=-1)

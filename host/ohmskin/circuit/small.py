@@ -16,11 +16,11 @@ from threadpoolctl import ThreadpoolController
 from ohmskin.arrays import Float
 
 
-def gram(rows: Float, scale: float = 1.0, onto: Float | None = None) -> Float:
-    """scale * rows rows^T, added onto a matrix that is overwritten, if there is one."""
+def gram(rows: Float, onto: Float | None = None) -> Float:
+    """rows rows^T, added onto a matrix that is overwritten, if there is one."""
     turned = rows.T  # C's order is Fortran's of the transpose: nothing is copied
     beta = 0.0 if onto is None else 1.0
-    return np.asarray(blas.dsyrk(scale, turned, beta, onto, trans=1, lower=1, overwrite_c=1))
+    return np.asarray(blas.dsyrk(1.0, turned, beta, onto, trans=1, lower=1, overwrite_c=1))
 
 
 def cholesky(system: Float) -> Float:

@@ -126,6 +126,9 @@ def _board_in_words(board: Hello) -> dict[str, str]:
     settle = f"{us} us" if us else "as long as the rate allows"
     return {
         "board": f"{board.board}, firmware {board.version}, layout 0x{board.layout_crc:04X}",
+        "wiring": f"another one, 0x{board.wiring:04X}"
+        if board.wiring
+        else "as docs/build.md has it",
         "unit id": str(board.unit_id),
         "cells": f"{board.rows} rows, {board.columns} columns",
         "mode": f"{board.mode}: readings {' '.join(MODES[board.mode])} of each cell",
@@ -152,8 +155,8 @@ def configure(
     ] = None,
     mode: Annotated[str | None, Option(help=" | ".join(MODES))] = None,
     unit_id: Annotated[int | None, Option(help="name this skin")] = None,
-    defaults: Annotated[bool, Option(help="return to the defaults first")] = False,
-    save: Annotated[bool, Option(help="keep it in the board's EEPROM")] = False,
+    defaults: Annotated[bool, Option("--defaults", help="return to these first")] = False,
+    save: Annotated[bool, Option("--save", help="keep it in the board's EEPROM")] = False,
 ) -> None:
     """Change how the board scans, until its reset or for good (--save)."""
     with ohmskin.open(port, start=False) as skin:

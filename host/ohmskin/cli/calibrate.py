@@ -22,12 +22,7 @@ from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cells_differ, check_enough
 from ohmskin.calibrate.scale import printed_s
 from ohmskin.calibrate.sessions import joined, session_paths
-from ohmskin.calibrate.tables import (
-    ForceLog,
-    PressTable,
-    load_force_log,
-    load_press_table,
-)
+from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
 from ohmskin.cli.knead import kneaded
 from ohmskin.cli.record import (
@@ -56,6 +51,7 @@ from ohmskin.files import check_place, naming
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello
+from ohmskin.link.protocol import all_lines
 from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recording, Tare, load_recording
@@ -74,7 +70,7 @@ AnyIndenter = Annotated[
 Force = Annotated[bool, Option("--force", help="even if cells seem to be touched at rest")]
 calibrate = typer.Typer(
     no_args_is_help=True,
-    help="Learn forces from presses of single cells: a calibration file (.json).",
+    help="Learn forces by a scale, weights or recordings: a calibration file.",
 )
 calibrate.command()(scale)
 
@@ -143,7 +139,7 @@ def weights(
     if left:
         command = "the same command without --redo" if again else "the same command"
         done = f"{len(wanted) - left} of {len(wanted)} presses are in {kept.path}"
-        TERMINAL.print(f"{done}: {command} goes on", markup=False)
+        TERMINAL.print(f"{done}: {command} goes on")
         raise typer.Exit(130)  # what a shell says of Ctrl-C
     with naming(kept.path):
         presses = kept.seen_by(calibrator)
@@ -176,11 +172,11 @@ def _weigh_anywhere(
             rest_ratio = _rest_of(skin)
             calibrator = calibrator_of(skin.info, rest_ratio, force)
             with Recorder(path, skin.info, lambda: skin.now_s) as recorder:
-                recorder.add(Tare(rest_ratio, skin.now_s, skin.info.mode))
+                recorder.add(Tare.of(rest_ratio, skin.info, skin.now_s))
                 left = guided(skin, calibrator, KeptAnywhere(recorder), missing, len(wanted))
         if left:
             done = f"{len(wanted) - left} of {len(wanted)} weights have been read"
-            TERMINAL.print(f"{done}: the same command goes on", markup=False)
+            TERMINAL.print(f"{done}: the same command goes on")
             raise typer.Exit(130)
         recordings.append(load_recording(path))
     _learn_totals(calibrator_of, joined(recordings), out, force)
@@ -222,9 +218,16 @@ def recording(
             raise ValueError("no scan in it")
         if log is None and not given.forces:
             raise ValueError("no force in it: say --forces LOG.csv")
-        if any(scan.mode != given.hellos[-1].mode for scan in given.scans):
+        given.scans = [scan for scan in given.scans if scan.is_complete]
+        board = given.hellos[-1]
+        modes = {scan.mode for scan in given.scans} | ({board.mode} if board.is_complete else set())
+        if not given.scans:
+            raise ValueError("no scans of one mode, near or far: record the presses in mode near")
+        if len(modes) > 1:
             raise ValueError("modes near and far are mixed in it: record the presses in one mode")
-        calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, rest_s), force)
+        rows, columns = map(all_lines, (board.rows, board.columns))
+        board = replace(board, mode=modes.pop(), row_mask=rows, column_mask=columns)
+        calibrator = calibrator_of(board, _rest_ratio(given, rest_s), force)
         if total:
             _knead(calibrator, given, log, out, as_json)
             return
@@ -331,8 +334,8 @@ def _knead(
     for begin_s, end_s in left_out:
         TERMINAL.print(f"left out: {begin_s:.1f} to {end_s:.1f} s, force beside the skin?")
     TERMINAL.print(f"{known} of {stds.size} cells have a gain of their own")
-    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator), markup=False)
-    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
+    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
+    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}")
 
 
 @calibrate.command()
@@ -354,7 +357,9 @@ def table(
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
         calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s), force)
-    _from_table(calibrator, rows, table, out)
+    with naming(table):
+        presses = calibrator.presses_in_table(rows)
+    _finish(calibrator, presses, table, out)
 
 
 def tare(
@@ -380,7 +385,7 @@ def tare(
             skin.tare(seconds, force=force)
             done = f"tared, largest force before it {largest_n:.3f} +- {std_n:.3f} N"
         skin.calibration.save(calibration)
-    TERMINAL.print(f"{calibration}: {done}", markup=False)
+    TERMINAL.print(f"{calibration}: {done}")
 
 
 # ---------------------------------------------------------------------- what they have in common
@@ -426,12 +431,6 @@ def _rest_ratio(given: Recording, rest_s: float) -> Float:
     return tares[0].rest_ratio
 
 
-def _from_table(calibrator: Calibrator, table: PressTable, source: Path, out: Path) -> None:
-    with naming(source):
-        presses = calibrator.presses_in_table(table)
-    _finish(calibrator, presses, source, out)
-
-
 def _finish(
     calibrator: Calibrator, presses: Presses, source: Path, out: Path, note: str = ""
 ) -> None:
@@ -455,8 +454,8 @@ def _finish(
         TERMINAL.print(
             message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else "")
         )
-    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator), markup=False)
-    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}", markup=False)
+    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
+    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}")
 
 
 def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:

@@ -10,13 +10,15 @@ from rich.columns import Columns
 
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_USIEMENS, Bool, Float
+from ohmskin.cli.picture import picture
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import WIDE, coloured
 from ohmskin.cli.terminal import Terminal
 from ohmskin.emulate.urls import emulated
+from ohmskin.errors import OhmskinError
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.files import check_place, whole_file
+from ohmskin.files import check_place
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.device import scans_for
 
@@ -25,9 +27,9 @@ _METHODS: Final = ("ohm", "joint")
 _out = Terminal()
 
 
-def compare(port: str, seconds: float, picture: Path) -> None:
-    """Scan an emulated board, print truth and estimates, and write a picture of them (PNG)."""
-    check_place(picture)
+def compare(port: str, seconds: float, path: Path) -> None:
+    """Scan an emulated board, print truth and estimates, and write a picture of them."""
+    check_place(path)
     _, scene, _ = emulated(port)
     with ohmskin.open(port) as skin:
         board = skin.info
@@ -56,37 +58,28 @@ def compare(port: str, seconds: float, picture: Path) -> None:
         took_ms = 1e3 * float(np.median([estimate.seconds for estimate in estimates]))
         out.print(f"{name:>8}: {verdict}, {took_ms:.2f} ms a scan")
     out.print(
-        f"{stats.scans} scans at {board.rate_hz:.2f} Hz, {stats.missed} missed, "
+        f"{len(frames)} scans at {board.rate_hz:.2f} Hz, {stats.missed} missed, "
         f"{stats.line.damaged} damaged"
     )
     try:
-        _save_picture(picture, views, title)
-    except ImportError:
-        hint = "run pip install '.[plot]' in the checkout, or 'FILE.whl[plot]' of a wheel"
-        out.print(f"no picture: pictures need matplotlib: {hint}")
-    else:
-        out.print(f"picture: {picture}")
+        _draw(path, views, title)
+        out.print(f"picture: {path}")
+    except OhmskinError as exc:
+        out.print(f"no picture: {exc}")
 
 
-def _save_picture(path: Path, views: Sequence[tuple[str, Float, Bool]], title: str) -> None:
-    """A PNG of views side by side: name, conductances [S] and touched cells, each (R, C).
-
-    :raises ImportError: matplotlib is not installed.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(3.4 * len(views) + 0.8, 3.9), layout="constrained")
-    figure.suptitle(title)
-    all_axes = figure.subplots(1, len(views), squeeze=False)[0]
-    for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
-        drawn_us = np.maximum(1e6 * cell_siemens, 0.1)  # the logarithm of 0 is no colour
-        axes.imshow(drawn_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_USIEMENS)
-        for row, column in np.argwhere(touched):
-            text = f"{drawn_us[row, column]:.0f}"
-            colour = "white" if drawn_us[row, column] < 50 else "black"
-            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
-        rows, columns = map(range, cell_siemens.shape)
-        axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
-    figure.colorbar(all_axes[0].images[0], ax=all_axes, label="cell conductance [µS]", shrink=0.9)
-    with whole_file(path) as file:
-        figure.savefig(file, format=path.suffix[1:] or "png", dpi=120)
+def _draw(path: Path, views: Sequence[tuple[str, Float, Bool]], title: str) -> None:
+    """Views side by side: name, conductances [S] and touched cells, each (R, C)."""
+    with picture(path, (3.4 * len(views) + 0.8, 3.9), title) as figure:
+        all_axes = figure.subplots(1, len(views), squeeze=False)[0]
+        for axes, (name, cell_siemens, touched) in zip(all_axes, views, strict=True):
+            drawn_us = np.maximum(1e6 * cell_siemens, 0.1)  # the logarithm of 0 is no colour
+            axes.imshow(drawn_us, cmap="viridis", norm="log", vmin=0.5, vmax=FULL_SCALE_USIEMENS)
+            for row, column in np.argwhere(touched):
+                text = f"{drawn_us[row, column]:.0f}"
+                colour = "white" if drawn_us[row, column] < 50 else "black"
+                axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
+            rows, columns = map(range, cell_siemens.shape)
+            axes.set(title=name, xlabel="column", ylabel="row", xticks=columns, yticks=rows)
+        scale = all_axes[0].images[0]
+        figure.colorbar(scale, ax=all_axes, label="cell conductance [µS]", shrink=0.9)

@@ -6,6 +6,8 @@ from typing import Annotated, Final
 
 from typer import Option
 
+from ohmskin.ctrl_c import ctrl_c_kept
+
 URL: Final = "emulator://8x8?scene=ghost&seed=1"
 
 
@@ -16,6 +18,7 @@ def demo(
 ) -> None:
     """Scan an emulated skin, and show what a ghost is and how it goes. Needs no board."""
     print(f"scanning {port} for {seconds:g} s", flush=True)  # noqa: T201
-    from ohmskin.cli.compare import compare  # loads for a second
+    with ctrl_c_kept():
+        from ohmskin.cli.compare import compare  # loads for a second
 
     compare(port, seconds, picture)

@@ -39,7 +39,7 @@ def doctor(
     ] = None,
     wires: Wires = "",
     leads: Leads = None,
-    press: Annotated[bool, Option(help="then ask for touches, which show the wires")] = False,
+    press: Annotated[bool, Option("--press", help="ask for touches that show the wires")] = False,
     into: Annotated[Path | None, Option(help="calibration that takes these wires (.json)")] = None,
     as_json: Annotated[bool, Option("--json", help="one JSON object")] = False,
 ) -> None:

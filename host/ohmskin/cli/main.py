@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import ohmskin
-from ohmskin.ctrl_c import forget_ctrl_c
+from ohmskin.ctrl_c import ctrl_c_kept, forget_ctrl_c, raise_again
 from ohmskin.errors import OhmskinError
 
 # The module and function of each command, and what the list of commands says of it. That is the
@@ -35,7 +35,7 @@ _COMMANDS: Final = {
     "record.export": "Write recordings as .npz or .csv: readings, or forces by a calibration.",
     "emulate.emulate": "Serve an emulated board at a pseudo-terminal. Ctrl-C ends it.",
     "demo.demo": "Scan an emulated skin, and show what a ghost is and how it goes. Needs no board.",
-    "calibrate.calibrate": "Learn forces from presses of single cells: a calibration file (.json).",
+    "calibrate.calibrate": "Learn forces by a scale, weights or recordings: a calibration file.",
 }
 
 
@@ -49,7 +49,8 @@ class _Command(TyperCommand):
     def load(self) -> Any:
         """The command itself, or the group of them. Its module may have an EPILOG for the help."""
         assert self.name is not None
-        module = import_module(f"ohmskin.cli.{self._module}")
+        with ctrl_c_kept():
+            module = import_module(f"ohmskin.cli.{self._module}")
         function, group = getattr(module, self.name), typer.Typer(add_completion=False)
         if isinstance(function, typer.Typer):
             group.add_typer(function, name=self.name)
@@ -85,6 +86,7 @@ app.commands = {place.partition(".")[2]: _Command(place, text) for place, text i
 
 def main() -> None:
     """Run the command line; the process's exit code says how it went."""
+    sys.unraisablehook = raise_again
     try:
         run(app, "ohmskin")
     finally:

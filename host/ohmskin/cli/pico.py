@@ -20,8 +20,6 @@ _PLACES: Final = ("/media/*", "/media/*/*", "/run/media/*/*", "/mnt/*", "/Volume
 _INFO: Final = "INFO_UF2.TXT"
 _BOARD_ID: Final = b"Board-ID: RPI-RP2"
 _INFO_MOST_BYTES: Final = 4096
-# What the firmware calls itself (firmware/pico/usb_descriptors.h).
-_PRODUCT: Final = "ohmskin pico"
 # How long a Pico that was flashed may take until its port is there [s]. Chosen: USB takes one.
 _APPEARS_S: Final = 10.0
 _LOOK_EVERY_S: Final = 0.2
@@ -60,11 +58,11 @@ def port_of_pico() -> str:
     """
     deadline_s = time.monotonic() + _APPEARS_S
     while True:
-        ports = [port.path for port in serial_ports() if _PRODUCT in port.description]
+        ports = [port.path for port in serial_ports() if port.board == "pico"]
         if len(ports) == 1:
             return ports[0]
         if time.monotonic() > deadline_s:
-            raise PortError(f"{len(ports) or 'no'} ports are called '{_PRODUCT}': plug it in again")
+            raise PortError(f"{len(ports) or 'no'} ports are those of a Pico: plug it in again")
         time.sleep(_LOOK_EVERY_S)
 
 

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -30,14 +29,13 @@ from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.files import check_place
-from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force import tables
+from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import DEFAULT_METHOD
-from ohmskin.force.tables import FORMATS, export_forces
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 from ohmskin.record import recorder as recording
 from ohmskin.record.export import Part
-from ohmskin.record.export import export as export_recording
 from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.readings import estimate_file, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
@@ -218,7 +216,8 @@ def _take_marks(recorder: Recorder) -> None:
 def export(
     recordings: Annotated[list[Path], Argument(metavar="RECORDING", help="recordings (.mcap)")],
     out: Annotated[
-        Path, Argument(help=f"file to write: {', '.join(FORMATS)}; or a folder for all of them")
+        Path,
+        Argument(help=f"file to write: {', '.join(tables.FORMATS)}; or a folder for all of them"),
     ],
     begin_s: Annotated[
         float, Option("--begin", min=0, help="from so long after the first scan, in s")
@@ -243,21 +242,17 @@ def export(
     if len(pairs) == 1:
         with ends_in_time(_errors.show_cursor), _bar() as bar:
             task = bar.add_task(pairs[0][1].name, total=pairs[0][0].stat().st_size)
-            read = partial(bar.update, task)
-            done = [_exported(*pairs[0], known, begin_s, end_s, lambda size: read(completed=size))]
+
+            def watch(size: int) -> None:
+                bar.update(task, completed=size)
+
+            done = [tables.export(*pairs[0], known, begin_s, end_s, watch)]
     else:
         done = _at_once(pairs, backend, known, begin_s, end_s)
     for (path, to), written in zip(pairs, done, strict=True):
         TERMINAL.print(f"{to}: {written.scans} scans")
         if written.cut_off:
             print(f"{path} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
-
-
-def _exported(path: Path, out: Path, known: Calibration | None, *more: Any) -> Part:
-    """more: begin, end, and who watches."""
-    if known is None:
-        return export_recording(path, out, *more)
-    return export_forces(path, out, known, *more)
 
 
 def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[Part]:
@@ -272,7 +267,7 @@ def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[P
                 # That of the lab, which dask's own configuration names; else one of this machine.
                 stack.enter_context(Client(dashboard_address=None))
             stack.enter_context(joblib.parallel_config(backend))
-            jobs = (joblib.delayed(_exported)(*pair, *told) for pair in pairs)
+            jobs = (joblib.delayed(tables.export)(*pair, *told) for pair in pairs)
             done = joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)
             bar = stack.enter_context(_bar())
             return list(bar.track(done, total=len(pairs), description="recordings"))
@@ -284,7 +279,7 @@ def estimate(
     readings: Annotated[Path, Argument(help="readings file (.npz)")],
     method: Annotated[str, Option(help=" | ".join(METHODS))],
     out: Annotated[Path, Option(help="file to write (.npz)")],
-    cold: Annotated[bool, Option(help="start every frame afresh")] = False,
+    cold: Annotated[bool, Option("--cold", help="start every frame afresh")] = False,
     ref_std: Annotated[float | None, REF_STD] = None,
 ) -> None:
     """Estimate every cell of every frame of a readings file.

@@ -4,20 +4,16 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any
 
 import numpy as np
 from typer import Argument, Option
 
 from ohmskin.cli.board import TERMINAL
-from ohmskin.files import check_place, whole_file
+from ohmskin.cli.picture import picture
+from ohmskin.files import check_place
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.geometry import Geometry
-
-# A picture is so wide and high [points]. Chosen: it fits into a page.
-_PICTURE: Final = 480
-# It is drawn as seen from beside: z moves a point by this share of it, to the right and up.
-_BESIDE: Final = np.array([0.35, -0.35])
 
 
 def skin(
@@ -28,7 +24,9 @@ def skin(
     radius_mm: Annotated[float, Option(help="columns go round a cylinder, in mm; 0: flat")] = 0.0,
     taxels: Annotated[Path | None, Option(help="a file of taxels: iCub's lines, or URDF")] = None,
     frame: Annotated[str, Option(help="name of the frame of all positions")] = "",
-    picture: Annotated[Path | None, Option(help="draw the cells into this file (.svg)")] = None,
+    drawing: Annotated[
+        Path | None, Option("--picture", help="draw the cells into this file (.svg, .png)")
+    ] = None,
 ) -> None:
     """Show a calibration file; say where its cells are, and draw them."""
     known = load_calibration(file)
@@ -56,24 +54,18 @@ def skin(
     corners = (placed.position_m[0, 0], placed.position_m[-1, -1])
     first, last = (", ".join(f"{1e3 * metres:.1f}" for metres in at_m) for at_m in corners)
     TERMINAL.print(f"{placed.kind}, in '{placed.frame_id}': from ({first}) to ({last}) mm")
-    if picture is not None:
-        check_place(picture, file)
-        with whole_file(picture) as out:
-            out.write(_drawn(placed).encode())
+    if drawing is not None:
+        check_place(drawing, file)
+        _draw(drawing, placed)
 
 
-def _drawn(placed: Geometry) -> str:
-    """An SVG of all cells, each with its normal and its row and column."""
-    feet, tips = (
-        at_m[..., :2] * [1, -1] + at_m[..., 2:] * _BESIDE
-        for at_m in (placed.position_m, placed.position_m + 5e-3 * placed.normal)
-    )
-    low, high = np.minimum(feet, tips).min((0, 1)), np.maximum(feet, tips).max((0, 1))
-    scale = 0.9 * _PICTURE / max((high - low).max(), 1e-9)
-    parts = [f'<svg xmlns="http://www.w3.org/2000/svg" width="{_PICTURE}" height="{_PICTURE}">']
-    for cell in np.ndindex(feet.shape[:2]):
-        (x, y), (u, v) = (scale * (ends[cell] - low) + 0.05 * _PICTURE for ends in (feet, tips))
-        parts.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{u:.1f}" y2="{v:.1f}" stroke="red"/>')
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2"/>')
-        parts.append(f'<text x="{x + 3:.1f}" y="{y:.1f}" font-size="7">{cell[0]},{cell[1]}</text>')
-    return "\n".join([*parts, "</svg>\n"])
+def _draw(path: Path, placed: Geometry) -> None:
+    """All cells in space, each with its normal and its row and column."""
+    with picture(path, (6, 6), placed.frame_id) as figure:
+        axes: Any = figure.add_subplot(projection="3d")
+        x, y, z = np.moveaxis(1e3 * placed.position_m, -1, 0)
+        axes.quiver(x, y, z, *np.moveaxis(placed.normal, -1, 0), length=5, color="red")
+        for cell in np.ndindex(x.shape):
+            axes.text(x[cell], y[cell], z[cell], "{},{}".format(*cell), fontsize=6)
+        axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", zlim=(z.min(), z.max() + 20))
+        axes.set_aspect("equal")

@@ -5,7 +5,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -28,6 +28,7 @@ from ohmskin.estimate.knowledge import REF_LOG_STD
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.contacts import ContactTracker
+from ohmskin.force.focus import Focus
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -58,6 +59,9 @@ def stream(
     force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
     tare_s: Annotated[float, Option("--tare", min=0, help="touch nothing for so long, in s")] = 0.0,
     ref_std: Annotated[float, REF_STD] = REF_LOG_STD,
+    focus: Annotated[
+        bool, Option("--focus", help="read contacts often, the rest now and then")
+    ] = False,
     as_json: Annotated[bool, Option("--json", help="one JSON object a scan")] = False,
     scans: Scans = 0,
     seconds: Seconds = 0.0,
@@ -69,8 +73,10 @@ def stream(
         calibration = None  # an option goes before what the environment says
     if method and calibration is not None:
         raise ValueError("say either --method or --calibration: a calibration has its own method")
+    if method == "none" and focus:
+        raise ValueError("--focus follows what an estimate shows: leave out --method none")
     loaded = None if calibration is None else load_calibration(calibration)
-    with ohmskin.open(port) as skin:
+    with ohmskin.open(port) as skin, ExitStack() as stack:
         reader = None
         if method != "none":
             reader = SkinReader(skin.info, loaded, method=method, force=force, ref_log_std=ref_std)
@@ -78,6 +84,8 @@ def stream(
             if tare_s:
                 # Without a calibration the rest is unknown, and cells may seem touched.
                 reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
+            if focus:
+                reader.focus = stack.enter_context(Focus(skin))
         with ends_by_ctrl_c(), ends_in_time(_out.show_cursor):
             given = asked_for(skin, scans, seconds)
             if as_json:
@@ -99,7 +107,7 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
             "host_time_s": round(scan.host_time_s, 6),
             "missed": scan.missed,
             "reading_names": scan.reading_names,
-            "ratio": scan.ratio.tolist(),
+            "ratio": numbers(scan.ratio),
         }
         if reader is not None:
             shown = reader.read(scan)

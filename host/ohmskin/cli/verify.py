@@ -4,7 +4,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 from typer import Argument, Option
@@ -15,6 +15,7 @@ from ohmskin.circuit.skin import CONFIGURATIONS
 from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
+from ohmskin.cli.picture import picture
 from ohmskin.cli.stream import numbers
 from ohmskin.cli.terminal import Terminal
 from ohmskin.doctor.examine import examine
@@ -22,6 +23,9 @@ from ohmskin.doctor.gather import gather_plate
 from ohmskin.doctor.plate import PlateExam, Tolerance
 from ohmskin.emulate.scenes import LEAD_OHM
 from ohmskin.files import check_place, whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MOST: Final = Tolerance()
 _out = Terminal(soft_wrap=True, highlight=False)
@@ -37,7 +41,7 @@ def verify(
     wires: Wires = "0,0",
     leads: Leads = LEAD_OHM,
     seconds: Annotated[float, Option(min=0.5, help="so long losses are counted")] = 60.0,
-    picture: Annotated[Path | None, Option(help="PNG to write")] = None,
+    png: Annotated[Path | None, Option("--picture", help="PNG to write")] = None,
     json_file: Annotated[str, Option("--json", help="file for all figures; -: here")] = "",
     cell_percent: Annotated[
         float, _most("error of a cell: 1 % of a resistor, 2 % of multiplexers and converter")
@@ -56,7 +60,7 @@ def verify(
     settled, noise by ADC clock, and lost scans. Leaves the board as it was. Exit code 0: all is
     within the tolerances; 1: something is not.
     """
-    for path in filter(None, (str(picture or ""), json_file.removeprefix("-"))):
+    for path in filter(None, (str(png or ""), json_file.removeprefix("-"))):
         check_place(Path(path), plate)
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires, leads), tolerance)
@@ -78,8 +82,9 @@ def verify(
     if json_file not in ("", "-"):
         with whole_file(json_file) as file:
             file.write(everything.encode())
-    if picture is not None:
-        _save_picture(picture, exam, f"{port}: {page['verdict']}")
+    if png is not None:
+        with picture(png, (15, 5), f"{port}: {page['verdict']}") as figure:
+            _draw(figure, exam)
     if diagnosis.worse:
         raise SystemExit(1)
 
@@ -95,19 +100,10 @@ def _print_exam(exam: PlateExam) -> None:
         _out.print("".join("      ." if np.isnan(each) else f"{each:7.2f}" for each in row))
 
 
-def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
-    """A PNG of what the board reads of the plate.
-
-    :raises ValueError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as exc:
-        raise ValueError("no picture: it needs matplotlib: pip install '.[plot]'") from exc
+def _draw(figure: "Figure", exam: PlateExam) -> None:
+    """What the board reads of the plate: errors of cells, changes by settling, and linearity."""
     size = 8 if max(exam.plate.shape) <= 8 else 5  # of letters
     most, crossings = exam.tolerance, range(max(exam.plate.shape))
-    figure = Figure(figsize=(15, 5), layout="constrained")
-    figure.suptitle(title, wrap=True)
     of_cells, of_settling, of_lines = figure.subplots(1, 3)
     for axes, values, limit, name, colours in (
         (of_cells, exam.error_percent, most.cell_percent, "error of each resistor [%]", "RdBu_r"),
@@ -129,5 +125,3 @@ def _save_picture(path: Path, exam: PlateExam, title: str) -> None:
         of_lines.plot(x, y - x, "o+x."[k], label=name, markersize=6, fillstyle="none")
     of_lines.set(title="reading less prediction [LSB]", xlabel="current by the circuit [LSB]")
     of_lines.legend(title="reading")
-    with whole_file(path) as file:
-        figure.savefig(file, format=path.suffix[1:] or "png", dpi=110)

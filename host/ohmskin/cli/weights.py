@@ -168,7 +168,7 @@ def guided(
             line, now = _step_in_words(step, anywhere)
             if line and line != last_line:
                 counted = f"{done} of {total}: " if step.rise is not None else ""
-                TERMINAL.print(counted + line, markup=False, highlight=False)
+                TERMINAL.print(counted + line, highlight=False)
                 last_line = line
             bar.update(task, completed=done, description=now)
             if step.state is State.DONE:

@@ -63,9 +63,14 @@ def gather(
     seconds: how long the first look takes.
     clocks: whether to scan by each ADC clock, too. Only plates have this done.
 
-    :raises ValueError: somebody would be asked to press a skin of one row or column.
+    :raises ValueError: somebody would be asked to press a skin of one row or column; or a recording
+        has no complete scans.
     """
     board, path = device.info, device.name.partition("?")[0]
+    if not board.is_complete:
+        with suppress(CommandRefused), put_back(device):  # a recording stays as it is
+            device.configure(rows=board.rows, columns=board.columns, rate_hz=0, mode="near")
+            return gather(device, report, told, press=press, seconds=seconds, clocks=clocks)
     device.only_unit = board.unit_id  # findings are of one board
     evidence = Evidence(board)
     # Wires without resistance cannot have changed: there is nothing to compare with.
@@ -79,7 +84,12 @@ def gather(
             evidence.report = device.self_test()
         report(Step.PLATE if clocks else Step.SKIN, seconds)
         _scan(device, evidence.scans, seconds)
-        evidence.board = device.info  # anew: if the board was reset meanwhile, it says why
+        # Anew: if the board was reset meanwhile, it says why. A recording may end with a region.
+        boards = [device.info, *(scan.board or board for scan in reversed(evidence.scans))]
+        complete = [each for each in boards if each.is_complete]
+        if not complete:
+            raise ValueError("nothing in it is of the whole skin, in mode near or far: record that")
+        evidence.board = complete[0]
         settling = second_look(evidence.board)
         with suppress(CommandRefused), put_back(device):
             if settling is not None:
@@ -120,7 +130,7 @@ def gather_plate(
 
     It is read in mode near: a line of a plate has one potential, so far ends show nothing more.
     """
-    rate_hz = device.info.rate_asked_mhz / 1000
+    rate_hz = device.info.rate_asked_mhz / 1000 if device.info.is_complete else 0.0
     with put_back(device):
         device.configure(rows=shape[0], columns=shape[1], rate_hz=rate_hz, mode="near")
         return gather(device, report, seconds=seconds, clocks=True)

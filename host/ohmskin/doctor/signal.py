@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import READING_SIGN
+from ohmskin.circuit.skin import READING_SIGN, READINGS_PER_CELL
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
@@ -127,15 +127,16 @@ class Look:
 
     @classmethod
     def of(cls, board: Hello, scans: Sequence[Scan]) -> Self | None:
-        """The scans that have the board's size; None if there are fewer than two.
+        """The complete scans of the board's size and mode; None if there are fewer than two.
 
-        Others are from before or after a reset.
+        Others are from before or after a reset, or of a region, or of fewer readings.
         """
-        of_size = [scan for scan in scans if scan.codes.shape[:2] == (board.rows, board.columns)]
-        if len(of_size) < 2:
+        kind = (board.rows, board.columns, READINGS_PER_CELL), board.mode
+        kept = [scan for scan in scans if scan.is_complete and scan.kind == kind]
+        if len(kept) < 2:
             return None
-        codes = np.stack([scan.codes for scan in of_size]).astype(np.float64)
-        return cls(board, codes, np.array([1e-6 * scan.time_us for scan in of_size]))
+        codes = np.stack([scan.codes for scan in kept]).astype(np.float64)
+        return cls(board, codes, np.array([1e-6 * scan.time_us for scan in kept]))
 
     @cached_property
     def mean(self) -> Float:

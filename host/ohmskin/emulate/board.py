@@ -54,7 +54,7 @@ SLOT_ADC_CLOCKS_MIN: Final = 15
 HELD_ADC_CLOCKS: Final = 11.5
 # A slot leaves this time for settling [us] if neither rate nor settle time is asked for, by mode
 # (scan_plan.h).
-SETTLE_US: Final = dict(zip(protocol.MODES, (20, 35, 20, 20), strict=True))
+SETTLE_US: Final = dict(zip(protocol.MODES, (20, 35, 40, 101), strict=True))
 # What the processor needs for a slot, for a reading besides, and for a scan [cycles] (scan_plan.h).
 BUSY_A_SLOT, BUSY_A_READING, BUSY_A_SCAN = 165, 240, 5000
 # The line is fed so much slower than it could go, an eighth (scan_plan.h).
@@ -292,8 +292,8 @@ class EmulatedBoard:
 
     def _send_scan(self, start_s: float) -> None:
         plan = self._plan
-        lines = protocol.lines_of(plan.row_mask), protocol.lines_of(plan.column_mask)
         codes = self.codes_at(start_s)
+        lines = map(protocol.lines_of, (plan.row_mask, plan.column_mask), codes.shape)
         self._send(
             "scan",
             protocol.pack_codes(codes[np.ix_(*lines)], protocol.PER_PASS[plan.mode]),

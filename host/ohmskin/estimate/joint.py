@@ -119,9 +119,9 @@ class JointEstimator(Estimator):
 
     def wires_are(self) -> str:
         """By what was told, and by how well the belief knows both layers since."""
-        if self.knowledge.nominal_wire_ohm.both is not None or all(self._belief.far):
-            return "known"
-        return "learned" if self._belief.stds().layer_std < LAYER_STD else ASSUMED
+        if self._belief.untold:
+            return ASSUMED if self._belief.is_assumed else "learned"
+        return "known"
 
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
@@ -402,7 +402,7 @@ class TouchEstimator(JointEstimator):
     def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer of these few touches; None if they leave something open, or one uncertain."""
         # Where wires are assumed, the fit of all resistances learns them sooner.
-        if self.knowledge.rest_ratio is None or self.wires_are() == ASSUMED:
+        if self.knowledge.rest_ratio is None or self._belief.is_assumed:
             return None
         touched = touches.explain()
         if touched is None:

@@ -159,12 +159,14 @@ def check_ratio(
 ) -> Float:
     """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell.
 
-    Of near ends, what was not read is NaN, and n is 4: a frame of `b` alone may be of shape
-    (R, C, 1), or (R, C, 4) with NaN for a, c and d. What was read are the same readings of all
-    crossings of some rows with some columns.
+    Of near ends, what was not read is NaN, and n is 4. A frame of mode half or quick may be of
+    shape (R, C, 2) or (R, C, 1) as well. What was read are the same readings of all crossings of
+    some rows with some columns.
     """
     readings = np.asarray(ratio, dtype=np.float64)
-    of_near = is_near(of)
+    of_near, width = is_near(of), readings.shape[-1] if readings.ndim else 0
+    if of_near and width not in (len(of), len(NEAR)):
+        of = next((names for names in MODES.values() if len(names) == width), of)
     shapes = [(rows, columns, len(of)), *([(rows, columns, len(NEAR))] if of_near else [])]
     if readings.shape not in shapes:
         raise ValueError(f"{name} has shape {readings.shape}, this skin {shapes[0]}")

@@ -308,13 +308,22 @@ class FarFaults:
         ]
         self._sensed = sensed
         self._lines = knowledge.rows, knowledge.columns
+        self._rest_sums = [np.zeros((4, 4))] * 2
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames before."""
+        """Forget the frames before, but what the rest readings have shown."""
         self._is_constant = [np.zeros(lines, dtype=bool) for lines in self._lines]
-        self._sums = [np.zeros((4, 4)) for _ in self._lines]
+        self._sums = list(self._rest_sums)
         self._is_near = [False, False]
+
+    def keep_as_rest(self, far: FarReadings, std: Float, shift: float) -> str:
+        """What `find` says of the rest readings; they count once, before all frames."""
+        self._rest_sums = [np.zeros((4, 4))] * 2
+        self.reset()
+        fault = self.find(far, std, shift)
+        self._rest_sums = list(self._sums)
+        return fault
 
     def find(self, far: FarReadings, std: Float, shift: float) -> str:
         """The lines at fault, in words: `far rows`, `far columns`, or `far row 3`; or empty.

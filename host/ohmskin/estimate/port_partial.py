@@ -6,13 +6,22 @@ Symbols are those of `port_currents` and `port_noise`; K are the readings of a c
     I = sum_{k in K} s_k R_k (y_k - o_k - b_k) / sum_{k in K} R_k^2 ,
     s_I^2 = v_I / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2 .
 
-Four readings show what fewer do not: the offset o_k of each node, v and v_I. They are those of the
-last frame in which all was read, at rest if there was no other; else o_k is 0, and
+Four readings show what fewer do not: the offset o_k of each node, and v. They are those of the last
+frame in which all was read, at rest if there was no other; v is that at rest if that is less,
+because lines that charge add to the other. Where neither was read, o_k is 0, and
 
-    v = v_I = max(2 s^2, median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455) ,
+    v = max(2 s^2, median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455) ,
 
-by the currents that two of the readings show. A port that was not read has its last current; that
-is less certain by `STALE_SHARE` of it for each frame since then.
+by the currents that two of the readings show. v_I is not taken from another frame: where lines
+charge goes by what is touched. One reading has v_I = v; several show it as in `port_noise`,
+
+    v_cell = sum_k residual_k^2 / (|K| - 1) ,  v_I = v + STAYING_SHARE^2 max(0, v_cell - v) .
+
+Of A and B alone, lines that charge add to A and take from B, which is read a slot later, less of
+it. So A has `FIRST_SHARE` of what stays in their difference, and that is taken from both.
+
+A port that was not read has its last current; that is less certain by `STALE_SHARE` of it for each
+frame since then.
 """
 
 from typing import Final, NamedTuple
@@ -24,24 +33,27 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN, reference_ohm
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import PortCurrents
-from ohmskin.estimate.port_noise import MEDIAN_CHI2, Variances
+from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 
 # Share of its current by which a port that is not read may change from frame to frame. Chosen: by
 # the next whole scan, 30 frames later, it may be anything.
 STALE_SHARE: Final = 0.03
 # Ports that no frame has shown yet are taken for as old as so many frames. Chosen: as above.
 _NEVER_FRAMES: Final = 30
+# What A has of the difference that lines make between A and B, in modes with these two alone.
+# Measured in firmware/sim with its preset `desk`: 0.75 to 0.85, by the length of slots.
+FIRST_SHARE: Final = 0.8
 
 
 class Shown(NamedTuple):
     """What a frame has shown: its ports; of all readings, also the two others.
 
-    offset_ratio: of each reading (4,) [V/Vdd]. variances: of readings.
+    offset_ratio: of each reading (4,) [V/Vdd]. noise: v.
     """
 
     ports: PortCurrents
     offset_ratio: Float | None = None
-    variances: Variances | None = None
+    noise: float | None = None
 
 
 class PartialEnds:
@@ -65,7 +77,8 @@ class PartialEnds:
 
     def keep(self, shown: Shown) -> None:
         """A frame of all readings has shown this."""
-        self._last, self.region = shown, None
+        noise = min(shown.noise or np.inf, self._rest.noise or np.inf)
+        self._last, self.region = shown._replace(noise=noise), None
         self._age = np.zeros_like(self._age)
 
     def keep_as_rest(self) -> None:
@@ -81,11 +94,22 @@ class PartialEnds:
         if self._last.offset_ratio is not None:
             signal -= self._last.offset_ratio
         signal = signal[..., kinds]
-        variances = self._last.variances or self._variances(signal, slope)
+        by_each = signal / slope
+        noise = self._last.noise or self._noise(by_each, slope)
         square_ohm = float(slope @ slope)
-        alike = max(0.0, self._rounding - 0.5 * variances.noise) * np.abs(slope).sum() ** 2
-        std = np.sqrt(variances.error / square_ohm + alike / square_ohm**2)
         current = signal @ slope / square_ohm
+        error = noise
+        if slope.size > 1:
+            residual = signal - current[..., None] * slope
+            by_cell = np.einsum("ijk,ijk->ij", residual, residual) / (slope.size - 1)
+            staying = np.maximum(by_cell - noise, 0.0)
+            error = noise + STAYING_SHARE**2 * staying
+            if kinds.tolist() == [True, True, False, False]:
+                weight = slope[0] ** 2 / square_ohm
+                share = staying / np.maximum(by_cell, noise)
+                current -= (FIRST_SHARE - 1 + weight) * share * (by_each[..., 0] - by_each[..., 1])
+        alike = max(0.0, self._rounding - 0.5 * noise) * np.abs(slope).sum() ** 2
+        std = np.broadcast_to(np.sqrt(error / square_ohm + alike / square_ohm**2), current.shape)
         is_read, last = ~np.isnan(current), self._last.ports
         ports = PortCurrents(
             np.where(is_read, current, last.current), np.where(is_read, std, last.std)
@@ -96,10 +120,10 @@ class PartialEnds:
         stale = STALE_SHARE * self._age * ports.current
         return PortCurrents(ports.current, np.hypot(ports.std, stale))
 
-    def _variances(self, signal: Float, slope: Float) -> Variances:
-        """v and v_I by this frame alone: signals (R, C, n), which are slopes (n,) times I."""
+    def _noise(self, by_each: Float, slope: Float) -> float:
+        """v by this frame alone: currents that each reading shows (R, C, n), slopes (n,)."""
         noise = 2.0 * self._rounding
         if slope.size > 1:
-            square = np.diff((signal / slope)[..., :2])[..., 0] ** 2 / np.sum(slope[:2] ** -2.0)
+            square = np.diff(by_each[..., :2])[..., 0] ** 2 / np.sum(slope[:2] ** -2.0)
             noise = max(noise, float(np.nanmedian(square)) / MEDIAN_CHI2[1])
-        return Variances(noise, np.full(signal.shape[:2], noise))
+        return noise

@@ -122,12 +122,11 @@ class PortReader:
         far = self._far_ends.read(ratio, near.ports, variance)
         drop_ratio_std = np.sqrt(variance)
         shift_ratio = self._noise.offset_std(near.spread, near.offset_ratio)
+        find = self._far_faults.find if in_order else self._far_faults.keep_as_rest
         return PortReadings(
             ratio,
             *far.ports,
-            "; ".join(
-                filter(None, (fault, self._far_faults.find(far, drop_ratio_std, shift_ratio)))
-            ),
+            "; ".join(filter(None, (fault, find(far, drop_ratio_std, shift_ratio)))),
             self.far,
             drop_ohm=far.drop / far.near_current,
             # Chosen: as good as nothing is known, and its square is still a number.
@@ -158,6 +157,6 @@ class PortReader:
         ports = PortCurrents(current, noise.current_std(variances))
         ports, fault = self._contradictions.mended(near, spread, ports)
         if not any(self.far):
-            self._partial.keep(Shown(ports, near.offset_ratio, variances))
+            self._partial.keep(Shown(ports, near.offset_ratio, variances.noise))
         # In mode far, both near ends have the same offset. Mode near does not use it.
         return NearPorts(ports, fault, spread, variances, float(near.offset_ratio[0]))

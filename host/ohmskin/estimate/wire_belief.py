@@ -84,12 +84,14 @@ from ohmskin.estimate.prior import (
     LEAD_STD,
     MAX_STEP_LOG,
     MEMORY,
+    REACH_STDS,
     SEGMENT_STD,
     STEADY_FADE,
     UNKNOWN_LAYER_STD,
     UNKNOWN_LEAD_OHM,
     UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
+    UNTOLD_REACH_STDS,
     USUAL_LEAD_STD_OHM,
     WireStds,
 )
@@ -158,6 +160,7 @@ class WireBelief(ABC):
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
     means: m, (n,). It is replaced when the belief changes, and never written into.
+    untold: whether nobody told them, and not both far ends measure them.
     leads_of_ports: which leads are in the readings of each port: those of its lines that are sensed
         at near ends, (RC, R+C), ones and zeros.
     """
@@ -177,6 +180,7 @@ class WireBelief(ABC):
         by_row = np.kron(np.eye(rows), np.ones((columns, 1))) * (not far[0])
         by_column = np.tile(np.eye(columns), (rows, 1)) * (not far[1])
         self.leads_of_ports = np.hstack([by_row, by_column])
+        self.untold = wires.both is None and not all(far)
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         layer_stds = np.array([wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
         # However well wires were measured: since then, the skin may have been stretched. No
@@ -319,10 +323,16 @@ class WireBelief(ABC):
         """
         return SEGMENT_STD * self._known_lead_std_ohm
 
+    @property
+    def is_assumed(self) -> bool:
+        """Whether a layer is what nobody told, nor frames have taught as well as if it were."""
+        return self.untold and float(self.mean_std()[:2].max()) >= LAYER_STD
+
     def stds(self) -> WireStds:
         """How well the means are known."""
         *layers, lead_std_ohm = self.mean_std()[:3].tolist()
-        return WireStds(max(layers), self._known_lead_std_ohm / lead_std_ohm)
+        reach = UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS
+        return WireStds(max(layers), self._known_lead_std_ohm / lead_std_ohm, reach)
 
     @property
     def _known_lead_std_ohm(self) -> float:

@@ -27,6 +27,7 @@ For x^b with b < 1 the differential is infinite at rest, the difference is not.
 """
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -82,7 +83,7 @@ class ForceModel:
             array = getattr(self, field.name)
             if array.shape != shape:
                 raise ValueError(f"{field.name} has shape {array.shape}, kind {shape}")
-        power = self.kind == POWER
+        power = self.is_power
         require("kind", power | (self.kind == LINEAR), f"neither {LINEAR} nor {POWER}")
         require("slope", (self.slope > 0) & np.isfinite(self.slope), "not above 0")
         require("correlation", np.abs(self.correlation) <= 1, "not in -1..1")
@@ -96,6 +97,11 @@ class ForceModel:
             require(name, np.isnan(error) | (np.isfinite(error) & (error >= 0)), "negative or inf")
         require("exponent", power | (self.exponent == 1), "not 1, as of a linear cell")
         require("exponent_std", power | (self.exponent_std == 0), "not 0, as of a linear cell")
+
+    @cached_property
+    def is_power(self) -> Bool:
+        """Which cells have a power law, (R, C): texts take long to compare."""
+        return np.asarray(self.kind == POWER)
 
     def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
         """Force and its standard deviation [N], each (R, C), of rises above rest (R, C).
@@ -115,7 +121,7 @@ class ForceModel:
         above = np.maximum(x, 0.0)
         logarithm = np.log(np.where(above > 0, above, 1.0))
         powered = above**self.exponent
-        by_slope = np.where(self.kind == POWER, powered, x) * self.slope_std
+        by_slope = np.where(self.is_power, powered, x) * self.slope_std
         by_exponent = self.slope * powered * logarithm * self.exponent_std
         # J K J^T; the exponent of a linear cell has no error. The slope of a power law is that at
         # 1 S, far from any press: where its error is large, so is that of the exponent, and the two
@@ -152,11 +158,16 @@ class Curve:
     exponent_std: float = 0.0
     held_out_rmse: float = np.nan
 
+    @property
+    def is_power(self) -> bool:
+        """Whether it is a power law."""
+        return self.kind == POWER
+
 
 def force_by(curve: ForceModel | Curve, x: Float) -> Float:
     """F of the module's equations [N], before forces below 0 are cut, shape of x."""
     power = curve.slope * np.maximum(x, 0.0) ** curve.exponent
-    return np.where(np.asarray(curve.kind) == POWER, power, curve.slope * x)
+    return np.where(curve.is_power, power, curve.slope * x)
 
 
 def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:

@@ -6,11 +6,15 @@ elsewhere, so whole scans come `WHOLE_HZ` times a second; and a touch that is ne
 of others outside, so the scan after it is a whole one.
 """
 
+import threading
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from ohmskin.arrays import Bool
+from ohmskin.errors import CommandRefused, DeviceLost
+from ohmskin.files import Closing
 from ohmskin.link.device import Device, Region
 from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import MODES
@@ -45,31 +49,45 @@ class Lines(NamedTuple):
         )
 
 
-class Focus:
-    """Tells a board where to read next, scan after scan.
+class Focus(Closing):
+    """Tells a board where to read next, scan after scan, until it is closed.
 
     mode: which readings a region has. whole_mode: which the whole skin has.
+
+    :raises CommandRefused: the board has no regions, or is a recording.
+    :raises ValueError: the board reads far ends, which no region shows.
     """
 
     def __init__(self, device: Device, mode: str = "quick", whole_mode: str = "near") -> None:
         self._device, self._mode, self._whole_mode = device, mode, whole_mode
         self._lines: Lines | None = None
         self._contacts = 0
+        self._lock, self._closed = threading.Lock(), False
+        self._before = Region.of(device.info)
+        if device.info.reads_far:
+            raise ValueError("only near ends can be followed: 'ohmskin configure PORT --mode near'")
+        device.set_region(Region(mode=whole_mode))
 
     def follow(self, touched: Bool, contacts: int, scan: Scan) -> None:
         """After a scan that showed these cells (R, C) touched, and so many contacts.
 
         A command takes some milliseconds, in which scans wait.
-
-        :raises CommandRefused: the board has no regions.
         """
         is_new, self._contacts = contacts > self._contacts, contacts
         lines = wanted_lines(touched, self._lines)
         if is_new and not scan.is_whole:
             lines = None
-        if lines != self._lines:
-            self._lines = lines
-            self._device.set_region(self._region(lines))
+        with self._lock:
+            if lines != self._lines and not self._closed:
+                self._lines = lines
+                self._device.set_region(self._region(lines))
+
+    def close(self) -> None:
+        """Let the board scan as before. May be called again."""
+        with self._lock, suppress(DeviceLost, CommandRefused):
+            if not self._closed:
+                self._closed = True
+                self._device.set_region(self._before)
 
     def _region(self, lines: Lines | None) -> Region:
         if lines is None:

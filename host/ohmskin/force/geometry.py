@@ -38,10 +38,14 @@ KINDS: Final = {
 # No cell is farther from the origin of its frame [m], and no pitch or radius is larger. Chosen:
 # robots are smaller.
 _FARTHEST_M: Final = 100.0
+# No cylinder is thinner [m]. Chosen: no textile bends round less.
+_LEAST_RADIUS_M: Final = 1e-4
 # A frame's name has at most so many characters. Chosen: names of links in URDF files are shorter.
 _LONGEST_NAME: Final = 100
 # A file of taxels is not larger. Chosen: `MAX_CELLS` of them with their meshes' names.
 _MAX_FILE_BYTES: Final = 1_000_000
+# A line of such a file. White space parts numbers, so that there is one way to read it.
+_SIX_NUMBERS: Final = r"\s*[-+.\deE]+" + r"\s+[-+.\deE]+" * 5 + r"\s*"
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +93,8 @@ class Geometry:
         if self.kind == "flat":
             return np.stack([x, y, zero], -1), np.stack([zero, zero, zero + 1], -1)
         radius_m = self.told["radius_m"]
-        if not radius_m > 0:
-            raise ValueError("radius_m is not above 0")
+        if not radius_m >= _LEAST_RADIUS_M:
+            raise ValueError(f"radius_m is not above {_LEAST_RADIUS_M:g}")
         normal = np.stack([np.sin(x / radius_m), zero, np.cos(x / radius_m)], -1)
         return radius_m * normal + np.stack([zero, y, zero], -1), normal
 
@@ -140,8 +144,7 @@ def _table(taxels: Float) -> dict[str, Float]:
 
 
 def _of_lines(text: str) -> dict[str, Float]:
-    numbers = r"\s*[-+.\deE]+" * 6
-    lines = [line.split() for line in text.splitlines() if re.fullmatch(numbers + r"\s*", line)]
+    lines = [line.split() for line in text.splitlines() if re.fullmatch(_SIX_NUMBERS, line)]
     return _table(np.array(lines, dtype=np.float64).reshape(-1, 6))
 
 
@@ -155,7 +158,7 @@ def _of_urdf(text: str) -> dict[str, Float]:
 
     def numbers(taxel: ElementTree.Element, name: str, count: int) -> Float:
         found = np.array(taxel.get(name, "0 0 0").split(), dtype=np.float64)
-        if found.size != count:
+        if found.size != count or not np.isfinite(found).all():
             raise ValueError(f"{name}='{taxel.get(name, '')[:40]}' is not {count} numbers")
         return found
 

@@ -155,6 +155,8 @@ class SkinReader:
     force: take the calibration of another unit.
     ref_log_std: how well both references are known (`SkinKnowledge`). Newtons do not depend on it.
 
+    focus: is told what scans show, so that the board follows contacts; None: it does not.
+
     The latest tare is the rest, whether `tare` took it or a played scan came with it
     (`Scan.rest_ratio`). Scans are read by one thread; all else may be called from any thread.
 
@@ -175,6 +177,7 @@ class SkinReader:
         self.board = board
         self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
         self._shared = _SharedKnowledge(board, calibration, ref_log_std)
+        self.focus: Focus | None = None
         self._begin()
 
     def another(self) -> SkinReader:
@@ -221,6 +224,18 @@ class SkinReader:
             rest = Rest.of(calibration.method, self._shared.knowledge(rest), rest.date)
         return replace(calibration, tare=None if rest is calibration.rest else rest)
 
+    def warm_up(self) -> None:
+        """Read a made-up scan of the untouched skin, where it is known, by a reader that goes.
+
+        A first estimate loads modules for most of a second. Scans would wait for it meanwhile, and
+        whoever reads every scan would be late for hundreds of them.
+        """
+        board, calibration = self.board, self.calibration
+        if calibration is not None:
+            codes = quantise(calibration.untouched.ratio, board.adc_bits)
+            reader = SkinReader(board, calibration, force=True)
+            reader.read(Scan(codes, 0, 0, 0.0, 0, mode=board.mode))
+
     def use(self, method: str) -> None:
         """Go on with another method, from the next scan on. Raises ValueError for no such."""
         self._shared.estimator(method, self.rest)  # is made to raise here, and not at the scan
@@ -242,6 +257,17 @@ class SkinReader:
         self._shared.rests.append(Untouched(rest_ratio, now()))
         return self._to_record(rest_ratio)
 
+    def tare_by(self, device: Device, seconds: float = TARE_S, *, force: bool = False) -> Tare:
+        """`tare` with the mean of the device's coming scans, of so many seconds.
+
+        :raises TareRefused: something touches the skin.
+        :raises DeviceLost: as `Device.mean_ratio`.
+        :raises ValueError: the board scans in another mode than was calibrated.
+        """
+        rest_ratio = device.mean_ratio(seconds)
+        self.check_mode(device.info.mode)
+        return replace(self.tare(rest_ratio, force=force), host_time_s=device.now_s)
+
     def undo_tare(self) -> Tare | None:
         """Return to the rest before the last tare. Returns that, for a `Recorder`, if it is known.
 
@@ -255,7 +281,7 @@ class SkinReader:
     def _to_record(self, rest_ratio: Float) -> Tare:
         from ohmskin.record.recording import Tare  # its library is loaded when needed
 
-        return Tare(rest_ratio, time.monotonic(), self.board.mode)
+        return Tare.of(rest_ratio, self.board, time.monotonic())
 
     def check_mode(self, mode: str) -> None:
         """Raise ValueError if the board scans now what the estimator does not take.
@@ -288,6 +314,8 @@ class SkinReader:
         contacts = self._tracker.update(scan.time_us, frame.touched, *of_contacts)
         if geometry is not None:
             contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
+        if (focus := self.focus) is not None:
+            focus.follow(frame.touched, len(contacts), scan)
         shown: dict[str, object] = {
             "force_n": force_n,
             "force_n_std": force_n_std,
@@ -334,24 +362,13 @@ class CalibratedSkin(Closing):
         focus: bool = False,
     ) -> None:
         self.device = device
-        self._focus = Focus(device) if focus else None
         self.name = device.name
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
+        self._focus = Focus(device) if focus else None
         device.only_unit = device.info.unit_id
-        self._warm_up()
+        self._reader.warm_up()
         self._lock = threading.Lock()  # a reader takes one scan at a time
-
-    def _warm_up(self) -> None:
-        """Read a made-up scan of the untouched skin, by a reader that goes.
-
-        A first estimate loads modules for most of a second. Scans would wait for it meanwhile, and
-        whoever reads every scan would be late for hundreds of them.
-        """
-        board, calibration = self.info, self.calibration
-        codes = quantise(calibration.untouched.ratio, board.adc_bits)
-        reader = SkinReader(board, calibration, force=True)
-        reader.read(Scan(codes, 0, 0, 0.0, 0, mode=board.mode))
 
     def new_reader(self) -> SkinReader:
         """A reader of this skin for another way of reading its scans; it knows the same tares."""
@@ -384,11 +401,8 @@ class CalibratedSkin(Closing):
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, with its forces."""
         reader = self.new_reader()
-        for scan in self.device:
-            read = reader.read(scan)
-            if self._focus is not None:
-                self._focus.follow(read.estimate.touched, len(read.contacts), scan)
-            yield read
+        reader.focus = self._focus
+        yield from map(reader.read, self.device)
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
         """The same for ``async for``."""
@@ -401,16 +415,8 @@ class CalibratedSkin(Closing):
             return self._reader.read(scan)
 
     def tare(self, seconds: float = TARE_S, *, force: bool = False) -> Tare:
-        """`SkinReader.tare` with the mean of the coming scans, of so many seconds.
-
-        :raises TareRefused: something touches the skin.
-        :raises DeviceLost: as `Device.mean_ratio`.
-        :raises ValueError: the board scans in another mode than was calibrated.
-        """
-        rest_ratio = self.device.mean_ratio(seconds)
-        self._reader.check_mode(self.info.mode)
-        tare = self._reader.tare(rest_ratio, force=force)
-        return replace(tare, host_time_s=self.device.now_s)
+        """`SkinReader.tare_by`, which says what this raises."""
+        return self._reader.tare_by(self.device, seconds, force=force)
 
     def undo_tare(self) -> Tare:
         """Return to the rest before the last tare. Returns that, for a `Recorder`.
@@ -423,6 +429,8 @@ class CalibratedSkin(Closing):
 
     def close(self) -> None:
         """Close the device. May be called again."""
+        if self._focus is not None:
+            self._focus.close()
         self.device.close()
 
 

@@ -21,7 +21,8 @@ the marks in the file's metadata. Files are written scan by scan: hours need no 
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,9 +34,10 @@ from ohmskin.files import PathName, save_table, whole_file
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import Contact
 from ohmskin.force.reader import ForceScan, SkinReader
-from ohmskin.record.export import Part, Stacks
+from ohmskin.record.export import FORMATS as OF_READINGS
+from ohmskin.record.export import Part, Stacks, save_readings
 
-FORMATS: Final = (".npz", ".csv", ".parquet")
+FORMATS: Final = (*OF_READINGS, ".parquet")
 _OF_SCAN: Final = ("number", "missed", "time_ns")
 _OF_CELLS: Final = ("force_n", "force_n_std")
 _OF_CONTACT: Final = ("row", "column", "force_n", "force_n_std")
@@ -48,36 +50,40 @@ def load_forces(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of the module's table, of the scans from `begin_s` to `end_s` [s after the first].
 
-    0 is to the last. An hour of 8x8 at 90 Hz takes 200 MB: `export_forces` keeps less in memory.
+    0 is to the last. An hour of 8x8 at 90 Hz takes 200 MB: `export` keeps less in memory.
 
     :raises RecordingError: the recording cannot be read.
     :raises ValueError: the calibration is of another unit, size or mode.
     """
-    part = Part(path, begin_s, end_s or float("inf"), timed=True)
+    part = Part(path, begin_s, end_s, timed=True)
     return _stacked(part, calibration, _stacks(calibration, None)).arrays() | _marks(part)
 
 
-def export_forces(
+def export(
     path: PathName,
     out: Path,
-    calibration: Calibration,
+    calibration: Calibration | None = None,
     begin_s: float = 0.0,
     end_s: float = 0.0,
     watch: Callable[[int], object] | None = None,
 ) -> Part:
-    """Write them to `out`, a file of one of `FORMATS`, complete or not at all.
+    """Write what `load_forces` gives to `out`, complete or not at all: one of `FORMATS`.
 
-    watch: is told how many bytes of the recording were read. Returns what was written.
+    calibration: None: readings (`ohmskin.record.export`), as .npz or .csv. watch: is told how many
+    bytes of the recording were read. Returns what was written.
 
-    :raises RecordingError: as `load_forces`.
-    :raises ValueError: as `load_forces`; or `out` cannot be written.
+    :raises RecordingError: as `load_forces`; they are too many for a readings file.
+    :raises ValueError: as `load_forces`; an unknown format, or `out` cannot be written.
     :raises OhmskinError: pyarrow is missing.
     """
-    if out.suffix not in FORMATS:
-        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
-    part = Part(path, begin_s, end_s or float("inf"), timed=True, watch=watch)
-    if out.suffix == ".csv":
-        _save_csv(read_forces(part, calibration), out)
+    formats = OF_READINGS if calibration is None else FORMATS
+    if out.suffix not in formats:
+        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(formats)}")
+    part = Part(path, begin_s, end_s, timed=calibration is not None, watch=watch)
+    if calibration is None:
+        save_readings(part, out)
+    elif out.suffix == ".csv":
+        _save_csv(part, calibration, out)
     elif out.suffix == ".parquet":
         _save_parquet(part, calibration, out)
     else:
@@ -91,7 +97,7 @@ def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
     reader: SkinReader | None = None
     for scan in part:
         reader = reader or SkinReader(part.boards[0], calibration)
-        tare = part.tares.get(scan.kind)
+        tare = part.tare_of(scan)
         yield reader.read(scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio))
 
 
@@ -132,14 +138,13 @@ def _marks(part: Part) -> dict[str, NDArray[Any]]:
     }
 
 
-def _save_csv(scans: Iterator[ForceScan], out: Path) -> None:
-    first = next(scans)
-    cells = list(np.ndindex(first.force_n.shape))
+def _save_csv(part: Part, calibration: Calibration, out: Path) -> None:
+    cells = list(np.ndindex(calibration.rows, calibration.columns))
     names = [f"r{row}c{column}_{name}" for name in _OF_CELLS for row, column in cells]
+    of_scan = attrgetter(*_OF_SCAN)
     rows = (
-        [getattr(scan, name) for name in _OF_SCAN]
-        + [newtons for name in _OF_CELLS for newtons in getattr(scan, name).reshape(-1).tolist()]
-        for scan in chain([first], scans)
+        [*of_scan(scan), *scan.force_n.ravel().tolist(), *scan.force_n_std.ravel().tolist()]
+        for scan in read_forces(part, calibration)
     )
     save_table(out, [*_OF_SCAN, *names], rows)
 

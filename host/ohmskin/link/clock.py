@@ -37,6 +37,7 @@ measurements". Both INFOCOM.
 import math
 from collections import deque
 from collections.abc import Collection
+from functools import lru_cache
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -102,13 +103,8 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     if board.board == "emulated":
         # An emulated board sends a whole scan at the end of its period.
         return 1 / board.rate_hz - scan_s(board, scan)
-    kind = protocol.FRAMES["scan"]
-    # Any counters will do: zeros among them end blocks that are known before the scan ends.
-    values = {field.name: 1 for field in kind.fields}
     masks = (scan.row_mask, scan.rows), (scan.column_mask, scan.columns)
-    row_mask, column_mask = (mask or protocol.all_lines(count) for mask, count in masks)
-    values |= {"row_mask": row_mask, "column_mask": column_mask, "dropped": 0, "rx_errors": 0}
-    header = bytes([kind.id, 1]) + kind.pack(**values)
+    header = _header(*(mask or protocol.all_lines(count) for mask, count in masks))
     codes = protocol.pack_codes(scan.codes_read, protocol.PER_PASS[scan.mode], scan.adc_bits)
     # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
     wire = cobs_encode(header + codes + b"\x01\x01")
@@ -123,6 +119,18 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
         delay_s = max(delay_s, on_line_s - max(unknown, 0) * byte_of_scan_s)
         begin += wire[begin]
     return delay_s + _FIRMWARE_S
+
+
+@lru_cache(maxsize=64)
+def _header(row_mask: int, column_mask: int) -> bytes:
+    """The bytes of a scan frame before its codes.
+
+    Any counters will do: zeros among them end blocks that are known before the scan ends.
+    """
+    kind = protocol.FRAMES["scan"]
+    values = {field.name: 1 for field in kind.fields}
+    values |= {"row_mask": row_mask, "column_mask": column_mask, "dropped": 0, "rx_errors": 0}
+    return bytes([kind.id, 1]) + kind.pack(**values)
 
 
 class _Line(NamedTuple):

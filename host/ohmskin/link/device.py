@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Final, Self, TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -56,6 +56,15 @@ class Region:
     settle_us: int = 0
     whole_every: int = 0
     whole_mode: str = "near"
+
+    @classmethod
+    def of(cls, board: Hello) -> Self:
+        """What this board scans now."""
+        rows = protocol.lines_of(board.row_mask, board.rows)
+        columns = protocol.lines_of(board.column_mask, board.columns)
+        rate_hz, settle_us = board.rate_asked_mhz / 1000, board.settle_asked_us
+        whole = board.whole_every, board.whole_mode
+        return cls(rows, columns, board.mode, rate_hz, settle_us, *whole)
 
     def fields(self, board: Hello) -> dict[str, protocol.Value]:
         """The fields of the command `set_region`. Raises ValueError for what cannot be sent."""
@@ -184,20 +193,19 @@ class Device(Closing):
     def _wait_for_scan(self, ready: Callable[[], bool], limit_s: float | None = None) -> None:
         limit_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz if limit_s is None else limit_s
         if not self._wait(ready, limit_s):
+            if late := self.info.late:  # a silent board has been asked for its hello
+                silent = f"{self.name} has sent no scan for {limit_s:.1f} s"
+                raise DeviceLost(f"{silent}: {late} conversions late", "ask for a lower rate")
             silent = f"{self.name} has said nothing for {limit_s:.1f} s"
             raise DeviceLost(f"{silent}: unplug and plug it")
         self._changed.notify_all()  # a replay may go on
 
     def mean_ratio(self, seconds: float) -> Float:
-        """Mean readings of the coming scans, shape (R, C, 4): of so many seconds, at least one.
+        """`mean_ratio` of the scans of the coming seconds.
 
-        :raises DeviceLost: the board went away, or there are no more scans.
+        :raises DeviceLost: the board went away, or there are no more whole scans.
         """
-        untouched = list(scans_for(self, seconds))
-        if not untouched:
-            raise DeviceLost(f"{self.name} gives no more scans")
-        # While a region is read, the rest is that of the whole scans in between.
-        return mean_ratio([scan for scan in untouched if scan.is_whole] or untouched)
+        return mean_ratio(scans_for(self, seconds))
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already."""
@@ -455,14 +463,16 @@ def scans_for(scans: Iterable[Scan], seconds: float) -> Iterator[Scan]:
 
 
 def mean_ratio(scans: Iterable[Scan]) -> Float:
-    """Mean readings (R, C, 4) of scans, at least one: how a skin at rest is measured.
+    """Mean readings (R, C, n) of whole scans, at least one: how a skin at rest is measured.
 
-    Somebody may configure the board meanwhile. Readings of two sizes or modes have no mean, so only
-    the scans after the last change count.
+    Somebody may configure the board meanwhile, or fewer readings of a cell are taken in between.
+    Readings of two sizes or modes have no mean: those count that are like the last complete scan.
+
+    :raises DeviceLost: there is no whole scan.
     """
-    alike: list[Scan] = []
-    for scan in scans:
-        if alike and scan.kind != alike[0].kind:
-            alike.clear()
-        alike.append(scan)
-    return np.asarray(np.mean([scan.ratio for scan in alike], axis=0))
+    whole = [scan for scan in scans if scan.is_whole]
+    if not whole:
+        raise DeviceLost("the port gives no more scans, or none of all cells: scan them all")
+    last = next((scan for scan in reversed(whole) if scan.is_complete), whole[-1])
+    alike = [scan.ratio for scan in whole if scan.kind == last.kind]
+    return np.asarray(np.mean(alike, axis=0))

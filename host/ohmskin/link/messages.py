@@ -19,6 +19,8 @@ from ohmskin.link.codes import check_adc_bits, ratio_from_codes
 from ohmskin.link.framing import Decoder, DecoderStats, RawFrame
 
 _SCAN = protocol.FRAMES["scan"]
+# Readings of a cell that show all of it: those of mode near, or as many of mode far.
+_COMPLETE_READINGS = len(protocol.MODES["near"])
 # Counters of a board go on with 0 after so many: the scan's number, its time [us], and how many
 # scans the board has dropped.
 _NUMBER_SPAN = _SCAN.span("scan")
@@ -90,6 +92,17 @@ class Hello:
     def readings_per_cell(self) -> int:
         """Readings that a scan takes of each cell."""
         return len(protocol.MODES[self.mode])
+
+    @property
+    def reads_far(self) -> bool:
+        """Whether far ends of the lines are read, and not near ends alone."""
+        return self.mode == "far"
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether scans are complete: `Scan.is_complete`."""
+        cells = self.row_mask.bit_count() * self.column_mask.bit_count()
+        return cells == self.rows * self.columns and self.readings_per_cell == _COMPLETE_READINGS
 
     @property
     def readings(self) -> int:
@@ -239,15 +252,19 @@ class Scan:
         return self.row_mask in (0, all_rows) and self.column_mask in (0, all_columns)
 
     @property
+    def is_complete(self) -> bool:
+        """Whether all cells were read, in mode near or far: what is learned of a skin needs it."""
+        return self.is_whole and len(self.reading_names) == _COMPLETE_READINGS
+
+    @property
     def codes_read(self) -> NDArray[np.uint16]:
         """Codes of the rows and columns that were read, shape (their rows, columns, readings)."""
-        codes: NDArray[np.uint16] = self.codes[self._lines()]
-        return codes
+        return self.codes if self.is_whole else self.codes[self._lines()]
 
     def _lines(self) -> tuple[NDArray[Any], ...]:
         """Indices of the rows and columns that were read."""
         rows, columns = (
-            protocol.lines_of(mask or protocol.all_lines(count))
+            protocol.lines_of(mask or protocol.all_lines(count), count)
             for mask, count in ((self.row_mask, self.rows), (self.column_mask, self.columns))
         )
         return np.ix_(rows, columns)
@@ -309,12 +326,14 @@ def _codes(
     :raises ValueError: the header says what cannot be, or `packed` has the wrong length for it.
     """
     mode, rows, columns = values["mode"], values["rows"], values["columns"]
+    limits = protocol.CONSTANTS
     if mode not in per_pass:
         raise ValueError(f"no mode {mode}")
     bits, readings = check_adc_bits(values["adc_bits"]), len(protocol.MODES[mode])
-    read = protocol.lines_of(values["row_mask"]), protocol.lines_of(values["column_mask"])
-    if not all(read) or read[0][-1] >= rows or read[1][-1] >= columns:
-        raise ValueError(f"no lines, or lines beyond {rows}x{columns} cells")
+    masks = values["row_mask"], values["column_mask"]
+    read = list(map(protocol.lines_of, masks, (rows, columns)))
+    if not (all(read) and rows <= limits["rows_max"] and columns <= limits["columns_max"]):
+        raise ValueError(f"no lines, or more than a board has: {rows}x{columns}")
     of_lines = protocol.unpack_codes(
         packed, (len(read[0]), len(read[1]), readings), per_pass[mode], bits
     )

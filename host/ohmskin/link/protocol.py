@@ -333,6 +333,11 @@ def all_lines(count: int) -> int:
     return (1 << min(count, CONSTANTS["rows_max"])) - 1
 
 
-def lines_of(mask: int) -> list[int]:
-    """The numbers of the rows or columns that are in a mask, rising."""
+def lines_of(mask: int, count: int) -> list[int]:
+    """The numbers of the rows or columns that are in a mask, rising; there are `count` of them.
+
+    :raises ValueError: others are in it.
+    """
+    if mask > all_lines(count):
+        raise ValueError(f"a mask has lines beyond the {count} that there are")
     return [line for line in range(mask.bit_length()) if mask >> line & 1]

@@ -26,10 +26,11 @@ _WRITE_TIMEOUT_S: Final = 2.0
 _SOCKET_BYTES: Final = 100_000
 # Linux shows the settings of USB serial bridges here.
 USB_SERIAL: Final = Path("/sys/bus/usb-serial/devices")
-# Boards by the USB ids of Arduino's product, under both of its vendor ids (boards.txt of its AVR
-# core). Other makers' boards have ids of USB bridges, which do not tell what is behind them.
-_ARDUINO_VENDORS: Final = (0x2341, 0x2A03)
-_BOARDS: Final = {0x0001: "uno", 0x0043: "uno", 0x0010: "megaatmega2560", 0x0042: "megaatmega2560"}
+# Boards by USB ids: Arduino's products, under both of its vendor ids (boards.txt of its AVR core),
+# and the firmware's own (firmware/pico/usb_descriptors.h). Other makers' boards have ids of USB
+# bridges, which do not tell what is behind them.
+_PRODUCTS: Final = {1: "uno", 0x43: "uno", 0x10: "megaatmega2560", 0x42: "megaatmega2560"}
+_BOARDS: Final = {0x2341: _PRODUCTS, 0x2A03: _PRODUCTS, 0x1209: {1: "pico"}}
 
 
 class Link(Protocol):
@@ -68,8 +69,7 @@ class SerialLink:
             )
         except (serial.SerialException, OSError, ValueError) as exc:
             raise PortUnusable(*_explain(path, exc)) from exc
-        # Its line DTR does that; a pseudo-terminal has no such lines.
-        self.resets_board = not os.path.realpath(path).startswith("/dev/pts/")
+        self.resets_board = resets_board(path)
 
     def read(self) -> bytes:
         """See `Link.read`: waits for one byte, then takes all there are."""
@@ -144,10 +144,21 @@ def serial_ports() -> list[SerialPort]:
         SerialPort(
             port.device,
             "" if port.description in (None, "n/a") else port.description,
-            _BOARDS.get(port.pid or 0, "") if port.vid in _ARDUINO_VENDORS else "",
+            _BOARDS.get(port.vid, {}).get(port.pid, ""),
         )
         for port in sorted(list_ports.comports(), key=lambda port: port.device)
     ]
+
+
+def resets_board(port: str) -> bool:
+    """Whether opening a port resets its board.
+
+    The line DTR does that. A pseudo-terminal has no such line, and on a Pico it says no more than
+    that a program reads.
+    """
+    real = os.path.realpath(port)
+    picos = (os.path.realpath(each.path) for each in serial_ports() if each.board == "pico")
+    return not real.startswith("/dev/pts/") and real not in picos
 
 
 def latency_timer(port: str) -> tuple[int, str] | None:

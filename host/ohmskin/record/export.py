@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans of a recording for other programs: a readings file (.npz) or a table (.csv).
 
-They are read and written one by one, so that an hour takes no more memory than a second.
+They are read and written one by one, so that an hour takes no more memory than a second. A file
+has the readings of all modes that its scans have; they are NaN, or empty, where a scan has not
+read them.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from io import BytesIO
 from itertools import chain
-from math import prod
 from operator import attrgetter
 from pathlib import Path
 from shutil import copyfileobj
@@ -23,8 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.errors import RecordingError
 from ohmskin.files import Closing, PathName, save_table, whole_file
-from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_FRAMES
 from ohmskin.record.recording import Mark, Tare, messages
 
@@ -42,7 +44,7 @@ class Stacks(Closing):
     """
 
     def __init__(self, forms: dict[str, tuple[str, tuple[int, ...]]], folder: Path | None) -> None:
-        self._forms = {name: (np.dtype(kind), shape) for name, (kind, shape) in forms.items()}
+        self._forms = forms
         new = BytesIO if folder is None else partial(TemporaryFile, dir=folder)
         self._files: dict[str, Any] = {name: new() for name in forms}
 
@@ -51,22 +53,23 @@ class Stacks(Closing):
         for name, row in rows.items():
             self._files[name].write(np.asarray(row, dtype=self._forms[name][0]).tobytes())
 
-    def _shape(self, name: str) -> tuple[int, ...]:
-        kind, shape = self._forms[name]
-        return self._files[name].tell() // (kind.itemsize * prod(shape)), *shape
-
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays, of stacks in memory."""
         return {
-            name: np.frombuffer(self._files[name].getbuffer(), kind).reshape(self._shape(name))
-            for name, (kind, _) in self._forms.items()
+            name: np.frombuffer(self._files[name].getbuffer(), kind).reshape(-1, *shape)
+            for name, (kind, shape) in self._forms.items()
         }
 
     def save(self, file: BinaryIO, more: Mapping[str, Any]) -> None:
-        """Write an .npz of all arrays, and of these others."""
+        """Write an .npz of all arrays, and of these others.
+
+        (`np.savez` would take the memory of a whole array, by the pages of its map.)
+        """
         with ZipFile(file, "w") as archive:
-            for name, (kind, _) in self._forms.items():
-                header = {"descr": kind.str, "fortran_order": False, "shape": self._shape(name)}
+            for name, (kind, shape) in self._forms.items():
+                size = np.dtype(kind).itemsize * math.prod(shape)
+                whole = self._files[name].tell() // size, *shape
+                header = {"descr": kind, "fortran_order": False, "shape": whole}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     npy.write_array_header_1_0(member, header)
                     self._files[name].seek(0)
@@ -85,11 +88,13 @@ class Stacks(Closing):
 class Part:
     """The scans of a part of a recording, one by one. What else was read is here after the last.
 
-    begin_s, end_s: the part's first and last moment [s after the first scan].
+    It may be iterated over again: then all is read again.
+
+    begin_s, end_s: the part's first and last moment [s after the first scan]; 0: of the recording.
     scans: how many there were.
     cut_off: whether the recording was not ended properly, so that its last second may be missing.
     boards: what the board says of itself at first.
-    tares: the newest of each size and mode.
+    tares: all that were read.
     marks: all that were read.
     timed, watch: as `messages` takes them.
 
@@ -97,100 +102,134 @@ class Part:
     """
 
     path: PathName
-    begin_s: float
-    end_s: float
+    begin_s: float = 0.0
+    end_s: float = 0.0
     scans: int = 0
     cut_off: bool = True
     boards: list[Hello] = field(default_factory=list)
-    tares: dict[object, Tare] = field(default_factory=dict)
+    tares: list[Tare] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     timed: bool = False
     watch: Callable[[int], object] | None = None
 
     def __iter__(self) -> Iterator[Scan]:
-        first = kind = None
+        self.scans, size, first = 0, None, None
+        for of_file in (self.boards, self.tares, self.marks):
+            of_file.clear()
         for message in messages(self.path, timed=self.timed, watch=self.watch):
             self.cut_off = message is not None
             match message:
                 case Hello() if not self.boards:
                     self.boards.append(message)
                 case Tare():
-                    self.tares[message.rest_ratio.shape, message.mode] = message
+                    self.tares.append(message)
                 case Mark():
                     self.marks.append(message)
                 case Scan():
                     first = first or message
                     after_s = message.host_time_s - first.host_time_s
-                    if self.begin_s <= after_s <= self.end_s:
-                        kind = kind or message.kind
-                        if message.kind != kind:
-                            change = f"cells or mode change after {after_s:.3f} s"
+                    if (self.begin_s or after_s) <= after_s <= (self.end_s or after_s):
+                        size = size or message.codes.shape[:2]
+                        if message.codes.shape[:2] != size:
+                            change = f"the cells change after {after_s:.3f} s"
                             raise self.error(f"{change}: export each part by itself")
                         self.scans += 1
                         yield message
         if not self.scans:
             raise RecordingError(f"{self.path}: no scans, neither in it nor in this part of it")
 
+    def tare_of(self, scan: Scan) -> Tare | None:
+        """The newest tare of such scans; None if there is none."""
+        return next((tare for tare in reversed(self.tares) if tare.is_of(scan)), None)
+
     def error(self, text: str) -> RecordingError:
         """That these scans do not make one file."""
         return RecordingError(f"{self.path}: {text}, --begin and --end")
 
 
-def export(
-    path: PathName,
-    out: Path,
-    begin_s: float = 0.0,
-    end_s: float = 0.0,
-    watch: Callable[[int], object] | None = None,
-) -> Part:
-    """Write the scans from `begin_s` to `end_s` [s after the first; 0: to the last] to `out`.
-
-    The file is complete or not there. watch: is told how many bytes of the recording were read.
-    Returns what was written.
+def save_readings(part: Part, out: Path) -> None:
+    """Write the readings of these scans to `out`, complete or not at all: one of `FORMATS`.
 
     :raises RecordingError: as `Part`, or they are too many for a readings file.
-    :raises ValueError: an unknown format, or `out` cannot be written.
+    :raises ValueError: `out` cannot be written.
     """
-    if out.suffix not in FORMATS:
-        raise ValueError(f"{out}: no format '{out.suffix}': there are {', '.join(FORMATS)}")
-    part = Part(path, begin_s, end_s or float("inf"), watch=watch)
-    if out.suffix == ".csv":
-        _save_csv(iter(part), out)
-    else:
-        _save_npz(part, out)
-    return part
+    save = _save_csv if out.suffix == ".csv" else _save_npz
+    names = {*next(iter(part)).reading_names}
+    while True:
+        in_order = next((of for of in MODES.values() if {*of} == names), tuple(sorted(names)))
+        try:
+            return save(part, out, in_order)
+        except _MoreNames as more:
+            names |= more.names
 
 
-def _save_npz(part: Part, out: Path) -> None:
+class _MoreNames(Exception):
+    """A file needs readings of these names, too: it is begun anew."""
+
+    def __init__(self, names: set[str]) -> None:
+        self.names = names
+
+
+def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
+    """Values (R, C, n) of a scan as those of the file's names (R, C, m); NaN where not read.
+
+    :raises _MoreNames: the scan has others.
+    """
+    if scan.reading_names == names and scan.is_whole:
+        return values
+    if missing := {*scan.reading_names} - {*names}:
+        raise _MoreNames(missing)
+    widened = np.full((*values.shape[:2], len(names)), np.nan)
+    places = [names.index(name) for name in scan.reading_names]
+    widened[..., places] = np.where(scan.read[..., None], values, np.nan)
+    return widened
+
+
+def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
     """A readings file, and the arrays of `_OF_SCAN` besides.
 
-    `rest_ratio` is the last tare of this size and mode.
+    `rest_ratio` is the last tare of such scans.
     """
     scans = iter(part)
     first = next(scans)
-    forms = {"ratio": (_RATIO.str, first.codes.shape), **{n: (k, ()) for n, k in _OF_SCAN.items()}}
+    size = first.codes.shape[:2]
+    forms = {"ratio": (_RATIO.str, (*size, len(names)))}
+    forms |= {name: (kind, ()) for name, kind in _OF_SCAN.items()}
     with whole_file(out) as file, Stacks(forms, out.parent) as stacks:
+        most = min(
+            MAX_FRAMES, MAX_ARRAY_BYTES // (_RATIO.itemsize * size[0] * size[1] * len(names))
+        )
         for scan in chain([first], scans):
-            if part.scans > min(MAX_FRAMES, MAX_ARRAY_BYTES // (_RATIO.itemsize * scan.codes.size)):
+            if part.scans > most:
                 many = f"{part.scans} scans are more than a readings file holds"
                 raise part.error(f"{many}: export a part of them")
-            ratio = ratio_from_codes(scan.codes, part.boards[0].adc_bits)
+            ratio = _of_names(scan, scan.ratio, names)
             stacks.add({"ratio": ratio, **{name: getattr(scan, name) for name in _OF_SCAN}})
-        board, tare = part.boards[0], part.tares.get(first.kind)
+        board, tare = part.boards[0], part.tare_of(scan)
         more = {
-            "reading_names": first.reading_names,
+            "reading_names": names,
             "ref_top_ohm": float(board.ref_top_ohm),
             "ref_bottom_ohm": float(board.ref_bottom_ohm),
             "adc_bits": board.adc_bits,
         }
-        stacks.save(file, more if tare is None else more | {"rest_ratio": tare.rest_ratio})
+        if tare is not None:
+            at_rest = replace(scan, mode=tare.mode, row_mask=0, column_mask=0)
+            more |= {"rest_ratio": _of_names(at_rest, tare.rest_ratio, names)}
+        stacks.save(file, more)
 
 
-def _save_csv(scans: Iterator[Scan], out: Path) -> None:
+def _save_csv(part: Part, out: Path, names: tuple[str, ...]) -> None:
     """A row a scan: its times, then the codes of each cell, named by row, column and reading."""
+    scans = iter(part)
     first = next(scans)
-    cells = np.ndindex(*first.codes.shape)
-    names = [f"r{row}c{column}{first.reading_names[k]}" for row, column, k in cells]
+    cells = np.ndindex(*first.codes.shape[:2])
+    columns = [f"r{row}c{column}{name}" for row, column in cells for name in names]
     times = attrgetter(*_OF_SCAN)
-    rows = ([*times(scan), *scan.codes.reshape(-1).tolist()] for scan in chain([first], scans))
-    save_table(out, [*_OF_SCAN, *names], rows)
+
+    def row(scan: Scan) -> list[Any]:
+        codes = _of_names(scan, scan.codes, names).reshape(-1).tolist()
+        if not (scan.is_whole and scan.reading_names == names):
+            codes = ["" if math.isnan(code) else int(code) for code in codes]
+        return [*times(scan), *codes]
+
+    save_table(out, [*_OF_SCAN, *columns], map(row, chain([first], scans)))

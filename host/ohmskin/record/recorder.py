@@ -245,6 +245,6 @@ def record(
             untouched.append(scan)
     finally:  # whatever ends the scans amid the tare
         if untouched:
-            recorder.add(Tare(mean_ratio(untouched), recorder.now_s(), untouched[-1].mode))
+            recorder.add(Tare.of(mean_ratio(untouched), recorder.board, recorder.now_s()))
     for scan in coming:
         keep(scan)

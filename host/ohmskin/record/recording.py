@@ -39,7 +39,7 @@ import zlib
 from array import array
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, BinaryIO, Final, TypeVar
+from typing import Any, BinaryIO, Final, Self, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -55,7 +55,7 @@ from ohmskin.link import layouts
 from ohmskin.link.clock import ScanClock
 from ohmskin.link.codes import check_adc_bits
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import MODES
+from ohmskin.link.protocol import MODES, lines_of
 from ohmskin.record.readings import check_size
 
 # Largest record of a file, and what a chunk unpacks to. Chosen: a second of 16x16 at full rate is
@@ -93,7 +93,7 @@ _T = TypeVar("_T")
 class Tare:
     """Mean readings of the untouched skin.
 
-    rest_ratio: shape (rows, columns, 4) [V/Vdd].
+    rest_ratio: shape (rows, columns, readings of `mode`) [V/Vdd].
     host_time_s: when it was taken, on the host's monotonic clock [s].
     mode: which readings these are.
     """
@@ -101,6 +101,13 @@ class Tare:
     rest_ratio: Float
     host_time_s: float
     mode: str = "near"
+
+    @classmethod
+    def of(cls, rest_ratio: Float, board: Hello, host_time_s: float) -> Self:
+        """Means of scans of this board, in whichever of its modes they were made."""
+        modes = (board.mode, board.whole_mode, *MODES)
+        mode = next(name for name in modes if len(MODES[name]) == rest_ratio.shape[-1])
+        return cls(rest_ratio, host_time_s, mode)
 
     def is_of(self, scan: Scan) -> bool:
         """Whether it is the rest of such scans: of the same cells, read at the same ends."""
@@ -376,6 +383,9 @@ def _message(name: str, octets: bytes) -> Recorded:
     for of_cells in {"codes", "rest_ratio"} & values.keys():
         shape = values.pop("rows"), values.pop("columns"), len(MODES[values["mode"]])
         values[of_cells] = _cells(of_cells, values[of_cells], shape)
+        if of_cells == "codes":
+            for mask, count in zip(("row_mask", "column_mask"), shape, strict=False):
+                lines_of(values[mask], count)  # raises for lines beyond
         if of_cells == "codes" and values["codes"].max() >> check_adc_bits(values["adc_bits"]):
             raise ValueError("codes: one is out of range")
     return KINDS[name](**values)

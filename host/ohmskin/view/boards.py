@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The boards of the page: a thread opens and reads each, and opens it again if it goes away."""
+"""The boards of the page: what a `LiveSkin` reads is shown, recorded and commanded."""
 
 import json
 import math
@@ -19,19 +19,20 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ohmskin import opening
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import as_near
 from ohmskin.emulate.urls import is_stepped
-from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
+from ohmskin.errors import OhmskinError
 from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES, Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
+from ohmskin.force.focus import Focus
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
-from ohmskin.link.device import LOG, Device
-from ohmskin.live import AGAIN_S
+from ohmskin.link.device import Device
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.live import LiveSkin
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
 
@@ -44,9 +45,6 @@ _NEEDED_LATER: Final = (
 )
 # A page has at most so many boards. Chosen: each is a thread that may use a good part of a core.
 MOST_BOARDS: Final = 16
-# `close` waits so long for a board's thread [s]. Chosen: it ends in a tenth of that, unless its
-# port never answers, and such a port must not hold up the end of the program.
-_CLOSE_S: Final = 1.0
 # A text that is typed at the page, a port or a mark, has at most so many characters. Chosen: far
 # longer than anybody types, and short enough for a line of an error.
 LONGEST_TEXT_CHARS: Final = 1000
@@ -54,10 +52,6 @@ LONGEST_TEXT_CHARS: Final = 1000
 _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns", "mode")
 # What it says of a contact.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
-# Boards that agree in all of these read the same skin: method, rest and tare stay good.
-_skin_of: Final = attrgetter(
-    "unit_id", "rows", "columns", "mode", "ref_top_ohm", "ref_bottom_ohm", "adc_bits"
-)
 
 
 class Shown(NamedTuple):
@@ -148,11 +142,10 @@ class _Recording(Closing):
         self._thread.join()
 
 
-class ViewedBoard(Closing):
-    """The board at `port`, whether it is there or not.
+class ViewedBoard(LiveSkin):
+    """The board at `port`, whether it is there or not, as the page shows and commands it.
 
-    Its thread opens the board and reads it, over and over: see `_work`. The page calls the other
-    methods from its own threads; all but `state` may wait for the board.
+    The page calls the methods from its own threads; all but `state` may wait for the board.
 
     port: a serial port or a URL.
     calibrations: the first that fits the board gives its forces.
@@ -163,36 +156,28 @@ class ViewedBoard(Closing):
     def __init__(
         self, port: str, calibrations: Sequence[Calibration], folder: Path, *, force: bool = False
     ) -> None:
-        self.port = port
         self.shown: Shown | None = None
         """What the newest scan shows; None while nobody looks."""
-        self._calibrations, self._force = calibrations, force
-        self._folder = folder
-        self._status, self._text = "opening", ""  # the text says why the board is gone or ended
+        self._calibrations, self._folder = calibrations, folder
         self._note = ""  # why there are no forces, although calibrations were given
-        self._skin: Device | None = None
-        self._reader: SkinReader | None = None
         self._recording: _Recording | None = None
-        self.watchers: set[Callable[[], None]] = set()
-        """They are called, from any thread, when `shown` or `state` may be new."""
         # Held by commands that read or change both the rest and the recording: a recording begins
         # with the tare that is in force, and takes each later one.
         self._commands = threading.Lock()
-        self.closing = threading.Event()
-        """Is set when `close` is called."""
-        # A port that never answers does not hold up the end of the program.
-        self._thread = threading.Thread(target=self._work, name=f"view {port}", daemon=True)
-        self._thread.start()
+        super().__init__(port, None, force=force, every=False)
 
     def state(self) -> dict[str, Any]:
         """What the page says beside the scans, as JSON has it."""
         reader, recording, running = self._reader, self._recording, self._running()
         board = None if reader is None else reader.board
         rest = None if reader is None else reader.rest
+        status = "scanning" if self.opened else "opening"
+        if self.ended or self.failure is not None:
+            status = "ended" if self.ended else "gone"
         return {
             "port": self.port,
-            "status": self._status,
-            "text": self._text,
+            "status": status,
+            "text": " ".join(str(self.failure or "").split()),
             "note": self._note,
             "board": board and {name: getattr(board, name) for name in _OF_BOARD},
             "methods": [] if reader is None else _methods(reader),
@@ -200,51 +185,62 @@ class ViewedBoard(Closing):
             "force_method": None if reader is None else reader.force_method,
             "rest_date": rest and rest.date,
             "tared": reader is not None and reader.is_tared,
+            "focus": reader is not None and reader.focus is not None,
             "recording": "" if running is None else str(running.recorder.path),
             "recorded": "" if recording is None else recording.text,
         }
 
-    def _changed(self) -> None:
-        for watcher in tuple(self.watchers):
-            watcher()
-
     def use(self, method: str) -> str:
         """Estimate by another method. Commands return what was done, and raise why it was not."""
-        _, reader = self._there()
+        _, reader = self.there()
         if method not in (*LIVE_METHODS, reader.force_method):
             raise ValueError(f"no method '{method[:40]}': there are {', '.join(_methods(reader))}")
         reader.use(method)
-        self._changed()
+        self._tell()
         return f"method {method}"
 
-    def tare(self, *, force: bool = False) -> str:
+    def take_rest(self, *, force: bool = False) -> str:
         """Take the mean of the coming second for the skin's rest.
 
         :raises TareRefused: something touches the skin.
         """
         with self._one_at_a_time():
-            skin, reader = self._there()
-            self._add(reader.tare(skin.mean_ratio(TARE_S), force=force))
+            _, reader = self.there()
+            self._add(self.tare(TARE_S, force=force))
         lasts = "; 'ohmskin tare' makes one that lasts" if reader.force_method else ""
         return f"tared, until this program ends{lasts}"
 
     def undo_tare(self) -> str:
         """Return to the rest before the last tare."""
         with self._one_at_a_time():
-            if (rest := self._there()[1].undo_tare()) is not None:
+            if (rest := self.there()[1].undo_tare()) is not None:
                 self._add(rest)
         return "the tare is undone: rest is as it was before"
+
+    def follow(self, on: bool) -> str:
+        """Read contacts often and the rest now and then, or all of the skin again."""
+        with self._one_at_a_time():
+            device, reader = self.there()
+            self._end_focus()
+            if on:
+                reader.focus = Focus(device)
+        return "contacts are read often" if on else "the whole skin is read in every scan"
+
+    def _end_focus(self) -> None:
+        if (reader := self._reader) is not None and (focus := reader.focus) is not None:
+            reader.focus = None
+            focus.close()
 
     def record(self) -> str:
         """Record every scan to a new file."""
         with self._one_at_a_time():
-            skin, reader = self._there()
+            skin, reader = self.there()
             if (running := self._running()) is not None:
                 raise OhmskinError(f"{running.recorder.path} is being recorded already")
             recorder = Recorder(self._new_file(reader.board.unit_id), skin.info)
             if reader.is_tared and reader.rest is not None:  # a replay then begins with it, too
-                recorder.add(Tare(reader.rest.ratio, time.monotonic(), reader.board.mode))
-            self._recording = _Recording(skin, recorder, self._changed)
+                recorder.add(Tare.of(reader.rest.ratio, reader.board, time.monotonic()))
+            self._recording = _Recording(skin, recorder, self._tell)
         return "recording: every scan, whatever is shown"
 
     def stop_recording(self) -> str:
@@ -264,13 +260,6 @@ class ViewedBoard(Closing):
             raise OhmskinError("a mark goes into a recording: start one first")
         return f"marked: {text}"
 
-    def _there(self) -> tuple[Device, SkinReader]:
-        """The open board and its reader. Raises DeviceLost where it is not open."""
-        skin, reader = self._skin, self._reader
-        if skin is None or reader is None:
-            raise DeviceLost(f"{self.port} is not there")
-        return skin, reader
-
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
         """Do a command, unless another is being done: that is refused, and not waited for."""
@@ -280,7 +269,7 @@ class ViewedBoard(Closing):
             yield
         finally:
             self._commands.release()
-            self._changed()
+            self._tell()
 
     def _running(self) -> _Recording | None:
         """The recording that goes on; None where the last one has ended, or none was begun."""
@@ -299,72 +288,12 @@ class ViewedBoard(Closing):
         paths = (self._folder / f"{name}{f'-{n}' if n > 1 else ''}.mcap" for n in count(1))
         return next(path for path in paths if not path.exists())
 
-    def _work(self) -> None:
-        """Read the board, and try again whenever it is gone, until `close` is called.
+    def _new_reader(self, board: Hello) -> SkinReader:
+        """Calibrations are tried in their order.
 
-        A recording that has been played is at its end, and is not played again. A defect of ours
-        ends the thread, too, and the page says so.
+        Where none fits, there are no forces, and the page notes why the last one does not.
         """
-        while not self.closing.is_set():
-            try:
-                self._follow()
-            except RecordingEnded as exc:
-                self._say("ended", str(exc))
-                return
-            except (OhmskinError, ValueError, OSError) as exc:
-                self._say("gone", " ".join(str(exc).split()))
-            except Exception as exc:
-                self._say("ended", f"a defect of this program: {exc!r}")
-                raise
-            self.closing.wait(AGAIN_S)
-
-    def _say(self, status: str, text: str = "") -> None:
-        """status: "scanning", "gone" (it is tried again) or "ended"; at first it is "opening"."""
-        if status != self._status:
-            LOG.warning("%s: %s %s", self.port, status, text)
-        self._status, self._text = status, text
-        self._changed()
-
-    def _follow(self) -> None:
-        """Open the board, and show its scans until `close`. Raises what its device raises."""
-        with opening.open(self.port) as skin:
-            reader = self._reader_of(skin)
-            self._reader, self._skin = reader, skin
-            skin.only_unit = skin.info.unit_id  # another one is opened anew, with its calibration
-            raw = make_estimator("ohm", SkinKnowledge.of(replace(reader.board, mode="near")))
-            try:
-                while not self.closing.is_set():
-                    scan, running = skin.latest(), self._running()
-                    if not self.watchers:
-                        # An estimate takes a good part of a core: none is made while nobody looks.
-                        self.shown = None
-                    else:
-                        force_scan = reader.read(scan)  # the method may be another from now on
-                        near_ratio = as_near(scan.ratio, scan.reading_names)
-                        more = {
-                            "method": reader.method,
-                            "missed": skin.stats.missed,
-                            "rate_hz": skin.info.rate_hz,
-                            "recorded": 0 if running is None else running.recorder.scans,
-                        }
-                        ghosts = raw.estimate(near_ratio)
-                        self.shown = _shown(force_scan, ghosts, reader.has_forces, more)
-                    self._say("scanning")
-            finally:
-                self._skin = None
-                skin.close()  # its scans end, and so does the recording
-                if (recording := self._recording) is not None:
-                    recording.close()
-
-    def _reader_of(self, skin: Device) -> SkinReader:
-        """The reader of this board: a board that is there again is read as before, tare and all.
-
-        Otherwise calibrations are tried in their order. Where none fits, there are no forces, and
-        the page notes why the last calibration does not fit.
-        """
-        board, before = skin.info, self._reader
-        if before is not None and _skin_of(before.board) == _skin_of(board):
-            return before
+        self._raw = make_estimator("ohm", SkinKnowledge.of(replace(board, mode="near")))
         self._note = note = ""
         for calibration in self._calibrations:
             try:
@@ -374,14 +303,31 @@ class ViewedBoard(Closing):
         self._note = note
         return SkinReader(board)
 
+    def _take(self, scan: Scan, device: Device, reader: SkinReader) -> None:
+        if not self.watchers and reader.focus is None:
+            # An estimate takes a good part of a core: none is made while nobody looks.
+            self.shown = None
+            return
+        read, running = reader.read(scan), self._running()  # the method may be another from now on
+        more = {
+            "method": reader.method,
+            "missed": device.stats.missed,
+            "rate_hz": device.info.rate_hz,
+            "recorded": 0 if running is None else running.recorder.scans,
+        }
+        ghosts = self._raw.estimate(as_near(scan.ratio, scan.reading_names))
+        self.shown = _shown(read, ghosts, reader.has_forces, more)
+
+    def _gone(self) -> None:
+        self._end_focus()
+        if (recording := self._recording) is not None:
+            recording.close()
+
     def close(self) -> None:
         """End reading; a recording is whole then. May be called again."""
-        self.closing.set()
-        for open_one in (self._skin, self._recording):
-            if open_one is not None:
-                open_one.close()
-        self._thread.join(_CLOSE_S)
-        self._changed()
+        self._end_focus()
+        super().close()
+        self._gone()
 
 
 def load_all() -> None:
@@ -400,9 +346,11 @@ def _methods(reader: SkinReader) -> tuple[str, ...]:
 
     The method of the calibration is one of them, because no other gives newtons.
     """
-    of_forces, is_near = reader.force_method, reader.board.mode == "near"
-    live = dict.fromkeys([*LIVE_METHODS, *filter(None, [of_forces])])
-    return tuple(name for name in live if is_near or kind_of(name).takes_far)
+    board, live = reader.board, dict.fromkeys([*LIVE_METHODS, *filter(None, [reader.force_method])])
+    kinds = {name: kind_of(name) for name in live}
+    if board.reads_far:
+        return tuple(name for name, kind in kinds.items() if kind.takes_far)
+    return tuple(name for name, kind in kinds.items() if kind.takes_partial or board.mode == "near")
 
 
 class ViewedBoards(Closing, dict[int, ViewedBoard]):

@@ -133,7 +133,9 @@ class Panel:
             case {"do": "method", "method": str(method)}:
                 return "method", lambda: board.use(method)
             case {"do": "tare", "force": bool(force)}:
-                return "tare", lambda: board.tare(force=force)
+                return "tare", lambda: board.take_rest(force=force)
+            case {"do": "focus", "on": bool(on)}:
+                return "focus", lambda: board.follow(on)
             case {"do": "undo"}:
                 return "undo", board.undo_tare
             case {"do": "record"}:

@@ -127,6 +127,7 @@ export class Panel {
     command(".anyway", () => ({ do: "tare", force: true }));
     command(".undo", () => ({ do: "undo" }));
     command(".record", () => ({ do: this.state?.recording ? "stop" : "record" }));
+    command(".focus", () => ({ do: "focus", on: !this.state?.focus }));
     this.find(".mark").addEventListener("submit", (event) => {
       event.preventDefault();
       this.command({ do: "mark", text: event.target.elements.text.value });
@@ -249,6 +250,7 @@ export class Panel {
     recording.textContent = state.recording ? "Stop recording" : "Record";
     recording.setAttribute("aria-pressed", Boolean(state.recording));
     this.element.classList.toggle("recorded", Boolean(state.recording));
+    this.find(".focus").setAttribute("aria-pressed", state.focus);
     this.enable(true);
     this.sayFile();
     const date = state.rest_date?.slice(0, 19).replace("T", " ");
@@ -267,7 +269,8 @@ export class Panel {
   enable(linked) {
     const { status, tared, recording } = this.state ?? {};
     const there = linked && status === "scanning";
-    for (const query of [".method", ".tare", ".anyway"]) this.find(query).disabled = !there;
+    for (const query of [".method", ".tare", ".anyway", ".focus"])
+      this.find(query).disabled = !there;
     this.find(".undo").disabled = !there || !tared;
     this.find(".record").disabled = !there && !(linked && recording);
     for (const control of this.find(".mark").elements) control.disabled = !linked || !recording;
