@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
 
@@ -33,16 +33,17 @@ from ohmskin.errors import OhmskinError, PortError, RecordingError
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.geometry import Geometry
 from ohmskin.force.reader import CalibratedSkin
+from ohmskin.force.tables import export
 from ohmskin.link import framing, protocol
 from ohmskin.link.clock import BoardClock, line_delay_s, scan_s, scan_times_s
 from ohmskin.link.device import configuration
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
 from ohmskin.link.serial_port import READ_TIMEOUT_S
-from ohmskin.record.export import export
 from ohmskin.record.force_sensor import ForceLineDecoder
-from ohmskin.record.readings import load_readings
-from ohmskin.record.recording import SCHEMAS, TOPIC, load_recording
+from ohmskin.record.readings import MAX_CELLS, load_readings
+from ohmskin.record.recording import SCHEMAS, TOPIC, load_recording, messages
 
 Target = Callable[[bytes], None]
 # Readers take names of files. They are made here: in memory, where there is a place for that.
@@ -107,7 +108,7 @@ def frames(octets: bytes) -> None:
                 protocol.FRAMES["configure"].pack(**configuration(board))
                 assert board.rate_hz >= 0.1
             if isinstance(message, Scan):
-                assert message.codes.shape[0] * message.codes.shape[1] <= 256
+                assert message.codes.size <= MAX_CELLS * protocol.CONSTANTS["readings"]
                 assert len(message.reading_names) == message.codes.shape[2]
             if isinstance(message, Scan) and board is not None:
                 end_us = message.time_us + 1e6 * scan_s(board)
@@ -221,6 +222,10 @@ def recordings(octets: bytes) -> None:
         recording = load_recording(path)
         if recording.scans:  # as a calibration does of it
             assert len(scan_times_s(recording.scans)) == len(recording.scans)
+        for message in messages(path, timed=True):  # as forces are read
+            assert not (isinstance(message, Hello) and message.impossible())
+            if isinstance(message, Scan):
+                assert message.codes_read.size, message.time_ns
         for suffix in (".npz", ".csv"):
             with suppress(RecordingError):
                 export(path, path.with_suffix(suffix))
@@ -263,9 +268,13 @@ def calibrations(octets: bytes) -> None:
 
 
 def tables(octets: bytes) -> None:
-    """A table of presses, or a log of forces."""
+    """A table of presses, a log of forces, or where taxels are."""
     path = file_of(octets, ".csv")
-    for load in (load_press_table, load_force_log):
+    for load in (
+        load_press_table,
+        load_force_log,
+        partial(Geometry.of_file, rows=1, columns=2, frame_id="x"),
+    ):
         try:
             load(path)
         except ValueError as error:
@@ -311,6 +320,10 @@ def seeds() -> dict[str, Sequence[bytes]]:
             "time_us": 9,
             "missed": 0,
             **size,
+            "row_mask": 3,
+            "column_mask": 7,
+            "adc_bits": 10,
+            "slot_cycles": 0,
             "codes": scan.codes.ravel().tolist(),
         },
         "tare": {**size, "rest_ratio": scan.ratio.ravel().round(3).tolist()},
@@ -326,6 +339,7 @@ def seeds() -> dict[str, Sequence[bytes]]:
     recorded, out = (_FOLDER / f"input{suffix}" for suffix in (".mcap", ".npz"))
     presses = "row,column,force_n,conductance\n" + "0,1,1.5,2e-5\n" * 3
     log = "time_s,force_n\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(12))
+    taxels = "0 .1 0 0 0 1\n" * 2, '<a><taxel idx="1" xyz="1 0 0" rpy="0 1 0"/><taxel/></a>'
     host, key = b"Host: 127.0.0.1\r\n", b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
     upgrade = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
     asks = (
@@ -355,7 +369,7 @@ def seeds() -> dict[str, Sequence[bytes]]:
             b"\0ratio|<f8|1,1,1,4|" + bytes(32) + b"\nreading_names|<U1|4,|a\0\0\0b\0\0\0",
         ],
         "calibrations": [(_FOLDER / "input.json").read_bytes()],
-        "tables": [presses.encode(), log.encode()],
+        "tables": [presses.encode(), log.encode(), *(text.encode() for text in taxels)],
         "urls": [
             b"scene=ghost&begin=0&seed=3&noise=1",
             b"rate=100&wires=2&hum=50&dead=0,1&drop=0.5&reset=1",
