@@ -3,6 +3,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -13,6 +14,7 @@ from email.message import Message
 from importlib.metadata import Distribution, distribution, distributions
 from pathlib import Path
 
+import pytest
 import yaml
 from markdown_it import MarkdownIt
 from packaging.requirements import Requirement
@@ -196,3 +198,15 @@ def test_make_setup_installs_files_that_are_known() -> None:
         if requirement.name != "ohmskin":
             assert requirement.specifier.contains(pins["all"][requirement.name])
     assert not re.findall(r"platform = .*[\^~>*]", (ROOT / "platformio.ini").read_text())
+
+
+@pytest.mark.parametrize(
+    ("told", "code"), [({}, 0), ({"CI": "true"}, 1), ({"OHMSKIN_NO_SKIP": "1"}, 1)]
+)
+def test_no_integration_is_left_out_in_silence(told: dict[str, str], code: int) -> None:
+    """Where there is no Python 3.12, which ROS 2 needs."""
+    nowhere = {"PATH": "/nowhere", "HOME": "/nowhere"}
+    command = [shutil.which("bash") or "bash", ROOT / "tools" / "test_world.sh", "ros2"]
+    done = subprocess.run(command, capture_output=True, text=True, env=nowhere | told, cwd=ROOT)
+    assert done.returncode == code
+    assert "test-world: ros2: 0 passed: needs Python 3.12" in done.stdout

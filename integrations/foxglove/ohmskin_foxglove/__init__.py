@@ -11,6 +11,7 @@ Both draw Protobuf messages of the schema foxglove.PointCloud, so a skin is two 
 Rerun draws neither foxglove.Grid nor foxglove.SceneUpdate, so neither is written.
 """
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import ohmskin
+from ohmskin.force.geometry import Geometry
 from ohmskin.force.tables import read_forces
 from ohmskin.record.export import Part
 
@@ -46,11 +48,16 @@ _FIELDS = [
 _HERE = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
+def required(geometry: Geometry | None) -> Geometry:
+    """The geometry of a calibration. Raises ValueError if it has none."""
+    if geometry is None:
+        raise ValueError("nobody has said where the cells are: ohmskin skin FILE --pitch-mm 10,10")
+    return geometry
+
+
 def clouds(scan: ohmskin.ForceScan) -> dict[str, PointCloud]:
     """The two clouds of a scan, by topic. Raises ValueError if the calibration has no geometry."""
-    placed = scan.geometry
-    if placed is None:
-        raise ValueError("nobody has said where the cells are: ohmskin skin FILE --pitch-mm 10,10")
+    placed = required(scan.geometry)
     newtons = [scan.force_n[..., None], scan.force_n_std[..., None]]
     cells = np.concatenate([placed.position_m, placed.normal, *newtons], axis=-1)
     contacts = [[*c.position_m, *c.normal, c.force_n, c.force_n_std] for c in scan.contacts]
@@ -81,7 +88,7 @@ def add_clouds(recording: Path, calibration: ohmskin.Calibration, out: Path) -> 
     :raises RecordingError: the recording cannot be read.
     :raises ValueError: the calibration is of another skin, or says no geometry.
     """
-    part = Part(recording, float("-inf"), float("inf"), timed=True)
+    part = Part(recording, timed=True)
     forces, schema = read_forces(part, calibration), PointCloud.get_schema()
     with recording.open("rb") as read, out.open("xb") as file:
         writer = Writer(file)
@@ -115,22 +122,31 @@ def serve(
 ) -> None:
     """Serve the clouds of a live skin to Foxglove, on loopback, until Ctrl-C.
 
-    started: is called when clients may connect. Raises what `clouds` raises, and RuntimeError if
-    the port is taken.
+    skin: of a calibration with a geometry; with ``every=False``, what is sent is always the newest.
+    started: is called when clients may connect. Raises RuntimeError if the port is taken.
     """
     import foxglove
 
     server = foxglove.start_server(name="ohmskin", host="127.0.0.1", port=port)
     channels = {topic: PointCloudChannel(topic) for topic in (POINTS, CONTACTS)}
+    sent: ohmskin.ForceScan | None = None
+
+    def send() -> None:
+        """In the thread that reads: to wake another one would take time."""
+        nonlocal sent
+        scan = skin.newest()
+        if scan is not None and scan is not sent:
+            sent = scan
+            for topic, cloud in clouds(scan).items():
+                channels[topic].log(cloud, log_time=scan.time_ns)
+
+    skin.watchers.add(send)
     try:
         started()
-        count = 0
         while True:
-            count, scans = skin.since(count, timeout_s=0.2)
-            for scan in scans[-32:]:  # what came before anybody looked is not sent
-                for topic, cloud in clouds(scan).items():
-                    channels[topic].log(cloud, log_time=scan.time_ns)
+            time.sleep(0.2)
     except KeyboardInterrupt:
         pass
     finally:
+        skin.watchers.discard(send)
         server.stop()

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import ohmskin
-from ohmskin_foxglove import add_clouds, serve
+from ohmskin_foxglove import add_clouds, required, serve
 
 
 def main() -> None:
@@ -28,7 +28,9 @@ def main() -> None:
             print(f"{told.out}: {scans} scans")
         else:
             where = f"ws://localhost:{told.ws_port}"
-            with ohmskin.LiveSkin(told.port, told.calibration) as skin:
+            known = ohmskin.load_calibration(told.calibration)
+            required(known.geometry)
+            with ohmskin.LiveSkin(told.port, known, every=False) as skin:
                 serve(skin, told.ws_port, lambda: print(f"Foxglove: open {where}", flush=True))
     except (ohmskin.OhmskinError, ValueError, OSError, RuntimeError) as exc:
         sys.exit(f"ohmskin-foxglove: {exc}")

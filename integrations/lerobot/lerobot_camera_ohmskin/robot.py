@@ -9,6 +9,7 @@ one NaN would make the statistics of the whole feature NaN.
 from dataclasses import dataclass, field
 from typing import Any
 
+import draccus
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from numpy.typing import NDArray
@@ -32,9 +33,13 @@ class SkinConfig:
 @RobotConfig.register_subclass("ohmskin")
 @dataclass(kw_only=True)
 class OhmskinRobotConfig(RobotConfig):
-    """robot: the robot itself. skins: by the names they get in the state."""
+    """robot: the options of the robot itself, with its type. skins: by their names in the state.
 
-    robot: RobotConfig
+    The options are no `RobotConfig`: LeRobot's command line lists the options of all robots, and
+    those of a robot in a robot would have no end.
+    """
+
+    robot: dict[str, Any]
     skins: dict[str, SkinConfig] = field(default_factory=dict)
 
 
@@ -89,7 +94,7 @@ class OhmskinRobot(Robot):
     def __init__(self, config: OhmskinRobotConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.robot = make_robot_from_config(config.robot)
+        self.robot = make_robot_from_config(draccus.decode(RobotConfig, config.robot))
         self.windows = [Window(name, skin) for name, skin in config.skins.items()]
 
     def __getattr__(self, name: str) -> Any:

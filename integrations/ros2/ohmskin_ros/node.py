@@ -5,8 +5,10 @@
 ~/image       sensor_msgs/Image                forces [N], one pixel a cell, 32FC1
 /diagnostics  diagnostic_msgs/DiagnosticArray  once a second: whether scans come, and what was lost
 ~/tare        std_srvs/Trigger                 what the skin reads now is no force
+~/examine     std_srvs/Trigger                 what 'ohmskin doctor' says of the board: up to 10 s
 
-Parameters: port, calibration (with a geometry), frame_id ("": that of the geometry).
+Parameters: port, calibration (with a geometry), frame_id ("": that of the geometry), every (false:
+publish the newest scan alone, where a machine is too busy for all of them).
 
 Points and images are reliable with a depth of 100: a second of scans. RViz subscribes so, and a
 subscriber that asks for best effort gets them as well.
@@ -24,6 +26,9 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_srvs.srv import Trigger
 
 import ohmskin
+from ohmskin.cli.doctor_words import verdict, words_of
+from ohmskin.doctor.examine import examine
+from ohmskin.doctor.gather import gather
 from ohmskin_ros.messages import header, image, point_cloud
 
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -37,6 +42,7 @@ class SkinNode(Node):
         port = self.declare_parameter("port", "/dev/ttyACM0").value
         path = self.declare_parameter("calibration", "skin.json").value
         frame_id = self.declare_parameter("frame_id", "").value
+        every = self.declare_parameter("every", True).value
         calibration = ohmskin.load_calibration(path)
         if calibration.geometry is None:
             said = "nobody has said where the cells are: ohmskin skin"
@@ -46,9 +52,11 @@ class SkinNode(Node):
         self._image = self.create_publisher(Image, "~/image", QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/tare", self._tare)
+        self.create_service(Trigger, "~/examine", self._examine)
         self.create_timer(1.0, self._diagnose)
         self.missed = self.published = 0
-        self.skin = ohmskin.LiveSkin(port, calibration)
+        self._doctor: DiagnosticStatus | None = None  # what it has said last
+        self.skin = ohmskin.LiveSkin(port, calibration, every=every)
         # A thread, so that a tare, which takes a second, holds up no scan.
         self._thread = threading.Thread(target=self._publish)
         self._thread.start()
@@ -74,6 +82,29 @@ class SkinNode(Node):
             answer.success, answer.message = False, str(exc)
         return answer
 
+    def _examine(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        """Ask the doctor, whose word is part of the diagnostics from then on."""
+        try:
+            device, _reader = self.skin.there()
+            diagnosis = examine(gather(device))
+            device.start()  # it stands still after that
+        except (ohmskin.OhmskinError, ValueError) as exc:
+            answer.success, answer.message = False, str(exc)
+            return answer
+        answer.success, answer.message = diagnosis.sound, verdict(diagnosis)
+        said = [(each.kind.id, words_of(each)) for each in diagnosis.findings]
+        self._doctor = DiagnosticStatus(
+            level=DiagnosticStatus.OK if diagnosis.sound else DiagnosticStatus.WARN,
+            name="ohmskin: doctor",
+            message=answer.message,
+            hardware_id=self.skin.port,
+            values=[
+                KeyValue(key=f"{kind}: {words['where']}", value=words["what_to_do"])
+                for kind, words in said
+            ],
+        )
+        return answer
+
     def _diagnose(self) -> None:
         failure, newest = self.skin.failure, self.skin.newest()
         level, said = DiagnosticStatus.OK, "scanning"
@@ -91,9 +122,8 @@ class SkinNode(Node):
         status = DiagnosticStatus(
             level=level, name="ohmskin", message=said, hardware_id=self.skin.port, values=values
         )
-        stamp = self.get_clock().now().to_msg()
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = stamp
+        array = DiagnosticArray(status=[status, *filter(None, [self._doctor])])
+        array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
     def close(self) -> None:

@@ -18,6 +18,7 @@ os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image, PointCloud2
@@ -26,6 +27,7 @@ from std_srvs.srv import Trigger
 HERE = Path(__file__).parents[1]
 URL = "emulator://8x8?scene=ghost&seed=1"
 TOUCHED = f"{URL}&begin=0"
+WATCHED_S = 60.0  # scans that are lost are counted for so long
 ENOUGH_S = 60.0  # a test waits so long for what comes at once, unless it never comes
 
 
@@ -66,11 +68,17 @@ def reader() -> Iterator[Node]:
     rclpy.try_shutdown()
 
 
-def until(reader: Node, ready: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + ENOUGH_S
+def until(reader: Node, ready: Callable[[], bool], limit_s: float = ENOUGH_S) -> None:
+    end_s = time.monotonic() + limit_s
     while not ready():
         assert time.monotonic() < end_s
         rclpy.spin_once(reader, timeout_sec=0.1)
+
+
+def asked(reader: Node, client: Client) -> Trigger.Response:
+    answer = client.call_async(Trigger.Request())
+    until(reader, answer.done)
+    return answer.result()
 
 
 def stamp_ns(message: PointCloud2 | Image) -> int:
@@ -88,6 +96,8 @@ def test_clouds_and_images_come(node: Callable, reader: Node) -> None:
     reader.create_subscription(Image, "/ohmskin/image", images.append, 100)  # reliable, as RViz
     node(TOUCHED)
     until(reader, lambda: len(clouds) >= 300 and len(images) >= 300)
+    end_s = time.monotonic() + WATCHED_S
+    until(reader, lambda: time.monotonic() > end_s, 2 * WATCHED_S)
     print(f"figure: last byte to subscriber, median: {np.median(late_ms[100:]):.1f} ms")
     cloud, picture = clouds[-1], {stamp_ns(i): i for i in images}.get(stamp_ns(clouds[-1]))
     assert cloud.header.frame_id == "palm"
@@ -108,6 +118,8 @@ def test_clouds_and_images_come(node: Callable, reader: Node) -> None:
     # In order, and none twice. (A machine that is too busy for 90 estimates a second skips scans.)
     periods = np.diff([stamp_ns(cloud) for cloud in clouds]) / (1e9 / 90)
     assert (periods > 0.5).all()
+    lost = int(np.sum(np.round(periods) - 1))
+    print(f"figure: scans lost before a subscriber, of {periods.size + lost}: {lost}")
 
 
 def test_a_tare_is_a_service(node: Callable, reader: Node) -> None:
@@ -115,35 +127,51 @@ def test_a_tare_is_a_service(node: Callable, reader: Node) -> None:
     node(TOUCHED)
     assert client.wait_for_service(ENOUGH_S)
 
-    def answer() -> Trigger.Response:
-        asked = client.call_async(Trigger.Request())
-        until(reader, asked.done)
-        return asked.result()
-
-    said = answer()
+    said = asked(reader, client)
     while "being opened" in said.message:
-        said = answer()
+        said = asked(reader, client)
     assert not said.success
     assert "cells (2, 2), (2, 5), (5, 2) are touched" in said.message
 
 
-def test_it_goes_on_when_the_board_is_plugged_again(node: Callable, reader: Node) -> None:
-    clouds, states = [], []
-    reader.create_subscription(PointCloud2, "/ohmskin/points", clouds.append, 100)
+def test_it_goes_on_when_the_board_is_plugged_20_times(node: Callable, reader: Node) -> None:
+    """It vanishes half a second after it was opened, and is opened again a second later."""
+    stamps, states = [], []
+    reader.create_subscription(
+        PointCloud2, "/ohmskin/points", lambda cloud: stamps.append(stamp_ns(cloud)), 100
+    )
     reader.create_subscription(
         DiagnosticArray, "/diagnostics", lambda each: states.append(each.status[0]), 10
     )
-    node(f"{TOUCHED}&vanish=1.5")
-    opened = "times the port was opened"
+    node(f"{TOUCHED}&vanish=0.5")
+    until(reader, lambda: np.sum(np.diff(stamps) > 0.5e9) >= 20, 4 * ENOUGH_S)
+    assert (np.diff(stamps) > 0).all()
+    assert {b"\x00", b"\x02"} <= {state.level for state in states}
+    assert any("is gone" in state.message for state in states)
+    opened = {value.key: value.value for value in states[-1].values}["times the port was opened"]
+    assert int(opened) >= 20
 
-    def times() -> int:
-        return max([int(v.value) for s in states for v in s.values if v.key == opened], default=0)
 
-    until(reader, lambda: times() >= 3)
-    seen = len(clouds)
-    until(reader, lambda: len(clouds) > seen)
-    assert {b"\x00", b"\x02"} & {state.level for state in states}
-    assert any("is gone" in state.message for state in states) or times() >= 3
+def test_the_doctor_says_what_is_wrong(node: Callable, reader: Node) -> None:
+    """A row that is torn off, by the service, and in the diagnostics after it."""
+    client, states = reader.create_client(Trigger, "/ohmskin/examine"), []
+    reader.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda each: states.append(each.status), 10
+    )
+    node("emulator://8x8?scene=rest&seed=1&open_row=3")
+    assert client.wait_for_service(ENOUGH_S)
+    said = asked(reader, client)
+    while "being opened" in said.message:
+        said = asked(reader, client)
+    assert not said.success
+    assert "not sound: 1 finding, first open row (row 3)" in said.message
+    until(reader, lambda: len(states) > 0 and len(states[-1]) == 2)
+    doctor = states[-1][1]
+    assert doctor.name == "ohmskin: doctor"
+    assert doctor.message == said.message
+    assert doctor.values[0].key == "open_row: row 3"
+    before = int(states[-1][0].values[0].value)  # scans
+    until(reader, lambda: int(states[-1][0].values[0].value) > before + 90)  # it goes on
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
