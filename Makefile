@@ -183,7 +183,7 @@ bench-pace: setup-host ## measure what it costs to read less of a skin, and what
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone
 	$(BENCH)/bench_far.py
 
-bench-orders: setup firmware sim ## measure in which order mode far should take its readings, simulated
+bench-orders: setup firmware sim ## measure in which order modes near and far should take their readings, simulated
 	$(BENCH)/bench_orders.py
 
 bench-desk: setup firmware sim ## measure estimates from a board as unkind as one on a desk, simulated

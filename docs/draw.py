@@ -5,8 +5,8 @@
 python docs/draw.py            write docs/*.svg
 python docs/draw.py --check    change nothing, exit 1 when one is stale
 
-A picture keeps a digest of its numbers and of this file, by which it is told to be current:
-matplotlib draws a little differently from version to version.
+A picture keeps a digest of its numbers and of the files that draw it, by which it is told to be
+current: matplotlib draws a little differently from version to version.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ import numpy as np
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
-sys.path.insert(0, str(ROOT / "host"))
+sys.path[:0] = [str(ROOT / "host"), str(DOCS)]
+
+import draw_wiring  # noqa: E402
 
 from ohmskin.circuit.skin import current_std  # noqa: E402
 from ohmskin.link import framing, protocol  # noqa: E402
@@ -116,6 +118,7 @@ def numbers() -> dict[str, Any]:
         "far-ends": None,
         "slot": slot(),
         "scan-rate": scan_rates(),
+        **{picture: draw_wiring.table(picture) for picture in draw_wiring.BOARDS},
     }
 
 
@@ -423,17 +426,22 @@ PICTURES = {
     "far-ends": (_draw_far_ends, (8.0, 5.1)),
     "slot": (_draw_slot, (8.0, 3.6)),
     "scan-rate": (_draw_rates, (6.4, 3.8)),
+    **{
+        picture: (lambda axes, name=picture: draw_wiring.draw(axes, draw_wiring.table(name)), size)
+        for picture, size in dict.fromkeys(draw_wiring.BOARDS, (8.0, 6.0)).items()
+    },
 }
 
 
 def _digest(content: Any) -> str:
     rounded = json.loads(json.dumps(content), parse_float=lambda text: f"{float(text):.6g}")
-    text = Path(__file__).read_text() + json.dumps(rounded)
+    sources = [Path(__file__), Path(draw_wiring.__file__)]
+    text = "".join(path.read_text() for path in sources) + json.dumps(rounded)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def stale(drawn: dict[str, Any]) -> list[Path]:
-    """Pictures that are missing, or drawn of other numbers or by another docs/draw.py."""
+    """Pictures that are missing, or drawn of other numbers or by other sources."""
     paths = {name: DOCS / f"{name}.svg" for name in PICTURES}
     return [
         path
