@@ -79,8 +79,8 @@ def test_all_readings_agree_with_ngspice(name: str) -> None:
     found = all_readings(skin, end_admittance(skin))
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-11)
     found = laplacian_readings(skin, names="abcdefgh")
-    # The Laplacian adds a cell of 1 MOhm to the far end's 1 ohm in one diagonal, which leaves it 1e-10
-    # of itself. Measured: 6e-12 to 2.3e-11, by the processor for which LAPACK was built.
+    # The Laplacian adds a cell of 1 MOhm to the far end's 1 ohm in one diagonal, and so knows it to
+    # 1e-10 of itself. Measured: 6e-12 to 2.3e-11, by the processor for which LAPACK was built.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
