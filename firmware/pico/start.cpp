@@ -7,6 +7,8 @@
 
 static ohmskin::Device device;
 
+void ohmskin::keep_pace() { device.keep_pace(); }
+
 extern "C" {
 
 extern uint32_t bss_start[], bss_end[], stack_top[];

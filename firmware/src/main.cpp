@@ -6,6 +6,8 @@
 
 static ohmskin::Device device;
 
+void ohmskin::keep_pace() { device.keep_pace(); }
+
 void setup() {
     ohmskin::board::begin();
     device.begin();

@@ -357,7 +357,7 @@ def test_watchdog_restarts_a_hung_main_loop(rig: Rig, scanning: bool, hang: str)
     """Its first time-out is an interrupt; where that cannot come, the second is a reset."""
     if scanning:
         rig.start_scan()
-        rig.run(0.1002)  # in no interrupt: a jump would leave them off
+        rig.run(0.10021)  # in no interrupt: a jump would leave them off
     hellos, resets = len(rig.frames("hello")), rig.sim.stats()["resets"]
     rig.sim.jump(address_of(rig.board, hang))
     rig.run(0.2 if hang == "__stop_program" else 0.45)

@@ -42,6 +42,13 @@ bool Device::poll() {
     return worked;
 }
 
+void Device::keep_pace() {
+    board::keep_alive();
+    transmit();
+    while (board::scanner.has_group())
+        take_group();
+}
+
 // The work of few passes: see attention_. True when there was some.
 bool Device::attend() {
     bool worked = false;

@@ -19,6 +19,8 @@ class Device {
     OHMSKIN_RARE void begin();
     // One pass; true when there was something to do.
     bool poll();
+    // What of a pass cannot wait where a command takes longer.
+    OHMSKIN_RARE void keep_pace();
 
   private:
     // What the slots run for.

@@ -103,8 +103,8 @@ void Device::count_scan() {
     scan_number_++;
     if (changing_ && !board::scanner.change_waits() &&
         board::scanner.changed_at() == static_cast<uint8_t>(scan_number_)) {
-        if (before.idle_slots == 0)
-            slots = static_cast<uint16_t>(slots + IDLE_TO_CHANGE);
+        if (before.idle_slots < IDLE_TO_CHANGE)
+            slots = static_cast<uint16_t>(slots + IDLE_TO_CHANGE - before.idle_slots);
         take_change();
         turns_.change(routes_.whole_every);
     }

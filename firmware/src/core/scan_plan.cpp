@@ -78,7 +78,7 @@ OHMSKIN_RARE void divide(uint32_t period, uint16_t first, int8_t step, uint16_t 
     uint16_t slots = first;
     for (uint8_t i = 0; i < SLOT_COUNTS_TRIED && slots >= least;
          i++, slots = static_cast<uint16_t>(slots + step)) {
-        board::keep_alive();  // all of it would take longer than the clock may wait
+        keep_pace();
         const uint32_t slot = (period + slots / 2) / slots;
         if (slot < slot_min)
             continue;
@@ -101,7 +101,7 @@ class Planner {
 
     // `route` has all but its plan. Returns Ok or why not; fastest_cycles() is known then.
     OHMSKIN_RARE Result plan(Route *route, uint32_t rate_mhz, uint16_t settle) {
-        board::keep_alive();
+        keep_pace();
         ScanPlan &plan = route->plan;
         const uint8_t cells_rows = count_of(route->rows);
         plan.readings = static_cast<uint16_t>(cells_rows * count_of(route->columns) *

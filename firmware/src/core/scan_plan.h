@@ -87,6 +87,10 @@ constexpr uint16_t SLOT_CYCLES_MAX = 60000;
 constexpr uint8_t LINE_IDLE_PART = 8;
 }  // namespace timing
 
+// What cannot wait until a plan is made, which takes milliseconds: codes, the line and the clock.
+// The program has it, beside its device (main.cpp).
+void keep_pace();
+
 // The plan for a request, or why there is none; `routes` changes only where there is one. With
 // settle_us 0 the slots fill the period; otherwise they are as short as the settle time allows and
 // the rest of the period is idle. Rate 0: as fast as the settle time allows, and as line and

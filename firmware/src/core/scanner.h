@@ -41,12 +41,12 @@ class Scanner {
 
     // To be called while no slots run.
     void begin(const Routes &routes) {
-        bank_ = 0;
-        banks_[0].set(routes);
+        bank_ = banks_;
+        bank_->set(routes);
         whole_lines_.set(routes.whole.rows, routes.whole.columns);
         turns_.begin();
         alternates_ = routes.whole_every != 0;
-        begin_scan(banks_[0], alternates_);
+        begin_scan(alternates_);
         idle_left_ = LEAD_IN;
         idling_ = true;
         kinds_ = 0;
@@ -62,7 +62,7 @@ class Scanner {
 
     // Other routes, from the scan after the one in progress on. Not while a change waits.
     void change(const Routes &routes) {
-        banks_[bank_ ^ 1].set(routes);
+        other_bank()->set(routes);
         __atomic_signal_fence(
             __ATOMIC_SEQ_CST);  // the steps are there before change_waits_ says so
         change_waits_ = true;
@@ -175,12 +175,13 @@ class Scanner {
         if (!sequence_.next())
             return READING;
         uint16_t idle_slots = idle_slots_;
-        if (idle_slots == 0) {
-            if (!stopping_ && !change_waits_) {
+        if (idle_slots < IDLE_TO_CHANGE) {
+            if (stopping_ || change_waits_) {
+                idle_slots = IDLE_TO_CHANGE;
+            } else if (idle_slots == 0) {
                 begun_++;
                 return STARTS_SCAN;
             }
-            idle_slots = IDLE_TO_CHANGE;
         }
         idle_left_ = idle_slots;
         idling_ = true;
@@ -196,32 +197,38 @@ class Scanner {
         }
         const uint16_t left = static_cast<uint16_t>(idle_left_ - 1);
         idle_left_ = left;
-        if (left != 0)
+        if (left != 0) {
+            if (left == 1 && change_waits_)
+                take_change();
             return IDLE;
+        }
         idling_ = false;
-        if (alternates_ || change_waits_)
-            *other_slots = choose();
+        if (alternates_) {
+            const uint16_t every = bank_->whole_every;
+            alternates_ = every != 0;
+            begin_scan(turns_.next_is_whole(every));
+            *other_slots = true;
+        }
         begun_++;
         return STARTS_SCAN;
     }
 
-    // Takes the steps of the scan that begins.
-    bool choose() {
-        uint8_t at = bank_;
-        if (change_waits_) {
-            at ^= 1;
-            bank_ = at;
-            turns_.change(banks_[at].whole_every);
-            alternates_ = banks_[at].whole_every != 0;
-            changed_at_ = begun_;
-            __atomic_signal_fence(__ATOMIC_SEQ_CST);  // it is told before the other bank is free
-            change_waits_ = false;
-        }
-        begin_scan(banks_[at], turns_.next_is_whole(banks_[at].whole_every));
-        return true;
+    // The scan that begins next is the first of the other bank. A slot earlier than its begin, so
+    // that no interrupt has to do both.
+    void take_change() {
+        Bank *const bank = other_bank();
+        bank_ = bank;
+        turns_.change(bank->whole_every);
+        alternates_ = true;
+        changed_at_ = begun_;
+        __atomic_signal_fence(__ATOMIC_SEQ_CST);  // it is told before the other bank is free
+        change_waits_ = false;
     }
+    Bank *other_bank() { return bank_ == banks_ ? banks_ + 1 : banks_; }
 
-    void begin_scan(const Bank &bank, bool whole) {
+    // Takes the steps of the scan that begins.
+    void begin_scan(bool whole) {
+        const Bank &bank = *bank_;
         const Steps &steps = whole ? bank.whole : bank.region;
         sequence_.begin(whole ? whole_lines_ : bank.lines, steps);
         idle_slots_ = steps.idle_slots;
@@ -281,10 +288,10 @@ class Scanner {
     volatile bool parked_ = false;
     volatile bool change_waits_ = false;
     volatile uint8_t changed_at_ = 0;
-    uint8_t bank_ = 0;            // whose steps are in force; moved by the interrupt
+    Bank *bank_ = nullptr;        // whose steps are in force; moved by the interrupt
     bool skipping_ = false;       // codes are left out until the next scan starts
     uint8_t on_time_ = 0;         // 0: no conversion had ended by the interrupt before
-    bool alternates_ = false;     // whole scans and those of a region take turns
+    bool alternates_ = false;     // the next scan may have other steps than the one before
     bool idling_ = false;         // the slot that selection() is for is idle
     uint8_t kinds_ = 0;           // of the last slots, see above
     uint8_t begun_ = 0;           // number of the next scan to be decided on, modulo 256

@@ -6,6 +6,9 @@ State state;
 }
 
 namespace ohmskin {
+
+void keep_pace() {}
+
 namespace board {
 
 using fake::state;
