@@ -2,10 +2,12 @@
 """What no touches can make of a skin is said, and nothing of the kind where touches are all."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
+from network import SkinCircuit
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import (
     Skin,
@@ -15,7 +17,7 @@ from ohmskin.circuit.skin import (
     readings,
 )
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.port_faults import ALIKE_FRAMES
+from ohmskin.estimate.port_faults import ALIKE_FRAMES, DOUBT_FRAMES
 from ohmskin.estimate.port_readings import PortReader
 from skins import shorted_readings, ten_bits, told
 from studies.trials import random_trial, skin_at_rest, touch
@@ -92,24 +94,51 @@ def test_a_line_open_since_rest_is_named(rest: Skin) -> None:
 
 
 @pytest.mark.parametrize(("first", "said"), [(4, "rows 4 and 5"), (8 + 1, "columns 1 and 2")])
-def test_shorted_lines_are_named(rest: Skin, touched: Skin, first: int, said: str) -> None:
-    shorted = ten_bits(shorted_readings(touched, first, first + 1))
+def test_shorted_lines_that_nothing_touches_are_named(rest: Skin, first: int, said: str) -> None:
+    shorted = ten_bits(shorted_readings(rest, first, first + 1))
     assert said in reader_of(readings(rest)).read(shorted).fault
-    at_rest = ten_bits(shorted_readings(rest, first, first + 1))
-    assert said in reader_of(at_rest).read(at_rest).fault
+    assert said in reader_of(shorted).read(shorted).fault
 
 
-def test_lines_that_were_apart_are_shorted_if_they_stay_alike(rest: Skin, touched: Skin) -> None:
+def test_touched_lines_are_in_doubt_then_shorted_if_they_stay_alike(rest: Skin) -> None:
+    cells = rest.cell_siemens.copy()
+    cells[4, 3] += 2e-4
+    touched = replace(rest, cell_siemens=cells)
     reader, apart = reader_of(readings(rest)), ten_bits(readings(touched))
     alike = ten_bits(shorted_readings(touched, 4, 5))
-    for _ in range(3):
-        assert not reader.read(apart).fault
-        faults = [reader.read(alike).fault for _ in range(ALIKE_FRAMES)]
-        assert not any(faults[:-1])
-        assert "rows 4 and 5" in faults[-1]
-    assert not reader.read(apart).fault
+    lines = np.zeros((8, 8), dtype=bool)
+    lines[4:6] = True
+    for doubted in (1, DOUBT_FRAMES, DOUBT_FRAMES):  # frames have shown the lines apart, later
+        frames = [reader.read(alike) for _ in range(ALIKE_FRAMES)]
+        assert not any(frame.fault for frame in frames[:-1])
+        assert "rows 4 and 5" in frames[-1].fault
+        assert not any(frame.doubt.any() for frame in frames[: doubted - 1])
+        assert all(np.array_equal(frame.doubt, lines) for frame in frames[doubted - 1 : -1])
+        shown = reader.read(apart)
+        assert not shown.fault
+        assert not shown.doubt.any()
     reader.reset()
-    assert "rows 4 and 5" in reader.read(alike).fault
+    assert reader.read(alike).doubt.any()
+
+
+def test_a_finger_that_lies_evenly_on_two_lines_is_in_doubt_and_no_short() -> None:
+    """The first frame that a program reads, with the finger exactly between two rows."""
+    random, row, column = np.random.default_rng(5), *np.indices((8, 8))
+    doubted = []
+    for place, peak_siemens in product(np.arange(1.0, 6.1, 0.5), (2e-5, 1e-4)):
+        rest = skin_at_rest(8, 8, random)
+        circuit = SkinCircuit(rest)
+        away = (row - 3.5) ** 2 + (column - place) ** 2
+        finger = peak_siemens * np.exp(-away / (2 * 1.5**2))
+        frames = [circuit.readings(rest.cell_siemens)] * 20
+        frames.append(circuit.readings(rest.cell_siemens + finger))
+        exact = np.array(frames)[..., :4]
+        *at_rest, now = ten_bits(exact + 0.3 / 1024 * random.standard_normal(exact.shape))
+        known = SkinKnowledge(8, 8, adc_bits=10, rest_ratio=np.mean(at_rest, axis=0))
+        frame = PortReader(known).read(now, in_order=True)
+        assert not frame.fault
+        doubted.append(frame.doubt[3:5].all())
+    assert np.mean(doubted) > 0.5
 
 
 def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:

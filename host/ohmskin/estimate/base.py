@@ -27,6 +27,9 @@ TOUCH_SIEMENS: Final = 0.5e-6
 # The conductance of a touched cell has also risen by more than so many standard deviations. Chosen:
 # by chance, one normal error of 32,000 is larger.
 TOUCH_STDS: Final = 4.0
+# Deviation of a cell over its conductance, if it may be that of another line, shorted to its own.
+# Chosen: then all of it is an error of three deviations.
+DOUBT_STD: Final = 0.3
 # What `Estimate.wires` says of wires that nobody told, and what people read of that.
 ASSUMED: Final = "assumed"
 ASSUMED_WIRES: Final = (
@@ -219,10 +222,11 @@ class Estimator(ABC):
         wires_std = unknown if solution.wire_ohm_std is None else solution.wire_ohm_std
         if knowledge.ref_log_std:
             wires_std = np.hypot(wires_std, knowledge.ref_log_std * wires)
+        relative_std = np.hypot(knowledge.ref_log_std, DOUBT_STD * ports.doubt)
         return Estimate(
             cell_siemens=solution.cell_siemens,
             cell_siemens_std=np.hypot(
-                solution.cell_siemens_std, knowledge.ref_log_std * solution.cell_siemens
+                solution.cell_siemens_std, relative_std * solution.cell_siemens
             ),
             level=level,
             level_std=level_std,

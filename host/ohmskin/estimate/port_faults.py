@@ -11,8 +11,8 @@ A frame is at fault, and its answer not to be relied on, where
   law: a row is shorted to a column. Where nobody has told the wires, the limit is one such cell;
 - two lines that differed at rest draw the same current from every other line, and all of it more
   than at rest: their electrodes are shorted. Or they did so at rest already, and more than the
-  other lines. A finger between two lines makes them alike for a moment. So lines that a frame has
-  shown apart must be alike in `ALIKE_FRAMES` of the frames that are compared after it;
+  other lines. A finger between two lines makes them alike, too. So touched lines must be alike in
+  `ALIKE_FRAMES` of the frames that are compared; until then, which of them is touched is in doubt;
 - a line showed no current at rest, though others did;
 - the far end of a line has a potential that is not between those of the near ends, or stays while
   that of the near end moves: it is open, or it belongs to another line;
@@ -56,9 +56,15 @@ DRIFT_SHARE: Final = 0.15
 # Two lines are alike if none of their currents differ by more standard deviations. Chosen: joined
 # electrodes give the same code, or differ by noise, and one code is 3.5 deviations of rounding.
 SAME_STDS: Final = 3.4
-# Lines that a frame has shown apart are shorted if no frame shows them apart while so many are
-# compared: three seconds at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
+# Touched lines are shorted if no frame shows them apart while so many are compared: three seconds
+# at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
 ALIKE_FRAMES: Final = 270
+# Lines that a frame has shown apart are in doubt after so many: a tenth of a second. Chosen: a
+# finger that moves passes the middle of two lines in less.
+DOUBT_FRAMES: Final = 9
+# A line is touched if a port draws more than this times its current at rest. Chosen: of two shorted
+# lines, a port draws no more than both at rest, which drift.
+TOUCHED_TIMES: Final = 2.5
 # Lines that were shorted at rest already drew more than this times the median line. Chosen: more
 # than lines at rest scatter, and less than the double that two lines in one draw.
 PAIR_TIMES: Final = 1.15
@@ -130,14 +136,16 @@ class LinePairs:
 
     Two shorted lines are one node, so their currents from every other line are the same. `compare`
     compares all pairs of lines in a frame. It counts, for each pair, the frames that were compared
-    since one has shown this pair apart, or was too noisy to tell. Other frames (`needs_frame` says
-    which) neither add to a count nor end it. This has a price: many brief touches that press the
-    same two lines equally may in the end look like shorted lines. It saves comparing all pairs in
-    most frames.
+    since one has shown this pair apart. Other frames (`needs_frame` says which) neither add to a
+    count nor end it. This has a price: many brief touches that press the same two lines equally may
+    in the end look like shorted lines. It saves comparing all pairs in most frames.
+
+    A finger that lies evenly on two lines joins them, too: its frame is that of a short with a
+    touch on one of them. Lines that nothing touches are alike for no such reason.
 
     high (lines,): which lines have clearly more current at all of their ports, as a short gives
     them. In a frame, that is more than the line itself had at rest; at rest, more than the median
-    line.
+    line. touched (lines,): which have more at some port than a short alone can give them.
     """
 
     def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
@@ -149,13 +157,11 @@ class LinePairs:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames before.
-
-        Until a frame has shown two lines apart, their count is as if they had always been alike:
-        the first frame may name a short that was there when reading began.
-        """
-        self._alike_frames: NDArray[np.intp] = np.full((self._lines, self._lines), ALIKE_FRAMES)
-        self._is_shorted = np.zeros((self._lines, self._lines), dtype=bool)
+        """Forget the frames before."""
+        shape = self._lines, self._lines
+        self._alike_frames: NDArray[np.intp] = np.zeros(shape, dtype=np.intp)
+        self._never_apart = np.ones(shape, dtype=bool)
+        self._is_first = True
 
     def were_shorted_at_rest(self, high: Bool) -> str:
         """The first pair of the lines `high` that was alike at rest already, in words, or empty.
@@ -167,32 +173,41 @@ class LinePairs:
             return ""
         return self._first(self._rest_apart < SAME_STDS, high)
 
-    def needs_frame(self, high: Bool) -> bool:
-        """Whether a frame with these lines `high` is worth comparing: all pairs take long.
+    def needs_frame(self, high: Bool, touched: Bool) -> bool:
+        """Whether a frame with these lines is worth comparing: all pairs take long.
 
-        A short shows in two high lines. Without them a frame is still compared while the count of
-        some pair is full: the frame may show this pair apart. Lines with fewer than three ports may
-        be alike by chance.
+        A short shows in two high lines, a doubt in two touched ones. Without them a frame is still
+        compared while the count of some pair is full: it may show this pair apart. So may the first
+        frame. Lines with fewer than three ports may be alike by chance.
         """
         some_count_is_full = self._alike_frames.max() >= ALIKE_FRAMES
-        return self._ports >= 3 and bool(some_count_is_full or np.count_nonzero(high) >= 2)
+        some_lines = max(np.count_nonzero(high), np.count_nonzero(touched)) >= 2
+        return self._ports >= 3 and bool(self._is_first or some_count_is_full or some_lines)
 
-    def compare(self, now: PortCurrents) -> None:
-        """Count in a frame for all pairs of lines."""
+    def compare(self, now: PortCurrents, high: Bool, touched: Bool) -> tuple[str, Bool]:
+        """Compare all pairs of lines in a frame.
+
+        Returns the first pair of lines that is shorted, in words, or empty; and which lines are in
+        doubt (lines,): touched, and alike for so long that they may be shorted.
+        """
         apart = self._apart(now)
-        # A pair can be judged if it differed at rest by clearly more than this frame's noise. Other
-        # pairs would look shorted in a frame so noisy. They are taken as apart, and the frame ends
-        # their count.
-        noisier = max(self._largest_std(now) / self._rest_std, 1.0)
-        apart[self._rest_apart <= 2 * SAME_STDS * noisier] = np.inf
         # Two shorted lines may differ by more than the limit in a noisy frame. So only a difference
         # of twice the limit shows them apart.
-        self._alike_frames = np.where(apart > 2 * SAME_STDS, 0, self._alike_frames + 1)
-        self._is_shorted = (apart < SAME_STDS) & (self._alike_frames >= ALIKE_FRAMES)
-
-    def shorted(self, high: Bool) -> str:
-        """The first pair of the lines `high` that is shorted, by the frames compared; or empty."""
-        return self._first(self._is_shorted, high)
+        shows_apart = apart > 2 * SAME_STDS
+        self._alike_frames = np.where(shows_apart, 0, self._alike_frames + 1)
+        self._never_apart &= ~shows_apart
+        self._is_first = False
+        alike = np.triu(apart < SAME_STDS, 1)
+        # Lines that hardly differed at rest are alike for no other reason. A pair that differed by
+        # clearly more than this frame's noise is shorted; that may be so since before the frames.
+        noisier = max(self._largest_std(now) / self._rest_std, 1.0)
+        differed = self._rest_apart > 2 * SAME_STDS * noisier
+        since = self._never_apart & ~(touched & touched[:, None])
+        is_shorted = alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
+        doubt = alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
+        doubt &= touched & touched[:, None]
+        in_doubt = np.asarray(doubt.any(axis=0) | doubt.any(axis=1))
+        return self._first(is_shorted, high), in_doubt
 
     def _first(self, is_alike: Bool, high: Bool) -> str:
         if not is_alike.any():
@@ -214,7 +229,11 @@ class LinePairs:
 
 
 class SkinFaults:
-    """Compares the currents of frames with those at rest, and with what the wires allow."""
+    """Compares the currents of frames with those at rest, and with what the wires allow.
+
+    doubt: cells of lines that the last frame shows touched alike, (R, C): a finger may lie evenly
+        on both lines, or they are shorted, and then one of them may be untouched.
+    """
 
     def __init__(self, knowledge: SkinKnowledge, rest: PortCurrents | None) -> None:
         """rest: currents of the untouched skin. Without them, only short ports are found."""
@@ -223,11 +242,13 @@ class SkinFaults:
         self._pairs: list[LinePairs] = []
         if rest is not None:
             self._pairs = [LinePairs(axis, rest, knowledge.current_std) for axis in (0, 1)]
+        self.reset()
 
     def reset(self) -> None:
         """Forget the frames before."""
         for pairs in self._pairs:
             pairs.reset()
+        self.doubt: Bool = np.zeros(self._highest.shape, dtype=bool)
 
     def at_rest(self) -> str:
         """What is wrong at rest already: a line that is open, or two that are shorted."""
@@ -255,6 +276,7 @@ class SkinFaults:
         A frame is compared for shorted lines only if it is whole and has no shorted port and no
         loss, and its columns only if no rows are shorted.
         """
+        self.doubt = np.zeros(now.current.shape, dtype=bool)
         fault = self._short(now)
         if fault or self._rest is None:
             return fault
@@ -262,12 +284,15 @@ class SkinFaults:
         if fault or not is_whole:
             return fault
         is_higher = now.current > (1.0 + DRIFT_SHARE) * self._rest.current
+        is_touched = now.current > TOUCHED_TIMES * self._rest.current + FAULT_STDS * now.std
         for axis, pairs in enumerate(self._pairs):
             high = np.asarray(is_higher.all(axis=1 - axis))
-            if pairs.needs_frame(high):
-                pairs.compare(now)
-                if pair := pairs.shorted(high):
+            touched = np.asarray(is_touched.any(axis=1 - axis))
+            if pairs.needs_frame(high, touched):
+                pair, doubt = pairs.compare(now, high, touched)
+                if pair:
                     return f"{pair} read alike as they did not at rest: shorted?"
+                self.doubt |= doubt[:, None] if axis == 0 else doubt
         return ""
 
     def _short(self, now: PortCurrents) -> str:

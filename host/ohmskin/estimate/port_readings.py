@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import FarEnds, NearEnds, PortCurrents
 from ohmskin.estimate.port_faults import Contradictions, FarFaults, SkinFaults
@@ -33,6 +33,7 @@ class PortReadings:
         the wires up to these ends had no resistance.
     current_std: standard deviation of current (R, C) [S].
     fault: why the frame cannot be relied on, in words; empty if it can.
+    doubt: cells of lines that may be touched alike, or shorted, (R, C) (`port_faults`).
     far: whether rows, and whether columns, are sensed at their far ends.
     region: flat indices of the ports that were read, (k,); None: all.
 
@@ -48,6 +49,7 @@ class PortReadings:
     current: Float
     current_std: Float
     fault: str = ""
+    doubt: Bool = field(default_factory=lambda: np.zeros((1, 1), dtype=bool))
     far: tuple[bool, bool] = (False, False)
     region: NDArray[np.intp] | None = None
     drop_ohm: Float = field(default_factory=lambda: np.zeros((2, 0, 0)))
@@ -115,7 +117,7 @@ class PortReader:
         fault = near.fault or self._rest_fault
         fault = fault or self._faults.find(near.ports, is_whole=region is None)
         if not any(self.far):
-            return PortReadings(ratio, *near.ports, fault, region=region)
+            return PortReadings(ratio, *near.ports, fault, self._faults.doubt, region=region)
         assert near.variances is not None  # at far ends, all is read
         assert near.spread is not None
         variance = self._noise.between_ends(near.variances)
@@ -127,6 +129,7 @@ class PortReader:
             ratio,
             *far.ports,
             "; ".join(filter(None, (fault, find(far, drop_ratio_std, shift_ratio)))),
+            self._faults.doubt,
             self.far,
             drop_ohm=far.drop / far.near_current,
             # Chosen: as good as nothing is known, and its square is still a number.
