@@ -34,6 +34,7 @@ those of the step before, used once more, would still move something.
 """
 
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,8 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.wire_belief import Lesson, WireBelief
 
+# A step that turns back by more than this share of the one before is shortened. Chosen.
+TURNED_SHARE: Final = -0.25
 # Limits of a cell's log resistance.
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
 
@@ -150,16 +153,19 @@ class FullFit:
     def _minimise(self) -> None:
         """Steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
 
-        Each is first tried with the slopes of the one before. The circuit is not evaluated after
-        the last move: `modelled`, `misfit` and `wires` are what the last step has forecast.
+        Each is first tried with the slopes of the one before, and shortened if it turns back. The
+        circuit is not evaluated after the last move: `modelled`, `misfit` and `wires` are what the
+        last step has forecast.
         """
         self._linearise()
         step, moved_stds = self._step()
+        before = np.zeros_like(step)
         while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
-            self._move(step)
+            self._move(_damped(step, before))
             if moved_stds < CLOSE_STDS:
                 return
+            before = step
             self._evaluate()
             step, moved_stds = self._step()
             # Old slopes are a little wrong, so by them the last step must be at most half as large.
@@ -332,3 +338,15 @@ class FullFit:
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
         _, factor = self._factorised(cell_std, self._belief.odd_lead_ohm())
         return Lesson(self._per_mean_std, residual, factor)
+
+
+def _damped(step: Float, before: Float) -> Float:
+    """So much of a step as leads to where there are no steps, if it turns back on the one before.
+
+    On the line through both, a step is r times the one before. Were it linear in the place, it
+    would be 0 after 1 / (1 - r) of this step. Where wires and cells explain the same readings,
+    whole steps go back and forth for ever, with r about -1.
+    """
+    square = before @ before
+    turned = float(step @ before) / max(float(square), 1e-12)
+    return step / (1.0 - turned) if turned < TURNED_SHARE else step

@@ -80,8 +80,8 @@ LEAST_STAYING_PORTS: Final = 16
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
 # by less than their rounding.
 LEAST_LEAD_OHM: Final = 20.0
-# [ohm] Longer lines are not neglected to find a start. Chosen: 8 segments of 3 kOhm; from there on
-# a fit takes fewer steps from rest.
+# [ohm] Longer lines are not neglected to find a start, and may hide touches. Chosen: 8 segments of
+# 3 kOhm; from there on a fit takes fewer steps from rest.
 LONG_LINE_OHM: Final = 24e3
 
 
@@ -240,7 +240,8 @@ class JointEstimator(Estimator):
         """Why this fit cannot be the answer; empty if it can."""
         if message := self._belief.fault or fit.message:
             return message
-        if self._rest_wires_log_std > REST_STD:
+        # On a leaky skin, short lines hide cells at rest, too; touches conduct more than these.
+        if self._rest_wires_log_std > REST_STD and self._line_ohm() > LONG_LINE_OHM:
             return "wires resist too much: even cells at rest are uncertain"
         if fit.misfit > MAX_CHI2:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
@@ -254,6 +255,10 @@ class JointEstimator(Estimator):
             return f"{cell}: conducts less than at rest, is a line open?"
         return ""
 
+    def _line_ohm(self) -> float:
+        """What the longer lines resist, from end to end."""
+        return float((np.exp(self._belief.means[:2]) * self._shape[::-1]).max())
+
     def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
         """Log resistances of the cells to start from, (RC,).
 
@@ -265,8 +270,7 @@ class JointEstimator(Estimator):
         """
         if touches is not None:
             return touches.log_cells
-        lines_ohm = np.exp(self._belief.means[:2]) * self._shape[::-1]
-        if all(self._belief.far) and lines_ohm.max() > LONG_LINE_OHM:
+        if all(self._belief.far) and self._line_ohm() > LONG_LINE_OHM:
             return prior.expected
         # To start from, cells that miss each reading by one deviation are near enough.
         tolerance = float(ports.current.size)
