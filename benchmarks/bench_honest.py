@@ -56,10 +56,12 @@ from studies.trials import (
     NOMINAL_WIRE_OHM,
     Trial,
     finger_trial,
+    palm,
     random_trial,
     skin_at_rest,
     trial_of,
 )
+from studies.unmodelled import lost
 
 SEED = 24000  # of the first skin
 SKINS, FRAMES = 4, 60  # of each condition
@@ -78,7 +80,7 @@ LONG_OHM = (10_000, 20_000, 41_000)
 CONSTANTS = (0.0, 0.3, 0.5, 0.8, 1.0)  # over Vdd: one of these for each skin
 LINE = 3  # the one far line that is off
 SEGMENT_TIMES, SHORT_OHM = 10.0, 20.0  # a damaged yarn; two neighbouring rows that touch
-PALM_SHARE, PALM_SIEMENS = 0.6, 2.5e-4
+PALM_SIEMENS = 2.5e-4
 UNTOLD_OHM = (500, 1000)
 LEAKS_OHM = (3_000_000, 1_000_000, 300_000)
 
@@ -120,29 +122,16 @@ class Shown(NamedTuple):
 
 def broken(ratio: Float, fault: str, number: int) -> Float:
     """These readings of mode far, (..., R, C, 4), with a fault of their far ends."""
-    ratio, names = ratio.copy(), list(MODES["far"])
-    near, far = ("b", "f") if fault.startswith("columns") else ("a", "e")
-    lines = slice(LINE, LINE + 1) if fault.startswith("line") else slice(None)
-    instead: Float | float = CONSTANTS[number % len(CONSTANTS)]
-    if fault.endswith("near"):
-        instead = ratio[..., lines, :, names.index(near)]
-    ratio[..., lines, :, names.index(far)] = instead
-    return ratio
+    how = "near" if fault.endswith("near") else "off"
+    lines = fault.removesuffix("_near").replace("line", "one row")
+    return lost(ratio, f"{lines} {how}", CONSTANTS[number % len(CONSTANTS)], LINE)
 
 
 def palm_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
-    """A firm palm over 60 % of the cells that comes and goes; peaks of cells vary by 30 %."""
+    """A firm palm that comes and goes."""
     random = np.random.default_rng(seed)
     rest = skin_at_rest(rows, columns, random)
-    i, j = np.mgrid[:rows, :columns]
-    middle = [random.uniform(0.35, 0.65) * (lines - 1) for lines in (rows, columns)]
-    away = ((i - middle[0]) / rows) ** 2 + ((j - middle[1]) / columns) ** 2
-    most = np.quantile(away, PALM_SHARE)
-    peak = PALM_SIEMENS * np.clip(3 * (most - away) / most, 0, 1)
-    peak = peak * np.exp(0.3 * random.standard_normal(rest.shape))
-    pressures = np.sin(np.pi * np.linspace(0.05, 0.95, frames))
-    skins = [replace(rest, cell_siemens=rest.cell_siemens + at * peak) for at in pressures]
-    return trial_of(rest, skins)
+    return trial_of(rest, palm(rest, frames, random, PALM_SIEMENS))
 
 
 def trial_of_scene(scene: Scene, frames: int) -> tuple[Skin, Float]:

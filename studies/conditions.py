@@ -28,6 +28,7 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.emulate.faults import SkinFaults, joined_readings
 from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.methods import METHODS
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ADC_BITS
 from studies.trials import NOMINAL_WIRE_OHM, SPREAD, knowledge_of, skin_at_rest, touch
@@ -84,6 +85,7 @@ class Sweep:
     values: of x, numbers or labels.
     build: a case from x, the skin's shape, how many frames are judged, a source of randomness.
     logarithmic: whether x has a logarithmic axis.
+    methods: which methods meet it.
     """
 
     name: str
@@ -92,6 +94,7 @@ class Sweep:
     values: tuple[float, ...] | tuple[str, ...]
     build: Callable[[float | str, Shape, int, Random], Case]
     logarithmic: bool = False
+    methods: tuple[str, ...] = METHODS
 
     @property
     def labelled(self) -> bool:
@@ -123,7 +126,8 @@ def _touched(rest: Skin, random: Random) -> Skin:
     return touch(rest, int(random.integers(1, most + 1)), random)
 
 
-def _touched_frames(rest: Skin, frames: int, random: Random) -> list[Skin]:
+def touched_frames(rest: Skin, frames: int, random: Random) -> list[Skin]:
+    """So many frames, touched anew in each."""
     return [_touched(rest, random) for _ in range(frames)]
 
 
@@ -139,7 +143,7 @@ def _wires(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     wire_ohm = (float(x) * PRESSED_OHM, float(x) * PRESSED_OHM)
     rest = skin_at_rest(*shape, random, wire_ohm=wire_ohm)
     skins = []
-    for skin in _touched_frames(rest, frames, random):
+    for skin in touched_frames(rest, frames, random):
         pressed = np.exp(SPREAD * random.standard_normal(shape)) / PRESSED_OHM
         cell = np.where(skin.cell_siemens > rest.cell_siemens, pressed, rest.cell_siemens)
         skins.append(replace(skin, cell_siemens=cell))
@@ -159,7 +163,7 @@ def _noise(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     rest = skin_at_rest(*shape, random)
     judged = [
         Frame(converted(readings(skin), random, float(x)), skin.cell_siemens)
-        for skin in _touched_frames(rest, frames, random)
+        for skin in touched_frames(rest, frames, random)
     ]
     return _case(judged, converted(readings(rest), random, float(x)))
 
@@ -167,7 +171,7 @@ def _noise(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
 def _nominal(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     """x: the nominal wires that are told, over the true ones."""
     rest = skin_at_rest(*shape, random)
-    judged = _judged(_touched_frames(rest, frames, random))
+    judged = _judged(touched_frames(rest, frames, random))
     top_ohm, bottom_ohm = NOMINAL_WIRE_OHM
     return _case(judged, converted(readings(rest)), (float(x) * top_ohm, float(x) * bottom_ohm))
 
@@ -180,7 +184,7 @@ def _before(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     rest = skin_at_rest(*shape, random)
     every_cell = rest.cell_siemens.size
     in_order: list[Frame] = []
-    for skin in _touched_frames(rest, frames, random):
+    for skin in touched_frames(rest, frames, random):
         before: Float | None = None
         match x:
             case "the same":
@@ -219,7 +223,7 @@ def _stuck(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     if fixed:
         _stick(rest_ratio, str(x), fixed, random)
     judged = []
-    for skin in _touched_frames(rest, frames, random):
+    for skin in touched_frames(rest, frames, random):
         ratio = readings(skin)
         _stick(ratio, str(x), fixed or _place(shape, random), random)
         judged.append(Frame(converted(ratio), skin.cell_siemens))
@@ -271,7 +275,7 @@ def _lines(x: float | str, shape: Shape, frames: int, random: Random) -> Case:
     fixed = _place(shape, random) if _since_rest(x) else None
     rest_ratio = with_line_fault(rest, str(x), fixed) if fixed else readings(rest)
     judged = []
-    for skin in _touched_frames(rest, frames, random):
+    for skin in touched_frames(rest, frames, random):
         ratio = with_line_fault(skin, str(x), fixed or _place(shape, random))
         judged.append(Frame(converted(ratio), skin.cell_siemens, afresh=fixed is None))
     return _case(judged, converted(rest_ratio))

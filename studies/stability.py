@@ -36,6 +36,9 @@ from studies.drawing import (
 from studies.judge import Verdict, verdict
 from studies.rows import Progress, as_csv, field_names, in_processes
 from studies.trials import PAPER_METHODS
+from studies.unmodelled import UNMODELLED
+
+ALL_SWEEPS: Final = SWEEPS | UNMODELLED
 
 
 @dataclass(frozen=True)
@@ -107,20 +110,20 @@ class Task:
 
 def tasks_of(plan: Plan, methods: Collection[str] = METHODS) -> list[Task]:
     """All tasks, the longest first: else the last process would work alone."""
-    papers = [method for method in methods if method in PAPER_METHODS]
-    others = [method for method in methods if method not in PAPER_METHODS]
-    conditions = [(sweep.name, x) for sweep in SWEEPS.values() for x in sweep.values]
+    conditions = [(sweep, x) for sweep in ALL_SWEEPS.values() for x in sweep.values]
     # Each of the paper's two is a task of its own, too, because a frame takes it seconds.
     longest = [
-        Task(*condition, (method,), plan.paper_shape, skin, plan.paper_frames)
-        for condition in conditions
-        for method in papers
+        Task(sweep.name, x, (method,), plan.paper_shape, skin, plan.paper_frames)
+        for sweep, x in conditions
+        for method in methods
+        if method in PAPER_METHODS and method in sweep.methods
         for skin in range(plan.paper_skins)
     ]
     return longest + [
-        Task(*condition, tuple(others), plan.shape, skin, plan.frames)
-        for condition in conditions
-        for skin in range(plan.skins if others else 0)
+        Task(sweep.name, x, others, plan.shape, skin, plan.frames)
+        for sweep, x in conditions
+        if (others := tuple(m for m in methods if m in sweep.methods and m not in PAPER_METHODS))
+        for skin in range(plan.skins)
     ]
 
 
@@ -129,7 +132,7 @@ def verdicts_of(task: Task) -> list[Row]:
     with threadpool_limits(limits=1):
         condition = zlib.crc32(f"{task.sweep} {task.x}".encode())
         random = np.random.default_rng([condition, task.skin])
-        case = SWEEPS[task.sweep].build(task.x, task.shape, task.frames, random)
+        case = ALL_SWEEPS[task.sweep].build(task.x, task.shape, task.frames, random)
         return [_judge_method(task, method, case) for method in task.methods]
 
 
@@ -156,7 +159,7 @@ def _judge_method(task: Task, method: str, case: Case) -> Row:
 def measure(
     tasks: Sequence[Task], *, jobs: int | None = None, progress: Progress | None = None
 ) -> list[Row]:
-    """Do all tasks: a row a condition and method, in the order of `SWEEPS` and `METHODS`.
+    """Do all tasks: a row a condition and method, in the order of `ALL_SWEEPS` and `METHODS`.
 
     jobs: processes, as `in_processes` takes them. progress: called after each task.
     """
@@ -165,7 +168,8 @@ def measure(
         for row in rows:
             place = (row.sweep, row.x, row.method)
             by_place[place] = by_place[place].plus(row) if place in by_place else row
-    order = [(s.name, x, method) for s in SWEEPS.values() for x in s.values for method in METHODS]
+    conditions = [(sweep.name, x) for sweep in ALL_SWEEPS.values() for x in sweep.values]
+    order = [(*condition, method) for condition in conditions for method in METHODS]
     return [by_place[place] for place in order if place in by_place]
 
 
@@ -178,10 +182,11 @@ def csv_text(rows: Iterable[Row]) -> str:
 
 
 def totals(rows: Iterable[Row]) -> dict[str, Row]:
-    """All frames of each method."""
+    """All frames of each method under the conditions that its equations have."""
     by_method: dict[str, Row] = {}
     for row in rows:
-        by_method[row.method] = by_method.get(row.method, Row("", "", row.method)).plus(row)
+        if row.sweep in SWEEPS:
+            by_method[row.method] = by_method.get(row.method, Row("", "", row.method)).plus(row)
     return by_method
 
 
@@ -216,18 +221,25 @@ _NOTES: Final = (
     "Dotted: fewer than 10 frames a condition, of smaller skins.",
     "Simulation. Readings of 10 bits, as are those at rest. What a panel does not vary: wire "
     "segments of 100 and 200 Ω, told; to 10 of 64 cells touched, with 1 to 100 kΩ, anew in each "
-    "frame; each frame started from the one before. Truth is the cell's, whatever the fault.",
+    "frame; each frame started from the one before. Truth is the cell's, whatever the fault. "
+    "The lowest line of panels is what no equation has, or what nobody has told; it does not count "
+    "in the totals. Leads are told nowhere there; far ends are read without wires told.",
 )
 
 
 def picture(rows: Sequence[Row]) -> bytes:
     """The rows of `stability.measure`, which are of all conditions, as a PNG."""
-    figure = new_figure(17.0, 12.6)
+    figure = new_figure(17.0, 18.0)
     # Labels need more room than numbers: to the right, and below.
-    lines = figure.add_gridspec(2, 1, height_ratios=(5.0, 5.6))
-    for line, labelled in enumerate((False, True)):
-        sweeps = [sweep for sweep in SWEEPS.values() if sweep.labelled == labelled]
-        widths = [len(sweep.values) if labelled else 1 for sweep in sweeps]
+    lines = figure.add_gridspec(3, 1, height_ratios=(5.0, 5.6, 5.6))
+    sweeps_of = [
+        [sweep for sweep in SWEEPS.values() if not sweep.labelled],
+        [sweep for sweep in SWEEPS.values() if sweep.labelled],
+        list(UNMODELLED.values()),
+    ]
+    for line, sweeps in enumerate(sweeps_of):
+        all_labelled = all(sweep.labelled for sweep in sweeps)
+        widths = [len(sweep.values) if all_labelled else 1 for sweep in sweeps]
         places = lines[line].subgridspec(2, len(sweeps), width_ratios=widths, height_ratios=(3, 2))
         for column, sweep in enumerate(sweeps):
             upper = figure.add_subplot(places[0, column])
@@ -240,7 +252,7 @@ def picture(rows: Sequence[Row]) -> bytes:
 
 def _draw(upper: Axes, lower: Axes, sweep: Sweep, rows: Sequence[Row]) -> None:
     """Lines over numbers, and bars over labels."""
-    methods = list(totals(rows))
+    methods = [method for method in totals(rows) if method in sweep.methods]
     width = _GROUP_WIDTH / len(methods)
     for number, method in enumerate(methods):
         shown = [row for row in rows if (row.sweep, row.method) == (sweep.name, method)]

@@ -47,6 +47,7 @@ BEND: Final = 1.35
 JUMP: Final = 1.5
 FINGER_CELLS: Final = 0.7  # standard deviation of a fingertip's pressure. Chosen: some 15 cells.
 FINGER_SIEMENS: Final = (5e-5, 5e-4)  # least and largest peak of a fingertip. Chosen.
+PALM_SHARE: Final = 0.6  # of the cells. Chosen.
 FINGER_FRAMES: Final = 40  # a fingertip's way round its circle. Chosen: it moves in each frame.
 
 
@@ -237,6 +238,19 @@ def jump_trial(rows: int, columns: int, touches: int, frames: int, seed: int) ->
     trial = random_trial(rows, columns, touches, frames, seed)
     before, after = trial.frames[: frames // 2], trial.frames[frames // 2 :]
     return trial_of(trial.rest, [*before, *(stretched(skin, JUMP) for skin in after)])
+
+
+def palm(rest: Skin, frames: int, random: np.random.Generator, peak_siemens: float) -> list[Skin]:
+    """A palm over 60 % of the cells that comes and goes; peaks of cells vary by 30 %."""
+    rows, columns = rest.shape
+    i, j = np.indices(rest.shape)
+    middle = [random.uniform(0.35, 0.65) * (lines - 1) for lines in (rows, columns)]
+    away = ((i - middle[0]) / rows) ** 2 + ((j - middle[1]) / columns) ** 2
+    most = np.quantile(away, PALM_SHARE)
+    peak = peak_siemens * np.clip(3 * (most - away) / most, 0, 1)
+    peak = peak * np.exp(0.3 * random.standard_normal(rest.shape))
+    pressures = np.sin(np.pi * np.linspace(0.05, 0.95, frames))
+    return [replace(rest, cell_siemens=rest.cell_siemens + at * peak) for at in pressures]
 
 
 def finger_trial(

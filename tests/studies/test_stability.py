@@ -16,16 +16,15 @@ from command_line import Command, finish
 from network import laplacian_readings
 from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.matrix import MatrixEstimator
-from ohmskin.estimate.methods import METHODS
 from studies import conditions, stability
 from studies.conditions import SWEEPS, Case
 from studies.judge import Verdict
-from studies.stability import Plan, Row, Task
+from studies.stability import ALL_SWEEPS, Plan, Row, Task
 from waiting import until
 
 TINY = Plan(skins=2, frames=2, paper_skins=0, paper_shape=(2, 2), shape=(3, 3))
 FAST = ("ohm", "matrix")
-SKINS = [(sweep.name, x) for sweep in SWEEPS.values() for x in sweep.values]
+SKINS = [(sweep.name, x) for sweep in ALL_SWEEPS.values() for x in sweep.values]
 
 
 def tiny_tasks() -> list[Task]:
@@ -81,7 +80,7 @@ def test_cut_lines(skin: Skin, fault: str, layer: str, segment: tuple[int, int])
 
 
 def build(sweep: str, x: float | str, frames: int = 3, seed: int = 1) -> Case:
-    return SWEEPS[sweep].build(x, (3, 4), frames, np.random.default_rng(seed))
+    return ALL_SWEEPS[sweep].build(x, (3, 4), frames, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize(("sweep", "x"), SKINS)
@@ -151,7 +150,7 @@ def test_the_results_do_not_depend_on_processes_or_threads(rows: list[Row]) -> N
 def test_every_method_meets_every_condition() -> None:
     tasks = stability.tasks_of(stability.QUICK)
     met = {(task.sweep, task.x, method) for task in tasks for method in task.methods}
-    assert met == {(*condition, method) for condition in SKINS for method in METHODS}
+    assert met == {(*place, method) for place in SKINS for method in ALL_SWEEPS[place[0]].methods}
     for task in tasks:
         paper = {"lsq", "regularized"} & set(task.methods)
         assert task.shape == ((2, 2) if paper else (8, 8))
