@@ -31,7 +31,7 @@ constexpr uint16_t LATE_US = 1000;
 // From the pins' change to the conversion [us], at the least. Chosen as SETTLE_US of scan_plan.h.
 constexpr uint16_t SETTLE_US = 20;
 // Bytes for the line in a pass of the main loop. Chosen: a scan brings 1.3 a slot.
-constexpr uint8_t BYTES_A_PASS = 4;
+constexpr uint8_t BYTES_A_PASS = 2;
 constexpr uint8_t ANALOG_PINS[] = {A0, A1, A2, A3, A4, A5};
 
 bool slots_run, converted_before, pins_are_set;  // the last: for the slot at hand
