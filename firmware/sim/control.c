@@ -20,7 +20,8 @@ enum {
     REQUEST_MAX = 4 << 20,
     ADMITTANCE_BYTES = SKIN_ENDS * SKIN_ENDS * sizeof(double),
     HAS_FAR = 0x80, /* in the count of rows */
-    TABLE_BYTES = SKIN_ROWS * SKIN_COLUMNS * SKIN_CONFIGURATIONS * sizeof(double)
+    TABLE_BYTES = SKIN_ROWS * SKIN_COLUMNS * SKIN_CONFIGURATIONS * sizeof(double),
+    SMALL_TABLE_BYTES = TABLE_BYTES / 4
 };
 static const uint64_t RUN_MAX = (uint64_t)CPU_HZ * 3600;
 
@@ -85,13 +86,18 @@ static bool run(uint64_t cycles) {
     return true;
 }
 
-static bool set_table(void) {
+static bool set_table(size_t length) {
     static double ratio[TABLE_BYTES / sizeof(double)];
-    memcpy(ratio, payload, sizeof ratio);
-    for (size_t i = 0; i < sizeof ratio / sizeof *ratio; i++)
+    memcpy(ratio, payload, length);
+    for (size_t i = 0; i < length / sizeof *ratio; i++)
         if (!isfinite(ratio[i]))
             return refuse("T: a ratio is not finite");
-    skin_set_table(ratio);
+    if (length == TABLE_BYTES)
+        skin_set_table(SKIN_ROWS, SKIN_COLUMNS, ratio);
+    else if (length == SMALL_TABLE_BYTES)
+        skin_set_table(SKIN_ROWS / 2, SKIN_COLUMNS / 2, ratio);
+    else
+        return refuse("T: a table of 16 or of 32 rows and columns");
     return control_reply('T', NULL, 0);
 }
 
@@ -105,7 +111,7 @@ static bool set_admittance(size_t length) {
     const size_t lines = has_far ? ends / 2 : ends;
     if (1 + ends * ends * sizeof *siemens != length || (has_far && ends % 2) || rows > SKIN_ROWS ||
         lines < rows || lines - rows > SKIN_COLUMNS)
-        return refuse("C: rows, then a square matrix of up to 16 rows and 16 columns");
+        return refuse("C: rows, then a square matrix of up to 32 rows and 32 columns");
     memcpy(siemens, payload + 1, length - 1);
     for (size_t i = 0; i < ends * ends; i++)
         if (!isfinite(siemens[i]))
@@ -177,7 +183,7 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
         uint32_t shortest, longest;
         bool lock_step_only;
     } OPS[] = {{'R', 8, 8, true},         {'W', 0, REQUEST_MAX, true},
-               {'B', 4, 4, false},        {'T', TABLE_BYTES, TABLE_BYTES, false},
+               {'B', 4, 4, false},        {'T', SMALL_TABLE_BYTES, TABLE_BYTES, false},
                {'O', 1, 80, false},       {'C', 1, 1 + ADMITTANCE_BYTES, false},
                {'S', 0, 0, false},        {'Z', 0, 0, false},
                {'L', 1, 1, false},        {'E', 0, 0, false},
@@ -204,7 +210,7 @@ static bool serve(uint8_t op, size_t length, bool real_time) {
     case 'B':
         return set_baud();
     case 'T':
-        return set_table();
+        return set_table(length);
     case 'C':
         return set_admittance(length);
     case 'O':

@@ -31,7 +31,8 @@ static const struct board BOARDS[] = {
                  {0x25, 3},
                  {0x2B, 2},
                  {0x2B, 3}},
-                {0, 1, 2, 3}},
+                {0, 1, 2, 3},
+                ADDRESS_PINS},
      .ports = UNO,
      .analog_port = 0x28,
      .tx = {0x2B, 1 << 1},
@@ -49,7 +50,8 @@ static const struct board BOARDS[] = {
                  {0x28, 3},
                  {0x10B, 0},
                  {0x10B, 1}},
-                {0, 1, 2, 3}},
+                {0, 1, 2, 3},
+                ADDRESS_PINS},
      .ports = MEGA,
      .analog_port = 0x31,
      .tx = {0x2E, 1 << 1},
@@ -98,7 +100,13 @@ bool skin_read_wiring(const char *text, struct wiring *wiring) {
     static const char LETTERS[] = "ABCDEFGHJKL";
     static const uint16_t PORTS[] = {0x22, 0x25,  0x28,  0x2B,  0x2E, 0x31,
                                      0x34, 0x102, 0x105, 0x108, 0x10B};
-    for (unsigned i = 0; i < PINS; i++) {
+    unsigned pins = 0;
+    for (const char *at = text; *at == 'P'; at += strcspn(at, ",") + 1)
+        pins++;
+    wiring->address_pins = pins == PINS_MAX ? ADDRESS_PINS_MAX : ADDRESS_PINS;
+    if (pins != 2u * wiring->address_pins + 2)
+        return false;
+    for (unsigned i = 0; i < pins; i++) {
         const char *letter = text[0] == 'P' && text[1] ? strchr(LETTERS, text[1]) : NULL;
         if (!letter || text[2] < '0' || text[2] > '7' || text[3] != ',')
             return false;
@@ -301,10 +309,11 @@ static uint8_t number_at(unsigned first, unsigned count) {
 }
 
 static void on_pins(instant when) {
-    const uint8_t row = number_at(PIN_ROW, 4), column = number_at(PIN_COLUMN, 4);
-    const bool top_high = number_at(PIN_DRIVE_TOP, 1), bottom_high = number_at(PIN_DRIVE_BOTTOM, 1);
+    const unsigned n = skin.board->wiring.address_pins, pins = 2 * n + 2;
+    const uint8_t row = number_at(0, n), column = number_at(n, n);
+    const bool top_high = number_at(2 * n, 1), bottom_high = number_at(2 * n + 1, 1);
     bool undriven = false;
-    for (unsigned i = 0; i < PINS; i++) {
+    for (unsigned i = 0; i < pins; i++) {
         const struct pin pin = skin.board->wiring.pins[i];
         undriven |= !is_output(pin.port, (uint8_t)(1 << pin.bit));
     }
@@ -341,14 +350,19 @@ bool skin_tx_pin_is_high(void) {
     return is_output(tx.port, tx.mask) && (cpu->data[tx.port] & tx.mask);
 }
 
+/* No cell carries a current. */
+static void connect_nothing(void) {
+    for (int r = 0; r < SKIN_ROWS; r++)
+        for (int c = 0; c < SKIN_COLUMNS; c++)
+            memcpy(skin.ratio[r][c], (const double[]){1, 0, 1, 0, 1, 0, 1, 0},
+                   sizeof skin.ratio[r][c]);
+}
+
 void skin_start(const struct board *board) {
     skin.board = board;
     skin.undriven = true;
-    for (int r = 0; r < SKIN_ROWS; r++)
-        for (int c = 0; c < SKIN_COLUMNS; c++) /* nothing connected: no current */
-            memcpy(skin.ratio[r][c], (const double[]){1, 0, 1, 0, 1, 0, 1, 0},
-                   sizeof skin.ratio[r][c]);
-    for (unsigned i = 0; i < PINS; i++) {
+    connect_nothing();
+    for (unsigned i = 0; i < 2u * board->wiring.address_pins + 2; i++) {
         const uint16_t port = board->wiring.pins[i].port;
         bool hooked = false;
         for (unsigned j = 0; j < i; j++)
@@ -360,10 +374,12 @@ void skin_start(const struct board *board) {
 
 void skin_reset(void) { on_pins(cpu->cycle); }
 
-void skin_set_table(const double *ratio) {
+void skin_set_table(size_t rows, size_t columns, const double *ratio) {
     advance(cpu->cycle);
     forget_modes();
-    memcpy(skin.ratio, ratio, sizeof skin.ratio);
+    connect_nothing();
+    for (size_t r = 0; r < rows; r++, ratio += columns * SKIN_CONFIGURATIONS)
+        memcpy(skin.ratio[r], ratio, columns * sizeof skin.ratio[r][0]);
     retarget(cpu->cycle);
 }
 

@@ -78,7 +78,7 @@ void events_reset(void);
 
 /* ---- skin.c: pins and table to node voltages */
 
-enum { SKIN_ROWS = 16, SKIN_COLUMNS = 16, SKIN_CONFIGURATIONS = 8 };
+enum { SKIN_ROWS = 32, SKIN_COLUMNS = 32, SKIN_CONFIGURATIONS = 8 };
 /* Sense nodes, by the converter's channel: those of the near ends, which are driven, and of the far
  * ends of the selected row and column. */
 enum { NODE_TOP, NODE_BOTTOM, DRIVEN_NODES, NODE_FAR_TOP = DRIVEN_NODES, NODE_FAR_BOTTOM, NODES };
@@ -93,11 +93,13 @@ struct pin {
     uint16_t port; /* data-space address of PORTx */
     uint8_t bit;
 };
-/* S0 to S3 of rows and of columns, and the drive pins; the converter's channels, by node. */
-enum { PIN_ROW, PIN_COLUMN = 4, PIN_DRIVE_TOP = 8, PIN_DRIVE_BOTTOM, PINS };
+/* Address pins of rows and as many of columns, and the drive pins, top first; the converter's
+ * channels, by node. */
+enum { ADDRESS_PINS = 4, ADDRESS_PINS_MAX = 5, PINS_MAX = 2 * ADDRESS_PINS_MAX + 2 };
 struct wiring {
-    struct pin pins[PINS];
+    struct pin pins[PINS_MAX];
     uint8_t channels[NODES];
+    uint8_t address_pins;
 };
 struct board {
     const char *name, *mcu;
@@ -108,14 +110,15 @@ struct board {
     const char *loader; /* with which it is sold */
 };
 const struct board *skin_find_board(const char *name);
-/* Another wiring of the board, as in PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3. False: it is
- * none. */
+/* Another wiring of the board, as in PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3: with four
+ * address pins each for rows and columns, or with five. False: it is none. */
 bool skin_read_wiring(const char *text, struct wiring *wiring);
 /* The node at a channel of the converter; NODES: none is. */
 unsigned skin_node_at(unsigned channel);
 void skin_start(const struct board *board);
 void skin_reset(void);
-void skin_set_table(const double *ratio);
+/* Of so many rows and columns; the others carry no current. */
+void skin_set_table(size_t rows, size_t columns, const double *ratio);
 /* Settings are about to change: the voltages up to now follow from the old ones. */
 void skin_before_setting(void);
 /* What the converter sees of a node. */

@@ -33,14 +33,14 @@ constexpr uint8_t bits_of(char port, const uint8_t *list, uint8_t size) {
                ? 0
                : static_cast<uint8_t>(bit_in(port, list[0]) | bits_of(port, list + 1, size - 1));
 }
-// What a port holds of a number that four pins show.
-constexpr uint8_t level(char port, const uint8_t *list, uint8_t number, uint8_t n) {
-    return (number >> n & 1) ? bit_in(port, list[n]) : 0;
+// What a port holds of a number that the first `n` pins of a list show.
+constexpr uint8_t levels(char port, const uint8_t *list, uint8_t number,
+                         uint8_t n = wiring::ADDRESS_PINS) {
+    return n == 0 ? 0
+                  : static_cast<uint8_t>(((number >> (n - 1) & 1) ? bit_in(port, list[n - 1]) : 0) |
+                                         levels(port, list, number, n - 1));
 }
-constexpr uint8_t levels(char port, const uint8_t *list, uint8_t number) {
-    return level(port, list, number, 0) | level(port, list, number, 1) |
-           level(port, list, number, 2) | level(port, list, number, 3);
-}
+constexpr uint8_t LINES = 1 << wiring::ADDRESS_PINS;
 
 constexpr bool exist(const uint8_t *list, uint8_t size) {
     return size == 0 || (list[0] > 1 && list[0] < ALL_PINS && exist(list + 1, size - 1));
@@ -75,10 +75,11 @@ template <char PORT> struct Port {
     static constexpr uint8_t TX = bit_in(PORT, 1);
     static constexpr uint8_t OUTPUTS = SCANNED | LAMP | TX;
     static constexpr uint8_t FIXED = static_cast<uint8_t>(~(SCANNED | LAMP | SENSING));
-    static constexpr bool HAS_ROWS = bits_of(PORT, wiring::ROW_PINS, 4) != 0;
-    static constexpr bool HAS_COLUMNS = bits_of(PORT, wiring::COLUMN_PINS, 4) != 0;
-    static const uint8_t ROWS[16];
-    static const uint8_t COLUMNS[16];
+    static constexpr bool HAS_ROWS = bits_of(PORT, wiring::ROW_PINS, wiring::ADDRESS_PINS) != 0;
+    static constexpr bool HAS_COLUMNS =
+        bits_of(PORT, wiring::COLUMN_PINS, wiring::ADDRESS_PINS) != 0;
+    static const uint8_t ROWS[LINES];
+    static const uint8_t COLUMNS[LINES];
     static inline uint8_t held(uint8_t row, uint8_t column, bool top, bool bottom) {
         uint8_t bits = FIXED;
         if (HAS_ROWS)
@@ -92,16 +93,22 @@ template <char PORT> struct Port {
         return bits;
     }
 };
-#define OHMSKIN_SIXTEEN(list)                                                                      \
-    {                                                                                              \
-        levels(PORT, list, 0),  levels(PORT, list, 1),  levels(PORT, list, 2),                     \
-        levels(PORT, list, 3),  levels(PORT, list, 4),  levels(PORT, list, 5),                     \
-        levels(PORT, list, 6),  levels(PORT, list, 7),  levels(PORT, list, 8),                     \
-        levels(PORT, list, 9),  levels(PORT, list, 10), levels(PORT, list, 11),                    \
-        levels(PORT, list, 12), levels(PORT, list, 13), levels(PORT, list, 14),                    \
-        levels(PORT, list, 15)}
-template <char PORT> const uint8_t Port<PORT>::ROWS[16] = OHMSKIN_SIXTEEN(wiring::ROW_PINS);
-template <char PORT> const uint8_t Port<PORT>::COLUMNS[16] = OHMSKIN_SIXTEEN(wiring::COLUMN_PINS);
+#define OHMSKIN_FOUR(list, n)                                                                      \
+    levels(PORT, list, n), levels(PORT, list, n + 1), levels(PORT, list, n + 2),                   \
+        levels(PORT, list, n + 3)
+#define OHMSKIN_SIXTEEN(list, n)                                                                   \
+    OHMSKIN_FOUR(list, n), OHMSKIN_FOUR(list, n + 4), OHMSKIN_FOUR(list, n + 8),                   \
+        OHMSKIN_FOUR(list, n + 12)
+#if OHMSKIN_LINES_MAX > 16
+#define OHMSKIN_LINES(list) OHMSKIN_SIXTEEN(list, 0), OHMSKIN_SIXTEEN(list, 16)
+#else
+#define OHMSKIN_LINES(list) OHMSKIN_SIXTEEN(list, 0)
+#endif
+template <char PORT> const uint8_t Port<PORT>::ROWS[LINES] = {OHMSKIN_LINES(wiring::ROW_PINS)};
+template <char PORT>
+const uint8_t Port<PORT>::COLUMNS[LINES] = {OHMSKIN_LINES(wiring::COLUMN_PINS)};
+#undef OHMSKIN_LINES
+#undef OHMSKIN_FOUR
 #undef OHMSKIN_SIXTEEN
 
 // Drive pins, as a value that pins_set() takes: one of them high, or none.

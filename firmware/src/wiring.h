@@ -16,6 +16,10 @@
 //     -DOHMSKIN_REF_TOP_OHM=30000      the reference resistors
 //     -DOHMSKIN_REF_BOTTOM_OHM=30000
 //
+// Multiplexers of 32 channels, such as the ADG732, on a Mega: five pins each, A0 to A4, and
+//
+//     -DOHMSKIN_ROWS_MAX=32 -DOHMSKIN_COLUMNS_MAX=32
+//
 // What cannot be, such as a pin that is used twice, does not compile.
 
 #if defined(OHMSKIN_ROW_PINS) || defined(OHMSKIN_COLUMN_PINS) || defined(OHMSKIN_DRIVE_TOP_PIN) || \
@@ -79,10 +83,19 @@ constexpr uint8_t SENSE_INPUTS[] = {OHMSKIN_SENSE_INPUTS};  // by Sense
 constexpr uint32_t REF_TOP_OHM = OHMSKIN_REF_TOP_OHM;
 constexpr uint32_t REF_BOTTOM_OHM = OHMSKIN_REF_BOTTOM_OHM;
 
+// Pins that select a row, and as many that select a column.
+constexpr uint8_t ADDRESS_PINS = OHMSKIN_LINES_MAX > 16 ? 5 : 4;
+#if OHMSKIN_LINES_MAX > 16
+#if !defined(__AVR_ATmega2560__)
+#error "OHMSKIN_ROWS_MAX, OHMSKIN_COLUMNS_MAX: more than 16 lines want a Mega"
+#endif
+static_assert(sizeof ROW_PINS == 5, "OHMSKIN_ROW_PINS: five pins for more than 16 lines, A0 to A4");
+static_assert(sizeof COLUMN_PINS == 5,
+              "OHMSKIN_COLUMN_PINS: five pins for more than 16 lines, A0 to A4");
+#else
 static_assert(sizeof ROW_PINS == 4, "OHMSKIN_ROW_PINS: four pins, S0 to S3");
 static_assert(sizeof COLUMN_PINS == 4, "OHMSKIN_COLUMN_PINS: four pins, S0 to S3");
-static_assert(ROWS_MAX <= 1 << sizeof ROW_PINS && COLUMNS_MAX <= 1 << sizeof COLUMN_PINS,
-              "OHMSKIN_ROWS_MAX, OHMSKIN_COLUMNS_MAX: more lines than four pins of address select");
+#endif
 static_assert(sizeof SENSE_INPUTS == 4, "OHMSKIN_SENSE_INPUTS: four inputs, the last two far");
 static_assert(REF_TOP_OHM >= 100 && REF_TOP_OHM <= 10000000 && REF_BOTTOM_OHM >= 100 &&
                   REF_BOTTOM_OHM <= 10000000,

@@ -202,8 +202,10 @@ class Check:
 class Rig(Closing):
     """A board in lock-step with a host that knows what every reading must be."""
 
-    def __init__(self, board: str, sim: LockstepSim | None = None) -> None:
+    def __init__(self, board: str, sim: LockstepSim | None = None, lines: int = 16) -> None:
+        """lines: of its multiplexers, for rows and for columns."""
         self.board = board
+        self._table_shape = lines, lines, len(READINGS)
         self.sim = sim or LockstepSim(board, elf_of(board))
         self.decoder = framing.Decoder()
         self.scans: list[ReceivedScan] = []
@@ -319,7 +321,7 @@ class Rig(Closing):
 
     # ---- the skin
     def set_codes(self, codes: NDArray[np.uint16], rng: np.random.Generator) -> None:
-        """Make the skin read `codes` (16, 16, 8): a third each at the step's edges and inside."""
+        """Make the skin read `codes` (lines, lines, 8): a third each at a step's edges and inside."""
         inside = rng.random(codes.shape)
         steps = 1 << self.sim.adc_bits
         upper_edge = np.nextafter((codes + 1.0) / steps, 0)
@@ -331,7 +333,7 @@ class Rig(Closing):
 
     def randomize(self, rng: np.random.Generator) -> NDArray[np.uint16]:
         """A new random skin, from this cycle on; the codes that it reads."""
-        codes = rng.integers(1 << self.sim.adc_bits, size=TABLE_SHAPE, dtype=np.uint16)
+        codes = rng.integers(1 << self.sim.adc_bits, size=self._table_shape, dtype=np.uint16)
         self.set_codes(codes, rng)
         return codes
 

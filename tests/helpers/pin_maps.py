@@ -28,6 +28,11 @@ class PinMap:
     ref_ohm: tuple[int, int] = (30_000, 30_000)
 
     @property
+    def lines(self) -> int:
+        """How many rows, and columns, its multiplexers can have."""
+        return 1 << len(self.rows)
+
+    @property
     def flags(self) -> str:
         """What platformio.ini's build_flags are told."""
         lists = {"ROW_PINS": self.rows, "COLUMN_PINS": self.columns, "SENSE_INPUTS": self.sense}
@@ -37,6 +42,8 @@ class PinMap:
             "REF_TOP_OHM": self.ref_ohm[0],
             "REF_BOTTOM_OHM": self.ref_ohm[1],
         }
+        if self.lines > 16:
+            numbers |= {"ROWS_MAX": self.lines, "COLUMNS_MAX": self.lines}
         said = {name: ",".join(map(str, pins)) for name, pins in lists.items()} | numbers
         return " ".join(f"-DOHMSKIN_{name}={value}" for name, value in said.items())
 
@@ -68,6 +75,10 @@ MAPS = {
         PinMap((62, 63, 64, 65), (6, 7, 8, 9), (13, 54), (1, 2, 3, 4)),
     ),
 }
+
+
+# Multiplexers of 32 channels, which want five pins each.
+WIDE = PinMap((22, 23, 24, 25, 26), (37, 36, 35, 34, 33), (49, 48), (0, 1, 2, 3))
 
 
 @cache

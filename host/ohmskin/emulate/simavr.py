@@ -100,7 +100,7 @@ class SkinSim(Closing):
         self._stderr.close()
 
     def set_table(self, ratio: Float) -> None:
-        """Set readings a to h, or a to d alone, (rows, columns, n), of up to 16 rows and columns.
+        """Set readings a to h, or a to d alone, (rows, columns, n), of up to 32 rows and columns.
 
         Cells beyond the array carry no current: 1, 0, 1, 0. An ideal conversion gives the code
         min(1023, floor(1024 ratio)). Raises SimulationError for a ratio that is not finite.
@@ -255,7 +255,8 @@ class SimavrLink(SerialLink):
 def _table(ratio: Float) -> bytes:
     """What the request "T" takes, of readings (rows, columns, n)."""
     rows, columns, readings = ratio.shape
-    table = np.tile([1.0, 0.0], (16, 16, 4))
+    lines = 16 if max(rows, columns) <= 16 else 32
+    table = np.tile([1.0, 0.0], (lines, lines, 4))
     table[:rows, :columns, :readings] = ratio
     return table.tobytes()
 
