@@ -41,13 +41,13 @@ def test_an_end_is_reported_and_stats_still_work(simulate: Simulate, fatal: str)
 BAD_REQUESTS = {
     "?": [b""],
     "R": [b"\x01", b"\xff" * 8],
-    "T": [bytes(16), b"\xff" * 8192],  # too short; not a number
+    "T": [bytes(16), bytes(16384 + 8), b"\xff" * 16384],  # of no size; not a number
     "O": [b"tau_us=-1", b"tau_us=nan", b"tau_us=1e10", b"tau_us=", b"tau_us", b"tau=1"],
     "C": [
         b"",
         b"\x01" + bytes(40),
         b"\x81" + bytes(3 * 3 * 8),
-        b"\x11" + bytes(18 * 18 * 8),
+        b"\x21" + bytes(34 * 34 * 8),
         b"\x01" + b"\xff" * 32,
     ],
     "B": [struct.pack("<I", 7)],
@@ -64,7 +64,7 @@ def test_bad_requests_are_refused(simulate: Simulate) -> None:
         for payload in payloads:
             with pytest.raises(SimulationError, match=r"^(?!skinsim)"):
                 sim.request(op, payload)
-    for shape in [(17, 1, 4), (1, 17, 4), (2, 2, 9)]:
+    for shape in [(33, 1, 4), (1, 33, 4), (2, 2, 9)]:
         with pytest.raises(ValueError, match="shape"):
             sim.set_table(np.zeros(shape))
     assert sim.stats()["state"] == "running"
