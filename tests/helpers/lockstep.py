@@ -321,7 +321,7 @@ class Rig(Closing):
 
     # ---- the skin
     def set_codes(self, codes: NDArray[np.uint16], rng: np.random.Generator) -> None:
-        """Make the skin read `codes` (lines, lines, 8): a third each at a step's ends and inside."""
+        """Make the skin read `codes` (lines, lines, 8): a third each at a step's ends and in it."""
         inside = rng.random(codes.shape)
         steps = 1 << self.sim.adc_bits
         upper_edge = np.nextafter((codes + 1.0) / steps, 0)
