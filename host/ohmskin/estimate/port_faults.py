@@ -11,8 +11,9 @@ A frame is at fault, and its answer not to be relied on, where
   law: a row is shorted to a column. Where nobody has told the wires, the limit is one such cell;
 - two lines that differed at rest draw the same current from every other line, and all of it more
   than at rest: their electrodes are shorted. Or they did so at rest already, and more than the
-  other lines. A finger between two lines makes them alike, too. So touched lines must be alike in
-  `ALIKE_FRAMES` of the frames that are compared; until then, which of them is touched is in doubt;
+  other lines. A finger between two lines makes them alike, too. So lines that are touched at one
+  place must be alike in `ALIKE_FRAMES` of the frames that are compared; until then, which of them
+  is touched is in doubt;
 - a line showed no current at rest, though others did;
 - the far end of a line has a potential that is not between those of the near ends, or stays while
   that of the near end moves: it is open, or it belongs to another line;
@@ -141,11 +142,13 @@ class LinePairs:
     in the end look like shorted lines. It saves comparing all pairs in most frames.
 
     A finger that lies evenly on two lines joins them, too: its frame is that of a short with a
-    touch on one of them. Lines that nothing touches are alike for no such reason.
+    touch on one of them. Lines that nothing touches are alike for no such reason, nor are lines
+    that are touched at several places, each time evenly.
 
     high (lines,): which lines have clearly more current at all of their ports, as a short gives
     them. In a frame, that is more than the line itself had at rest; at rest, more than the median
-    line. touched (lines,): which have more at some port than a short alone can give them.
+    line. places (lines,): at how many places, of neighbouring ports, a line has more than a short
+    alone can give it.
     """
 
     def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
@@ -173,7 +176,7 @@ class LinePairs:
             return ""
         return self._first(self._rest_apart < SAME_STDS, high)
 
-    def needs_frame(self, high: Bool, touched: Bool) -> bool:
+    def needs_frame(self, high: Bool, places: NDArray[np.intp]) -> bool:
         """Whether a frame with these lines is worth comparing: all pairs take long.
 
         A short shows in two high lines, a doubt in two touched ones. Without them a frame is still
@@ -181,10 +184,10 @@ class LinePairs:
         frame. Lines with fewer than three ports may be alike by chance.
         """
         some_count_is_full = self._alike_frames.max() >= ALIKE_FRAMES
-        some_lines = max(np.count_nonzero(high), np.count_nonzero(touched)) >= 2
+        some_lines = max(np.count_nonzero(high), np.count_nonzero(places)) >= 2
         return self._ports >= 3 and bool(self._is_first or some_count_is_full or some_lines)
 
-    def compare(self, now: PortCurrents, high: Bool, touched: Bool) -> tuple[str, Bool]:
+    def compare(self, now: PortCurrents, high: Bool, places: NDArray[np.intp]) -> tuple[str, Bool]:
         """Compare all pairs of lines in a frame.
 
         Returns the first pair of lines that is shorted, in words, or empty; and which lines are in
@@ -202,10 +205,11 @@ class LinePairs:
         # clearly more than this frame's noise is shorted; that may be so since before the frames.
         noisier = max(self._largest_std(now) / self._rest_std, 1.0)
         differed = self._rest_apart > 2 * SAME_STDS * noisier
-        since = self._never_apart & ~(touched & touched[:, None])
+        least_places = np.minimum(places, places[:, None])
+        since = self._never_apart & (least_places != 1)
         is_shorted = alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
         doubt = alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
-        doubt &= touched & touched[:, None]
+        doubt &= least_places > 0
         in_doubt = np.asarray(doubt.any(axis=0) | doubt.any(axis=1))
         return self._first(is_shorted, high), in_doubt
 
@@ -287,9 +291,11 @@ class SkinFaults:
         is_touched = now.current > TOUCHED_TIMES * self._rest.current + FAULT_STDS * now.std
         for axis, pairs in enumerate(self._pairs):
             high = np.asarray(is_higher.all(axis=1 - axis))
-            touched = np.asarray(is_touched.any(axis=1 - axis))
-            if pairs.needs_frame(high, touched):
-                pair, doubt = pairs.compare(now, high, touched)
+            touched = is_touched if axis == 0 else is_touched.T
+            begins = touched[:, 1:] & ~touched[:, :-1]
+            places = touched[:, 0] + np.count_nonzero(begins, axis=1)
+            if pairs.needs_frame(high, places):
+                pair, doubt = pairs.compare(now, high, places)
                 if pair:
                     return f"{pair} read alike as they did not at rest: shorted?"
                 self.doubt |= doubt[:, None] if axis == 0 else doubt
