@@ -52,7 +52,7 @@ def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str
     found = estimates(random_trial(8, 8, 8, FRAMES, 24001), method, short_ohm=20.0)
     late = found[20:]
     assert sum(one.converged for one in late) <= 6
-    assert sum(one.message == STAYS for one in late) >= 5  # that nothing else flags
+    assert sum(one.message == STAYS for one in late) >= 3  # that nothing else flags
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])

@@ -55,7 +55,9 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.wire_belief import Lesson, WireBelief
 
-# A step that turns back by more than this share of the one before is shortened. Chosen.
+# Fits that find their way take fewer steps. After these, a step that turns back by more than this
+# share of the one before is shortened. Chosen.
+USUAL_ITERATIONS: Final = 12
 TURNED_SHARE: Final = -0.25
 # Limits of a cell's log resistance.
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
@@ -153,16 +155,16 @@ class FullFit:
     def _minimise(self) -> None:
         """Steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
 
-        Each is first tried with the slopes of the one before, and shortened if it turns back. The
-        circuit is not evaluated after the last move: `modelled`, `misfit` and `wires` are what the
-        last step has forecast.
+        Each is first tried with the slopes of the one before; late ones are shortened if they turn
+        back. The circuit is not evaluated after the last move: `modelled`, `misfit` and `wires` are
+        what the last step has forecast.
         """
         self._linearise()
         step, moved_stds = self._step()
         before = np.zeros_like(step)
         while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
-            self._move(_damped(step, before))
+            self._move(step if self.iterations < USUAL_ITERATIONS else _damped(step, before))
             if moved_stds < CLOSE_STDS:
                 return
             before = step
