@@ -185,7 +185,8 @@ def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
     for name in ("BUSY_A_SLOT", "BUSY_A_READING", "BUSY_A_SCAN"):
         assert number(avr, name) == getattr(emulator, name)
     assert number(plan, "LINE_IDLE_PART") == emulator.LINE_IDLE_PART
-    assert number(plan, "IDLE_TO_CHANGE") == emulator.IDLE_TO_CHANGE
+    for name in ("IDLE_TO_CHANGE", "FEW", "IDLE_OF_FEW"):
+        assert number(plan, name) == getattr(emulator, name)
     assert f"OHMSKIN_ROWS_MAX {emulator.LINES_MAX}" in source("core/scan_sequence.h")
     slot_min, held = re.findall(r"\((\d+)u \* prescaler\(accuracy\)( / 2)?\)", source(avr))
     assert slot_min == (str(emulator.SLOT_ADC_CLOCKS_MIN), "")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Regions of the built firmware: their codes, order and times, changed while it scans."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ohmskin.link import framing, protocol
 
 pytestmark = pytest.mark.simavr
 
+MODES = list(protocol.MODES)
 REGION: dict[str, Any] = {
     "row_mask": 0b11100,
     "column_mask": 0b1110,
@@ -55,6 +57,30 @@ def test_the_second_scan_begun_after_the_command_has_the_new_region(rig: Rig) ->
         assert all(header["row_mask"] == REGION["row_mask"] for header in after[1:])
         assert len(after) > 4
         assert rig.check_regions().wrong == 0
+
+
+def test_the_smallest_regions_are_read_by_short_interrupts(
+    rig: Rig, rng: np.random.Generator
+) -> None:
+    """A scan of one to four readings begins, ends and changes in the same few slots.
+
+    At rate 0 they leave the processor no time to plan a region, so that a few scans are dropped.
+    """
+    go_fast(rig)
+    rig.start_scan()
+    rig.sim.reset_stats()
+    for mode, lines, whole_every in itertools.product(MODES, range(1, 5), (0, 1, 3)):
+        small = {"mode": mode, "row_mask": 1, "column_mask": protocol.all_lines(lines)}
+        by_row = {"row_mask": small["column_mask"], "column_mask": 2}
+        for region in small, small | by_row:
+            rig.must("set_region", **(REGION | region | {"whole_every": whole_every}))
+            rig.run(float(rng.uniform(0.01, 0.03)))
+            rig.randomize(rng)
+    rig.must("stop")
+    assert rig.check_regions().wrong == 0
+    last = rig.scans[-1].header
+    assert last["scan"] + 1 - len(rig.scans) == last["dropped"] < 10
+    assert rig.sim.stats()["interrupts"]["cycles_max"] <= 270
 
 
 def test_whole_scans_come_in_between(rig: Rig) -> None:

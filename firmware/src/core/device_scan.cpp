@@ -54,11 +54,19 @@ void Device::begin_scan() {
         send_pending();
     const Route &now = route();
     if (writer_.used() <= now.ring_limit) {
-        const frames::Scan header = {
-            scan_number_,     scan_time_us_,          dropped_,
-            reader_.errors(), settings_.request.rows, settings_.request.columns,
-            now.pattern,      board::ADC_BITS,        now.rows,
-            now.columns,      now.plan.slot_cycles};
+        // Field by field: an initializer clears all of it first, 1 % of the time of a scan of 3x3.
+        frames::Scan header;
+        header.scan = scan_number_;
+        header.time_us = scan_time_us_;
+        header.dropped = dropped_;
+        header.rx_errors = reader_.errors();
+        header.rows = settings_.request.rows;
+        header.columns = settings_.request.columns;
+        header.mode = now.pattern;
+        header.adc_bits = board::ADC_BITS;
+        header.row_mask = now.rows;
+        header.column_mask = now.columns;
+        header.slot_cycles = now.plan.slot_cycles;
         writer_.begin(Type::Scan);
         writer_.put(&header, sizeof header);
         codes_left_ = now.plan.readings;

@@ -115,7 +115,8 @@ class Planner {
         uint16_t slot_min = board::slot_min(accuracy_);
         if (least_us != 0 && settled > slot_min)
             slot_min = static_cast<uint16_t>(settled);
-        const uint16_t least = static_cast<uint16_t>(plan.readings + idle_min_);
+        const uint8_t idle_min = plan.readings <= FEW ? IDLE_OF_FEW : idle_min_;
+        const uint16_t least = static_cast<uint16_t>(plan.readings + idle_min);
 
         const uint32_t by_line = line_cycles(plan.readings);
         // The processor has what the interrupts of all slots leave, which are few where slots are

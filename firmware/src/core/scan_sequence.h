@@ -165,6 +165,7 @@ class ScanSequence {
         at_ = steps.first;
     }
     const Selection &at() const { return at_; }
+    const Steps &steps() const { return *steps_; }
 
     // Steps to the next reading; true when that is the first of a scan again.
     bool next() {

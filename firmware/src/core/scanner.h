@@ -48,14 +48,13 @@ class Scanner {
         alternates_ = routes.whole_every != 0;
         begin_scan(alternates_);
         idle_left_ = LEAD_IN;
-        idling_ = true;
         kinds_ = 0;
         write_ = read_ = 0;
         begun_ = 0;
         scans_ = 0;
         late_codes_ = 0;
-        skipping_ = true;
-        change_waits_ = stopping_ = parked_ = false;
+        takes_ = 0;
+        change_waits_ = stopping_ = pauses_ = parked_ = false;
         on_time_ = 0;
     }
     void begin(const Route &only) { begin(Routes{only, only, 0}); }
@@ -63,6 +62,7 @@ class Scanner {
     // Other routes, from the scan after the one in progress on. Not while a change waits.
     void change(const Routes &routes) {
         other_bank()->set(routes);
+        pauses_ = true;  // before change_waits_, whose end sets it back
         __atomic_signal_fence(
             __ATOMIC_SEQ_CST);  // the steps are there before change_waits_ says so
         change_waits_ = true;
@@ -90,7 +90,7 @@ class Scanner {
         kinds_ = kinds | next;
         return other_slots;
     }
-    uint16_t slot_cycles() const { return slot_cycles_; }
+    uint16_t slot_cycles() const { return sequence_.steps().slot_cycles; }
 
     // ---- main loop's side
     bool has_group() const { return static_cast<uint8_t>((write_ - read_) & QUEUE_MASK) >= GROUP; }
@@ -106,7 +106,10 @@ class Scanner {
         read_ = static_cast<uint8_t>((read_ + GROUP) & QUEUE_MASK);
     }
 
-    void stop_after_scan() { stopping_ = true; }
+    void stop_after_scan() {
+        stopping_ = true;
+        pauses_ = true;  // after stopping_, which the end of a change looks at
+    }
     // The last scan is over, and every code of it is in the queue.
     bool parked() const { return parked_; }
 
@@ -153,6 +156,7 @@ class Scanner {
     static constexpr uint8_t IDLE = 0, READING = 1, STARTS_SCAN = 2;
     static constexpr uint8_t HELD_SHIFT = 2 * KIND_BITS;
     static constexpr uint8_t HELD = 3 << HELD_SHIFT;
+    static constexpr uint8_t LAST = 3;  // the slot that selection() is for
 
     // Both kinds of scans, and when each has its turn. Whole scans have the same lines until
     // begin().
@@ -170,13 +174,13 @@ class Scanner {
 
     // Moves on to the slot after next, and says what it is for. kinds: before it.
     uint8_t next_kind(uint8_t kinds, bool *other_slots) {
-        if (idling_)
+        if ((kinds & LAST) == IDLE)
             return idle(kinds, other_slots);
         if (!sequence_.next())
             return READING;
-        uint16_t idle_slots = idle_slots_;
+        uint16_t idle_slots = sequence_.steps().idle_slots;
         if (idle_slots < IDLE_TO_CHANGE) {
-            if (stopping_ || change_waits_) {
+            if (pauses_) {
                 idle_slots = IDLE_TO_CHANGE;
             } else if (idle_slots == 0) {
                 begun_++;
@@ -184,7 +188,6 @@ class Scanner {
             }
         }
         idle_left_ = idle_slots;
-        idling_ = true;
         return IDLE;
     }
 
@@ -198,11 +201,12 @@ class Scanner {
         const uint16_t left = static_cast<uint16_t>(idle_left_ - 1);
         idle_left_ = left;
         if (left != 0) {
-            if (left == 1 && change_waits_)
+            // The first of the three slots that pauses_ makes. A change that comes later waits for
+            // the next scan's end: this one may be followed by fewer idle slots.
+            if (left == IDLE_TO_CHANGE - 1 && change_waits_)
                 take_change();
             return IDLE;
         }
-        idling_ = false;
         if (alternates_) {
             const uint16_t every = bank_->whole_every;
             alternates_ = every != 0;
@@ -213,14 +217,15 @@ class Scanner {
         return STARTS_SCAN;
     }
 
-    // The scan that begins next is the first of the other bank. A slot earlier than its begin, so
-    // that no interrupt has to do both.
+    // The scan that begins next is the first of the other bank. Earlier than its begin, so that no
+    // interrupt has to do both.
     void take_change() {
         Bank *const bank = other_bank();
         bank_ = bank;
         turns_.change(bank->whole_every);
         alternates_ = true;
         changed_at_ = begun_;
+        pauses_ = stopping_;
         __atomic_signal_fence(__ATOMIC_SEQ_CST);  // it is told before the other bank is free
         change_waits_ = false;
     }
@@ -229,10 +234,7 @@ class Scanner {
     // Takes the steps of the scan that begins.
     void begin_scan(bool whole) {
         const Bank &bank = *bank_;
-        const Steps &steps = whole ? bank.whole : bank.region;
-        sequence_.begin(whole ? whole_lines_ : bank.lines, steps);
-        idle_slots_ = steps.idle_slots;
-        slot_cycles_ = steps.slot_cycles;
+        sequence_.begin(whole ? whole_lines_ : bank.lines, whole ? bank.whole : bank.region);
     }
 
     // The end of the last group, which counts as full: its scan is over.
@@ -249,30 +251,31 @@ class Scanner {
     // too.
     void push(uint16_t code, uint8_t held, uint8_t converted) {
         uint8_t at = write_;
-        uint8_t mark = 0;
+        uint8_t mark = 0, takes = takes_;
         if (held == STARTS_SCAN << HELD_SHIFT) {
             at = whole_groups(at);
-            write_ = at;
             mark = scans_;
             scans_ = static_cast<uint8_t>(mark + 1);
             mark |= FIRST;
-            skipping_ = !on_time_;
+            takes_ = takes = on_time_;
         }
         const uint8_t of_group = at & (GROUP - 1);
         if (!converted) {
             late_codes_ = static_cast<uint16_t>(late_codes_ + 1);
-            skipping_ = true;
+            takes_ = 0;
             write_ = at ^ of_group;
             return;
         }
         if (of_group == 0) {
             const uint8_t end = static_cast<uint8_t>((at + GROUP) & QUEUE_MASK);
             if (end == read_)
-                skipping_ = true;
+                takes_ = takes = 0;
             marks_[at / GROUP] = mark;
         }
-        if (skipping_)
+        if (!takes) {
+            write_ = at;
             return;
+        }
         queue_[at] = code;
         __atomic_signal_fence(__ATOMIC_SEQ_CST);  // the code is there before write_ says so
         write_ = static_cast<uint8_t>((at + 1) & QUEUE_MASK);
@@ -285,21 +288,19 @@ class Scanner {
     volatile uint8_t write_ = 0;
     volatile uint8_t read_ = 0;
     volatile bool stopping_ = false;
+    volatile bool pauses_ = false;  // scans are followed by idle slots enough to stop or to change
     volatile bool parked_ = false;
     volatile bool change_waits_ = false;
     volatile uint8_t changed_at_ = 0;
     Bank *bank_ = nullptr;        // whose steps are in force; moved by the interrupt
-    bool skipping_ = false;       // codes are left out until the next scan starts
+    uint8_t takes_ = 0;           // 0: codes are left out until the next scan starts
     uint8_t on_time_ = 0;         // 0: no conversion had ended by the interrupt before
     bool alternates_ = false;     // the next scan may have other steps than the one before
-    bool idling_ = false;         // the slot that selection() is for is idle
     uint8_t kinds_ = 0;           // of the last slots, see above
     uint8_t begun_ = 0;           // number of the next scan to be decided on, modulo 256
     volatile uint8_t scans_ = 0;  // number of the next scan whose codes come
     volatile uint16_t late_codes_ = 0;
-    uint16_t idle_slots_ = 0;   // after each scan
-    uint16_t idle_left_ = 0;    // still to come before the next scan
-    uint16_t slot_cycles_ = 0;  // of the slot at hand and those after it
+    uint16_t idle_left_ = 0;  // idle slots still to come before the next scan
     Turns turns_;
     ScanSequence sequence_;
 };

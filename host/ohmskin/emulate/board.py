@@ -59,8 +59,9 @@ SETTLE_US: Final = dict(zip(protocol.MODES, (20, 35, 40, 101), strict=True))
 BUSY_A_SLOT, BUSY_A_READING, BUSY_A_SCAN = 165, 240, 5000
 # The line is fed so much slower than it could go, an eighth (scan_plan.h).
 LINE_IDLE_PART: Final = 8
-# Slots that are idle between scans of two kinds, at least (scan_plan.h).
-IDLE_TO_CHANGE: Final = 3
+# Slots that are idle between scans of two kinds, and after scans of up to `FEW` readings, at least
+# (scan_plan.h).
+IDLE_TO_CHANGE, FEW, IDLE_OF_FEW = 3, 3, 5
 # Rows and columns that the multiplexers have (scan_sequence.h).
 LINES_MAX: Final = 16
 # A byte takes so many bits on the line, 8N1.
@@ -429,7 +430,8 @@ def _scan_plan(wanted: dict[str, Any], baud: int) -> ScanPlan:
     masks, mode = (wanted["row_mask"], wanted["column_mask"]), wanted["mode"]
     prescaler = _PRESCALERS[wanted["accuracy"]]
     readings = math.prod(mask.bit_count() for mask in masks) * len(protocol.MODES[mode])
-    least = readings + IDLE_TO_CHANGE * (wanted["whole_every"] > 0)  # slots
+    idle_min = IDLE_TO_CHANGE if wanted["whole_every"] else 0
+    least = readings + (IDLE_OF_FEW if readings <= FEW else idle_min)  # slots
     rate, settle = wanted["rate_mhz"], wanted["settle_us"]
     slot, held = SLOT_ADC_CLOCKS_MIN * prescaler, int(HELD_ADC_CLOCKS * prescaler)
     if settle or not rate:
