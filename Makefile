@@ -177,7 +177,7 @@ bench-knead: setup-host ## measure forces of skins that were kneaded over a scal
 bench-honest: setup-host ## measure whether answers say so where a skin is not as the model supposes
 	$(BENCH)/bench_honest.py
 
-bench-pace: setup-host ## measure what it costs to read less of a skin, and what it saves, simulated
+bench-pace: setup firmware sim ## measure what it costs to read less of a skin, and what it saves, simulated
 	$(BENCH)/bench_pace.py
 
 bench-far: setup-host ## measure what sensing both ends of the lines gains, beside near ends alone

@@ -19,6 +19,8 @@ desk_*              the same scenes on the desk of `make bench-desk`: the built 
 partial_*           a region of 3x3 cells around one fingertip, b alone, after one whole frame in
                     thirty: time of its estimate over that of whole frames, and in units of `make
                     bench-estimators`.
+focus_*, new_touch_*, refocus_*, slip_*, clock_*
+                    the host and the built firmware together: focused.py says what they are.
 joint_16x16_*       time of `joint` under a fingertip on 16x16 cells, wires not told, in units of
                     8x8 cells: median and 99th percentile.
 """
@@ -32,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+import focused
 from bars import Part, at_least, at_most, run  # beside this file
 from bench_estimators import times_of, unit_s
 from desk import paced_skin  # tests/helpers
@@ -198,7 +201,8 @@ def of_large(part: Part) -> dict[str, float]:
 
 def measure(part: Part) -> dict[str, float]:
     """All figures, as the JSON line has them."""
-    return of_modes(part) | of_desk(part) | of_region(part) | of_large(part)
+    parts = (of_modes, of_desk, of_region, focused.measure, of_large)
+    return {name: value for figures in parts for name, value in figures(part).items()}
 
 
 BARS = [
@@ -214,6 +218,12 @@ BARS = [
     at_least("desk_quick_hz", 120),
     at_most("partial_time_over_whole", 0.6),
     at_most("partial_3x3_units", 5),
+    at_most("focus_error_over_whole", 1.2),
+    at_most("new_touch_s", 0.1),
+    at_most("refocus_scans", 2),
+    at_most("slip_hz_error", 0.01),
+    at_most("slip_amplitude_error", 0.1),
+    at_most("clock_delay_error_ms", 0.3),
     at_most("joint_16x16_finger_units", 115),
     at_most("joint_16x16_finger_units_p99", 145),
 ]

@@ -22,7 +22,7 @@ import ohmskin
 from calibrations import half_doubtful, of_scene
 from command_line import Run, python, well
 from lsl_stub import CLOCK_OFFSET_S, StreamInfo, pylsl_module
-from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.emulate.scenes import BEGIN_S, SLIP_HZ, SLIP_SHARE, Scene
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
 from places import ROOT
@@ -99,6 +99,24 @@ def test_forces_says_where_a_force_is_uncertain(tmp_path: Path) -> None:
     assert first == "uncertain at (2.0, 2.0)\n"
     assert re.fullmatch(r"1\.2\d \+- 0\.0\d N at \(2\.0, 5\.0\)\n", second)
     assert third == "uncertain at (5.0, 2.0)\n"
+
+
+def test_slip_shows_what_only_a_region_is_fast_enough_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skin, picture = tmp_path / "skin.json", tmp_path / "slip.png"
+    of_scene("slip").save(skin)
+    port = "emulator://8x8?scene=slip&seed=1&begin=0&speed=0"
+    example("slip").main(port, str(skin), str(picture))
+    line = r"(\d+) times .*: the strongest line is ([\d.]+) % of .* at ([\d.]+) Hz"
+    found = re.findall(line, capsys.readouterr().out)
+    (whole_hz, _, seen_hz), (region_hz, share, true_hz) = [list(map(float, line)) for line in found]
+    assert (whole_hz, seen_hz) == (90, abs(SLIP_HZ - 2 * 90))  # 200 Hz look like 20
+    assert region_hz > 600
+    assert true_hz == pytest.approx(SLIP_HZ, rel=0.01)
+    # The calibration's cells are linear; those of the scene add k F^1.7.
+    assert share == pytest.approx(1.7 * 100 * SLIP_SHARE, rel=0.1)
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> None:
@@ -231,6 +249,6 @@ def test_an_example_without_arguments_says_how_to_call_it(name: str) -> None:
 def test_every_example_is_run_here() -> None:
     tested = {
         *("every_scan.py", "estimate.py", "forces.py", "two_boards.py"),
-        "lsl_outlet.py",
+        *("lsl_outlet.py", "slip.py"),
     }
     assert {path.name for path in EXAMPLES.glob("*.py")} == tested

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ohmskin.force.simulated import SimulatedSkin
     from ohmskin.force.tables import load_forces
     from ohmskin.link.clock import BoardClock
-    from ohmskin.link.device import Device
+    from ohmskin.link.device import Device, Region
     from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
     from ohmskin.live import LiveSkin
     from ohmskin.opening import open
@@ -66,6 +66,7 @@ __all__ = [
     "ProtocolMismatch",
     "RecordingEnded",
     "RecordingError",
+    "Region",
     "Scan",
     "SelfTestReport",
     "SimulatedSkin",
@@ -99,7 +100,7 @@ _MODULES = {
     "force.simulated": ("SimulatedSkin",),
     "force.tables": ("load_forces",),
     "link.clock": ("BoardClock",),
-    "link.device": ("Device",),
+    "link.device": ("Device", "Region"),
     "link.messages": ("BoardStats", "Hello", "Scan", "SelfTestReport"),
     "live": ("LiveSkin",),
     "opening": ("open",),

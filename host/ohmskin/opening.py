@@ -24,7 +24,7 @@ from ohmskin.errors import PortError
 from ohmskin.files import PathName
 from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import CalibratedSkin
-from ohmskin.link.device import Device
+from ohmskin.link.device import Device, Region
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
 from ohmskin.link.url import PortUrl
@@ -43,7 +43,7 @@ def open(
     start: bool = True,
     calibration: CalibrationLike,
     force: bool = False,
-    focus: bool = False,
+    focus: bool | Region = False,
 ) -> CalibratedSkin: ...
 
 
@@ -53,13 +53,14 @@ def open(
     start: bool = True,
     calibration: CalibrationLike | None = None,
     force: bool = False,
-    focus: bool = False,
+    focus: bool | Region = False,
 ) -> Device | CalibratedSkin:
     """Connect to a board, and start scanning unless told otherwise.
 
     calibration: a `Calibration` or the path of its file; scans then carry forces. force: take it
     even if it is of another unit. focus: while somebody iterates, a region around the contacts is
-    read, a thousand times a second or more, and the whole skin `focus.WHOLE_HZ` times.
+    read, hundreds of times a second, and the whole skin `focus.WHOLE_HZ` times. A `Region` says
+    how: ``Region(settle_us=20)`` reads 3x3 cells a thousand times, less well where lines charge.
 
     >>> with open("emulator://8x8?scene=ghost") as skin:
     ...     skin.latest().ratio.shape

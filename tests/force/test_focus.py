@@ -12,8 +12,9 @@ import ohmskin
 from calibrations import of_scene
 from ohmskin.arrays import Bool
 from ohmskin.errors import CommandRefused
-from ohmskin.force.focus import Focus, Lines, wanted_lines
+from ohmskin.force.focus import WHOLE_HZ, Focus, Lines, wanted_lines
 from ohmskin.link.device import Region, scans_for
+from ohmskin.link.messages import Hello
 from ohmskin.record.recorder import Recorder, record
 from stepped import stepped
 from studies.judge import STATED_STDS
@@ -62,17 +63,37 @@ def test_a_region_stays_while_it_holds_what_is_touched_and_little_more() -> None
 def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> None:
     """It may be the ghost of touches outside of the region."""
     asked: list[Region] = []
-    info = stepped("emulator://8x8").info
-    focus = Focus(SimpleNamespace(info=info, set_region=asked.append))
+    info = replace(stepped("emulator://8x8").info, whole_scan_cycles=177_000)
+
+    def set_region(region: Region) -> Hello:
+        asked.append(region)
+        return info
+
+    focus = Focus(SimpleNamespace(info=info, set_region=set_region))
     assert (asked.pop().rows, asked) == (None, [])
     whole, some = SimpleNamespace(is_whole=True), SimpleNamespace(is_whole=False)
     focus.follow(touched((3, 4)), 1, whole)
     focus.follow(touched((3, 4)), 1, some)
-    assert [(region.rows, region.mode) for region in asked] == [(range(2, 5), "quick")]
+    # Twice, where the board has said how long its scans take.
+    assert {(region.rows, region.mode) for region in asked} == {(range(2, 5), "quick")}
     focus.follow(touched((3, 4), (3, 6)), 2, some)
     assert (asked[-1].rows, asked[-1].mode) == (None, "near")
     focus.follow(touched((3, 4), (3, 6)), 2, whole)
     assert (asked[-1].columns, asked[-1].mode) == (range(3, 8), "quick")
+
+
+@pytest.mark.parametrize("settle_us", [0, 20])
+@pytest.mark.parametrize("size", [3, 5])
+def test_whole_scans_come_as_often_whatever_a_region_takes(size: int, settle_us: int) -> None:
+    skin = stepped("emulator://8x8?scene=single&begin=0")
+    like = Region(mode="quick", whole_mode="near", settle_us=settle_us)
+    with Focus(skin, like) as focus:
+        cells = touched(*((row, row) for row in range(2, size)))
+        focus.follow(cells, 1, next(iter(skin)))
+        board = skin.info
+    assert (board.row_mask.bit_count(), board.settle_us > 90) == (size, settle_us == 0)
+    period = board.whole_every * board.scan_cycles + board.whole_scan_cycles - board.scan_cycles
+    assert 0.9 / WHOLE_HZ < period / board.clock_hz < 1.1 / WHOLE_HZ
 
 
 def test_who_has_followed_contacts_leaves_the_board_as_it_was() -> None:

@@ -15,6 +15,7 @@ from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.doctor.examine import Evidence, examine
 from ohmskin.doctor.findings import Diagnosis
 from ohmskin.doctor.wires import CornerScans, moved_across, suggested_corners
+from ohmskin.emulate.simavr import SkinSim
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Scan
@@ -52,7 +53,7 @@ def _on_desk(seed: int, mode: str = "near", **settings: float) -> Iterator[tuple
         rig.sim.set(desk=1)
         rig.sim.set(**converter | settings | {"far_open": float(mode == "near")})
         rig.run(0.3)
-        _show(rig, rest, mode)
+        show(rig.sim, rest, mode)
         rig.start_scan(mode=mode)
         rig.sim.hold_log(False)
         yield rig, rest, random
@@ -68,7 +69,7 @@ def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) 
         rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
         ratios = []
         for skin in skins:
-            _show(rig, skin, mode)
+            show(rig.sim, skin, mode)
             ratios.append(ratio_from_codes(_scans(rig, SCANS)))
     return DeskSkin(rest, rest_ratio, skins, ratios)
 
@@ -91,7 +92,7 @@ class PacedSkin:
 def paced_skin(seed: int, trial: Trial, **scan: Any) -> PacedSkin:
     """A trial of 8x8 cells on the desk of this seed, at rest in mode near at 90 Hz, then so."""
     with _on_desk(seed) as (rig, _, _):
-        _show(rig, trial.rest, "near")
+        show(rig.sim, trial.rest, "near")
         rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
         rig.must("stop")
         rig.start_scan(**scan)
@@ -99,7 +100,7 @@ def paced_skin(seed: int, trial: Trial, **scan: Any) -> PacedSkin:
         scans_hz = CPU_HZ / rig.hello()["scan_cycles"]
         ratios = []
         for skin in trial.frames:
-            _show(rig, skin, "near")
+            show(rig.sim, skin, "near")
             rig.scans.clear()
             ratios.append(list(_until_third(rig, scan["mode"])))
     return PacedSkin(trial, scans_hz, rest_ratio, ratios)
@@ -131,20 +132,21 @@ def examined(seed: int, nominal: tuple[float, float]) -> Diagnosis:
         for cells in (corners, moved_across(corners)):
             siemens = rest.cell_siemens.copy()
             siemens[tuple(np.transpose(cells))] += 1 / PRESS_OHM
-            _show(rig, replace(rest, cell_siemens=siemens), "near")
+            show(rig.sim, replace(rest, cell_siemens=siemens), "near")
             for codes in _scans(rig, LOOK_SCANS):
                 presses.take(Scan(codes, 0, 0, 0.0, 0))
     return examine(Evidence(board, scans, told=WireOhm(*nominal, lead=0.0), presses=presses))
 
 
-def _show(rig: Rig, skin: Skin, mode: str) -> None:
+def show(sim: SkinSim, skin: Skin, mode: str = "near") -> None:
+    """Let a simulated board read this skin from now on."""
     if mode == "far":
         ends = end_admittance(skin)
-        rig.sim.set_table(all_readings(skin, ends.copy()))
-        rig.sim.request("C", bytes([0x80 | skin.shape[0]]) + ends.tobytes())
+        sim.set_table(all_readings(skin, ends.copy()))
+        sim.request("C", bytes([0x80 | skin.shape[0]]) + ends.tobytes())
     else:
-        rig.sim.request("C", bytes([skin.shape[0]]) + near_admittance(skin).tobytes())
-        rig.sim.set_table(readings(skin))
+        sim.request("C", bytes([skin.shape[0]]) + near_admittance(skin).tobytes())
+        sim.set_table(readings(skin))
 
 
 def near_admittance(skin: Skin) -> Float:

@@ -57,6 +57,13 @@ _FINGER_STD_CELLS: Final = 0.7
 # A cell in its middle gains this conductance [S]. Chosen: 5 kOhm is a firm touch.
 _FINGER_SIEMENS: Final = 2e-4
 
+# In the scene "slip", a fingertip presses with this force [N], as one that holds a cup.
+_SLIP_N: Final = 4.0
+# Its force trembles so often in a second, and by this share to either side. Chosen: as where a
+# thing begins to slip.
+SLIP_HZ: Final = 200.0
+SLIP_SHARE: Final = 0.05
+
 # A force of 1 N adds this conductance to a usual cell [S]. Chosen: as in the studies' model of
 # textile contact (studies/press.py).
 _SIEMENS_AT_1N: Final = 30e-6
@@ -105,6 +112,8 @@ SCENES: Final = {
     f"{_CORNERS_HELD_S:g} s one of them moves across",
     "moving": f"after {BEGIN_S:g} s, one fingertip on a closed curve over the whole skin, once in "
     f"{_MOVING_PERIOD_S:g} s",
+    "slip": f"after {BEGIN_S:g} s, one fingertip that stays; its {_SLIP_N:g} N tremble by "
+    f"{100 * SLIP_SHARE:g} % {SLIP_HZ:g} times a second",
     "presses": f"after {_ROBOT_BEGIN_S:g} s, a robot presses cell after cell {ROBOT_PRESSES} times "
     f"with {_ROBOT_PEAK_N[0]:g} to {_ROBOT_PEAK_N[1]:g} N, which takes some 4.5 s a cell",
     "knead": f"{_ROBOT_BEGIN_S:g} s after scans begin, one fingertip after another with "
@@ -147,7 +156,7 @@ class Scene:
         self.name = name
         self.rows = rows
         self.columns = columns
-        self.moves = name in ("corners", "moving", "presses", "knead", "weights")
+        self.moves = name in ("corners", "moving", "slip", "presses", "knead", "weights")
         self._waits_s = _BEGIN_S.get(name, BEGIN_S) if begin_s is None else begin_s
         self.begin_s = self._waits_s
         if not self.begin_s >= 0:
@@ -233,6 +242,10 @@ class Scene:
                 return self._corners(time_s)
             case "moving":
                 return self._finger(time_s)
+            case "slip":
+                row, column = (self.rows - 1) / 2, (self.columns - 1) / 2
+                tremble = SLIP_SHARE * np.sin(2 * np.pi * SLIP_HZ * (time_s - self.begin_s))
+                return self._by_force(_SLIP_N * (1 + tremble) * self._pressure(row, column))
             case "presses":
                 cell, _, force_n = self._robot.at(time_s - self.begin_s)
                 of_cells = np.arange(self._touches.size) == cell // ROBOT_PRESSES

@@ -77,8 +77,10 @@ class PartialEnds:
 
     def keep(self, shown: Shown) -> None:
         """A frame of all readings has shown this."""
-        noise = min(shown.noise or np.inf, self._rest.noise or np.inf)
-        self._last, self.region = shown._replace(noise=noise), None
+        # Without noise, all readings of a frame may agree: then it does not show how much there is.
+        noises = [each for each in (shown.noise, self._rest.noise) if each]
+        self._last = shown._replace(noise=min(noises, default=None))
+        self.region = None
         self._age = np.zeros_like(self._age)
 
     def keep_as_rest(self) -> None:

@@ -120,7 +120,7 @@ class RegionFit:
                 break
         residual = residual - by_cell @ move
         self._x = x
-        if not is_last or residual @ residual > MAX_CHI2 * region.size:
+        if not is_last or not residual @ residual <= MAX_CHI2 * region.size:
             return False
         whitened_means = solve_lower(factor, self._by_wires[:, -whole.belief.means.size :])
         covariance = solve_positive(system, self._eye.copy(order="F"))

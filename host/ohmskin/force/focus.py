@@ -8,6 +8,7 @@ of others outside, so the scan after it is a whole one.
 
 import threading
 from contextlib import suppress
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,11 +18,10 @@ from ohmskin.errors import CommandRefused, DeviceLost
 from ohmskin.files import Closing
 from ohmskin.link.device import Device, Region
 from ohmskin.link.messages import Scan
-from ohmskin.link.protocol import MODES
 
 # Whole scans come so often at least [Hz]. Chosen: a new touch is seen within a tenth of a second,
-# estimate and command included.
-WHOLE_HZ: Final = 15.0
+# even if it comes just behind a whole scan; the scan, its way and its estimate included.
+WHOLE_HZ: Final = 18.0
 # Lines around the touched ones that are read, too. Chosen: a fingertip that moves by a line is
 # still inside when the next region is asked for.
 MARGIN: Final = 1
@@ -30,9 +30,11 @@ MARGIN: Final = 1
 SPARE: Final = 1
 # A region of more of the cells is no faster than all of them. Chosen.
 MOST_SHARE: Final = 0.6
-# A small scan on the line: its header, its codes and what frames them. Chosen: that of 3x3 cells.
-_FRAME_BYTES: Final = 54
-_BITS_OF_BYTE: Final = 10  # one start bit and one stop bit
+# How regions are read, unless told: as fast as is accurate (docs/accuracy.md).
+FOLLOWING: Final = Region(mode="quick", whole_mode="near")
+# What is asked for before a board has said how long scans take, and how often it is asked again.
+_FIRST_EVERY: Final = 20
+_TRIES: Final = 2
 
 
 class Lines(NamedTuple):
@@ -52,21 +54,24 @@ class Lines(NamedTuple):
 class Focus(Closing):
     """Tells a board where to read next, scan after scan, until it is closed.
 
-    mode: which readings a region has. whole_mode: which the whole skin has.
+    like: how the region is read, and the whole skin in between. Rows and columns are those of the
+        contacts, and `whole_every` is what `WHOLE_HZ` needs.
 
     :raises CommandRefused: the board has no regions, or is a recording.
     :raises ValueError: the board reads far ends, which no region shows.
     """
 
-    def __init__(self, device: Device, mode: str = "quick", whole_mode: str = "near") -> None:
-        self._device, self._mode, self._whole_mode = device, mode, whole_mode
+    def __init__(self, device: Device, like: Region = FOLLOWING) -> None:
+        self._device, self._like = device, like
         self._lines: Lines | None = None
         self._contacts = 0
         self._lock, self._closed = threading.Lock(), False
         self._before = Region.of(device.info)
         if device.info.reads_far:
             raise ValueError("only near ends can be followed: 'ohmskin configure PORT --mode near'")
-        device.set_region(Region(mode=whole_mode))
+        # How long a scan of a region takes for each of its cells, and a whole scan [s].
+        self._cell_s = self._whole_s = 0.0
+        self._ask(None)
 
     def follow(self, touched: Bool, contacts: int, scan: Scan) -> None:
         """After a scan that showed these cells (R, C) touched, and so many contacts.
@@ -80,7 +85,7 @@ class Focus(Closing):
         with self._lock:
             if lines != self._lines and not self._closed:
                 self._lines = lines
-                self._device.set_region(self._region(lines))
+                self._ask(lines)
 
     def close(self) -> None:
         """Let the board scan as before. May be called again."""
@@ -89,18 +94,26 @@ class Focus(Closing):
                 self._closed = True
                 self._device.set_region(self._before)
 
-    def _region(self, lines: Lines | None) -> Region:
+    def _ask(self, lines: Lines | None) -> None:
+        """Ask for these lines; None: for the whole skin."""
         if lines is None:
-            return Region(mode=self._whole_mode)
-        board = self._device.info
-        reading_s = board.slot_cycles / board.clock_hz
+            self._device.set_region(Region(mode=self._like.whole_mode))
+            return
         cells = len(lines.rows) * len(lines.columns)
-        scan_s = max(
-            cells * len(MODES[self._mode]) * reading_s, _FRAME_BYTES * _BITS_OF_BYTE / board.baud
-        )
-        whole_s = board.rows * board.columns * len(MODES[self._whole_mode]) * reading_s
-        every = max(round((1 / WHOLE_HZ - whole_s) / scan_s), 2)
-        return Region(*lines, mode=self._mode, whole_every=every, whole_mode=self._whole_mode)
+        for _ in range(_TRIES):
+            every = self._whole_every(cells)
+            region = replace(self._like, rows=lines.rows, columns=lines.columns, whole_every=every)
+            found = self._device.set_region(region)
+            self._cell_s = found.scan_cycles / found.clock_hz / cells
+            self._whole_s = found.whole_scan_cycles / found.clock_hz
+            if abs(self._whole_every(cells) - every) <= 1 + every / 10:
+                break
+
+    def _whole_every(self, cells: int) -> int:
+        """Each how many-th scan is a whole one, for a region of so many cells."""
+        if not self._cell_s:
+            return _FIRST_EVERY
+        return max(int((1 / WHOLE_HZ - self._whole_s) / (self._cell_s * cells)) + 1, 2)
 
 
 def wanted_lines(touched: Bool, before: Lines | None) -> Lines | None:

@@ -29,10 +29,10 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
-from ohmskin.force.focus import Focus
+from ohmskin.force.focus import FOLLOWING, Focus
 from ohmskin.force.geometry import Geometry
 from ohmskin.link.codes import quantise
-from ohmskin.link.device import Device, in_threads
+from ohmskin.link.device import Device, Region, in_threads
 from ohmskin.link.messages import BoardStats, Hello, Scan
 from ohmskin.link.protocol import MODES
 
@@ -346,9 +346,9 @@ class CalibratedSkin(Closing):
     """A device whose scans carry forces, and which can be tared. Made by ``ohmskin.open``.
 
     device: the board or recording alone, with all its commands. force: take the calibration of
-    another unit. focus: scans follow the contacts while somebody iterates (`focus`). Iterating and
-    `latest` are those of `Device`, with forces. Where another unit comes behind the same line, they
-    end by DeviceLost.
+    another unit. focus: scans follow the contacts while somebody iterates (`focus`); a `Region`
+    says how the region is read. Iterating and `latest` are those of `Device`, with forces. Where
+    another unit comes behind the same line, they end by DeviceLost.
 
     :raises ValueError: the calibration is of another unit or geometry.
     """
@@ -359,13 +359,13 @@ class CalibratedSkin(Closing):
         calibration: Calibration,
         *,
         force: bool = False,
-        focus: bool = False,
+        focus: bool | Region = False,
     ) -> None:
         self.device = device
         self.name = device.name
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
-        self._focus = Focus(device) if focus else None
+        self._focus = Focus(device, FOLLOWING if focus is True else focus) if focus else None
         device.only_unit = device.info.unit_id
         self._reader.warm_up()
         self._lock = threading.Lock()  # a reader takes one scan at a time

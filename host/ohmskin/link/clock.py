@@ -23,7 +23,15 @@ line of that chain at the mean of u [Zhang2002]. Late points change nothing, how
 and however late, as long as some points are on time. A line of least squares would move with the
 load of the machine.
 
-A delay that all scans have in common cannot be seen and is part of h.
+A delay d_in that all scans have in common is part of h, and scans alone cannot show it. Commands
+can, because a board's answer says at which u it has read the command. One that left at s, and was
+d_out on its way, came at s + d_out. So
+
+    h(u) - s >= d_in + d_out,    answer's t - s >= d_in + d_out
+
+both without what the bytes take on the line, and the least of all such differences is taken for the
+sum. No clock can tell one way from the other, so half of the sum is taken for each, as other
+protocols of time do [Mills1991]: times of scans are then off by half of it at most.
 
 The line is fitted to the last `FIT_WINDOW_S`, because a resonator drifts while it warms. A new line
 would make times jump, and perhaps go back. Therefore the difference to the old line is added at
@@ -31,7 +39,8 @@ first, and fades within a second.
 
 [Moon1999]: Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
 measurements". [Zhang2002]: Zhang, Liu, Xia, "Clock synchronization algorithms for network
-measurements". Both INFOCOM.
+measurements". Both INFOCOM. [Mills1991]: Mills, "Internet time synchronization: the network time
+protocol", IEEE Transactions on Communications 39(10).
 """
 
 import math
@@ -45,7 +54,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.link import protocol
-from ohmskin.link.framing import MAX_BLOCK_BYTES, cobs_encode
+from ohmskin.link.framing import MAX_BLOCK_BYTES, cobs_encode, encode
 from ohmskin.link.messages import MAX_RATE_ERROR, Hello, Scan
 
 # Board time of the points that a line is fitted to. A ceramic resonator that warms drifts by up to
@@ -64,9 +73,14 @@ _SLEW_S: Final = 1.0
 # A byte takes ten bits on a line of 8N1, as frames.toml says of `baud_default`: a start bit, eight
 # data bits and a stop bit.
 _BITS_PER_BYTE: Final = 10
+# The newest so many commands show delays. Chosen: one in a hundred is late, and few are as many.
+_COMMANDS: Final = 16
 # Time for the last conversion and for the pass of the main loop that packs its cell: 0.1 ms fits
 # the built firmware in the simulator (tests/link/test_timing.py).
 _FIRMWARE_S: Final = 0.1e-3
+
+# The board's clock goes on with 0 after so long, in an answer.
+_TIME_SPAN_S: Final = 1e-6 * protocol.FRAMES["ack"].span("time_us")
 
 _Point = tuple[float, float]  # (u, t)
 
@@ -84,6 +98,18 @@ def scan_s(board: Hello, scan: Scan | None = None) -> float:
     if scan is None:
         return board.readings * slot_s(board)
     return scan.codes_read.size * (scan.slot_cycles or board.slot_cycles) / board.clock_hz
+
+
+def byte_s(board: Hello) -> float:
+    """Time that a byte takes on the line [s]; 0 on that of an emulated board."""
+    return 0.0 if board.board == "emulated" else _BITS_PER_BYTE / board.baud
+
+
+def answer_delay_s(board: Hello) -> float:
+    """Time from a command's last byte to that of the answer of a board that does not scan [s]."""
+    ack = protocol.FRAMES["ack"]
+    size = len(encode(ack.id, 1, bytes(ack.struct.size)))
+    return size * byte_s(board) + _FIRMWARE_S * (board.board != "emulated")
 
 
 def line_delay_s(scan: Scan, board: Hello) -> float:
@@ -108,7 +134,7 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     codes = protocol.pack_codes(scan.codes_read, protocol.PER_PASS[scan.mode], scan.adc_bits)
     # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
     wire = cobs_encode(header + codes + b"\x01\x01")
-    byte_on_line_s = _BITS_PER_BYTE / board.baud
+    byte_on_line_s = byte_s(board)
     byte_of_scan_s = scan_s(board, scan) / len(codes)
     delay_s, begin, unknown = 0.0, 0, len(header) + len(codes)  # bytes of content not known yet
     while begin < len(wire):
@@ -186,6 +212,37 @@ class BoardClock:
         self._last_u_s = 0.0  # of the newest point
         # What the line before the present one gave more at this time u; see the module.
         self._slew_s, self._slew_from_u_s = 0.0, 0.0
+        # Of commands among scans: u at which the board had read them, and when they left.
+        self._commands: deque[_Point] = deque()
+        self._delay_s = math.inf  # the least that answers have shown, or commands before those
+
+    @property
+    def delay_s(self) -> float:
+        """The constant delays of both directions together [s]; 0: no command has shown them."""
+        least_s = self._delay_s
+        for u_s, sent_s in self._commands:
+            assert self._line is not None
+            least_s = min(least_s, self._line.at(u_s) - sent_s)
+        return max(least_s, 0.0) if least_s < math.inf else 0.0
+
+    def answered(self, time_us: float, sent_s: float, host_time_s: float) -> None:
+        """Learn that the answer to a command that left at `sent_s` was known at `host_time_s`.
+
+        time_us: the board's clock when it had read the command; it may wrap. Both host times are
+        without what the bytes take on the line.
+        """
+        self._delay_s = min(self._delay_s, host_time_s - sent_s)
+        u_s = self._last_u_s + math.remainder(1e-6 * time_us - self._last_u_s, _TIME_SPAN_S)
+        # Where no scans come, the line is of another time, and perhaps of before a reset.
+        if self._line is not None and abs(u_s - self._last_u_s) < _BLOCK_S:
+            if len(self._commands) == _COMMANDS:
+                self._forget_command()
+            self._commands.append((u_s, sent_s))
+
+    def _forget_command(self) -> None:
+        """Forget the oldest one, but not what it has shown."""
+        self._delay_s = self.delay_s
+        self._commands.popleft()
 
     def add(self, time_us: float, host_time_s: float) -> None:
         """Learn that something at `time_us` of the board's clock was known here at `host_time_s`.
@@ -201,6 +258,8 @@ class BoardClock:
         self._last_u_s = u_s
         ends_block = u_s - self._block_u_s >= _BLOCK_S
         if ends_block:
+            if self._commands and u_s - self._commands[0][0] > FIT_WINDOW_S:
+                self._forget_command()
             while self._points and u_s - self._points[0][0] > FIT_WINDOW_S:
                 self._points.popleft()
             self._points.append((u_s, t_s))
@@ -225,6 +284,7 @@ class BoardClock:
         rate = self._line.rate if self._line else 1.0  # a restart does not change the resonator
         self._line = _Line(rate, u_s, t_s)
         self._points = deque([(u_s, t_s)])
+        self._commands.clear()
         self._last_u_s = self._block_u_s = u_s
         self._slew_s = 0.0
 
@@ -241,21 +301,23 @@ class ScanClock:
     """Says of scan after scan of a board when its middle was, by a `BoardClock`.
 
     epoch_ns: the time since 1970 [ns] at which the clock of `Scan.host_time_s` showed 0. It stays,
-    so that no clock of the day that is set anew makes times jump.
+    so that no clock of the day that is set anew makes times jump. board: what is learned of the
+    board's clock.
     """
 
     def __init__(self, epoch_ns: int) -> None:
         self._epoch_ns = epoch_ns
-        self._clock = BoardClock()
+        self.board = BoardClock()
 
     def time_ns(self, scan: Scan, board: Hello) -> int:
         """The middle of this scan, the newest so far, since 1970 [ns].
 
-        It is late by the delay that USB has for all scans alike, which no host can see.
+        Half of `Scan.delay_s` is taken for the way of scans, so it is off by half at most.
         """
         took_us = 1e6 * scan_s(board, scan)
-        self._clock.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
-        return self._epoch_ns + round(1e9 * self._clock.host_s(scan.time_us + took_us / 2))
+        self.board.add(scan.time_us + took_us, scan.host_time_s - line_delay_s(scan, board))
+        middle_s = self.board.host_s(scan.time_us + took_us / 2) - scan.delay_s / 2
+        return self._epoch_ns + round(1e9 * middle_s)
 
 
 def scan_times_s(scans: list[Scan]) -> Float:

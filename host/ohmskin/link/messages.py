@@ -196,6 +196,8 @@ class Scan:
         were damaged on the way.
     mode: which readings these are, a name of the enum `mode`.
     time_ns: when the middle of the scan was, since 1970 [ns], by `ScanClock`; 0: nobody asked it.
+    delay_s: constant delays of both directions of the line together, by `BoardClock` [s]; 0: not
+        known.
     adc_bits: of a code.
     row_mask, column_mask: which rows and columns were read, bit 0 for the first; 0: all.
     slot_cycles: time from one reading to the next [clock cycles of the board]; 0: that of `board`.
@@ -210,6 +212,7 @@ class Scan:
     missed: int
     mode: str = field(default="near", kw_only=True)
     time_ns: int = field(default=0, kw_only=True)
+    delay_s: float = field(default=0.0, kw_only=True)
     adc_bits: int = field(default=protocol.ADC_BITS, kw_only=True)
     row_mask: int = field(default=0, kw_only=True)
     column_mask: int = field(default=0, kw_only=True)

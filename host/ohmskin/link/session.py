@@ -22,7 +22,7 @@ from ohmskin.errors import (
     ProtocolMismatch,
 )
 from ohmskin.link import framing, layouts, protocol
-from ohmskin.link.clock import ScanClock
+from ohmskin.link.clock import ScanClock, answer_delay_s, byte_s
 from ohmskin.link.device import COMMAND_TRIES, LOG, Device, configuration
 from ohmskin.link.messages import (
     Ack,
@@ -102,6 +102,9 @@ class Session(Device):
         self._decoder = BoardDecoder()
         super().__init__(link.name, self._decoder.stats)
         self._acks: dict[int, Ack] = {}  # by the sequence numbers of their commands
+        self._sent_s: dict[
+            int, float
+        ] = {}  # likewise: when they were sent, and the line had taken them
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0  # number of the last command
         self._clock = ScanClock(time.time_ns() - round(1e9 * self.now_s))
@@ -109,8 +112,9 @@ class Session(Device):
         self._begin_thread(self._read, f"read {self.name}")
         try:
             self._connect()
-            if self.info.scanning:
-                self._command("stop")
+            scanned = self.info.scanning
+            self._command("stop")  # also where it does not scan: its answer shows the line's delays
+            if scanned:
                 self._refresh()
             if baud is not None and baud != self.info.baud:
                 self._command("set_baud", baud=baud)
@@ -163,7 +167,10 @@ class Session(Device):
             self._wait(lambda: False, 0.0)  # raises what has ended it, such as close()
             sequence = self._sequence = (self._sequence + 1) % framing.SEQUENCE_SPAN
             self._acks.pop(sequence, None)
-        self._link.write(framing.encode(frame.id, sequence, frame.pack(**taken)))
+        octets = framing.encode(frame.id, sequence, frame.pack(**taken))
+        on_line_s = len(octets) * byte_s(self._hello) if self._hello else 0.0
+        self._sent_s[sequence] = self.now_s + on_line_s
+        self._link.write(octets)
         return sequence
 
     def _command(self, name: str, **values: protocol.Value) -> None:
@@ -199,7 +206,7 @@ class Session(Device):
         with self._changed:
             messages = self._decoder.feed(octets, now_s)
             for message in messages:
-                self._keep(message)
+                self._keep(message, now_s)
             if messages:
                 self._heard_s = now_s
                 self._changed.notify_all()
@@ -210,8 +217,11 @@ class Session(Device):
             self._link.set_baud(protocol.CONSTANTS["baud_default"])
             self._send("get_hello")
 
-    def _keep(self, message: Message) -> None:
-        """Give a message to who waits for it. Raises ProtocolError for what no board can say."""
+    def _keep(self, message: Message, now_s: float) -> None:
+        """Give a message that came now to who waits for it.
+
+        :raises ProtocolError: no board can say that.
+        """
         if isinstance(message, Hello):
             self._check_unit(message)
         match message:
@@ -221,9 +231,14 @@ class Session(Device):
                 said = f"{_size(self.info)} cells, its scans have {_size(message)}"
                 raise ProtocolError(f"{self.name}: hello says {said}", _BROKEN)
             case Scan() if self._hello is not None:
-                time_ns = self._clock.time_ns(message, self._hello)
-                self._publish(replace(message, time_ns=time_ns))
+                timed = replace(message, delay_s=self._clock.board.delay_s)
+                time_ns = self._clock.time_ns(timed, self._hello)
+                self._publish(replace(timed, time_ns=time_ns))
             case Ack():
+                sent_s = self._sent_s.pop(message.command_sequence, None)
+                if sent_s is not None and message.time_us is not None and self._hello is not None:
+                    known_s = now_s - answer_delay_s(self._hello)
+                    self._clock.board.answered(message.time_us, sent_s, known_s)
                 self._acks[message.command_sequence] = message
             case SelfTestReport():
                 self._report = message

@@ -69,6 +69,8 @@ _UNPACKED_BYTES: Final = 1_000_000
 # Chunks unpack to at most so many times the file's bytes, besides. Chosen: codes without noise pack
 # best, 115 times.
 _MOST_UNPACKED: Final = 130
+# No line of a board that answers delays by more. Chosen: commands are given up after a second.
+_LARGEST_DELAY_S: Final = 10.0
 # Counters are kept in 64 bits.
 _LARGEST_COUNTER: Final = np.iinfo(np.int64).max
 # A record of a chunk counts as so many bytes at least. Chosen: what a scan of one cell, or a force,
@@ -173,6 +175,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
         "adc_bits": _is("integer", "of a code"),
         "row_mask": _is("integer", "rows that were read, bit 0 for the first"),
         "column_mask": _is("integer", "columns that were read, bit 0 for the first"),
+        "delay_s": _is("number", "constant delays of both ways of the line [s]; 0: not known"),
         "slot_cycles": _is("integer", "from one reading to the next [clock]; 0: that of hello"),
         **_SIZE,
         "codes": _is("array", f"ADC codes: {_ORDER}", items={"type": "integer"}),
@@ -374,10 +377,13 @@ def _message(name: str, octets: bytes) -> Recorded:
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
     content.setdefault("mode", "near")  # recordings from before there was another do not say it
+    content.setdefault("delay_s", 0.0)  # nor this, before it was measured
     content = layouts.today(name, content)  # of boards of then
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
+    if not 0 <= values.get("delay_s", 0.0) <= _LARGEST_DELAY_S:
+        raise ValueError(f"delay_s {values['delay_s']:g}: no line delays so much, or so little")
     if name == "hello":
         return _hello(values)
     for of_cells in {"codes", "rest_ratio"} & values.keys():
