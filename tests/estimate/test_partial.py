@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of which not all was read. Readings are those of the node Laplacian, with noise."""
 
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import estimate_file, load_readings
 from studies.judge import STATED_STDS, answers_of, judge, pooled
-from studies.trials import Trial, finger_trial, random_trial
+from studies.trials import Trial, finger_trial, random_trial, skin_at_rest
 
 NOISE_RATIO = 0.3 / 1024
 READ = {"near": (0, 1, 2, 3), "half": (0, 1), "quick": (1,)}
@@ -158,6 +159,19 @@ def test_ports_that_are_not_read_become_less_certain() -> None:
     assert (first.current_std < second.current_std)[outside].all()
     read_again = reader.read(frames[3], in_order=True)
     np.testing.assert_allclose(read_again.current_std, whole.current_std)
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_region_after_a_frame_without_noise_has_an_answer(method: str) -> None:
+    """Its readings agree in most cells, and then it does not show how much noise there is."""
+    skin = skin_at_rest(8, 8, np.random.default_rng(3))
+    skin = replace(skin, cell_siemens=np.full((8, 8), 1e-6))
+    frame = ratio_from_codes(quantise(SkinCircuit(skin).readings(skin.cell_siemens)[..., :4]))
+    estimator = make_estimator(method, knowledge(None))
+    estimator.estimate(frame)
+    found = estimator.estimate(of_region(frame, slice(2, 5), slice(2, 5), READ["quick"]))
+    assert np.isfinite(found.cell_siemens).all()
+    assert np.isfinite(found.cell_siemens_std[2:5, 2:5]).all()
 
 
 def test_offsets_that_whole_scans_have_shown_are_taken_from_one_reading() -> None:
