@@ -15,11 +15,11 @@ namespace ohmskin {
 using ScanRequest = frames::Configure;
 using RegionRequest = frames::SetRegion;
 
-// Idle slots between scans of two kinds, at least. In the last of them the interrupt takes the other
-// kind's steps: with three, no code comes in that slot, which would cost time, too.
+// Idle slots between scans of two kinds, at least. In the last of them the interrupt takes the
+// other kind's steps: with three, no code comes in that slot, which would cost time, too.
 constexpr uint8_t IDLE_TO_CHANGE = 3;
-// A scan of up to FEW readings ends no later than its first code comes. So many idle slots after it,
-// at least, leave less to do in that interrupt. The line takes longer than these slots anyway.
+// A scan of up to FEW readings ends no later than its first code comes. So many idle slots after
+// it, at least, leave less to do in that interrupt. The line takes longer than these slots anyway.
 constexpr uint8_t FEW = 3, IDLE_OF_FEW = 5;
 
 // How the board keeps the times of a scan: slots of equal length, one conversion each, a whole
