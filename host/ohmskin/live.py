@@ -189,7 +189,8 @@ class LiveSkin(Closing):
         return SkinReader(board, self._calibration, force=self._force)
 
     def _take(self, scan: Scan, device: Device, reader: SkinReader) -> None:
-        if self._every and device.now_s - scan.host_time_s > LATE_S:
+        is_late = not device.waits and device.now_s - scan.host_time_s > LATE_S
+        if self._every and is_late:
             self.skipped += 1
             return
         read = reader.read(scan)

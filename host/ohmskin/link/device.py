@@ -103,6 +103,8 @@ class Device(Closing):
         """Presses a cell by a force [N], or none, where a simulated skin lets a program do so."""
         self.only_unit: int | None = None
         """The unit that is meant: another that says hello ends the device. None: any may come."""
+        self.waits = False
+        """Whether scans wait until they are taken: a recording that is played at speed 0."""
         self._stats = stats
         self._changed = threading.Condition()
         self._hello: Hello | None = None

@@ -45,6 +45,7 @@ class Replay(Device):
             raise ValueError(f"speed must be 0 or more, not {speed}")
         super().__init__(name, BoardStats())
         self._speed = speed
+        self.waits = speed == 0
         self._messages = messages(path, timed=True)
         hello = next(self._messages)
         assert isinstance(hello, Hello)
@@ -116,9 +117,9 @@ class Replay(Device):
 
     def _due_s(self, message: Hello | Scan, now_s: float) -> float:
         """When a message is due on the host's clock [s]; infinite while nobody wants it."""
-        if not (self._running and self._asked) or (self._speed == 0 and self._readers_are_behind()):
+        if not (self._running and self._asked) or (self.waits and self._readers_are_behind()):
             return float("inf")
-        if isinstance(message, Hello) or self._speed == 0 or self._last is None:
+        if isinstance(message, Hello) or self.waits or self._last is None:
             return now_s
         pause_s = (message.host_time_s - self._last[1]) / self._speed
         return self._last[0] + min(max(pause_s, 0.0), LONGEST_PAUSE_S)
