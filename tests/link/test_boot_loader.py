@@ -12,10 +12,25 @@ import pytest
 from ohmskin.emulate.driver import SteppedLink, SteppedSkin
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import DeviceSilent
+from ohmskin.link import framing
+from ohmskin.link.protocol import FRAMES
 
 QUIET_S = 2.0  # from the opening of the port to the first question
 AGAIN_S = 6.0  # from a question to the next, so that a loader that has heard it is done
 AT_ONCE_S = 0.5
+QUESTION = framing.encode(FRAMES["get_hello"].id, 0, b"")
+
+
+class DeafLink(SteppedLink):
+    """A board that says hello by itself and then hears nothing: it is reset once more."""
+
+    def __init__(self) -> None:
+        board, _, faults = emulated("emulator://1x1")
+        super().__init__(board, "deaf", faults)
+        super().write(QUESTION)
+
+    def write(self, octets: bytes) -> None:
+        pass
 
 
 class SilentLink(SteppedLink):
@@ -56,3 +71,10 @@ def test_a_board_that_was_not_reset_is_asked_at_once() -> None:
     with pytest.raises(DeviceSilent):
         SteppedSkin(link)
     assert min(map(min, link.asked_s.values())) == 0
+
+
+def test_a_board_that_is_reset_when_it_has_said_hello_is_open_all_the_same() -> None:
+    link = DeafLink()
+    with SteppedSkin(link) as skin:
+        assert not skin.info.scanning
+        assert link.now_s() < AT_ONCE_S

@@ -2,6 +2,8 @@
 """Boards that were flashed before the definition changed: read, commanded, and refused by name."""
 
 import json
+from contextlib import suppress
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -47,7 +49,7 @@ class OldBoard:
     name, resets_board = "old board", False
 
     def __init__(self) -> None:
-        self._decoder, self._out = framing.Decoder(), bytearray()
+        self._decoder, self._out = framing.Decoder(), SimpleQueue[bytes]()
         self.heard: list[tuple[str, dict[str, Any]]] = []
 
     def write(self, octets: bytes) -> None:
@@ -56,15 +58,16 @@ class OldBoard:
             frame = frames[raw.type]
             self.heard.append((frame.name, frame.unpack(raw.payload)))
             if frame.name == "get_hello":
-                self._out += hello_wire()
+                self._out.put(hello_wire())
             answer = {"command": raw.type, "command_sequence": raw.sequence, "result": "ok"}
-            self._out += framing.encode(old("ack").id, 0, old("ack").pack(**answer))
+            self._out.put(framing.encode(old("ack").id, 0, old("ack").pack(**answer)))
             if frame.name == "start":
-                self._out += SCAN
+                self._out.put(SCAN)
 
     def read(self) -> bytes:
-        octets, self._out = bytes(self._out), bytearray()
-        return octets
+        with suppress(Empty):
+            return self._out.get(timeout=0.01)
+        return b""
 
     def set_baud(self, baud: int) -> None:
         pass

@@ -67,6 +67,8 @@ ATTEMPTS_AFTER_RESET: Final = (
 # Time that a board has for its answer, besides the time for the scan that it ends first. Chosen:
 # far above what a USB bridge and the slowest command, `save`, take.
 COMMAND_TIMEOUT_S = 1.0
+# A board that does not scan has answered in this time [s]. Chosen: ten times what it takes.
+_ANSWER_S: Final = 0.1
 # A scanning board that sends no valid frame for so long is asked who it is. Chosen: a board that is
 # reset and left alone says hello within 2 s, and only what stays silent has to be asked.
 _SPEED_LOST_S = 2.5
@@ -102,9 +104,8 @@ class Session(Device):
         self._decoder = BoardDecoder()
         super().__init__(link.name, self._decoder.stats)
         self._acks: dict[int, Ack] = {}  # by the sequence numbers of their commands
-        self._sent_s: dict[
-            int, float
-        ] = {}  # likewise: when they were sent, and the line had taken them
+        # When the line had taken them [s], by the same numbers.
+        self._sent_s: dict[int, float] = {}
         self._closing, self._ends = False, threading.Lock()
         self._sequence = 0  # number of the last command
         self._clock = ScanClock(time.time_ns() - round(1e9 * self.now_s))
@@ -112,10 +113,13 @@ class Session(Device):
         self._begin_thread(self._read, f"read {self.name}")
         try:
             self._connect()
-            scanned = self.info.scanning
-            self._command("stop")  # also where it does not scan: its answer shows the line's delays
-            if scanned:
+            if self.info.scanning:
+                self._command("stop")
                 self._refresh()
+            else:  # the answer shows the line's delays; a board that is just reset gives none
+                sequence = self._send("stop")
+                with self._changed:
+                    self._wait(lambda: sequence in self._acks, _ANSWER_S)
             if baud is not None and baud != self.info.baud:
                 self._command("set_baud", baud=baud)
                 link.set_baud(baud)
