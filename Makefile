@@ -133,8 +133,9 @@ fuzz: setup $(FUZZED) ## fuzz all that comes from outside, ten minutes (SECURITY
 
 STUDY := $(ONE_THREAD) PYTHONPATH=. $(BIN)/python -m studies
 
-chart: setup ## time a frame against error, all methods, simulated: docs/speed-accuracy.png
+chart: setup firmware sim ## time a frame and rate of scans against error, simulated: docs/*-accuracy.png
 	$(STUDY) chart
+	$(BENCH)/chart_rates.py
 
 stability: setup ## where methods fail, and whether they say so, simulated: docs/stability.png
 	$(STUDY) stability

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans of skins that the built firmware reads in simavr, on a board as unkind as one on a desk."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lockstep import CPU_HZ, READINGS, Rig
+from lockstep import CPU_HZ, DEFAULT_SCAN, Rig
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.doctor.examine import Evidence, examine
@@ -19,7 +19,7 @@ from ohmskin.emulate.simavr import SkinSim
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Scan
-from ohmskin.link.protocol import MODES
+from ohmskin.link.protocol import MODES, lines_of
 from stepped import stepped
 from studies.trials import Trial, skin_at_rest, touch
 
@@ -43,18 +43,25 @@ class DeskSkin:
 
 
 @contextmanager
-def _on_desk(seed: int, mode: str = "near", **settings: float) -> Iterator[tuple[Rig, Skin, Any]]:
-    """A board that scans an untouched skin, that skin, and the source of randomness behind both."""
+def _on_desk(
+    seed: int, mode: str = "near", *, rest: Skin | None = None, **settings: float
+) -> Iterator[tuple[Rig, Skin, Any]]:
+    """A board that scans an untouched skin, that skin, and the source of randomness behind both.
+
+    rest: the skin; None: one of 8x8, drawn.
+    """
     random = np.random.default_rng([77, seed])
     converter = dict(zip(("offset_lsb", "gain_lsb"), random.uniform(-2, 2, 2), strict=True))
     converter |= {"inl_lsb": random.uniform(-1.5, 1.5), "seed": seed}
-    rest = skin_at_rest(8, 8, random)
+    rest = skin_at_rest(8, 8, random) if rest is None else rest
+    rows, columns = rest.shape
+    rate_mhz = DEFAULT_SCAN["rate_mhz"] if max(rest.shape) <= 8 else 0
     with Rig("uno") as rig:
         rig.sim.set(desk=1)
         rig.sim.set(**converter | settings | {"far_open": float(mode == "near")})
         rig.run(0.3)
         show(rig.sim, rest, mode)
-        rig.start_scan(mode=mode)
+        rig.start_scan(mode=mode, rows=rows, columns=columns, rate_mhz=rate_mhz)
         rig.sim.hold_log(False)
         yield rig, rest, random
 
@@ -78,9 +85,9 @@ def desk_skin(seed: int, frames: int, *, mode: str = "near", **settings: float) 
 class PacedSkin:
     """A trial, as a board on a desk reads it.
 
-    scans_hz: of its region, without whole scans in between. rest_ratio: mean of near scans.
-    ratios: of each frame, the scans up to the third one of the mode that was asked for, each
-    (R, C, 4); what was not read is NaN.
+    scans_hz: of its region, without whole scans in between. rest_ratio: mean of near scans, or of
+    those of mode far. ratios: of each frame, the scans up to the third one of the mode that was
+    asked for, each (R, C, 4); what was not read is NaN.
     """
 
     trial: Trial
@@ -89,34 +96,42 @@ class PacedSkin:
     ratios: list[list[Float]]
 
 
-def paced_skin(seed: int, trial: Trial, **scan: Any) -> PacedSkin:
-    """A trial of 8x8 cells on the desk of this seed, at rest in mode near at 90 Hz, then so."""
-    with _on_desk(seed) as (rig, _, _):
-        show(rig.sim, trial.rest, "near")
+def paced_skin(
+    seed: int, trial: Trial, *, settings: Mapping[str, float] = {}, **scan: Any
+) -> PacedSkin:
+    """A trial on the desk of this seed, at rest in mode near at 90 Hz, then scanned so.
+
+    settings: those of the simulator, instead of the desk's.
+    """
+    at_rest = "far" if scan["mode"] == "far" else "near"
+    rows, columns = trial.rest.shape
+    with _on_desk(seed, at_rest, rest=trial.rest, **settings) as (rig, _, _):
         rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
         rig.must("stop")
-        rig.start_scan(**scan)
+        rig.start_scan(rows=rows, columns=columns, **scan)
         rig.sim.hold_log(False)
         scans_hz = CPU_HZ / rig.hello()["scan_cycles"]
         ratios = []
         for skin in trial.frames:
-            show(rig.sim, skin, "near")
+            show(rig.sim, skin, at_rest)
             rig.scans.clear()
-            ratios.append(list(_until_third(rig, scan["mode"])))
+            ratios.append(list(_until_third(rig, scan["mode"], at_rest, trial.rest.shape)))
     return PacedSkin(trial, scans_hz, rest_ratio, ratios)
 
 
-def _until_third(rig: Rig, mode: str) -> Iterator[Float]:
+def _until_third(rig: Rig, mode: str, near: str, shape: tuple[int, int]) -> Iterator[Float]:
     """Scans of the skin as it is, up to the third of this mode: those under way are left out."""
-    taken = 2
+    taken, names = 2, MODES[near]
     for _ in range(SCANS):
         while True:
             while len(rig.scans) <= taken:
                 rig.run(0.004)
             scan, taken = rig.scans[taken], taken + 1
-            ratio = np.full((*scan.codes.shape[:2], 4), np.nan)
-            names = MODES[scan.header["mode"]]
-            ratio[..., [READINGS.index(name) for name in names]] = ratio_from_codes(scan.codes)
+            ratio = np.full((*shape, 4), np.nan)
+            masks = scan.header["row_mask"], scan.header["column_mask"]
+            lines = [lines_of(mask, count) for mask, count in zip(masks, shape, strict=True)]
+            kinds = [names.index(name) for name in MODES[scan.header["mode"]]]
+            ratio[np.ix_(*lines, kinds)] = ratio_from_codes(scan.codes)
             yield ratio
             if scan.header["mode"] == mode:
                 break
