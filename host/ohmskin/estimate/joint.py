@@ -45,7 +45,7 @@ from ohmskin.estimate.prior import (
     siemens_std,
 )
 from ohmskin.estimate.region_fit import RegionFit, WholeFrame
-from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched
+from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
 from ohmskin.estimate.wire_belief import FAR_LOG, MOST_FITS, LearnedWires, WireBelief
 
 # Both numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
@@ -164,11 +164,7 @@ class JointEstimator(Estimator):
         prior = self._prior_of(ports)
         if ports.region is not None and (part := self._of_region(prior, ports)):
             return self._solution(ports, part), False
-        touches = None
-        # Trying takes time, and under a finger that stays, few touches explain no frame. So they
-        # are not tried after a fit with many.
-        if self._finder is not None and self._touches <= self._finder.most:
-            touches = self._finder.find(ports)
+        touches = self._few_touches(prior, ports)
         if touches is not None and (touched := self._explained_by(touches)):
             again = not ports.fault and self._belief.after_fit(touched, ports, again=again)
             return self._solution(ports, touched, self._belief.fault), again
@@ -192,6 +188,19 @@ class JointEstimator(Estimator):
         solution = self._solution(ports, fit, message)
         self._belief.expect_usual_leads(True)
         return solution, again
+
+    def _few_touches(self, prior: CellPrior, ports: PortReadings) -> FewTouches | None:
+        """The touched cells, if they are few.
+
+        Trying takes time, and under a finger that stays, few touches explain no frame. So they are
+        not tried after a fit with many. Where wires hide even cells at rest, no few are sure.
+        """
+        hidden = self._rest_wires_log_std > REST_STD
+        if hidden or self._touches > most_touches(self._shape):
+            return None
+        if self._finder is None or self._finder.prior is not prior:
+            self._finder = SparseFit(prior, self._belief, self.knowledge.ref_ohm)
+        return self._finder.find(ports)
 
     def _of_region(self, prior: CellPrior, ports: PortReadings) -> RegionFit | None:
         """The answer by the cells that were read, about the last whole frame; None: not by them."""
@@ -290,12 +299,7 @@ class JointEstimator(Estimator):
             prior = self._prior_by_rest(self._rest_ports)
         else:
             prior = self._prior_followed(before)
-        if prior is not before:
-            self._prior = prior
-            # Where wires hide even cells at rest, no few touches are sure. Then there is no finder,
-            # and all frames start from `matrix`.
-            if self._rest_wires_log_std <= REST_STD:
-                self._finder = SparseFit(prior, self._belief, self.knowledge.ref_ohm)
+        self._prior = prior
         return prior
 
     def _prior_followed(self, prior: CellPrior) -> CellPrior:
@@ -310,7 +314,7 @@ class JointEstimator(Estimator):
         # Cells at rest follow the layers by slopes, which hold for small moves only. (Readings at
         # far ends hardly have these wires in them.)
         if not any(self._belief.far) and np.abs(means - self._rest_means)[:2].max() > FAR_LOG:
-            return self._prior_by_rest(self._rest_ports)
+            return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
         least = [least_log, least_log, LEAST_LEAD_OHM, *(SEGMENT_STD * np.abs(means[3:]))]
         if (np.abs(means - prior.means) > least).any():
@@ -335,15 +339,19 @@ class JointEstimator(Estimator):
         logs, stds, means = np.full(cells, log_ohm), np.full(cells, std), self._belief.means
         return CellPrior(logs, stds, np.zeros((cells, len(means))), means)
 
-    def _prior_by_rest(self, ports: PortReadings) -> CellPrior:
+    def _prior_by_rest(self, ports: PortReadings, before: CellPrior | None = None) -> CellPrior:
         """Log resistances of the untouched cells, and how well they are known: by the same fit.
 
         Its prior has all cells alike. It is made again about the median of what was found, because
-        a level that is wrong for many cells by a little would weigh more than the readings.
+        a level that is wrong for many cells by a little would weigh more than the readings. With
+        the prior `before`, by other wires, that median is near, and one fit from there is enough.
         """
-        level = rest_level(ports.current, self.knowledge.ref_ohm)
-        log_cells: Float = np.full(ports.current.size, -np.log(level))
-        alike, fit = self._fit_rest(ports, log_cells)
+        if before is None:
+            level = rest_level(ports.current, self.knowledge.ref_ohm)
+            log_cells: Float = np.full(ports.current.size, -np.log(level))
+            alike, fit = self._fit_rest(ports, log_cells)
+        else:
+            alike, fit = self._fit_rest(ports, before.expected, 1)
         if len(self._belief.means) == 3 and leaks_of(fit)[0] > DAMP_GAIN:
             alike, fit = self._expect_leaks(ports, fit)
         log_cells = fit.log_cells
@@ -368,9 +376,11 @@ class JointEstimator(Estimator):
         self._belief.expect_leaks(leaks_us, np.hypot(stds_us, LEAK_STD * leaks_us))
         return alike, fit
 
-    def _fit_rest(self, ports: PortReadings, log_cells: Float) -> tuple[CellPrior, FullFit]:
+    def _fit_rest(
+        self, ports: PortReadings, log_cells: Float, fits: int = REST_FITS
+    ) -> tuple[CellPrior, FullFit]:
         """Fits of the rest readings from these cells (RC,), and the prior of the last."""
-        for _ in range(REST_FITS):
+        for _ in range(fits):
             self._belief.before_fit(log_cells, ports)
             alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
             fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)

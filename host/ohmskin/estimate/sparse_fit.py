@@ -235,6 +235,11 @@ class Touched:
     misfit: float = 0.0
 
 
+def most_touches(shape: tuple[int, int]) -> float:
+    """Touches of a skin (R, C) that are still few."""
+    return MAX_TOUCHES_PER_LINE * sum(shape)
+
+
 class SparseFit:
     """Fits the frames of a skin (R, C), each by itself.
 
@@ -252,7 +257,7 @@ class SparseFit:
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self.prior, self.belief = prior, belief
         self.series_ohm = ref_ohm + belief.leads_of_port * prior.means[2]
-        self.most = MAX_TOUCHES_PER_LINE * sum(belief.shape)
+        self.most = most_touches(belief.shape)
         self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
         self.net = net = RestNetwork(
