@@ -352,7 +352,8 @@ class JointEstimator(Estimator):
             alike, fit = self._fit_rest(ports, log_cells)
         else:
             alike, fit = self._fit_rest(ports, before.expected, 1)
-        if len(self._belief.means) == 3 and leaks_of(fit)[0] > DAMP_GAIN:
+        leaks_open = not fit.message and len(self._belief.means) == 3
+        if leaks_open and leaks_of(fit)[0] > DAMP_GAIN:
             alike, fit = self._expect_leaks(ports, fit)
         log_cells = fit.log_cells
         self._rest_means = means = self._belief.means
@@ -373,6 +374,8 @@ class JointEstimator(Estimator):
             leaks_us = np.clip(leaks_us + 0.5 * more_us, 0.0, MOST_LEAK_US)
             self._belief.expect_leaks(leaks_us, np.full(2, LEAST_LEAK_US))
             alike, fit = self._fit_rest(ports, fit.log_cells)
+            if fit.message:
+                break
         self._belief.expect_leaks(leaks_us, np.hypot(stds_us, LEAK_STD * leaks_us))
         return alike, fit
 
@@ -384,6 +387,8 @@ class JointEstimator(Estimator):
             self._belief.before_fit(log_cells, ports)
             alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
             fit = FullFit(alike, self._belief, self.knowledge.ref_ohm, ports, log_cells)
+            if fit.message:  # no skin gives these readings: more fits would only take more time
+                break
             log_cells = fit.log_cells
         return alike, fit
 
