@@ -222,12 +222,13 @@ class Estimator(ABC):
         wires_std = unknown if solution.wire_ohm_std is None else solution.wire_ohm_std
         if knowledge.ref_log_std:
             wires_std = np.hypot(wires_std, knowledge.ref_log_std * wires)
-        relative_std = np.hypot(knowledge.ref_log_std, DOUBT_STD * ports.doubt)
+        siemens, siemens_std = solution.cell_siemens, solution.cell_siemens_std
+        if knowledge.ref_log_std or ports.doubt.any():
+            relative_std = np.hypot(knowledge.ref_log_std, DOUBT_STD * ports.doubt)
+            siemens_std = np.hypot(siemens_std, relative_std * siemens)
         return Estimate(
-            cell_siemens=solution.cell_siemens,
-            cell_siemens_std=np.hypot(
-                solution.cell_siemens_std, relative_std * solution.cell_siemens
-            ),
+            cell_siemens=siemens,
+            cell_siemens_std=siemens_std,
             level=level,
             level_std=level_std,
             touched=touched,
@@ -259,10 +260,11 @@ class Estimator(ABC):
         else:
             rest_siemens = self._rest.cell_siemens
             std = np.hypot(std, self._rest.cell_siemens_std)
+        known_std = np.where(np.isnan(std), 0.0, std)
         with np.errstate(divide="ignore", invalid="ignore"):
             ohm = 1.0 / siemens
-            # Stated deviations reach to this limit. One that is NaN is not known.
-            lower_ohm = 1.0 / np.maximum(siemens - REACH_STDS * np.nan_to_num(std), 0.0)
+            # Stated deviations reach to this limit.
+            lower_ohm = 1.0 / np.maximum(siemens - REACH_STDS * known_std, 0.0)
             lowest = 1.0 / (ohm + TOUCH_STDS / REACH_STDS * (lower_ohm - ohm))
         return np.asarray((siemens - rest_siemens > TOUCH_SIEMENS) & (lowest > rest_siemens))
 

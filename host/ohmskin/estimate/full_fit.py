@@ -193,7 +193,7 @@ class FullFit:
 
     def _move(self, step: Float) -> None:
         """Take a step, or so much of it that no log resistance moves by more than MAX_STEP_LOG."""
-        step, stds_step = np.split(step, [self.log_cells.size])
+        step, stds_step = step[: self.log_cells.size], step[self.log_cells.size :]
         means_step = self._belief.means_off(stds_step) - self._belief.means
         # A cell that would leave its limits goes to the limit, and does not shorten the whole step.
         log_cells = self.log_cells + self._cell_std * step + self._prior.by_means @ means_step
@@ -277,7 +277,7 @@ class FullFit:
             learned = wider**2 * learned
             with_means *= wider[:, None]
             cell_std = wider * cell_std
-        self.wires_log_std: Float = cell_std * np.linalg.norm(with_means[:, :2], axis=1)
+        self.wires_log_std: Float = cell_std * np.hypot(*with_means[:, :2].T)
         self.leads_log_std: Float = cell_std * np.abs(with_means[:, 2])
         self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 

@@ -164,7 +164,7 @@ class LinePairs:
         shape = self._lines, self._lines
         self._alike_frames: NDArray[np.intp] = np.zeros(shape, dtype=np.intp)
         self._never_apart = np.ones(shape, dtype=bool)
-        self._is_first = True
+        self._is_first, self._is_full = True, False
 
     def were_shorted_at_rest(self, high: Bool) -> str:
         """The first pair of the lines `high` that was alike at rest already, in words, or empty.
@@ -176,16 +176,20 @@ class LinePairs:
             return ""
         return self._first(self._rest_apart < SAME_STDS, high)
 
-    def needs_frame(self, high: Bool, places: NDArray[np.intp]) -> bool:
+    def needs_frame(self, high: Bool, touched: Bool) -> bool:
         """Whether a frame with these lines is worth comparing: all pairs take long.
 
-        A short shows in two high lines, a doubt in two touched ones. Without them a frame is still
-        compared while the count of some pair is full: it may show this pair apart. So may the first
-        frame. Lines with fewer than three ports may be alike by chance.
+        A short shows in two high lines, a doubt in two touched ones, (lines,). Without them a frame
+        is still compared while the count of some pair is full: it may show this pair apart. So may
+        the first frame. Lines with fewer than three ports may be alike by chance.
         """
-        some_count_is_full = self._alike_frames.max() >= ALIKE_FRAMES
-        some_lines = max(np.count_nonzero(high), np.count_nonzero(places)) >= 2
-        return self._ports >= 3 and bool(self._is_first or some_count_is_full or some_lines)
+        if self._ports < 3:
+            return False
+        return (
+            self._is_first
+            or self._is_full
+            or bool(np.count_nonzero(high) >= 2 or np.count_nonzero(touched) >= 2)
+        )
 
     def compare(self, now: PortCurrents, high: Bool, places: NDArray[np.intp]) -> tuple[str, Bool]:
         """Compare all pairs of lines in a frame.
@@ -199,7 +203,7 @@ class LinePairs:
         shows_apart = apart > 2 * SAME_STDS
         self._alike_frames = np.where(shows_apart, 0, self._alike_frames + 1)
         self._never_apart &= ~shows_apart
-        self._is_first = False
+        self._is_first, self._is_full = False, bool(self._alike_frames.max() >= ALIKE_FRAMES)
         alike = np.triu(apart < SAME_STDS, 1)
         # Lines that hardly differed at rest are alike for no other reason. A pair that differed by
         # clearly more than this frame's noise is shorted; that may be so since before the frames.
@@ -292,9 +296,9 @@ class SkinFaults:
         for axis, pairs in enumerate(self._pairs):
             high = np.asarray(is_higher.all(axis=1 - axis))
             touched = is_touched if axis == 0 else is_touched.T
-            begins = touched[:, 1:] & ~touched[:, :-1]
-            places = touched[:, 0] + np.count_nonzero(begins, axis=1)
-            if pairs.needs_frame(high, places):
+            if pairs.needs_frame(high, touched.any(axis=1)):
+                begins = touched[:, 1:] & ~touched[:, :-1]
+                places = touched[:, 0] + np.count_nonzero(begins, axis=1)
                 pair, doubt = pairs.compare(now, high, places)
                 if pair:
                     return f"{pair} read alike as they did not at rest: shorted?"
