@@ -296,7 +296,7 @@ class SkinFaults:
         for axis, pairs in enumerate(self._pairs):
             high = np.asarray(is_higher.all(axis=1 - axis))
             touched = is_touched if axis == 0 else is_touched.T
-            if pairs.needs_frame(high, touched.any(axis=1)):
+            if pairs.needs_frame(high, np.asarray(touched.any(axis=1))):
                 begins = touched[:, 1:] & ~touched[:, :-1]
                 places = touched[:, 0] + np.count_nonzero(begins, axis=1)
                 pair, doubt = pairs.compare(now, high, places)
