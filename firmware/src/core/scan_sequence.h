@@ -169,9 +169,9 @@ class ScanSequence {
 
     // Steps to the next reading; true when that is the first of a scan again.
     bool next() {
-        const Steps &steps = *steps_;
+        const Steps &now = *steps_;
         uint8_t entry = at_.pattern_entry;
-        const uint8_t mask = steps.group_mask;
+        const uint8_t mask = now.group_mask;
         if ((entry & mask) != mask) {
             at_.pattern_entry = static_cast<uint8_t>(entry + 1);
             return false;
@@ -187,9 +187,9 @@ class ScanSequence {
         const uint8_t column = lines_->column_after(at_.column);
         const bool same_pass = column > at_.column;
         at_.column = column;
-        const bool ends = !same_pass && entry == steps.last_group;
+        const bool ends = !same_pass && entry == now.last_group;
         if (ends)
-            entry = steps.first.pattern_entry;
+            entry = now.first.pattern_entry;
         else if (!same_pass)
             entry = static_cast<uint8_t>(entry + mask + 1);
         at_.pattern_entry = entry;
