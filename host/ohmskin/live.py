@@ -189,8 +189,8 @@ class LiveSkin(Closing):
         return SkinReader(board, self._calibration, force=self._force)
 
     def _take(self, scan: Scan, device: Device, reader: SkinReader) -> None:
-        is_late = not device.waits and device.now_s - scan.host_time_s > LATE_S
-        if self._every and is_late:
+        waited_s = device.now_s - scan.host_time_s
+        if self._every and not device.waits and waited_s > LATE_S:
             self.skipped += 1
             return
         read = reader.read(scan)

@@ -224,3 +224,19 @@ def test_what_no_board_leaves_out_is_refused() -> None:
         estimator.estimate(np.full((8, 8, 4), np.nan))
     with pytest.raises(ValueError, match="rest_ratio has cells without any reading"):
         knowledge(of_region(rest, slice(1, 6), slice(1, 6), READ["near"]))
+
+
+def test_two_readings_of_a_cell_are_worth_the_mean_of_two() -> None:
+    """Where nothing but noise makes them differ, as on lines that settle at once."""
+    made, rest, _ = trial("touches")
+    random = np.random.default_rng(8)
+    exact = np.repeat(made.readings.ratio[:1], 60, axis=0)
+    frames = ratio_from_codes(quantise(exact + NOISE_RATIO * random.standard_normal(exact.shape)))
+    reader, every = PortReader(knowledge(rest)), slice(None)
+    reader.read(frames[0], in_order=True)
+    read = [reader.read(of_region(each, every, every, READ["half"])) for each in frames]
+    a, b = np.moveaxis(frames[..., :2], -1, 0)
+    of_two = (1.0 - a + b) / (2 * knowledge(rest).ref_top_ohm)
+    found = np.array([ports.current for ports in read])
+    assert found.std(axis=0).mean() < 1.05 * of_two.std(axis=0).mean()
+    assert found.std(axis=0).mean() < 1.3 * np.mean([ports.current_std for ports in read])

@@ -99,13 +99,13 @@ class PacedSkin:
 def paced_skin(
     seed: int, trial: Trial, *, settings: Mapping[str, float] = {}, **scan: Any
 ) -> PacedSkin:
-    """A trial on the desk of this seed, at rest in mode near at 90 Hz, then scanned so.
+    """A trial on the desk of this seed: at rest in mode near, or far, then scanned so.
 
-    settings: those of the simulator, instead of the desk's.
+    settings: of the simulator, in place of the desk's.
     """
-    at_rest = "far" if scan["mode"] == "far" else "near"
+    of_all = "far" if scan["mode"] == "far" else "near"
     rows, columns = trial.rest.shape
-    with _on_desk(seed, at_rest, rest=trial.rest, **settings) as (rig, _, _):
+    with _on_desk(seed, of_all, rest=trial.rest, **settings) as (rig, _, _):
         rest_ratio = ratio_from_codes(_scans(rig, REST_SCANS)).mean(axis=0)
         rig.must("stop")
         rig.start_scan(rows=rows, columns=columns, **scan)
@@ -113,15 +113,18 @@ def paced_skin(
         scans_hz = CPU_HZ / rig.hello()["scan_cycles"]
         ratios = []
         for skin in trial.frames:
-            show(rig.sim, skin, at_rest)
+            show(rig.sim, skin, of_all)
             rig.scans.clear()
-            ratios.append(list(_until_third(rig, scan["mode"], at_rest, trial.rest.shape)))
+            ratios.append(list(_until_third(rig, scan["mode"], of_all, trial.rest.shape)))
     return PacedSkin(trial, scans_hz, rest_ratio, ratios)
 
 
-def _until_third(rig: Rig, mode: str, near: str, shape: tuple[int, int]) -> Iterator[Float]:
-    """Scans of the skin as it is, up to the third of this mode: those under way are left out."""
-    taken, names = 2, MODES[near]
+def _until_third(rig: Rig, mode: str, of_all: str, shape: tuple[int, int]) -> Iterator[Float]:
+    """Scans of the skin as it is, up to the third of this mode: those under way are left out.
+
+    of_all: the mode that takes all readings, near or far.
+    """
+    taken, names = 2, MODES[of_all]
     for _ in range(SCANS):
         while True:
             while len(rig.scans) <= taken:

@@ -352,8 +352,8 @@ class JointEstimator(Estimator):
             alike, fit = self._fit_rest(ports, log_cells)
         else:
             alike, fit = self._fit_rest(ports, before.expected, 1)
-        leaks_open = not fit.message and len(self._belief.means) == 3
-        if leaks_open and leaks_of(fit)[0] > DAMP_GAIN:
+        has_leaks = len(self._belief.means) > 3
+        if not (has_leaks or fit.message) and leaks_of(fit)[0] > DAMP_GAIN:
             alike, fit = self._expect_leaks(ports, fit)
         log_cells = fit.log_cells
         self._rest_means = means = self._belief.means

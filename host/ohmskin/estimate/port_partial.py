@@ -18,7 +18,8 @@ charge goes by what is touched. One reading has v_I = v; several show it as in `
     v_cell = sum_k residual_k^2 / (|K| - 1) ,  v_I = v + STAYING_SHARE^2 max(0, v_cell - v) .
 
 Of A and B alone, lines that charge add to A and take from B, which is read a slot later, less of
-it. So A has `FIRST_SHARE` of what stays in their difference, and that is taken from both.
+it. So A has `FIRST_SHARE` of what stays in their difference, and that is taken from both: the share
+max(0, 1 - `CLEAR_NOISES` v / v_cell) of it.
 
 A port that was not read has its last current; that is less certain by `STALE_SHARE` of it for each
 frame since then.
@@ -43,6 +44,9 @@ _NEVER_FRAMES: Final = 30
 # What A has of the difference that lines make between A and B, in modes with these two alone.
 # Measured in firmware/sim with its preset `desk`: 0.75 to 0.85, by the length of slots.
 FIRST_SHARE: Final = 0.8
+# What is less than so many times the noise does not stay. Chosen: two deviations; less would follow
+# noise, and make of two readings hardly more than one.
+CLEAR_NOISES: Final = 4.0
 
 
 class Shown(NamedTuple):
@@ -97,7 +101,8 @@ class PartialEnds:
             signal -= self._last.offset_ratio
         signal = signal[..., kinds]
         by_each = signal / slope
-        noise = self._last.noise or self._noise(by_each, slope)
+        # Where rest is a mean of many scans, it hardly shows any noise.
+        noise = max(self._last.noise or self._noise(by_each, slope), 2.0 * self._rounding)
         square_ohm = float(slope @ slope)
         current = signal @ slope / square_ohm
         error = noise
@@ -108,7 +113,7 @@ class PartialEnds:
             error = noise + STAYING_SHARE**2 * staying
             if kinds.tolist() == [True, True, False, False]:
                 weight = slope[0] ** 2 / square_ohm
-                share = staying / np.maximum(by_cell, noise)
+                share = np.maximum(1.0 - CLEAR_NOISES * noise / np.maximum(by_cell, 1e-30), 0.0)
                 current -= (FIRST_SHARE - 1 + weight) * share * (by_each[..., 0] - by_each[..., 1])
         alike = max(0.0, self._rounding - 0.5 * noise) * np.abs(slope).sum() ** 2
         std = np.broadcast_to(np.sqrt(error / square_ohm + alike / square_ohm**2), current.shape)
@@ -124,8 +129,7 @@ class PartialEnds:
 
     def _noise(self, by_each: Float, slope: Float) -> float:
         """v by this frame alone: currents that each reading shows (R, C, n), slopes (n,)."""
-        noise = 2.0 * self._rounding
-        if slope.size > 1:
-            square = np.diff(by_each[..., :2])[..., 0] ** 2 / np.sum(slope[:2] ** -2.0)
-            noise = max(noise, float(np.nanmedian(square)) / MEDIAN_CHI2[1])
-        return noise
+        if slope.size == 1:
+            return 0.0
+        square = np.diff(by_each[..., :2])[..., 0] ** 2 / np.sum(slope[:2] ** -2.0)
+        return float(np.nanmedian(square)) / MEDIAN_CHI2[1]

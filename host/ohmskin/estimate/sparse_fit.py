@@ -236,7 +236,7 @@ class Touched:
 
 
 def most_touches(shape: tuple[int, int]) -> float:
-    """Touches of a skin (R, C) that are still few."""
+    """How many touches of a skin (R, C) are still few."""
     return MAX_TOUCHES_PER_LINE * sum(shape)
 
 

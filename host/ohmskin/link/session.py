@@ -67,7 +67,8 @@ ATTEMPTS_AFTER_RESET: Final = (
 # Time that a board has for its answer, besides the time for the scan that it ends first. Chosen:
 # far above what a USB bridge and the slowest command, `save`, take.
 COMMAND_TIMEOUT_S = 1.0
-# A board that does not scan has answered in this time [s]. Chosen: ten times what it takes.
+# A board that does not scan has answered in this time [s]. Chosen: five times what a USB bridge may
+# keep an answer.
 _ANSWER_S: Final = 0.1
 # A scanning board that sends no valid frame for so long is asked who it is. Chosen: a board that is
 # reset and left alone says hello within 2 s, and only what stays silent has to be asked.
