@@ -261,20 +261,16 @@ class CellFit:
         held = ((lowest >= 0) & (gradient <= 0)) | ((highest <= 0) & (gradient >= 0))
         step = np.zeros_like(cell)
         for _ in range(rounds):
-            system, target = normal, gradient
-            if held.any():
-                # A held cell has the equation "step = what it has stepped", and the others lose
-                # what that step explains.
-                system = normal.copy()
-                target = gradient - system @ (step * held)
-                system[held, :] = 0.0
-                system[:, held] = 0.0
-                system.ravel()[:: len(cell) + 1] += held
-                target[held] = step[held]
-            _, step, failed = lapack.dposv(system, target, lower=1)
+            system, target, free = normal, gradient, ~held
+            if not free.any():
+                break
+            if held.any():  # what held cells have stepped explains a part of the target
+                system = normal[np.ix_(free, free)]
+                target = gradient[free] - normal[np.ix_(free, held)] @ step[held]
+            _, step[free], failed = lapack.dposv(system, target, lower=1)
             if failed:
                 return None
-            crossing = ((step < lowest) | (step > highest)) & ~held
+            crossing = ((step < lowest) | (step > highest)) & free
             step = np.clip(step, lowest, highest)
             if not crossing.any():
                 break
