@@ -4,8 +4,8 @@
     make bench-largest
     .venv/bin/python benchmarks/bench_largest.py
 
-A frame of random readings, which no skin gives, over random rest readings: each method gives up
-after all its iterations. Each runs in a process of its own.
+A frame of random readings, which no skin gives, over random rest readings: each method gives up.
+Each runs in a process of its own.
 
 METHOD_SIZE_MODE_s, _mb     of one frame, with what reading the rest takes.
 """

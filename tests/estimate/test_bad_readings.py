@@ -117,6 +117,17 @@ def test_after_nonsense_a_good_frame_is_answered_as_if_nothing_had_been(method: 
     assert after.converged
 
 
+@pytest.mark.parametrize("method", ["joint", "touch"])
+@pytest.mark.parametrize("shape", [(12, 12), (6, 24)])
+def test_nonsense_is_given_up_early(method: str, shape: tuple[int, int]) -> None:
+    random = np.random.default_rng(6)
+    estimator = make_estimator(method, knowledge_of(shape, "all"))
+    for _ in range(3):
+        found = estimator.estimate(frame("one current", shape, random))
+        assert not found.converged
+        assert found.iterations == 12
+
+
 def test_a_cell_beyond_the_hardest_touch_is_named() -> None:
     rest = rest_of((4, 4))
     cells = rest.cell_siemens.copy()
