@@ -68,6 +68,9 @@ AnyIndenter = Annotated[
     float | None, Option("--indenter-mm2", help="the same, where single cells are pressed")
 ]
 Force = Annotated[bool, Option("--force", help="even if cells seem to be touched at rest")]
+# Makes a calibrator, from what the board says of itself and the readings (R, C, 4) of its untouched
+# skin. All else is known from the command line.
+_CalibratorOf = Callable[[Hello, Float], Calibrator]
 calibrate = typer.Typer(
     no_args_is_help=True,
     help="Learn forces by a scale, weights or recordings: a calibration file.",
@@ -106,10 +109,11 @@ def weights(
         raise ValueError(
             "say --indenter-mm2, or --anywhere without --indenter-mm2, --cells, --redo"
         )
-    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table=not anywhere)
+    told = wires_of(wires, leads)
+    calibrator_of = _options(out, method, indenter_mm2, told, force, table=not anywhere)
     forces_n = [mass_g * NEWTONS["g"] for mass_g in grams_of(grams)]
     if anywhere:
-        _weigh_anywhere(port, out, np.repeat(forces_n, repeats or 20), calibrator_of, force)
+        _weigh_anywhere(port, out, np.repeat(forces_n, repeats or 20), calibrator_of)
         return
     kept = KeptPresses(out.with_suffix(".presses.csv"))
     with ohmskin.open(port) as skin:
@@ -128,7 +132,7 @@ def weights(
             every = [*read, *missing]
             check_enough(len(every), [press.force_n for press in every])
             check_cells_differ({press.cell for press in every}, shape)
-        calibrator = calibrator_of(skin.info, _rest_of(skin), force)
+        calibrator = calibrator_of(skin.info, _rest_of(skin))
         with naming(kept.path):
             calibrator.presses_in_table(kept.table)  # raises ValueError for another skin's
         if again:
@@ -154,13 +158,7 @@ def _rest_of(skin: Device) -> Float:
     return skin.mean_ratio(TARE_S)
 
 
-def _weigh_anywhere(
-    port: str,
-    out: Path,
-    forces_n: Float,
-    calibrator_of: Callable[[Hello, Float, bool], Calibrator],
-    force: bool,
-) -> None:
+def _weigh_anywhere(port: str, out: Path, forces_n: Float, calibrator_of: _CalibratorOf) -> None:
     """Learn from weights at places of the user's choice, each of these forces (n,) [N]."""
     before, path = session_paths(out, "weights")
     recordings = [load_recording(each) for each in before]
@@ -170,7 +168,7 @@ def _weigh_anywhere(
         with ohmskin.open(port) as skin:
             skin.only_unit = skin.info.unit_id
             rest_ratio = _rest_of(skin)
-            calibrator = calibrator_of(skin.info, rest_ratio, force)
+            calibrator = calibrator_of(skin.info, rest_ratio)
             with Recorder(path, skin.info, lambda: skin.now_s) as recorder:
                 recorder.add(Tare.of(rest_ratio, skin.info, skin.now_s))
                 left = guided(skin, calibrator, KeptAnywhere(recorder), missing, len(wanted))
@@ -179,7 +177,7 @@ def _weigh_anywhere(
             TERMINAL.print(f"{done}: the same command goes on")
             raise typer.Exit(130)
         recordings.append(load_recording(path))
-    _learn_totals(calibrator_of, joined(recordings), out, force)
+    _learn_totals(calibrator_of, joined(recordings), out)
 
 
 @calibrate.command()
@@ -210,7 +208,8 @@ def recording(
     """
     if total == (indenter_mm2 is not None):
         raise ValueError("say either --indenter-mm2, of presses of single cells, or --total")
-    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), recording, forces)
+    told = wires_of(wires, leads)
+    calibrator_of = _options(out, method, indenter_mm2, told, force, recording, forces)
     given = load_recording(recording)
     log = None if forces is None else load_force_log(forces, any_zero=total)
     with naming(recording):
@@ -227,7 +226,7 @@ def recording(
             raise ValueError("modes near and far are mixed in it: record the presses in one mode")
         rows, columns = map(all_lines, (board.rows, board.columns))
         board = replace(board, mode=modes.pop(), row_mask=rows, column_mask=columns)
-        calibrator = calibrator_of(board, _rest_ratio(given, rest_s), force)
+        calibrator = calibrator_of(board, _rest_ratio(given, rest_s))
         if total:
             _knead(calibrator, given, log, out, as_json)
             return
@@ -270,7 +269,7 @@ def knead(
 
     Ctrl-C ends it with what there is. The same command goes on: all recordings beside OUT count.
     """
-    calibrator_of = _options(out, method, None, wires_of(wires, leads))
+    calibrator_of = _options(out, method, None, wires_of(wires, leads), force)
 
     def sensor_of(skin: Device) -> ForceSensor | None:
         if is_truth(force_port, skin):
@@ -278,19 +277,14 @@ def knead(
         return ForceSensor(force_port, force_baud, force_scale, force_unit, force_column)
 
     given, known = kneaded(port, out, sensor_of, seconds)
-    _learn_totals(calibrator_of, given, out, force)
+    _learn_totals(calibrator_of, given, out)
     if not known:
         TERMINAL.print("not all cells are known yet: the same command goes on")
 
 
-def _learn_totals(
-    calibrator_of: Callable[[Hello, Float, bool], Calibrator],
-    given: Recording,
-    out: Path,
-    force: bool,
-) -> None:
+def _learn_totals(calibrator_of: _CalibratorOf, given: Recording, out: Path) -> None:
     """Write the calibration that the forces on the whole skin teach."""
-    calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, 0.0), force)
+    calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, 0.0))
     _knead(calibrator, given, None, out, as_json=False)
 
 
@@ -353,10 +347,11 @@ def table(
     force: Force = False,
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
-    calibrator_of = _options(out, method, indenter_mm2, wires_of(wires, leads), table, table=True)
+    told = wires_of(wires, leads)
+    calibrator_of = _options(out, method, indenter_mm2, told, force, table, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
-        calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s), force)
+        calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s))
     with naming(table):
         presses = calibrator.presses_in_table(rows)
     _finish(calibrator, presses, table, out)
@@ -396,14 +391,14 @@ def _options(
     method: str,
     indenter_mm2: float | None,
     wires: WireOhm,
+    force: bool,
     *inputs: Path | None,
     table: bool = False,
-) -> Callable[[Hello, Float, bool], Calibrator]:
+) -> _CalibratorOf:
     """Check the options that all commands have, before anybody presses cells for an hour.
 
-    table: whether presses are in a table. Returns a function that makes the calibrator from what
-    the board says of itself, the readings (R, C, 4) of its untouched skin, and whether they count
-    even if cells seem touched.
+    force: the rest counts even if cells seem touched. table: whether presses are in a table.
+    Returns a function that makes the calibrator.
     """
     if method not in LEVEL_METHODS:
         raise ValueError(f"no method '{method}': there are {', '.join(LEVEL_METHODS)}")
@@ -413,7 +408,7 @@ def _options(
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     check_place(out, *inputs)
     area_m2 = None if indenter_mm2 is None else 1e-6 * indenter_mm2
-    return lambda board, rest, force: Calibrator(board, rest, method, area_m2, wires, force)
+    return lambda board, rest: Calibrator(board, rest, method, area_m2, wires, force)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
