@@ -137,11 +137,9 @@ class Kneading:
         """The wires with which one curve and gains fit the totals best."""
         knowledge = self._calibrator.knowledge
         told = knowledge.nominal_wire_ohm
-        (*centre, lead), (*std, lead_std) = (each.tolist() for each in wire_prior(told))
-        lead_ohm, lead_std_ohm = lead * UNKNOWN_LEAD_OHM, lead_std * UNKNOWN_LEAD_OHM
-        if told.lead is None:
-            lead_std_ohm = USUAL_LEAD_STD_OHM
-        w, scale = np.array(centre), None
+        centre, std = (of_wires[:2] for of_wires in wire_prior(told))
+        lead_ohm, lead_std_ohm = told.lead_or(UNKNOWN_LEAD_OHM, USUAL_LEAD_STD_OHM)
+        w, scale = centre, None
         if told.both is None:
             w = np.minimum(w, np.log(START_OHM))
         used, is_first = self._in_stretches(FIRST_CELLS), True
@@ -154,7 +152,7 @@ class Kneading:
             levels = self._levels(estimator, used)
             wires = estimator.wires()
             lead_ohm = wires.lead or 0.0
-            prior = WireSlopes(self._slopes(wires, levels), centre - w, np.array(std))
+            prior = WireSlopes(self._slopes(wires, levels), centre - w, std)
             fit = TotalFit(self._totals(levels, log), prior, scale).fit()
             scale = fit.scale_
             step, stds = fit.w

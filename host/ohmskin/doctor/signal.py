@@ -38,7 +38,7 @@ from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
-from ohmskin.estimate.prior import LEAD_STD, UNKNOWN_LEAD_OHM
+from ohmskin.estimate.prior import UNKNOWN_LEAD_OHM
 from ohmskin.link.clock import slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -190,11 +190,12 @@ class Rest:
     told: WireOhm = NO_WIRES
 
     def lead_ohm(self, unknown_std_ohm: float) -> tuple[float, float]:
-        """The leads of all lines together, and their deviation, which is given if none is told."""
-        ohm, std_ohm = self.told.lead, self.told.lead_std_ohm
-        if ohm is None:
-            return UNKNOWN_LEAD_OHM, unknown_std_ohm
-        return ohm, max(std_ohm or LEAD_STD * ohm, 1.0)  # 1 ohm: a precision is made of it
+        """The usual lead of all lines, and its standard deviation [ohm].
+
+        unknown_std_ohm: the deviation of a lead that nobody has told.
+        """
+        ohm, std_ohm = self.told.lead_or(UNKNOWN_LEAD_OHM, unknown_std_ohm)
+        return ohm, max(std_ohm, 1.0)  # 1 ohm: a precision is made of it
 
     @property
     def ratio(self) -> Float:

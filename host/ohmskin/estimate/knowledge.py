@@ -20,6 +20,7 @@ from ohmskin.circuit.skin import (
     current_std,
     is_near,
 )
+from ohmskin.estimate.prior import LEAD_STD
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
@@ -57,6 +58,15 @@ class WireOhm(NamedTuple):
             if number is not None and not 0 <= number <= MAX_OHM:
                 raise ValueError(f"{name} is {number:g}, it must be from 0 to {MAX_OHM:g}")
         return self
+
+    def lead_or(self, ohm: float, std_ohm: float) -> tuple[float, float]:
+        """The lead and its standard deviation [ohm]; these two where nobody has told the lead.
+
+        A lead that was told without its deviation is known to the share `LEAD_STD`.
+        """
+        if self.lead is None:
+            return ohm, std_ohm
+        return self.lead, self.lead_std_ohm or LEAD_STD * self.lead
 
     @property
     def both(self) -> tuple[float, float] | None:

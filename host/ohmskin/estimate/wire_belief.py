@@ -81,7 +81,6 @@ from ohmskin.estimate.prior import (
     AGILE_FADE,
     AGILE_SHARE,
     LAYER_STD,
-    LEAD_STD,
     MAX_STEP_LOG,
     MEMORY,
     REACH_STDS,
@@ -188,12 +187,9 @@ class WireBelief(ABC):
         if may_be_bent or not layer_stds.all():
             layer_stds = np.hypot(layer_std, layer_stds)
         layer_stds = np.maximum(layer_stds, 0.01)
-        lead_ohm, lead_std_ohm = UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM
-        self._usual_lead_std_ohm = USUAL_LEAD_STD_OHM
-        if wires.lead is not None:
-            lead_ohm, lead_std_ohm = wires.lead, wires.lead_std_ohm or LEAD_STD * wires.lead
-            lead_std_ohm = max(lead_std_ohm, 1e-3)
-            self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
+        lead_ohm, lead_std_ohm = wires.lead_or(UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM)
+        lead_std_ohm = max(lead_std_ohm, 1e-3)
+        self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
         self._prior_covariance = np.diag([*layer_stds, lead_std_ohm]) ** 2
         nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
         self._nominal: Float = np.array([*np.log(nominal), lead_ohm])
