@@ -27,6 +27,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
+from ohmskin.calibrate.totals import GAIN_STD
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -37,9 +38,6 @@ from ohmskin.record.recording import ForceSample, Recording, Tare
 # A cell is known when what its force is multiplied by is known within this. Chosen: as well as
 # presses of contacts of textile repeat.
 KNOWN_LOG: Final = 0.15
-# Cells differ by this, before anything is known: the deviation of a logarithm. Chosen: as cells of
-# textile scatter, and some more.
-GAIN_STD: Final = 0.25
 # The level of all cells is known to this, before anything is: the deviation of a logarithm.
 # Chosen: a factor of e.
 LEVEL_STD: Final = 1.0

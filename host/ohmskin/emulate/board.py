@@ -26,6 +26,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import DEFAULT_REF_OHM
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.link import framing, protocol
+from ohmskin.link.clock import BITS_PER_BYTE
 from ohmskin.link.codes import quantise
 from ohmskin.version import VERSION
 
@@ -64,8 +65,6 @@ LINE_IDLE_PART: Final = 8
 IDLE_TO_CHANGE, FEW, IDLE_OF_FEW = 3, 3, 5
 # Rows and columns that the multiplexers have (scan_sequence.h).
 LINES_MAX: Final = 16
-# A byte takes so many bits on the line, 8N1.
-_BITS_PER_BYTE: Final = 10
 # The pins change at most this time after the hold of a reading [cycles] (docs/timing.md).
 SELECT_CYCLES: Final = 120
 
@@ -459,5 +458,5 @@ def _line_cycles(readings: int, baud: int) -> int:
     content = _SCAN.struct.size + protocol.codes_size(readings)
     # As core/frame_writer.h counts: type, sequence, CRC and delimiters, and the blocks of COBS.
     octets = content + 6 + 1 + (content + 6) // (framing.MAX_BLOCK_BYTES - 1)
-    cycles = octets * (CLOCK_HZ // baud * _BITS_PER_BYTE)
+    cycles = octets * (CLOCK_HZ // baud * BITS_PER_BYTE)
     return cycles + cycles // (LINE_IDLE_PART - 1)
