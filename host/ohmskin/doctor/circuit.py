@@ -217,7 +217,7 @@ def _judge_cells(
     rows, columns = siemens.shape
     top, bottom = rest.wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
-    path_ohm += 2 * rest.lead_ohm(limits.USUAL_LEAD_STD_OHM)[0]
+    path_ohm += 2 * rest.lead_ohm(limits.SWITCH_LEAD_STD_OHM)[0]
     # A short is seen through its wires, which may be above nominal by as much as is no fault. No
     # touch makes the cell itself conduct as well.
     most_ohm = (1 + limits.CHANGED_SHARE) * path_ohm + 1 / HIGHEST_TOUCH_SIEMENS

@@ -67,7 +67,7 @@ from ohmskin.doctor.limits import (
     FEW_STDS,
     KNOWN_STD,
     MANY_STDS,
-    USUAL_LEAD_STD_OHM,
+    SWITCH_LEAD_STD_OHM,
 )
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
@@ -93,8 +93,8 @@ ALIKE_STDS: Final = 2.5
 MOST_LINE_OHM: Final = 50e3
 
 
-class FarReadings:
-    """Mean readings of mode far, without the rows and columns that are left out (`examine_far`).
+class FarSkin:
+    """A skin by its mean readings of mode far, without the lines that `examine_far` leaves out.
 
     shape: number of rows and columns that are kept.
     loss_std_floating: u, s and w of rows (3, R, C), and of columns (3, C, R) [ohm].
@@ -361,7 +361,7 @@ class _Layer:
     def report_ends(self, ends_ohm: Float, dead: Bool, diagnosis: Diagnosis) -> None:
         """Add far ends that do not show their lines.
 
-        ends_ohm: what `FarReadings.ends` gives for this layer.
+        ends_ohm: what `FarSkin.ends` gives for this layer.
         dead: dead cells, (R, C).
         """
         # A broken yarn explains its far end. Such a line is not reported as swapped or open, too.
@@ -526,24 +526,24 @@ def examine_far(
     for is_open, shorts in zip(near.open_lines, near.shorts, strict=True):
         left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
         kept.append([n for n in range(len(is_open)) if n not in left_out])
-    readings, expected_lead = FarReadings(rest, kept), rest.lead_ohm(USUAL_LEAD_STD_OHM)
+    skin, expected_lead = FarSkin(rest, kept), rest.lead_ohm(SWITCH_LEAD_STD_OHM)
     layers = [
         _Layer(axis, kept, near.shorts[axis], loss_std_floating, expected_lead, silent)
         for axis, (loss_std_floating, silent) in enumerate(
-            zip(readings.loss_std_floating, readings.silent, strict=True)
+            zip(skin.loss_std_floating, skin.silent, strict=True)
         )
     ]
-    wire_ohm: Float = np.zeros((2, *readings.shape))
+    wire_ohm: Float = np.zeros((2, *skin.shape))
     for _ in range(ROUNDS):
         leads_ohm = sum(layer.lead_ohm for layer in layers)
-        shares = readings.current_shares(wire_ohm, leads_ohm)
+        shares = skin.current_shares(wire_ohm, leads_ohm)
         own_leads = [each.own_lead(share) for each, share in zip(layers, shares, strict=True)]
         for layer, current_share, own, of_other in zip(
             layers, shares, own_leads, own_leads[::-1], strict=True
         ):
             layer.fit_lines(current_share, _agreed(own, of_other, expected_lead))
         wire_ohm = np.stack([layers[0].wire_ohm, layers[1].wire_ohm.T])
-    ends_ohm = readings.ends(wire_ohm)
+    ends_ohm = skin.ends(wire_ohm)
     for layer, ends, nominal in zip(layers, ends_ohm, rest.told.both or (None, None), strict=True):
         layer.report_shorts(diagnosis)
         layer.report_ends(ends, near.dead, diagnosis)

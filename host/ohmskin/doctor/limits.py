@@ -34,8 +34,9 @@ DEAD_SHARE: Final = 0.3
 # [1] Wires that differ by less than this share from what they should be are no fault. Chosen:
 # estimators expect changes of LAYER_STD anyway.
 CHANGED_SHARE: Final = 0.25
-# [ohm] Leads that nobody has told are as usual within this. Chosen: a CD74HC4067's switch has 70
-# ohm typically and 180 at most (data sheet, at 4.5 V); a margin of yarn must be told.
-USUAL_LEAD_STD_OHM: Final = 40.0
+# [ohm] Standard deviation of a lead that nobody has told: the doctor takes it for the switch of a
+# multiplexer alone. Chosen: a CD74HC4067's switch has 70 ohm typically and 180 at most (data sheet,
+# at 4.5 V). A margin of yarn has more, and must be told.
+SWITCH_LEAD_STD_OHM: Final = 40.0
 # [log] Wires with a larger deviation are not known. Chosen: it is not far below CHANGED_SHARE.
 KNOWN_STD: Final = 0.15
