@@ -1,24 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well each cell is known while a skin is kneaded over a scale, before anything is fitted.
 
-The scale shows the sum of the cells' forces, so a number of it tells of each cell by its share.
+The scale shows the sum of the cells' forces. So each number of the scale tells something of a cell,
+the more the larger the cell's share of the force is.
 
 ======== ====== ===================================================================== ======
 symbol   shape  meaning                                                               unit
 ======== ====== ===================================================================== ======
 x        (N,)   rise of each cell above rest; 0 where it is not touched               S
 s        (N,)   share of each cell in the force, by the usual curve: x^`USUAL_EXPONENT`  1
-t        (N,)   log of what each cell's force is over that of the usual curve          1
+t        (N,)   log of the ratio of each cell's force to that of the usual curve       1
 F, v            force; variance of its log                                             N, 1
 A        (N, N) information on t                                                        1
 ======== ====== ===================================================================== ======
 
-    d log F / d t = s ,   A = A_0 + sum over numbers of s s^T / v ,   v = v_contact + (d_F / F)^2 ,
+    d log F / d t = s ,   A = A_0 + sum over numbers of s s^T / v ,
 
-    A_0 = (I - 1 1^T / N) / `GAIN_STD`^2 + 1 1^T / (N `LEVEL_STD`)^2 :
+    v = `CONTACT_STD`^2 + (`SCALE_STD_N` / F)^2 ,
 
-cells scatter about a level that nobody knows. The deviation of t is the root of diag(A^-1). Of what
-the scale shows, its size alone is needed: this is the theory of the design of experiments.
+    A_0 = (I - 1 1^T / N) / `GAIN_STD`^2 + 1 1^T / (N `LEVEL_STD`)^2 .
+
+A_0 is what is known before any number: cells scatter about a level that nobody knows. The standard
+deviation of t is the root of diag(A^-1). A needs the force only to know how large v is, and not how
+far the force is from what a curve predicts. So it is known before any curve is fitted, as in the
+theory of the design of experiments.
 """
 
 from dataclasses import replace
@@ -35,26 +40,27 @@ from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recording import ForceSample, Recording, Tare
 
-# A cell is known when what its force is multiplied by is known within this. Chosen: as well as
-# presses of contacts of textile repeat.
+# A cell is known when its t has a smaller standard deviation. Chosen: presses of a contact of
+# textile repeat as well.
 KNOWN_LOG: Final = 0.15
-# The level of all cells is known to this, before anything is: the deviation of a logarithm.
-# Chosen: a factor of e.
+# Standard deviation of the mean t of all cells, before any number. Chosen: a factor of e.
 LEVEL_STD: Final = 1.0
 # Force grows with this power of the rise. Chosen: that of rough contacts (docs/force.md).
 USUAL_EXPONENT: Final = 0.6
-# Deviation of a number of the scale from what all cells' curves let expect. Chosen: noise and
-# hysteresis of a contact, less by the few cells of a fingertip.
+# Standard deviation of the log of a force about the sum that right curves predict, by the contacts.
+# Chosen: noise and hysteresis of one contact, less because a fingertip covers a few cells.
 CONTACT_STD: Final = 0.08
-# The same, of the scale [N]. Chosen: a few grams, and what its filter leaves.
+# Standard deviation of a force by the scale itself [N]. Chosen: a few grams, and what is left of
+# the lag of its filter.
 SCALE_STD_N: Final = 0.05
-# Numbers that come sooner after the last are no news [s]. Chosen: the noise of a contact lasts as
-# long, and most scales show ten numbers a second.
+# A number that comes sooner after the last one tells nothing new [s]. Chosen: the noise of a
+# contact lasts as long, and most scales show ten numbers a second.
 NEWS_S: Final = 0.1
-# No cell counts as known before so many numbers of the scale for each cell. Chosen: one or two
-# presses a cell, because the curve of all cells and the wires have to be known, too.
+# No cell counts as known before the scale has shown so many numbers for each cell of the skin.
+# Chosen: those of one or two presses a cell. The curve of all cells and the wires, which are not in
+# t, need them.
 NUMBERS_A_CELL: Final = 10
-# Less force is not counted [N]. Chosen: there, a scale's zero is a share of it.
+# A smaller force is not counted [N]. Chosen: the error of a scale's zero is a large share of it.
 LEAST_N: Final = 0.3
 
 
@@ -111,7 +117,11 @@ class LiveCoverage:
         self._estimator: Estimator | None = None
 
     def look(self, scan: Scan, tare: Tare | None, sample: ForceSample | None) -> bool:
-        """A scan, the recording's tare if it is taken, the newest force. Returns if they tell."""
+        """Take in a scan. Returns whether it has told something of the cells.
+
+        tare: of the recording; None: it is not taken yet.
+        sample: the newest force; None: there is none.
+        """
         if sample is None or tare is None or not tare.is_of(scan):
             self._zeros_n += [] if sample is None else [sample.force_n]
             return False

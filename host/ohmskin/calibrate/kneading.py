@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From scans of a skin that is pressed anywhere, and the total force meanwhile, to its calibration.
 
-What the presses show of the forces, `totals` learns. Before that, the wires are learned from the
-same presses: with wrong wires, cells far from the electrodes, and those under much force, come out
-too soft or too hard, and no one curve with gains fits the sums.
+`totals` learns the force curves from the presses. Before that, the wires are learned from the same
+presses. With wrong wires, cells far from the electrodes and cells under much force seem too soft or
+too hard, so that no single curve, with a gain for each cell, fits the total forces.
 
 Symbols
 
@@ -13,18 +13,20 @@ symbol shape   meaning                                                          
 x      (n, C)  rise of each cell above rest, by an estimator that is told the wires      S
 g      (n, C)  conductance of each cell                                                  S
 w      (2,)    logs of a top and of a bottom segment                                     1
-A, B           slopes of the ports' currents, over their noise, by log g of the pressed
-               cells, and by w
+A, B           slopes of the ports' currents, over their noise: A by log g of the pressed
+               cells, B by w
 ====== ======= ========================================================================= =======
 
-The currents of the ports do not depend on what anybody believes of the wires. So if these change by
-dw, the pressed cells follow by
+The measured currents of the ports are the same, whatever wires are believed. So if the believed
+wires change by dw, the estimated cells must change so that the currents stay:
 
     d log g = -(A^T A + 1 / 3^2)^-1 A^T B dw ,    d log x = (g / x) d log g .
 
-`TotalFit` takes these slopes and finds dw together with curve and gains. That is repeated with the
-wires found, until they hardly change. The estimator learns the leads meanwhile, by frames of
-several touches: in totals, a lead looks as hysteresis does.
+3 is the deviation that a touch may have (`UNLIMITED_STD`); without it, cells that the currents
+hardly show would change without limit. `TotalFit` takes these slopes and finds dw together with
+curve and gains. Then the scans are estimated again with the new wires, until these hardly change.
+In the total force, a lead looks like hysteresis. So the leads are not found here: the estimator
+learns them from frames of several touches.
 """
 
 from dataclasses import replace
@@ -48,32 +50,43 @@ from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Scan
 
-# Scans of presses are estimated that are so far apart [s]. Chosen: half of the time in which a
-# finger comes or goes has two.
+# Of the scans of a press, those are estimated that are so far apart [s]. Chosen: a finger comes, or
+# goes, within four of them.
 SCAN_STEP_S: Final = 0.04
-# At most so many of them are estimated for the curves; and for each trial of the wires, so many
-# cells of them: first trials, and those after a short step. Chosen: 16x16 then takes some minutes.
+# For the curves, at most so many scans of presses are estimated. A trial of the wires takes as many
+# scans as have so many cells together: FIRST_CELLS in the first trials, TRIAL_CELLS after a short
+# step. Chosen: 16x16 cells then take some minutes.
 MOST_SCANS, FIRST_CELLS, TRIAL_CELLS = 8000, 60_000, 240_000
-# Presses are chosen in stretches of so many. Chosen: what a slow scale still shows of a press that
-# was not chosen is in one of so many.
+# Where a trial does not take all presses, it takes stretches of so many that follow each other.
+# Chosen: a slow scale still shows the press before a stretch, which spoils one press of so many.
 STRETCH: Final = 12
-# So many scans of pauses show what cells show of nothing. Chosen: enough for a median.
+# So many scans of pauses are estimated, to see which rises untouched cells show by error. Chosen:
+# enough for a median.
 PAUSE_SCANS: Final = 200
-# Rises below this many times what cells show of nothing tell no force.
+# A rise below so many times the largest one of a usual pause counts as none. Chosen: errors in
+# pauses are seldom twice as large.
 PAUSE_TIMES: Final = 2.0
-# Trials of the wires, their longest step, one that is short, and the one that is the last.
+# There are at most so many trials of the wires. The steps are logs: the longest one that is taken,
+# the one below which trials take more cells, and the one below which they end.
 TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 8, 1.5, 0.5, 0.1
-# A step that is shorter than so many deviations is short enough.
+# Trials also end at a step below so many standard deviations of the wires. Chosen: the presses do
+# not tell the wires better.
 CLOSE_STDS: Final = 0.7
-# Untold segments are at first tried with this [ohm]. Chosen: with wires that are far too large,
-# cells under much force conduct without limit, and the slopes tell nothing.
+# Segments that nobody has told are at most this in the first trial [ohm]. Chosen: with wires that
+# are far too large, cells under much force conduct without limit, and the slopes tell nothing.
 START_OHM: Final = 50.0
-# How well a trial's segments are told: so well that no scan teaches others. Chosen.
+# Standard deviation with which a trial tells its segments to the estimator, of their logs. Chosen:
+# so small that no scan teaches it others.
 TRIAL_LOG_STD: Final = 1e-3
 
 
 class _Levels(NamedTuple):
-    """x (n, C), 0 where nothing is pressed; at rest, (R, C); which scans were used, (n,)."""
+    """What an estimator shows of the scans.
+
+    rise: x, (n, C); 0 where nothing is pressed.
+    rest: level of the untouched cells, (R, C) [S].
+    used: which scans were used, (n,).
+    """
 
     rise: Float
     rest: Float
@@ -83,8 +96,9 @@ class _Levels(NamedTuple):
 class Kneading:
     """Scans of presses anywhere, by which a calibrator learns.
 
-    time_s: of the scans, (n,) [s]. of_skin: what all ports rise by together, (n,) [S]. shape:
-    (R, C).
+    time_s: time of each scan, (n,) [s].
+    of_skin: rise of the currents of all ports together, (n,) [S].
+    shape: (R, C).
     """
 
     def __init__(self, calibrator: Calibrator, scans: list[Scan]) -> None:
@@ -107,8 +121,9 @@ class Kneading:
     def learn(self, log: ForceLog, progress: Progress = iter, *, lags: bool = True) -> TotalFit:
         """Find the wires, unless the estimator shows them, and fit the curves.
 
-        log: of the scale, by the clock of the scans, but for its lag. lags: as for `Totals`; where
-        it does not, scans are used whose force is known.
+        log: forces of the scale, on the clock of the scans; only the scale's own lag is in them.
+        lags: as in `Totals`. A scale that does not lag shows the force of some scans, such as
+            known weights do: then only scans whose force is known are used.
         """
         calibrator = self._calibrator
         if not lags:
@@ -128,7 +143,10 @@ class Kneading:
         return np.asarray(self._is_clear & ((self._press < 0) | is_edge | (counts % every == 0)))
 
     def _in_stretches(self, most_cells: int) -> Bool:
-        """Which scans to use, (n,): as `_spaced`, of some stretches of presses."""
+        """Which scans to use, (n,): those of `_spaced` in some stretches of presses.
+
+        most_cells: the cells of all these scans together are about as many at most.
+        """
         used, press = self._spaced(MOST_SCANS), np.maximum.accumulate(self._press)
         cells = int(np.count_nonzero(used & (self._press >= 0))) * self.shape[0] * self.shape[1]
         return np.asarray(used & (press // STRETCH % (cells // most_cells + 1) == 0))
@@ -167,7 +185,7 @@ class Kneading:
         return FoundWires(found, told, fit.presses, ())
 
     def _levels(self, estimator: Estimator, used: Bool, progress: Progress = iter) -> _Levels:
-        """What an estimator shows of the scans that are used, (n,), but for those it doubts."""
+        """What an estimator shows of the scans to use, (n,); those that it doubts are left out."""
         pressed = self._press >= 0
         pauses = np.flatnonzero(used & ~pressed)
         wanted = used & pressed
@@ -184,7 +202,10 @@ class Kneading:
         return _Levels(rise, rest, good if self._weighed is None else good & self._weighed)
 
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
-        """What skin and scale have shown, of the scans that were used: no more rows than scans."""
+        """What skin and scale have shown. Numbers of the scale beside unused scans are left out.
+
+        If the scale has shown more numbers than there are scans, forces are taken at the scans.
+        """
         time_s, used = self.time_s, levels.used
         rise = levels.rise[used]
         of_scans = time_s[used], rise, self._press[used], self._margin(rise)

@@ -260,7 +260,8 @@ class Calibrator:
     def _tell(self, wires: WireOhm) -> None:
         """Make the estimator, which knows these wires.
 
-        While it is pressed, the skin is as its presses show it: not bent since.
+        It is told that the skin was not bent since its wires were measured: the presses that show
+        the wires are the ones that it estimates.
         """
         knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires)
         self.knowledge = replace(knowledge, may_be_bent=False)
@@ -304,7 +305,8 @@ class Calibrator:
             levels.append((answer.level - rest, answer.level_std, answer.touched))
             read.append(scan)
         history = LevelHistory(scan_times_s(read), *map(np.array, zip(*levels, strict=True)))
-        # Single cells are pressed: each is untouched in most scans.
+        # Single cells are pressed, so each cell is untouched in most scans, and its median rise is
+        # about 0. If it is far below, something that touched the cell at rest has gone since.
         rise, std = np.median(history.rise, axis=0), np.median(history.rise_std, axis=0)
         self._refuse(-rise > np.fmax(LOST_SHARE * rest, TOUCH_STDS * std))
         return history
@@ -314,8 +316,10 @@ class Calibrator:
     ) -> None:
         """Find the wires by presses, and tell them the estimator.
 
-        ratios: readings (R, C, 4) of each row of `presses`. in_order: they are scans, not means of
-        scans. Raises ValueError where no press is clear.
+        ratios: readings (R, C, 4) of each row of `presses`.
+        in_order: the readings are scans, one after the other, and not means of scans.
+
+        Raises ValueError where no press is clear.
         """
         reader, cells = PortReader(self.knowledge), presses.cells
         current = np.empty((2, cells.size))
@@ -363,7 +367,8 @@ class Calibrator:
         seen = zip(levels, presses.cells, strict=True)
         rise = np.array([level.flat[cell] for level, cell in seen])
         rise -= self.rest_level.flat[presses.cells]
-        # What scattered while a weight lay on the cell scatters as much in shares.
+        # The deviations in the table are of rises with other wires. As shares of the rise, they are
+        # the same with these wires.
         return replace(presses, rise=rise, rise_std=presses.rise_std * np.abs(rise / presses.rise))
 
     def calibration(self, presses: Presses) -> tuple[Calibration, str]:

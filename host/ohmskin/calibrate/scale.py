@@ -31,23 +31,24 @@ from ohmskin.link.clock import without_delays_s
 # scale.
 DELAYS_S: Final = (0.0, 0.1, 0.2, 0.4)
 LENGTHS_S: Final = (0.02, 0.1, 0.3)
-# A scale shows a force this much earlier than the scan that it is in, at most [s]. Chosen: a scan
-# takes no longer.
+# The delay may be negative down to this [s], since a force may reach the scale before the scan that
+# sees it has ended. Chosen: a scan takes no longer.
 EARLIEST_S: Final = -0.1
 # Filters are computed on a grid of half a scan, or of this, the longer [s].
 LEAST_STEP_S: Final = 0.01
-# It has so many points for each scan at most, also where a pause or a jump of the clock is long.
-# Chosen: twenty times as many as scans without a pause have.
+# The grid has at most so many points for each scan, however long a pause or a jump of the clock
+# makes it. Chosen: twenty times as many as scans without a pause have.
 MOST_POINTS: Final = 40
 
 
 # A scale that prints nothing for so long has made a pause [s].
 SILENCE_S: Final = 2.0
-# Lines are lost where the earliest of so many seconds is late by half a step or more [s]. Chosen:
-# no machine is too busy for so long.
+# Numbers were lost between two windows of so many seconds if the earliest number of the second one
+# is later, by half a step or more, than that of the first [s]. Chosen: no machine is too busy for
+# so long.
 LOST_WINDOW_S: Final = 5.0
-# Fewer numbers than so many tell no step, nor do numbers whose median is late by more than a step
-# and this [s]: they are not printed at equal steps.
+# Fewer numbers than this tell no step. If the median number is late by more than a step and by more
+# than this [s], the scale does not print at equal steps.
 LEAST_NUMBERS, MOST_LATE_S = 20, 0.05
 
 
@@ -63,7 +64,7 @@ def printed_s(arrival_s: Float) -> Float:
 
 
 def _in_steps(arrival_s: Float) -> Float:
-    """The same between two pauses."""
+    """`printed_s` of numbers between two pauses."""
     half = arrival_s.size // 2
     if arrival_s.size < LEAST_NUMBERS:
         return arrival_s
@@ -75,7 +76,7 @@ def _in_steps(arrival_s: Float) -> Float:
     lost = np.zeros_like(number)
     for first, last in pairwise(earliest):
         more = round(float(late_s[last] - late_s[first]) / step_s)
-        if more > -lost[-1]:  # none was lost that was not printed
+        if more > -lost[-1]:  # what was counted as lost may be taken back, and no more than that
             lost[first + 1 + int(np.argmax(np.diff(arrival_s[first : last + 1]))) :] += more
     times_s = without_delays_s(np.asarray(step_s * (number + lost)), arrival_s)
     is_even = np.median(arrival_s - times_s) < max(step_s, MOST_LATE_S)

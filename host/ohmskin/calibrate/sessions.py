@@ -13,8 +13,8 @@ import numpy as np
 
 from ohmskin.record.recording import ForceSample, Recording
 
-# Between two of them, time is taken to pass so long [s]. Chosen: longer than any gap that forces or
-# clocks are interpolated across.
+# So much time is taken to pass between two recordings [s]. Chosen: longer than any gap across which
+# forces or clocks are interpolated.
 PAUSE_S: Final = 100.0
 
 

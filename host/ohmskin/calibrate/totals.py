@@ -16,41 +16,45 @@ h, t     (n, C)   half the width of a contact's hysteresis, a log of x; where in
                   cell is: 1 if its force grows, -1 if it falls
 v, M     (n,)     force on a cell that is pressed too little to be seen; number of      N, 1
                   cells that seem untouched, beside touched ones
-g        (C,)     log of each cell's gain about that
+g, e     (C,)     log of each cell's gain about the curve of k and b; its exponent about b  1
 P        (n, C)   force on each cell                                                    N
 w        (2,)     logs of a top and of a bottom segment, less those that x is of        1
 S                 the scale's filter (`scale`): (n,) to (m,); its delay is learned here
 z        (q,)     zero of the scale at times `KNOT_S` apart; B (m, q) is straight       N
                   between them
 y, r     (m,)     what the scale shows; y - S sum(P) - B z                              N
-s0, s1            scatter of y at no force; its share of the force                      N, 1
+s0, s1            scatter of y at no force; its share of the total force                N, 1
 ======== ======== ===================================================================== ==========
 
     P = exp(k + g) (x' exp(h t) / x0)^(b + e) ,    1 / x' = 1 / x - c / x1 ,
     y = S (sum(P) + v M) + B z + scatter ,
     variance of y = s0^2 + s1^2 ((S sum P)^2 + F0^2) where the skin is pressed, F0 = max / 2 .
 
-F0 is large, because what is wrong at little force, such as cells that have not come back yet, is as
-large in newtons at any force. The fit is least squares (Gauss-Newton) with priors: gains have the
-deviation `GAIN_STD` about one curve, which the fit corrects by what cells show; b is about
-`EXPONENT`; the zero wanders by `ZERO_STEP_N` from knot to knot; w is what was told of the wires.
+F0 is large because some errors are as large in newtons at a small force as at a large one: those of
+cells that have not come back yet from the press before. The fit is least squares (Gauss-Newton)
+with these priors: gains scatter by `GAIN_STD` about the curve of all cells, which the fit corrects
+by the scatter that it sees; b is near `EXPONENT`; the zero changes by about `ZERO_STEP_N` from knot
+to knot; w is what was told of the wires.
 
-Errors of one press have few causes, so its rows count as `PRESS_ROWS` together, and it is kept or
-left out as a whole: at first only those count that fit best, and cells hardly differ; then all but
-those that are off by more than `OUTLIER_STDS` robust deviations. Such a press is one whose force
-does not go through the skin: a finger beside it, a hand on the plate.
+All rows of one press have nearly the same error. So they count as `PRESS_ROWS` rows together, and a
+press is kept or left out as a whole. In the first rounds, only the presses that fit best count, and
+the gains of cells may hardly differ. After these, all presses count but those that are off by more
+than `OUTLIER_STDS` robust deviations. The force of such a press does not go through the skin: a
+finger is beside it, or a hand on the plate.
 
-What no force lowers (c) bends the curve as wires do. So do hysteresis, because the largest force of
-each press comes while it grows, and force that is not seen, because it is a larger share of little
-force. Without h and v, wires come out 20 to 50 % too large. Hysteresis looks as a scale that is
-early, so its delay is found together with h. Wires are learned with a row a press, because errors
-of presses look like them.
+Three things bend the curve in the same way as wires do: a resistance that no force lowers (c);
+hysteresis (h), because the largest force of each press comes while the force grows; and force on
+cells that are pressed too little to be seen (v), because that is a larger share of a small force.
+Without h and v, wires come out 20 to 50 % too large. Hysteresis also looks like a scale that shows
+forces too early, so the delay of the scale is found together with h. Errors of presses look like
+wires, too. So while wires are looked for, all rows of a press count as one (`WIRE_PRESS_ROWS`).
 
-A reader of forces does not know t: curves are those of t = 0, and b h is part of their scatter.
-They are kept as the power laws that are nearest to them.
+Whoever reads forces later does not know t. So the curves that are kept are those of t = 0, and b h
+is added to their scatter. A calibration holds power laws: it gets those nearest to the curves.
 
-A cell's force is wrong by more than the sum, where errors average out. With r of the sum from s1 of
-each cell, r^2 = s1^2 sum(P^2): this s1 is the `residual_share` of the model.
+In the sum, the errors of single cells partly cancel, so one cell's force is wrong by a larger share
+than the sum is. If each cell is wrong by the share s1 of its own force, and all by chance, the sum
+is off by r with r^2 = s1^2 sum(P^2). The s1 of this equation is the `residual_share` of the model.
 """
 
 from dataclasses import replace
@@ -65,65 +69,71 @@ from ohmskin.calibrate.rules import MIN_PRESSES
 from ohmskin.calibrate.scale import EARLIEST_S, Scale, fit_scale
 from ohmskin.force.curve import MAX_EXPONENT, MIN_EXPONENT, POWER, ForceModel
 
-# Prior deviation of log gains. Chosen: cells of one skin scatter by some ten percent, and knitted
-# by hand by more.
+# Standard deviation of the log gains of cells, before any press. Chosen: cells of one skin scatter
+# by some ten percent, and by more where it is knitted by hand.
 GAIN_STD: Final = 0.25
-# That while it is not known yet which presses are beside the skin. Chosen: so the gains of cells
-# that few presses reach do not follow these.
+# The same in the first rounds, when nobody knows yet which presses are beside the skin. Chosen: so
+# small that the gains of cells with few presses do not follow presses beside the skin.
 FIRST_GAIN_STD: Final = 0.05
-# That deviation counts as much as so many cells that show it.
+# `GAIN_STD` counts as much as so many cells of the skin, when the fit makes a scatter of both.
 GAIN_CELLS: Final = 4.0
-# Exponent of F by x: contacts conduct by F^1 to F^2.
+# Exponent b, of force by rise, and its standard deviation: contacts conduct by F^1 to F^2.
 EXPONENT, EXPONENT_STD = 0.67, 0.3
-# Deviation of cells' exponents about b. Chosen: as those of single presses.
+# Standard deviation of e, of cells' exponents about b. Chosen: as those of single presses.
 BEND_STD: Final = 0.02
-# c. Chosen: 350 ohm at 140 microsiemens, a hard x1 of fingertips.
+# c before any press. Chosen: 350 ohm at 140 microsiemens, a hard x1 of fingertips.
 SERIES: Final = 0.05
-# A cell turns within this log of x. Chosen: noise of a pressed cell is less.
+# t goes from -1 to 1 while log x rises by this. Chosen: the noise of a pressed cell is less.
 TURN_LOG: Final = 0.1
-# So much of a rise at least is left with other wires.
+# With other wires, at least this share is left of a rise. Chosen: slopes hold for small changes of
+# the wires only, and a rise must stay above 0.
 LEAST_LEFT: Final = 0.2
-# Deviations of k, b, c, h and v [N] before anything is known. Chosen: k is free, half of the cells
-# have no series to speak of, and 0.1 N on one cell is seen.
+# Standard deviations of k, b, c, h and v [N] before any press. Chosen: k is free, half of the cells
+# have no series resistance to speak of, and 0.1 N on one cell is seen.
 FIRST_STD: Final = (10.0, EXPONENT_STD, 0.1, 0.1, 0.1)
-# Least and most of b, c, h. Chosen: no fit gets there but by going astray; others end at 0 by their
-# priors, because a limit at 0 would pull what goes with it.
+# Least and most of b, c, h. Chosen: only a fit that goes astray gets there. c and h may be below 0,
+# because a limit at 0 would pull the parameters that go with them; their priors keep them near 0.
 LIMITS: Final = ((MIN_EXPONENT, -0.4, -0.2), (MAX_EXPONENT, 0.8, 0.2))
-# Prior deviation of the scale's delay from that of the step before, and step of its slopes [s].
+# In one step, the delay of the scale changes by about the first number. Its slopes are differences
+# over the second [s].
 DELAY_STD_S, DELAY_STEP_S = 0.1, 0.005
-# The power law of the model is that of rises from so small a share of the largest ones, which are
-# this quantile, on. Chosen: from a tenth of the force; what lies beyond the largest is not known.
+# The power law of the model is fitted from the first share of the largest rise up to that rise,
+# which is the second quantile of all. Chosen: from a tenth of the force on; what is above the
+# largest rise is not known.
 LEAST_RISE, MOST_RISE_QUANTILE = 0.03, 0.999
 # x1 is this quantile of all rises.
 HARD_QUANTILE: Final = 0.99
-# A contact seems worse by its series by at most this factor.
+# x / x' is at least this. Chosen: far below what contacts have; x' must stay above 0.
 LEAST_OF_SERIES: Final = 0.1
-# The zero is known at times so far apart [s], and wanders by so much from one to the next [N].
-# Chosen: a load cell that warms up drifts by a gram in seconds.
+# The zero is found at times so far apart [s], and changes by about so much from one to the next
+# [N]. Chosen: a load cell that warms up drifts by a gram in seconds.
 KNOT_S, ZERO_STEP_N = 15.0, 0.05
-# There are so many of these times at most: those of an hour. What lasts longer has them farther
-# apart, so that a clock that jumps costs no more.
+# There are so many of these times at most: those of an hour. In a longer recording they are farther
+# apart, so that a clock that jumps does not fill the memory.
 MOST_KNOTS: Final = 240
-# The rows of a press count as so many; and while the wires are looked for. Chosen: from no force to
-# its highest and back; see the module.
+# The rows of a press count as so many rows together: usually, and while wires are looked for.
+# Chosen: a press goes from no force to its highest and back; the module says why wires take one.
 PRESS_ROWS, WIRE_PRESS_ROWS = 4.0, 1.0
-# A press is not over so many scans before and after it. Chosen: forces are straight between scans
-# here, which no finger's is.
+# Rows so many scans before and after a press are neither of the press nor of a pause. Chosen: there
+# the model takes forces for straight between scans, which those of a finger are not.
 NEAR_SCANS: Final = 2
-# F0 as a share of the largest total. Chosen: see the module.
+# F0 as a share of the largest total force. Chosen: the module says why it is large.
 FLOOR_SHARE: Final = 0.5
 # A press that is off by more robust standard deviations is left out. Chosen: by chance, one normal
 # error of 16,000 is larger, and presses are not quite normal.
 OUTLIER_STDS: Final = 4.0
-# At first only this share of the presses counts: those that fit best.
+# In the first rounds only this share of the presses counts: those that fit best. Chosen: fewer
+# presses are beside the skin.
 SURE_SHARE: Final = 0.7
 # A press is never left out that is off by less than this share, or by less than this force [N].
 LEAST_OFF: Final = 0.15
 LEAST_OFF_N: Final = 0.15
-# Rounds of the fit: robust ones, then ones with outliers left out; the filter is fitted after some.
+# Rounds of the fit: first only the surest presses count, then outliers alone are left out. The
+# filter of the scale is fitted before the rounds of these numbers.
 ROBUST_ROUNDS, TRIMMED_ROUNDS = 5, 8
 SCALE_ROUNDS: Final = (0, 3)
-# A gain whose deviation is still so much of the prior's is not the cell's own.
+# A cell has no gain of its own if the standard deviation of its log gain is still above this share
+# of what it was before the presses. Chosen: its presses have told half of the variance.
 POOLED_SHARE: Final = 0.7
 # Cells whose forces scatter by more than this share follow no curve.
 MOST_SHARE: Final = 0.7
@@ -135,10 +145,14 @@ _MEDIAN_STD: Final = 0.6745
 class Totals(NamedTuple):
     """What a skin and the scale under it have shown.
 
-    time_s: of the scans, (n,) [s]. rise: x (n, C). press: number of the press that each scan is of,
-    (n,), below 0: of none. margin: M (n,).
-    shown_s, shown_n: when the scale has shown what, (m,) [s], [N]. lags: whether its filter, zero
-    and drift are to be found; else it shows the force at its time.
+    time_s: time of each scan, (n,) [s].
+    rise: x, (n, C).
+    press: number of the press that each scan is of, (n,); below 0: it is of none.
+    margin: M, (n,).
+    shown_s: when the scale has shown its numbers, (m,) [s].
+    shown_n: these numbers, (m,) [N].
+    lags: whether the scale has a filter, a zero and a drift, which are to be found; else each
+        number is the force at its time.
     """
 
     time_s: Float
@@ -227,7 +241,10 @@ class TotalFit:
         return log_x + np.log(steeper) + self._p[3] * self._turn, steeper, u * steeper
 
     def _changed(self) -> Float:
-        """What w makes of x, a factor, (n, C): by logs, small rises would grow without end."""
+        """The factor by which x changes with w, (n, C).
+
+        It is 1 + slope w and not its exponential, which would let small rises grow without end.
+        """
         assert self._wires is not None
         change = np.tensordot(self._p[self._of_wires], self._wires.slopes, 1)
         return np.asarray(np.maximum(1 + change, LEAST_LEFT))
@@ -343,7 +360,11 @@ class TotalFit:
         return precision, precision @ (centre - p)
 
     def _judge(self, *, trims: bool) -> None:
-        """Leave out groups by how far each is off. trims: outliers alone; cells may differ then."""
+        """Decide which presses and pauses are left out of the next round, by how far each is off.
+
+        trims: leave out outliers alone, and let the gains of cells scatter as far as they do; else
+            keep only the presses that fit best.
+        """
         size_n = np.where(self._ends, 0.0, self.total_n_ + self._floor_n)
         weight = np.bincount(self._of_row, size_n, self._groups) + 1e-12
         off_n = np.bincount(self._of_row, size_n * self.off_n_, self._groups) / weight
@@ -445,7 +466,11 @@ class TotalFit:
 
 
 def _turns(log_x: Float, on: Bool) -> Float:
-    """t of each cell, (n, C), as the play of a gear has it."""
+    """t of each cell, (n, C).
+
+    It follows log x as a gear with play follows another one: it moves with log x between -1 and 1,
+    and stays at these ends. A press begins with growing force, at 1.
+    """
     turns, now = np.ones_like(log_x), np.ones(log_x.shape[1])
     steps = 2 / TURN_LOG * np.diff(log_x, axis=0)
     begins = ~(on[1:] & on[:-1])
@@ -456,5 +481,5 @@ def _turns(log_x: Float, on: Bool) -> Float:
 
 
 def _robust_std(off: Float, least: float) -> float:
-    """Standard deviation of what is off by so much, (n,), by its median; `least` at least."""
+    """Standard deviation of errors (n,) by the median of their sizes; `least` at least."""
     return max(least, float(np.median(np.abs(off))) / _MEDIAN_STD) if off.size else least

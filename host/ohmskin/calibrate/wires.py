@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wires of a skin, from presses of single cells by known forces.
 
-A cell conducts alike under a force wherever it lies, but for its scatter. What its port shows is
-less the more wire lies in series: j+1 segments of its row, i+1 of its column. So one law of all
-cells, from force to conductance, and the wires are found together: whoever takes the wires for less
-than they are finds cells far from the electrodes too soft, and all the more under large forces.
+Under the same force, all cells conduct alike wherever they lie, apart from some scatter. But the
+more wire lies in series with a cell, the less current its port shows: j+1 segments of its row, i+1
+of its column. With wires that are taken for too small, cells far from the electrodes would seem to
+conduct too little, and most of all under large forces. So the wires are found together with one law
+from force to conductance, which holds for all cells.
 
 Symbols. A press has up to `LEVELS` rows, each of them the mean of its scans at about one force.
 
@@ -39,11 +40,11 @@ network is solved once (`RestNetwork`). A pressed cell is a change of rank 1.
     C = N + S S^T * [same cell] (v_cell + v_exponent x x^T + v_press [same press]
                                  + (v_row + v_force / F^2) [same row]) + U U^T * K ,
 
-N the noise of the readings, * by elements, and [...] 1 where it is so, else 0. Minimised is
-(y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits the variances v are made those
-of most likelihood. Two leads and r add to one series resistance, so presses tell their sum alone,
-and the prior of r decides: what a lead adds to the usual r is taken for the lead.
-The covariance of p is that of least squares.
+N is the noise of the readings, * multiplies by elements, and [...] is 1 where it holds, else 0.
+The fit minimises (y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits, the variances
+v are replaced by the most likely ones. Two leads and r lie in series, so presses tell their sum
+alone, and the prior of r divides it: what is above the usual r is taken for the leads. The
+covariance of p is that of least squares.
 """
 
 from dataclasses import dataclass
@@ -81,24 +82,27 @@ LEAST_FORCE_SHARE: Final = 0.05
 LEAST_RISE_STDS: Final = 6.0
 
 # Priors: centres, and deviations of logs.
-# Wires that nobody has told. Chosen: two deviations are a factor of twenty either way.
+# Deviation of the log of segments that nobody has told. Chosen: two deviations are a factor of
+# twenty either way.
 UNTOLD_STD: Final = 1.5
-# A lead that nobody has told [ohm]. Chosen: margins of yarn have kilohms.
+# Deviation of a lead that nobody has told [ohm]. Chosen: margins of yarn have kilohms.
 UNTOLD_LEAD_STD_OHM: Final = 1500.0
-# What no force lowers [ohm], as of the cell in docs/force.md. Chosen deviation: a factor of e.
+# r [ohm], that of the cell in docs/force.md, and the deviation of its log. Chosen: a factor of e.
 SERIES_OHM, SERIES_STD = 250.0, 1.0
-# By which share r differs from cell to cell. Chosen: as a cell's factor, `SCATTER`.
+# r differs from cell to cell by this share. Chosen: as a cell's factor does (`SCATTER`).
 SERIES_SPREAD: Final = 0.2
 # Exponent b: linear contacts have 1, rough ones up to 2. Chosen.
 EXPONENT, EXPONENT_STD = 1.5, 1.0
 # Bend q. Chosen: from 0.4 to 8 N, it changes the exponent by 0.3.
 BEND_STD: Final = 0.1
-# Deviations of log G, and of a force [N], and how far their logs may be off. Chosen: cells of one
+# The roots of v before any press: of a cell's factor, of its exponent, of a press and of a row, all
+# of log G; and of a force [N]. Then the deviations of the logs of these roots. Chosen: cells of one
 # skin scatter by some ten percent, presses by less.
 SCATTER: Final[Float] = np.array([0.2, 0.03, 0.05, 0.08, 0.03])
 SCATTER_LOG_STD: Final[Float] = np.array([0.5, 0.7, 1.0, 1.0, 1.0])
 
-# Wires whose log is uncertain by more are unclear, if it matters. Chosen: a factor of 1.6.
+# Wires are unclear if the deviation of their log is larger, and if that matters (`FoundWires`).
+# Chosen: a factor of 1.6.
 UNCLEAR_LOG: Final = 0.5
 
 # The search.
@@ -112,15 +116,19 @@ ROUNDS: Final = 4
 _REST_STEPS, _CLOSE_STEP = 20, 1e-6
 # Step of p for slopes by differences.
 _DIFFERENCE: Final = 1e-3
-# A log that is off by so much is a factor of e^14: no fit gets there but by going astray.
+# p stays within this of its centre. Chosen: as a log, it is a factor of e^14, and only a fit that
+# goes astray gets there.
 _LIMIT: Final = 14.0
 
 
 class PressReadings(NamedTuple):
     """What n scans of pressed cells show, arrays (n,).
 
-    cells: flat index of the pressed cell. press: number of its press. force_n: on it [N].
-    current, current_std: of its port per Vdd, and the standard deviation [S].
+    cells: flat index of the pressed cell.
+    press: number of its press.
+    force_n: force on the cell [N].
+    current: of the cell's port per Vdd [S].
+    current_std: standard deviation of current [S].
     """
 
     cells: NDArray[np.intp]
@@ -134,9 +142,11 @@ class PressReadings(NamedTuple):
 class FoundWires:
     """What presses tell of the wires, together with what was told.
 
-    wires: most likely, with their deviations. told: before. presses: how many.
-    unclear: layers whose wires are uncertain by half, and by so much that their longest line is by
-        more than the hardest touch has.
+    wires: the most likely ones, with their deviations.
+    told: what was told before.
+    presses: how many presses there were.
+    unclear: layers whose wires are not clear: the deviation of their log is above `UNCLEAR_LOG`,
+        and the longest line is uncertain by more ohms than the hardest touch has.
     """
 
     wires: WireOhm
@@ -333,11 +343,11 @@ class _PressFit:
         half = 0.5 * SEGMENT_STD
         by_contact = (y(log_contact + half)[0] - y(log_contact - half)[0]) / (2 * half)
         own = (SERIES_SPREAD * np.exp(p[6])) ** 2 * np.eye(self._cells.size)
-        # d(I - I0) / d ohm = I0^2 - I^2, and so by log(I - I0):
+        # U: d(I - I0) / d ohm = I0^2 - I^2, so that d log(I - I0) / d ohm = -(I + I0).
         return _Expected(middle, by_contact, -(current + rest_current), trial.path_variance + own)
 
     def _whitener(self, model: _Expected, scatter: Float) -> "_Whitener":
-        """For residuals of y, at this model, with this scatter (5,)."""
+        """Whitens residuals of y at this model. scatter: roots of v, (5,)."""
         block, is_row, rows = self._block, self._is_row, self._rows
         x, press = self._x[block], rows.press[block]
         cell, exponent, of_press, of_row, of_force = scatter**2
@@ -355,7 +365,10 @@ class _PressFit:
     # ----------------------------------------------------------------------------- the search
 
     def minimised(self, start_ohm: float) -> tuple[float, Float, Float]:
-        """From wires of so much: -2 log likelihood, p, and its covariance (7, 7)."""
+        """The fit that starts from segments of `start_ohm`, both layers alike.
+
+        Returns -2 log likelihood, p, and the covariance of p (7, 7).
+        """
         from scipy.optimize import least_squares
 
         p, scatter = self._start(start_ohm), SCATTER
