@@ -98,8 +98,8 @@ class LinesAndCells:
 def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> LinesAndCells:
     """Add what is wrong with lines, cells and references.
 
-    While something moves on the skin, shorted lines and dead cells are not judged: the means are
-    those of no one skin, in which lines could be alike or cells be dead.
+    While something moves on the skin, shorted lines and dead cells are not judged: the means then
+    belong to no single state of the skin.
     """
     shown = np.where(READING_SIGN > 0, rest.codes, LARGEST_CODE - rest.codes)
     current = shown.mean(axis=2)
@@ -183,7 +183,8 @@ def _shorted(
         is_short, others = not few, np.log(np.delete(level, members))
         if len(others):
             rise = float(np.log(level[members].min()) - np.median(others))
-            # Few ports may agree by chance: then the rise must stand out of the others' scatter.
+            # Few ports may agree by chance. Then the conductance of these lines must also stand out
+            # of the scatter of the other lines.
             is_short = rise > max(np.log(DOUBLED), limits.FEW_STDS * few * float(np.std(others)))
         if is_short:
             groups.append([int(lines[member]) for member in members])
@@ -207,8 +208,8 @@ def _judge_cells(
     if not rest.moves and high.sum() < judged.sum() > 1:
         usual = float(np.median(siemens[judged & ~high]))
         hidden = np.logical_and.outer(high.any(axis=1), high.any(axis=0))
-        # Cells of an untouched skin are known well. Their deviation also has what wrong references
-        # would do to it, but that would do the same to all cells.
+        # Touches elsewhere make a cell uncertain, so it is dead only beyond that doubt. On an
+        # untouched skin, all cells are known well.
         doubt = limits.MANY_STDS * std if high.any() else 0.0
         dead = np.asarray(judged & ~hidden & (siemens + doubt < limits.DEAD_SHARE * usual))
     if dead.any():
@@ -218,8 +219,8 @@ def _judge_cells(
     top, bottom = rest.wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
     path_ohm += 2 * rest.lead_ohm(limits.SWITCH_LEAD_STD_OHM)[0]
-    # A short is seen through its wires, which may be above nominal by as much as is no fault. No
-    # touch makes the cell itself conduct as well.
+    # A saturated cell shows the wires up to it, and these may be above nominal by the share that is
+    # no fault. The cell itself conducts more than the hardest touch could make it.
     most_ohm = (1 + limits.CHANGED_SHARE) * path_ohm + 1 / HIGHEST_TOUCH_SIEMENS
     saturated = high & (siemens * most_ohm > 1)
     if saturated.any():

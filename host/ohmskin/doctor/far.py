@@ -24,15 +24,15 @@ m      (L,)      mean of a line's segments, or the usual one of the layer [ohm]
 ====== ========= ===========================================================================
 
 A far end carries no current, so its potential shows what the lead and all segments of the line
-lose: u = l + A r. On an untouched skin, a line draws current at all its crossings alike; a touch
-draws it at its own.
+lose: u = l + A r. On an untouched skin, a line draws the same current at each of its crossings; a
+touch draws most of it at its own crossing.
 
 A 1 is what segments of 1 ohm lose. With one m for all segments of a line, u = l + m A 1 is a
-straight line over A 1 that begins at the lead. Each line has a lead of its own. The layer's is
-their mean by precision, of those that are near the median: others have a bad crimp. An untouched
-skin shows it badly, so that what the other layer has and what is expected count, too, unless they
-contradict it. A first segment cannot be told from a lead: what a line's lead is above the layer's
-counts as its first segment.
+straight line over A 1 that begins at the lead. Each line has a lead of its own. The layer's lead is
+the mean of these by precision, without those that are far from their median: they have a bad crimp.
+An untouched skin shows the lead badly. So the other layer's lead and the expected one count, too,
+unless they contradict it. A first segment cannot be told from a lead. So what a line's lead has
+above the layer's counts as a part of its first segment.
 
 A depends on the cells. The cells follow from the port resistances without their wires, and the
 wires follow from u and A. So the cells, A and the wires are computed in turn, `ROUNDS` times.
@@ -45,10 +45,10 @@ With m free, this gives the segments of a sound line. With the usual m of the la
 that may have any resistance, it finds a bad segment.
 
 A far end is at fault if it stays while the near end moves, if it shows what the near end shows, if
-no r fits, or if u = k w fits clearly better, with k from 0 to 1. That is what a node shows that is
-not connected: it keeps the voltage of the cell before (k = 1), unless the converter's sample
-capacitor brings along that of the near end, which is read before (down to k = 0). Two ends are
-swapped if what the circuit says of the other line's end fits.
+no r fits, or if u = k w fits clearly better, with k from 0 to 1. A node that is not connected shows
+the last: it keeps the voltage of the cell before (k = 1), but the converter's sample capacitor may
+bring along the voltage of the near end, which is read just before (then k goes down to 0). Two ends
+are swapped if the potentials that the circuit gives for the other line's end fit.
 """
 
 from collections.abc import Iterable, Sequence
@@ -128,7 +128,8 @@ class FarSkin:
             std_ohm = (std[axis] / self._current).mean(axis=1 - axis) / loss.shape[2 - axis] ** 0.5
             most_ohm = LEAST_LOSS_OHM - FEW_STDS * std_ohm
             whole = ohm.mean() < LEAST_LOSS_OHM - FEW_STDS * std_ohm.mean() / ohm.size**0.5
-            # In single lines, what wires lose may undo what cells make of the current.
+            # A single line may stay by chance, where the loss of its wires cancels what the cells
+            # change. So it counts only if all lines stay.
             silent.append(stays.all() | (ohm < most_ohm) | whole)
         self.silent = silent[0], silent[1]
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
@@ -253,10 +254,11 @@ class _Layer:
         self.usual_ohm = self._median_ohm(self.measured)
 
     def own_lead(self, current_share: Float) -> tuple[float, float]:
-        """The usual lead of the lines, by these currents A alone, and its deviation [ohm].
+        """The usual lead by the lines of this layer alone, and its deviation [ohm].
 
-        That of a line, and m, come from u = l + m A 1 + v, where v are the noise and what segments
-        have of their own: its covariance is s^2 + (SPREAD_SHARE m)^2 A A^T, for the m of before.
+        current_share: A. Lead l and mean segment m of each line are fitted to u = l + m A 1 + v. v
+        is the noise, and what segments differ from m by. Its covariance is
+        s^2 + (SPREAD_SHARE m)^2 A A^T, with m as of the round before.
         """
         slopes = np.stack([np.ones_like(self.loss_ohm), current_share.sum(axis=2)], axis=2)
         before_ohm = (self.loss_ohm - self.lead_ohm).mean(axis=1) / slopes[..., 1].mean(axis=1)
@@ -376,9 +378,10 @@ class _Layer:
                 diagnosis.add(kind, self.place(lines_of(lines)))
 
     def _report_broken(self, line: int, dead: Bool, diagnosis: Diagnosis) -> bool:
-        """Whether the yarn of a line is broken, whose far end is lost.
+        """Add a broken yarn if that is why the far end of this line is lost; whether it is.
 
-        It is if all cells from some crossing on are dead. It is added, and explains these cells.
+        The yarn is broken if all cells of the line beyond some crossing are dead. The finding
+        explains these cells.
         """
         number = self.numbers[line]
         in_line = np.take(dead, number, axis=self.axis)[self.across]
@@ -422,7 +425,8 @@ class _Layer:
             return None
         fit, lines = self.fit, self.measured
         line_ohm = float(np.median(fit.ohm[lines].sum(axis=1)))
-        # The variance of a median is pi / 2 times that of a mean. The lead is off for all alike.
+        # The variance of a median is pi / 2 times that of a mean. An error of the lead is the same
+        # in all lines, so that no mean makes it smaller.
         own_std_ohm = np.median(fit.covariance[lines].sum(axis=(1, 2)) ** 0.5)
         own_std_ohm *= (np.pi / 2 / lines.sum()) ** 0.5
         by_lead = self.lead_std_ohm * np.median(fit.by_lead[lines].sum(axis=1))
@@ -430,10 +434,10 @@ class _Layer:
         return line_ohm / len(self.across), log_std
 
     def _report_segment(self, line: int, one_bad: Fit, diagnosis: Diagnosis) -> bool:
-        """Whether one bad segment explains a line. Then it is added, and its fit is the line's.
+        """Add a bad segment if one explains this line, and take its fit; whether one does.
 
-        It does if it explains the line clearly better than usual segments alone do, and as well as
-        a line of another mean; and if it adds a share to the line that counts.
+        It explains the line if it does so clearly better than usual segments alone, and as well as
+        segments of another mean, and if what it adds is a large enough share of the line.
 
         one_bad: what `_fit_one_bad` gives of all lines.
         """
@@ -488,7 +492,10 @@ def near_ends(rest: Rest) -> Rest:
 
 
 def _agreed(own: tuple[float, float], *others: tuple[float, float]) -> tuple[float, float]:
-    """Mean by precision of a lead and those others that do not contradict it, with deviations."""
+    """The mean by precision of a lead and of those others that do not contradict it.
+
+    Each is a lead and its deviation [ohm], and so is the mean.
+    """
     ohm, std_ohm = own
     for other_ohm, other_std_ohm in others:
         if abs(ohm - other_ohm) < ALIKE_STDS * np.hypot(std_ohm, other_std_ohm):
@@ -548,7 +555,7 @@ def examine_far(
         layer.report_shorts(diagnosis)
         layer.report_ends(ends, near.dead, diagnosis)
         layer.report_wires(nominal, diagnosis)
-    # What is only usual is not measured.
+    # What is told counts as measured. A lead that is only usual does not.
     lead_ohm = _agreed(*own_leads, *(() if rest.told.lead is None else (expected_lead,)))
     diagnosis.wires_by_far_ends = _wires_of(layers, lead_ohm)
     if np.isfinite(lead_ohm[1]):

@@ -84,7 +84,8 @@ def gather(
             evidence.report = device.self_test()
         report(Step.PLATE if clocks else Step.SKIN, seconds)
         _scan(device, evidence.scans, seconds)
-        # Anew: if the board was reset meanwhile, it says why. A recording may end with a region.
+        # Read once more: a board that was reset meanwhile says why. A recording may end with a
+        # region, so the newest hello of the whole skin counts.
         boards = [device.info, *(scan.board or board for scan in reversed(evidence.scans))]
         complete = [each for each in boards if each.is_complete]
         if not complete:

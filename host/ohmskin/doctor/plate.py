@@ -48,8 +48,8 @@ FULL_LSB: Final = 1 << ADC_BITS
 # [S] Where the plate has no resistor, a bridge conducts more than this, and than TOUCH_STDS
 # deviations. Chosen: 1 MOhm, far above what a plate's resistors are.
 BRIDGE_SIEMENS: Final = 1e-6
-# [1] In the right order, lines differ from the plate by less than this share of what they differ in
-# the wrong one. Chosen: a wrong resistor stays wrong in any order.
+# [1] Lines are swapped if, in another order, they differ from the plate by less than this share of
+# what they differ now. Chosen: a wrong resistor stays wrong in any order.
 SWAPPED_SHARE: Final = 0.5
 # [1] A resistor tells the references if its share of the loop with them is between these. Chosen:
 # else the references, or the resistor, have too few codes.

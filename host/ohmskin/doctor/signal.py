@@ -68,8 +68,8 @@ LEAST_LONGER_US: Final = 100
 # [us] In mode far, the longer settle time is at least this: wires show as a few codes, so that a
 # tenth counts. Chosen: with less, far nodes keep a part of a code (docs/troubleshooting.md).
 LONGER_FAR_US: Final = 300
-# [1] A settle time that is longer by less than this factor shows nothing new. Chosen: a
-# fifth more is the least that clearly changes what a slow node lacks, by 60 % at 5 time constants.
+# [1] A settle time that is longer by less than this factor shows nothing new. Chosen: a fifth
+# more is the least that clearly changes a slow node: after 5 time constants, it lacks 60 % less.
 NOT_LONGER: Final = 1.2
 # [Hz] The second look is not slower, unless the board is. Chosen: some six scans in SETTLED_S.
 LEAST_LOOK_HZ: Final = 4.0
@@ -80,11 +80,12 @@ MAINS_HZ: Final = (50.0, 60.0)
 # [Hz] They are looked for so far off: a board's ceramic resonator is off by up to 0.5 %, as
 # `messages.MAX_RATE_ERROR` says. Chosen: steps so fine that no tone falls between two.
 MAINS_SEARCH_HZ: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)
-# [deviations] P of hum is above that of noise by this many, if all readings were independent. The
-# four readings of a cell round alike, so that it is half as many. Chosen: 5 of these.
+# [deviations] P of hum is above that of noise by so many deviations, as if all readings were
+# independent. But the four readings of a cell round alike, which makes the true deviation twice as
+# large. Chosen: 5 true ones.
 HUM_OVER_NOISE: Final = 10.0
-# [1] P of hum is above that of frequencies beside it by this factor, which drift and other tones
-# are not. Chosen: in noise, the largest of some is about twice the usual one.
+# [1] P of hum is above that of frequencies beside it by this factor; P of drift and of other tones
+# is not. Chosen: in noise alone, the largest P of some frequencies is about twice the usual one.
 HUM_OVER_BESIDE: Final = 3.0
 # [1 / duration] Frequencies beside a tone. A Hann window's main lobe ends at 2 (Harris 1978).
 BESIDE_BINS: Final = (-7, -6, -5, -4, 4, 5, 6, 7)
@@ -108,7 +109,7 @@ NOISY_SHARE: Final = 1.7
 MOVED_LSB: Final = 3.0
 # [LSB] A longer settle time changes settled readings by less. Chosen: a code.
 UNSETTLED_LSB: Final = 1.0
-# [1] Of readings A to D, this makes the mean of what they show of the current, (4, 1).
+# [1] Readings A to D times this are the mean of what the four show of the current, (4, 1).
 _CURRENT: Final = READING_SIGN[:, None] / READING_SIGN.size
 
 

@@ -249,8 +249,9 @@ class CornerScans:
         for corners, codes in self._codes.items():
             if len(codes) < HELD_SHARE * most:
                 continue
-            # A hand trembles. So codes round up and down, as with noise, and rounding leaves less
-            # in the mean. But trembling adds no noise to it, since all readings follow it alike.
+            # A hand trembles. So codes round up and down, as with noise, and rounding leaves a
+            # smaller error in the mean. But the trembling itself is no error of the mean, because
+            # all readings follow it together.
             scatter_lsb = np.maximum(np.std(codes, axis=0), rest.noise_lsb)
             variance = np.mean(rounding_std_lsb(scatter_lsb) ** 2, axis=-1)
             std_lsb = np.sqrt(variance + rest.noise_lsb**2 / len(codes))
@@ -352,6 +353,6 @@ def _pressed_fit(
         lift += np.where(free, np.clip(lift_step, -MAX_STEP_LOG, MAX_STEP_LOG), 0.0)
         if abs(step) < CLOSE_STEP:
             break
-    # As many readings are left to contradict the model as cells are not free, less one for y.
+    # Readings that may contradict the model: one for each cell that is not free, less one for y.
     misfit = float(residual @ weighed[:, 1]) / max(int((~free).sum()) - 1, 1)
     return log_share, (max(misfit, 1.0) / precision) ** 0.5
