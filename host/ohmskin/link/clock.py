@@ -233,7 +233,8 @@ class BoardClock:
         """
         self._delay_s = min(self._delay_s, host_time_s - sent_s)
         u_s = self._last_u_s + math.remainder(1e-6 * time_us - self._last_u_s, _TIME_SPAN_S)
-        # Where no scans come, the line is of another time, and perhaps of before a reset.
+        # Where no scans come, the line was fitted to scans of long ago, perhaps of before a reset.
+        # Then it does not tell when the board had read the command.
         if self._line is not None and abs(u_s - self._last_u_s) < _BLOCK_S:
             if len(self._commands) == _COMMANDS:
                 self._forget_command()
@@ -331,10 +332,12 @@ def scan_times_s(scans: list[Scan]) -> Float:
 
 
 def without_delays_s(board_s: Float, host_s: Float) -> Float:
-    """When something was by the host's clock [s], (n,), that was at times (n,) of a board's [s].
+    """Times by the host's clock [s], (n,), of what happened at times of a board's clock.
 
-    host_s: when the host knew of it, (n,) [s]. Here, unlike in `BoardClock`, a line can be fitted
-    to what came later as well. At every half `FIT_WINDOW_S` of the board's clock there is a knot,
+    board_s: times of the board's clock, (n,) [s]. host_s: when the host knew of them, (n,) [s].
+
+    Here, unlike in `BoardClock`, a line can be fitted to what came later as well. At every half
+    `FIT_WINDOW_S` of the board's clock there is a knot,
     whose time is by the line that fits the window around it. Between knots, times are interpolated.
     What comes before and after a step back is taken separately, and so is what comes before and
     after a pause of a window, across which no line is fitted. Therefore there are no more than two

@@ -45,7 +45,7 @@ class Region:
     mode: which readings a scan takes, a name of the enum `mode`.
     rate_hz: scans a second; 0: as fast as readings settle, and as line and processor keep up.
     settle_us: least settle time; 0: as long as the rate allows.
-    whole_every: each so many-th scan is a whole one, of all cells; 0: none is.
+    whole_every: one of so many scans is a whole one, of all cells; 0: none is.
     whole_mode: which readings a whole scan takes.
     """
 
@@ -467,8 +467,9 @@ def scans_for(scans: Iterable[Scan], seconds: float) -> Iterator[Scan]:
 def mean_ratio(scans: Iterable[Scan]) -> Float:
     """Mean readings (R, C, n) of whole scans, at least one: how a skin at rest is measured.
 
-    Somebody may configure the board meanwhile, or fewer readings of a cell are taken in between.
-    Readings of two sizes or modes have no mean: those count that are like the last complete scan.
+    Somebody may configure the board meanwhile, or scans of fewer readings may come in between.
+    Readings of two sizes or modes have no mean. So only the scans of the same size and mode as the
+    last complete scan count.
 
     :raises DeviceLost: there is no whole scan.
     """

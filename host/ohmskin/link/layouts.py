@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What boards of before say and take, in the words of now.
+"""What boards with older firmware say and take, translated from and to the names of today.
 
-A board is flashed once and used for years, so this host reads what boards of every definition say
-that was ever shipped (`protocol.definition`), and recordings of them. `today` puts what they say in
-the words of now, and `asked` puts commands in theirs. Boards of now are left as they are.
+A board is flashed once and used for years. So this host reads boards, and recordings, of every
+definition that was ever shipped (`protocol.definition`). `today` gives fields that such a board
+sends the names of today. `asked` gives the fields of a command the names that the board knows.
+Fields of today's definition stay as they are.
 """
 
 from typing import Any

@@ -52,11 +52,11 @@ class Attempt(NamedTuple):
 # How a board is made to say hello where opening the port does not reset it, so that it may be
 # asked at once: often, because answers get lost. Chosen: 0.3 s is far above what an answer takes.
 ATTEMPTS = 3 * (4 * [Attempt("baud_default", True, 0.3)] + [Attempt("baud_fast", True, 0.3)])
-# How it is made to where opening the port resets it. Then it says hello by itself, and its boot
-# loader must be left alone: it takes a byte for the start of an upload, and the Mega's then waits
-# for 5 s after the last byte (firmware/sim/README.md). So the questions at both speeds are close to
-# each other, and the silence after them is longer than 5 s: a board that was reset late and heard
-# both says hello 5.0 s after the second.
+# How a board is made to say hello where opening the port resets it. Then it says hello by itself,
+# and its boot loader must be left alone: it takes a byte for the start of an upload, and the Mega's
+# then waits for 5 s after the last byte (firmware/sim/README.md). So the questions at both speeds
+# come close to each other, and the silence after them is longer than 5 s: a board that was reset
+# late, and heard both questions in its boot loader, says hello 5.0 s after the second.
 ATTEMPTS_AFTER_RESET: Final = (
     Attempt("baud_default", False, 2.0),
     Attempt("baud_default", True, 0.5),
