@@ -11,14 +11,14 @@ c      (n, n)    current through its segments, per current of these ports       
 q      (n,)      what segments like the layer's mean, as believed, would lose       ohm
 t      (4,)      mean segment of each layer over what is believed of it; o; and
                  the mean lead [ohm]
-o      scalar    offset of far ends against near ones, over its deviation           1
+o      scalar    offset of far ends against near ends, over its standard deviation  1
 h      (n,)      what an offset of one deviation adds to p: over I, so it differs    ohm
                  from port to port
 m      scalar    reference: mean segment of the layer, as first seen                ohm
-z      (1+n,)    the line's lead [ohm] and its segments, in shares of m; y their
-                 mean
-V      (1+n,)    variances of what each of them has of its own. In the fit of t, a
-                 line as a whole gets the same share: the worst case
+z      (1+n,)    the line's lead [ohm] and its segments, in shares of m; y the mean
+                 of the segments
+V      (1+n,)    variances by which each of them differs from its mean. In the fit
+                 of t, all wires of a line differ alike: the worst case
 L      (1+n,     information of all frames: sums of g^T g / s^2, with g = [1, m c] the
        1+n)      slopes of p by z
 l      (1+n,)    sums of g^T p / s^2
@@ -26,37 +26,39 @@ l      (1+n,)    sums of g^T p / s^2
 
 The circuit gives c and q, which depend little on the wires. So p = g z is linear in the wires.
 
-A lead loses its resistance for each current of a port, the same for all ports of the line. So of
-what a line loses, q grows from port to port, and the lead is what stays.
+What the segments lose, q, grows along the line from port to port. What the lead loses is the same
+at all ports of the line. By this, lead and segments are told apart.
 
-A frame alone shows the layers and the mean lead. An offset of the far ends would make rows seem to
-lose too much and columns too little, so it is found with them. Minimised is, over t and o,
+A single frame shows the layers and the mean lead. An offset of the far ends would make rows seem to
+lose too much and columns too little. So it is found together with them, by minimising over t, in
+which o is one element,
 
-    sum_lines (p - X t)^T (s^2 + A A^T)^-1 (p - X t) + o^2 + (lead - k)^2 / d^2 ,
+    sum_lines (p - X t)^T (s^2 + A A^T)^-1 (p - X t) + o^2 + (lead - k)^2 / d^2 .
 
-where X has the columns q of the line's layer, -+ h of the offset (- rows, + columns) and ones for
-the lead, t is what each is multiplied with, and A has the columns q and ones, each times the
-deviation that a wire has of its own. A is there because the ports of a line share its wires: what
-these have of their own moves all ports of the line together, so they are not as many independent
-looks at the means. k and d are the mean lead that frames before have shown, and its deviation. For
-the layers, the result is weighed against what frames before have shown. That fades, because a skin
-bends.
+X has a column for each element of t that concerns the line: q for its layer, h for the offset (-h
+if the line is a column), and ones for the lead. A has the columns q and ones, each times the
+deviation of a wire from its mean. It is there because all ports of a line share the wires of the
+line: what these wires differ from their means by moves all these ports together, so the ports are
+not as many independent measurements of the means. k and d are the mean lead that frames before have
+shown, and its deviation. The means of the layers that result are weighed against those that frames
+before have shown. What frames have shown of the layers fades, because a skin bends.
 
-What single segments have of their own takes many frames. It does not fade, because it is kept in
-shares of a reference m, and a bend stretches all segments alike. m stays until the layer differs
-from it by more than a segment does. With z the lead of a line [ohm] and its segments [m], u of them
-what is expected, and V its variances, as a diagonal,
+It takes many frames to show how single segments differ from the mean. This does not fade: it is
+kept in shares of a reference m, and a bend stretches all segments alike. m is changed when the mean
+of the layer differs from it by more than segments do from each other. With z the lead of a line
+[ohm] and its segments [m], u what is expected of them, and V a diagonal,
 
     z = u + V (1 + L V)^-1 (l - L u) ,
 
-of covariance V (1 + L V)^-1. The expected lead is the mean lead. Expected segments are all y, where
-the readings of all lines are most probable: with e the ones of segments,
+of covariance V (1 + L V)^-1. The expected lead is the mean lead. The expected segments are all the
+same, y, at which the readings of all lines are most probable. With e a vector of ones for segments
+and 0 for the lead,
 
     y = sum_lines e^T (1 + L V)^-1 (l - L u_lead) / sum_lines e^T (1 + L V)^-1 L e .
 
-No calmer frame takes a lesson's place here, as it does where touches teach the wires. There, a
-touch is a lesson once, and its error would stay. Here, each frame measures the layers anew, and in
-the sums L and l a noisy frame counts for little, because it is weighed by its noise.
+`LearnedWires` lets a calmer frame of the same touch replace a lesson. That is not needed here.
+There, each touch is a lesson only once, so that the error of a noisy frame would stay. Here, each
+frame measures the layers anew, and in the sums L and l a noisy frame has a small weight.
 """
 
 from typing import Final
@@ -77,12 +79,13 @@ from ohmskin.estimate.wire_belief import Fit, WireBelief
 # Share of what is known of the layers that fades after each lesson, because skins bend. Chosen: as
 # each frame measures the layers, little depends on it.
 FADE_SHARE: Final = 0.1
-# A line whose far end shows less than this share of what the usual line loses is at fault, by so
-# many deviations. Chosen: lines differ by less, and one of 2,000 errors is as large.
+# The far end of a line is at fault if the line loses less than this share of what the usual line
+# loses. Chosen: sound lines differ by less.
 OFF_SHARE: Final = 0.5
+# It must be less by so many deviations. Chosen: by chance, one normal error of 2,000 is as large.
 OFF_STDS: Final = 3.5
-# A layer whose mean segment is known by less than this has been measured. Chosen: between what a
-# bend may change and what is supposed of wires that nobody has told.
+# A layer counts as measured if the log of its mean segment has a smaller deviation. Chosen: between
+# what a bend may change and what is supposed of wires that nobody has told.
 KNOWN_LOG: Final = 0.5
 
 
@@ -107,14 +110,14 @@ class MeasuredWires(WireBelief):
         ]
 
     def learned(self) -> WireOhm | None:
-        """The means as the last frame has shown them: one under a fingertip, too."""
+        """The means as the last frame has shown them, also if it had a fingertip on the skin."""
         return None if self._known[0] is self._nominal else self._as_known()
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Take the means from this frame, weighed against the frames before.
 
-        log_cells: those that the fit starts from will do: c and q need no more than a model of the
-        frame that is nearly right.
+        log_cells: the cells that the fit starts from are good enough, because c and q need only an
+            approximate model of the frame.
         """
         self._measure(self.circuit(log_cells, self.means), ports)
 
@@ -127,12 +130,12 @@ class MeasuredWires(WireBelief):
                 # By noise, t may come out as 0 or less, which has no log.
                 factor = max(factors[layer], np.exp(-MAX_STEP_LOG))
                 # A scalar Kalman step in logs, for each layer by itself. The variance of log t is
-                # that of t over t^2. That both t have the same error, of o, is neglected.
+                # that of t over t^2. An error of o is in both t; this is neglected.
                 kept = 1.0 / (1.0 + variance[layer] * factor**2 / covariance[layer, layer])
                 measured = self.means[layer] + np.log(factor)
                 means[layer] += (1 - kept) * (measured - means[layer])
                 variance[layer] *= kept
-        # What was known of the lead is in the fit already.
+        # For the lead, the fit has already weighed what frames before have shown.
         means[2], variance[2] = factors[3], covariance[3, 3]
         self._believe(means, np.diag(variance))
         return factors[2], covariance[2, 2]
@@ -148,8 +151,9 @@ class MeasuredWires(WireBelief):
         """
         weight = ports.drop_std**-2.0
         lead_ohm, lead_variance = (before[2] for before in self._means_before)
-        # The 1 of o is o^2 in the cost. The 1 of t stays only for a layer that is not sensed, whose
-        # t nobody uses: without it, there were no inverse.
+        # On the diagonal, the 1 of o is the term o^2 of the cost. Those of the layers are replaced
+        # below, but for a layer that is not sensed: nobody uses its t, and with 0 in place of the 1
+        # the matrix would have no inverse.
         normal, right = np.eye(4), np.zeros(4)
         normal[3, 3], right[3] = 1.0 / lead_variance, lead_ohm / lead_variance
         own = np.array([SEGMENT_STD, SEGMENT_STD * abs(self.means[2])])
@@ -176,10 +180,11 @@ class MeasuredWires(WireBelief):
         return covariance @ right, covariance
 
     def _notice(self, layer: int, products: Float) -> None:
-        """Notice lines that lose much less than the usual one, and a layer than was believed.
+        """Notice lines that lose much less than the usual line, and layers that lose nothing.
 
-        The loss of a line over that of the believed wires, and lead, is that of least squares. What
-        has been noticed of a line stays until a frame shows that it loses as it should.
+        Judged is the loss of each line as a share of what the believed wires and lead would lose,
+        by least squares. What has been noticed stays until a frame shows that the line loses as it
+        should.
 
         products (lines, 4, 4): ab of q, h, ones and p.
         """
@@ -194,7 +199,7 @@ class MeasuredWires(WireBelief):
         off = self._off[layer]
         off[share + reach < usual] = True
         off[share - reach > usual] = False
-        # Once its wires are known, a layer may have been bent, but not so that it loses nothing.
+        # A layer whose wires are known may have been bent, but not so far that it loses nothing.
         sound = np.where(off, 0.0, precision)
         total = max(float(sound.sum()), 1e-9)
         loss, nothing = float(share @ sound) / total, OFF_STDS * total**-0.5
@@ -216,7 +221,7 @@ class MeasuredWires(WireBelief):
         return ""
 
     def fix_rest_wires(self) -> None:
-        """Later frames are expected about the wires at rest, but for a bend."""
+        """Expect the wires at rest in later frames, with the variance that a bend adds."""
         prior = np.diagonal(self._prior_covariance)
         found = np.diagonal(self._root) ** 2
         bend = np.array([*np.where(self.far, LAYER_STD**2 + found[:2], prior[:2]), *found[2:]])
@@ -224,7 +229,7 @@ class MeasuredWires(WireBelief):
         self._means_before = self._nominal, bend
 
     def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
-        """Learn from a frame that is news: means as before the fit, and single segments."""
+        """Learn from a frame that is news: the means, measured once more, and single segments."""
         if not self._is_news(fit.log_cells):
             return False
         self._lesson_cells = fit.log_cells
@@ -287,5 +292,5 @@ class MeasuredWires(WireBelief):
         return self._segment_ohm.copy()
 
     def segment_std(self) -> Float:
-        """As of layers that are known, and what readings leave of each segment's own."""
+        """The deviation of the layer's mean, and that of the segment's difference from it."""
         return np.asarray(np.hypot(np.diagonal(self._root)[:2, None, None], self._own_std))

@@ -21,21 +21,21 @@ V      (n, n)     its covariance; V0 before any frame
 s      (W,)       deviation of a wire from its mean, each by itself               log ohm, ohm
 L      (n, W)     ones: which wires are of which mean
 P      (W, W)     covariance of w, L^T V L + s^2
-J      (n, W)     slope of n readings by w, over their noise
-N      (n, n)     covariance of these readings, were the means known: of their    1
-                  noise, of cells, and of what wires have of their own
-S      (n, n)     covariance of these readings, N + J L^T V L J^T                 1
-z      (n,)       residual of these readings at the mean                          1
+J      (k, W)     slope of k readings by w, over their noise
+N      (k, k)     covariance of these readings if the means were known: of their  1
+                  noise, of cells, and of what wires differ from their means by
+S      (k, k)     covariance of these readings, N + J L^T V L J^T                 1
+z      (k,)       residual of these readings at the mean                          1
 ====== ========== =============================================================== ==========
 
 Leads are no logs, because a lead may be next to nothing, and because readings are nearly linear in
-them. P^1/2 has a column for each wire's own deviation, and three for what wires share:
-s and L^T V^1/2.
+them. P^1/2 has a column for each wire's own deviation (s), and one for each mean (L^T V^1/2).
 
-There are two beliefs, and `joint` asks both the same: `before_fit`, what this frame and those
-before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`, below, knows near ends
-only: there a frame says something of the wires once its touches are known, so it learns after the
-fit. `MeasuredWires` (`far_wires`) knows far ends: they show the wires before the fit.
+There are two kinds of belief, and `joint` asks the same of both: `before_fit`, what this frame and
+those before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`, below, is for
+skins that are read at near ends only. There, a frame says something of the wires once its touches
+are known, so it learns after the fit. `MeasuredWires` (`far_wires`) is for far ends, which show the
+wires before the fit.
 
 A lesson of `LearnedWires` is one step of a Kalman filter,
 
@@ -49,21 +49,26 @@ information A, the inverse of a covariance:
 
 V^1/2 the Cholesky factor of V, and V^T/2 its transpose.
 
-A touch alone reveals nothing, as its own resistance is in the same reading: N holds the touched
-cells as noise without limit. What single wires have of their own is not learned: frames of near
-ends say too little of it.
+A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
+holds the touched cells as noise without limit. What single wires differ from their means by is not
+learned: frames of near ends say too little of it.
 
-A skin bends, so before a lesson V grows by a share f towards that of told layers; leads stay.
-Most skins are still, and are known best where little fades; some have just been bent. So there are
-two filters, steady and agile, each with its own f, m and V. How well a filter has expected a lesson
-is its log likelihood, less what is the same for both. With g_0 = L J^T N^-1 z at the mean that the
-fit had, n = m - that mean, V before and V' after the lesson, and g = g_0 - A n,
+A skin bends. So before a lesson, V grows by a share f towards the covariance of layers that are
+only told; that of the leads stays. For a skin that is still, which most are, a small f gives the
+best means; for one that was just bent, a large f does. So there are two filters, steady and agile,
+each with its own f, m and V. The score of a filter says how well it has expected a lesson: it is
+the log likelihood, without what is the same for both.
 
-    score = n . g_0 - n . A n / 2 + (g . V' g - log det(1 + V A)) / 2 .
+With m_0 the mean that the fit had, d = m - m_0, g_0 = L J^T N^-1 z at m_0, g = g_0 - A d, V before
+and V' after the lesson,
 
-Believed is the mixture of both: its mean and its covariance. The odds of agile are those before any
-lesson, times exp of the difference of both sums of scores, which forget (a multiple-model filter:
-Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, chapter 11).
+    score = d . g_0 - d . A d / 2 + (g . V' g - log det(1 + V A)) / 2 .
+
+What is believed is the mixture of both filters, by its mean and its covariance. The odds of the
+agile one are those before any lesson, times the exponential of the difference of both sums of
+scores. At each lesson, a sum keeps the share `MEMORY` of what it was. (This is a multiple-model
+filter: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
+chapter 11.)
 """
 
 from abc import ABC, abstractmethod
@@ -95,19 +100,19 @@ from ohmskin.estimate.prior import (
     WireStds,
 )
 
-# A frame is fitted again if it moves the log of a mean by more. Chosen: 30 %, up to which slopes
-# are nearly right.
+# A frame is fitted again if its lesson moves the log of a mean by more. Chosen: 30 %, up to which
+# slopes are nearly right.
 FAR_LOG: Final = 0.3
-# So often at most.
+# A frame is fitted so often at most. Chosen: the time of a frame stays bounded.
 MOST_FITS: Final = 4
 
 
 class Lesson(NamedTuple):
-    """What n readings of one frame say of the wires.
+    """What k readings of one frame say of the wires.
 
-    per_mean_std: J L^T V^1/2, (n, 3).
-    residual: z, (n,).
-    factor: Cholesky factor of S, (n, n).
+    per_mean_std: J L^T V^1/2, (k, n).
+    residual: z, (k,).
+    factor: Cholesky factor of S, (k, k).
     """
 
     per_mean_std: Float
@@ -211,12 +216,15 @@ class WireBelief(ABC):
         self._believe(self._nominal, self._prior_covariance)
 
     def _believe(self, means: Float, covariance: Float) -> None:
-        """Take these for what is known, (n,) and (n, n).
+        """Take these means (n,), with this covariance (n, n), for what is known.
 
-        A lead that nobody told may be anything up to kilohms, and that is how frames teach it. But
-        most skins have a usual lead, and frames that tell nothing of it, as under fingertips, are
-        answered better if fits expect that, in so far as what is known agrees: as a cell's, this
-        prior has a heavy tail (`prior.CellPrior`). Deviations of answers always have what is known.
+        A lead that nobody has told may be anything up to kilohms, and lessons must be able to show
+        that. But most skins have a usual lead. Frames that tell nothing of the lead, as those of
+        fingertips do, are answered better if fits expect the usual one. So there are two states.
+        `_free` is what is known. `_usual` also has a prior of the usual lead. Where the known lead
+        is far from the usual one, this prior is as wide as they are apart: like that of a cell, it
+        has a heavy tail (`prior.CellPrior`). The deviations of answers always come from what is
+        known.
         """
         self._known = means, covariance
         self._free = self._usual = _State(means, covariance)
@@ -232,7 +240,7 @@ class WireBelief(ABC):
         self.expect_usual_leads(True)
 
     def expect_usual_leads(self, wanted: bool) -> None:
-        """Whether m and V are what fits take under fingertips, or what is known."""
+        """Let m and V be what fits expect under fingertips (wanted), or what is known."""
         self._state = self._usual if wanted else self._free
         self.means, self._root = self._state.means, self._state.root
 
@@ -313,15 +321,15 @@ class WireBelief(ABC):
         return np.asarray(np.linalg.norm(self._root, axis=1))
 
     def odd_lead_ohm(self) -> float:
-        """What a lead may have of its own, as the mean lead is not known [ohm].
+        """Deviation of a lead from the mean lead, in so far as the mean lead is not known [ohm].
 
-        It is noise for a lesson: where leads are large, they also differ by more.
+        A lesson takes it for noise: the mean lead may be large, and large leads differ by more.
         """
         return SEGMENT_STD * self._known_lead_std_ohm
 
     @property
     def is_assumed(self) -> bool:
-        """Whether a layer is what nobody told, nor frames have taught as well as if it were."""
+        """Whether nobody has told the layers, and frames have not taught them as well."""
         return self.untold and float(self.mean_std()[:2].max()) >= LAYER_STD
 
     def stds(self) -> WireStds:
@@ -342,8 +350,7 @@ class WireBelief(ABC):
         """J P^1/2: by what wires have of their own (W columns), by what they share (one a mean).
 
         by_segment, by_lead: J of the log segments (2RC columns) and of the leads (R+C).
-        of_cells: what the means change in readings besides: by leaks, and by the cells at rest that
-            follow all means.
+        of_cells: J of the means, by what else follows them: leaks, and the cells at rest.
         """
         segments, wires = by_segment.shape[1], sum(self._counts)
         root = np.empty((len(by_segment), wires + len(self.means)))
@@ -448,11 +455,11 @@ class LearnedWires(WireBelief):
         if not replace_last:
             self._before_lesson = self._filters
         per_mean_std, residual, factor = lesson
-        # One reading shows its own touch, of unknown resistance, and so nothing of the wires.
+        # The unknown resistance of its touch explains a single reading: it says nothing of wires.
         if len(residual) < 2:
             return
-        # The lesson counts in deviations of the belief that the fit had, but the step may start
-        # from an older belief. So the lesson is first changed to logs, and freed of that belief:
+        # The lesson is counted in deviations of the belief that the fit had, but the step may start
+        # from an older belief. So the lesson is first brought to logs, and the belief taken out:
         #     L J^T N^-1 = V^-T/2 (1 - X)^-1 V^T/2 L J^T S^-1     are the `weights`,
         # X is `gain @ per_mean_std`, and A is `information`. The step from V and m of the older
         # belief is V' = (V^-1 + A)^-1, m' = m + V' L J^T N^-1 z: the same as that by S above.
@@ -475,8 +482,8 @@ class LearnedWires(WireBelief):
 
     def _stepped(self, before: _Filter, fade: float, information: Float, pull: Float) -> _Filter:
         """One filter after a lesson. information: A, (n, n). pull: g_0 at `self.means`, (n,)."""
-        # A bend changes no leads, and layers by no more than told ones may be off. Nor does it
-        # change leaks, but these dry.
+        # A bend changes layers by no more than told ones may be off, and no leads. Nor does it
+        # change leaks, but a damp skin dries: their covariance may grow to what it was at first.
         bent = np.diagonal(self._prior_covariance).copy()
         bent[:3] = np.minimum(bent[:3], [LAYER_STD**2, LAYER_STD**2, 0.0])
         widest = np.diag(np.maximum(np.diagonal(before.covariance), bent))
