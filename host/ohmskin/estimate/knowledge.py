@@ -169,9 +169,9 @@ def check_ratio(
 ) -> Float:
     """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell.
 
-    Of near ends, what was not read is NaN, and n is 4. A frame of mode half or quick may be of
-    shape (R, C, 2) or (R, C, 1) as well. What was read are the same readings of all crossings of
-    some rows with some columns.
+    At near ends, n is 4, and a reading that was not taken is NaN. A frame of mode half or quick may
+    be of shape (R, C, 2) or (R, C, 1) as well. The readings that were taken must be the same at all
+    crossings of some rows with some columns.
     """
     readings = np.asarray(ratio, dtype=np.float64)
     of_near, width = is_near(of), readings.shape[-1] if readings.ndim else 0

@@ -35,10 +35,10 @@ residuals shows only the offset that both nodes have in common.
 **Lines that charge.** The lines of other ports float. They have a capacitance, and they charge
 through the skin until they have settled. Until then the current into the row is larger than the
 current out of the column by what these lines draw, 2 c on average over both polarities. Least
-squares give the mean of both currents. The lines draw from the row as well as the row conducts to
-them, and from the column likewise: in the ratio of I_row, the sum of the row's other port currents,
-to I_column, that of the column's. The port's own current is that into the row, I + c, less what the
-lines draw from the row:
+squares give the mean of both currents. How much the lines draw from the row, and how much from the
+column, depends on how well each conducts to them. So it is in the ratio of I_row, the sum of the
+currents of the row's other ports, to I_column, the same sum of the column. The port's own current
+is that into the row, I + c, less what the lines draw from the row:
 
     I + c - 2 c I_row / (I_row + I_column) = I - c (I_row - I_column) / (I_row + I_column) .
 
@@ -77,10 +77,11 @@ MOST_OFFSET_RATIO: Final = 0.008
 # Sign of each reading's residual in c: c is half of the current into the row, which readings of the
 # top node show, less the current out of the column, which readings of the bottom node show.
 _INTO_ROW: Final = READING_SIGN * np.where(READING_SENSES_TOP, 1.0, -1.0)
-# A port without a current of so many deviations is dead. Chosen: as faults are told from noise.
+# A port is dead if its current is below so many deviations. Chosen: as `FAULT_STDS` of
+# `port_faults`.
 DEAD_STDS: Final = 5.0
-# The least voltage between the far ends of a port, over what its references lose. Chosen: currents
-# are divided by 1 more than it.
+# [1] U, over the voltage R_s I that the references lose, is taken to be at least this. Chosen: u is
+# 1 / (R_s (1 + this)), which noise must not make infinite or negative.
 LEAST_APART: Final = -0.9
 
 
@@ -148,11 +149,11 @@ class NearEnds:
         return np.asarray(charging * np.clip(share, -1.0, 1.0))
 
     def best_three(self, ratio: Float) -> tuple[float, float]:
-        """Of the four readings (4,) of a cell in mode near, leave out the one that fits least.
+        """Leave out one of the four readings (4,) of a cell in mode near: the one that fits least.
 
-        There are four ways to leave one out. The best is that whose three others agree best.
-        Returns by how much these three disagree, the root mean square of their residuals [V/Vdd],
-        and the current that they show [S].
+        It is the one without which the other three agree best. Returns by how much these three
+        disagree, the root mean square of their residuals [V/Vdd], and the current that they show
+        [S].
         """
         threes = []
         for left_out in range(READINGS_PER_CELL):
@@ -169,12 +170,14 @@ class FarReadings(NamedTuple):
     """What the far ends of one frame show.
 
     ports: u and its standard deviation.
-    near_current: I, but at least one standard deviation: others are divided by it (R, C) [S].
+    near_current: I, but at least its deviation by rounding, because losses are divided by it (R, C)
+        [S].
     is_dead: ports whose near ends show no current, as of an open line: far ends show nothing of
         their wires (R, C).
-    drop: what the wires of row and of column lose, p_r I and p_c I, (2, R, C) [V/Vdd].
-    read_drop: the same by both ends as they are read: the references do not matter, but lines that
-        charge do.
+    drop: what the wires of row and of column lose, p_r I and p_c I, (2, R, C) [V/Vdd]. The near end
+        is computed from I, so that lines that charge do not matter.
+    read_drop: the same, but the near end is taken as it was read, so that the values of the
+        references do not matter.
     ends: e and f, or a and b where no far end is sensed, (2, R, C) [V/Vdd].
     """
 

@@ -9,11 +9,11 @@ A frame is at fault, and its answer not to be relied on, where
   any two electrodes (Rayleigh's monotonicity law). So touches cannot do this, but open lines do;
 - a port has less resistance than it had if every cell were pressed as hard as can be, by the same
   law: a row is shorted to a column. Where nobody has told the wires, the limit is one such cell;
-- two lines that differed at rest draw the same current from every other line, and all of it more
-  than at rest: their electrodes are shorted. Or they did so at rest already, and more than the
-  other lines. A finger between two lines makes them alike, too. So lines that are touched at one
-  place must be alike in `ALIKE_FRAMES` of the frames that are compared; until then, which of them
-  is touched is in doubt;
+- two lines that differed at rest draw the same current from every other line, and each of these
+  currents is larger than at rest: their electrodes are shorted. The same holds for two lines that
+  were alike at rest already, and drew more than the other lines. A finger between two lines makes
+  them alike, too. So lines that are touched at one place only must be alike in `ALIKE_FRAMES` of
+  the frames that are compared; until then, it is in doubt which of them is touched;
 - a line showed no current at rest, though others did;
 - the far end of a line has a potential that is not between those of the near ends, or stays while
   that of the near end moves: it is open, or it belongs to another line;
@@ -44,9 +44,9 @@ MOST_CELLS_RATIO: Final = 0.016
 # A cell is at fault if its readings disagree by more than this root mean square, over Vdd. Chosen:
 # about twice `MOST_CELLS_RATIO`, because one of many cells is the worst even on a sound skin.
 ONE_CELL_RATIO: Final = 0.03
-# In noise, a cell at fault also disagrees by more than so many times the median cell. The same
-# limit is used for the three readings that are left when one is taken out: they agree if they
-# disagree by less. Chosen: one more than `FAULT_STDS`, as the median cell is not the noisiest.
+# A cell at fault must also disagree by more than so many times the median cell, so that noise makes
+# none. The three readings that are left when one is taken out agree if they disagree by less than
+# this. Chosen: one more than `FAULT_STDS`, because the median cell is not the noisiest.
 ONE_CELL_TIMES: Final = 6.0
 # Without noise, three readings of a cell agree if they disagree by less than so many standard
 # deviations of rounding. Chosen: 1.2 LSB, more than rounding alone can make of them.
@@ -71,20 +71,26 @@ TOUCHED_TIMES: Final = 2.5
 PAIR_TIMES: Final = 1.15
 # Share of its nominal wires that a skin has at least. Chosen: no bend or wrong number halves them.
 WIRE_SHARE: Final = 0.5
-# A far end is constant if its range is within noise and is so many times less than that of the near
-# end, once this is clear: so many deviations of the difference. Chosen: far ends move by more than
-# near ones, and the range of eight equal readings is up to four deviations.
+# A far end is constant if its range over the ports of its line is so many times less than the range
+# of the near end, and within noise. Chosen: the far end of a sound line moves by more than the near
+# end does.
 CONSTANT_TIMES: Final = 3.0
+# That is judged only where the near end clearly moves: where its range is above so many deviations
+# of the difference of both ends. Chosen: twice the range that noise gives eight equal readings,
+# four deviations, up to which the range of a far end is within noise.
 CLEAR_STDS: Final = 8.0
-# Lines of fewer ports are not said to be constant. Chosen: one of four ports has been, by chance.
+# A far end is not judged so over fewer ports. Chosen: a sound line of four ports was constant by
+# chance.
 LEAST_PORTS: Final = 6
 # [ohm] What lines lose at the least up to their far ends. Chosen: a switch of a CD74HC4067 alone
 # has 70 ohm, typically (data sheet).
 LEAST_LOSS_OHM: Final = 60.0
-# Far ends are at their near ends if they lose less by so many deviations, and not clearly anything.
-# Chosen: one frame of a sound skin in 4,000 is off by as much.
+# A layer's far ends show its near ends if what its lines lose is below the least loss by so many
+# deviations, and not above 0 by as many. Chosen: one frame of a sound skin in 4,000 is off by as
+# much.
 NO_LOSS_STDS: Final = 3.5
-# Share of what frames have shown of that, which is left after each frame. Chosen: thirty frames.
+# Share of the sums that tell this loss which is left after each frame. Chosen: they remember some
+# thirty frames.
 FAR_MEMORY: Final = 0.97
 
 # Near ends of rows are above their far ends, those of columns below.
@@ -121,9 +127,9 @@ class Contradictions:
                 disagreement, current_of_three = self._near_ends.best_three(near.ratio[cell])
                 if disagreement < agree:
                     current[cell] = current_of_three
-                    # The cell's own deviation has the stuck reading in it, so it goes by the best
-                    # cell's. In three readings, offsets and what lines draw do not cancel. Chosen:
-                    # twice that of the best cell.
+                    # The cell's own deviation comes from the stuck reading, too, so that of the
+                    # best cell is taken. Chosen: twice that, because in three readings offsets and
+                    # what lines draw do not cancel.
                     std[cell] = 2.0 * std.min()
                     continue
             by = 100 * spread.rms[cell]
@@ -137,18 +143,19 @@ class LinePairs:
 
     Two shorted lines are one node, so their currents from every other line are the same. `compare`
     compares all pairs of lines in a frame. It counts, for each pair, the frames that were compared
-    since one has shown this pair apart. Other frames (`needs_frame` says which) neither add to a
-    count nor end it. This has a price: many brief touches that press the same two lines equally may
-    in the end look like shorted lines. It saves comparing all pairs in most frames.
+    since the last one that has shown this pair apart. Frames that are not compared (`needs_frame`
+    says which) neither add to a count nor end it. So most frames take no time here. The price is
+    that many brief touches, all of which press the same two lines equally, may in the end look like
+    shorted lines.
 
-    A finger that lies evenly on two lines joins them, too: its frame is that of a short with a
-    touch on one of them. Lines that nothing touches are alike for no such reason, nor are lines
-    that are touched at several places, each time evenly.
+    A finger that lies evenly on two lines joins them, too: a short with a touch on one of the lines
+    would give the same frame. A finger does not explain why two lines are alike if nothing touches
+    them, or if they are touched at several places: it would have to lie evenly at each of them.
 
     high (lines,): which lines have clearly more current at all of their ports, as a short gives
     them. In a frame, that is more than the line itself had at rest; at rest, more than the median
-    line. places (lines,): at how many places, of neighbouring ports, a line has more than a short
-    alone can give it.
+    line. places (lines,): at how many places, each of neighbouring ports, a line has more current
+    than a short alone can give it.
     """
 
     def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
@@ -179,9 +186,10 @@ class LinePairs:
     def needs_frame(self, high: Bool, touched: Bool) -> bool:
         """Whether a frame with these lines is worth comparing: all pairs take long.
 
-        A short shows in two high lines, a doubt in two touched ones, (lines,). Without them a frame
-        is still compared while the count of some pair is full: it may show this pair apart. So may
-        the first frame. Lines with fewer than three ports may be alike by chance.
+        A short shows in two high lines, a doubt in two touched ones, (lines,). Without two of them,
+        a frame is compared only if it may show a pair apart that counts as alike: while the count
+        of some pair is full, and if it is the first frame. Lines with fewer than three ports may be
+        alike by chance.
         """
         if self._ports < 3:
             return False
@@ -205,11 +213,13 @@ class LinePairs:
         self._never_apart &= ~shows_apart
         self._is_first, self._is_full = False, bool(self._alike_frames.max() >= ALIKE_FRAMES)
         alike = np.triu(apart < SAME_STDS, 1)
-        # Lines that hardly differed at rest are alike for no other reason. A pair that differed by
-        # clearly more than this frame's noise is shorted; that may be so since before the frames.
+        # Lines that hardly differed at rest are alike without any fault. So a pair counts only if
+        # it differed at rest by clearly more than this frame's noise.
         noisier = max(self._largest_std(now) / self._rest_std, 1.0)
         differed = self._rest_apart > 2 * SAME_STDS * noisier
         least_places = np.minimum(places, places[:, None])
+        # If no frame has shown them apart, they may have been shorted between rest and the first
+        # frame, and need not be alike for long. But a touch at one place may be a finger on both.
         since = self._never_apart & (least_places != 1)
         is_shorted = alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
         doubt = alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
@@ -365,8 +375,8 @@ class FarFaults:
 
         std: of the difference between both ends (R, C); shift: of the offset of far ends [V/Vdd].
         """
-        # Lines that charge spoil what is read, and references that differ what is modelled: a fault
-        # is in both.
+        # Near ends are known in two ways: as modelled by the current, which references with other
+        # values spoil, and as read, which lines that charge spoil. A fault shows in both.
         drops = np.array([far.drop, far.read_drop])
         near = far.ends + drops * _TO_NEAR
         alive = ~far.is_dead  # else the near end is at fault
@@ -388,14 +398,16 @@ class FarFaults:
     def _constant(self, axis: int, near: Float, far: Float, std: Float) -> Bool:
         """Lines whose far end is the same for all ports, though the near end is not, (lines,).
 
-        near (2, R, C), far (R, C): potentials of the ends [V/Vdd], near ones as they may be.
+        near: potentials of near ends, modelled and read, (2, R, C) [V/Vdd].
+        far: potentials of far ends, (R, C) [V/Vdd].
         """
         across = 1 - axis
         of_near = (near.max(axis=1 + across) - near.min(axis=1 + across)).min(axis=0)
         of_far, noise = far.max(axis=across) - far.min(axis=across), std.max(axis=across)
         is_constant = (of_far < 4.0 * noise) & (of_far < of_near / CONSTANT_TIMES)
         state = self._is_constant[axis]
-        # In a few ports, what wires lose may undo what cells make of the current.
+        # Over a few ports, what the wires lose may by chance cancel what the cells change, so that
+        # the far end stays.
         if far.shape[across] >= LEAST_PORTS:
             np.copyto(state, is_constant, where=of_near > CLEAR_STDS * noise)
         return state
@@ -403,10 +415,10 @@ class FarFaults:
     def _loses_nothing(
         self, axis: int, drops: Float, current: Float, weight: Float, shift: float
     ) -> bool:
-        """Whether a layer's ends show what its near ends show, as where the connector is off.
+        """Whether a layer's far ends show what its near ends show, as where the connector is off.
 
-        All that its lines lose is taken for the same resistance, and an offset of all far ends.
-        This frame is judged alone, and with those before.
+        What all lines of the layer lose is fitted by one resistance, and by one offset of all far
+        ends. This frame is judged alone, and together with those before.
 
         drops (2, R, C): what they lose, in two ways [V/Vdd].
         """

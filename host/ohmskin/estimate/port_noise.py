@@ -24,8 +24,8 @@ offsets of the board are fitted, too, one for two readings: n / 2 of them, share
 **Noise, and what stays.** Residuals have three causes: noise; lines that charge; a converter that
 is not linear. Noise changes from frame to frame, the other two stay while nothing moves. The
 difference of the residuals of two frames has twice the variance of noise, and nothing of what
-stays. Where v_n, so measured, is much less than v, most of a disagreement stays. Of that, most is
-taken from the current (`port_currents`), and a share of it counts as error:
+stays. Where v_n, so measured, is much less than v, most of a disagreement stays. What stays is
+taken from the current for the most part (`port_currents`). A share of it counts as error:
 
     v_I = v_n + STAYING_SHARE^2 max(0, v_cell - v_n) .
 
@@ -54,8 +54,8 @@ MEDIAN_CHI2: Final = {1: 0.455, 3: 2.366}
 # A cell is usual if its readings disagree by less than so many standard deviations, of the median
 # cell or of rounding. Chosen: noise hardly ever exceeds it; what does has a cause of its own.
 USUAL_STDS: Final = 3.0
-# If noise is less than this share of the usual cell's variance, most of a disagreement stays.
-# Chosen: that is half of its deviation, so what stays is larger than noise.
+# If the variance of noise is less than this share of the usual cell's variance, most of a
+# disagreement stays. Chosen: then noise has half of the deviation, and what stays is larger.
 NOISE_SHARE: Final = 0.25
 # Share of a staying disagreement that is still in the current after what floating lines draw is
 # taken from it. Measured in firmware/sim with its preset `desk`, as `make bench-desk` does.

@@ -6,23 +6,26 @@ Symbols are those of `port_currents` and `port_noise`; K are the readings of a c
     I = sum_{k in K} s_k R_k (y_k - o_k - b_k) / sum_{k in K} R_k^2 ,
     s_I^2 = v_I / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2 .
 
-Four readings show what fewer do not: the offset o_k of each node, and v. They are those of the last
-frame in which all was read, at rest if there was no other; v is that at rest if that is less,
-because lines that charge add to the other. Where neither was read, o_k is 0, and
+Fewer than four readings do not show the offset o_k of each node, nor v. Both are taken from the
+last frame in which all was read; before there was one, from the rest readings. v is that of the
+rest readings if they have less, because lines that charge add to v in a frame. Where neither a
+frame nor rest was read, o_k is 0, and
 
     v = max(2 s^2, median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455) ,
 
-by the currents that two of the readings show. v_I is not taken from another frame: where lines
-charge goes by what is touched. One reading has v_I = v; several show it as in `port_noise`,
+with I_1 and I_2 the currents that two of the readings show. v_I is not taken from another frame,
+because what is touched decides where lines charge. A single reading has v_I = v. Several show it as
+in `port_noise`:
 
     v_cell = sum_k residual_k^2 / (|K| - 1) ,  v_I = v + STAYING_SHARE^2 max(0, v_cell - v) .
 
-Of A and B alone, lines that charge add to A and take from B, which is read a slot later, less of
-it. So A has `FIRST_SHARE` of what stays in their difference, and that is taken from both: the share
-max(0, 1 - `CLEAR_NOISES` v / v_cell) of it.
+If A and B alone are read, lines that charge add to A, and take less from B, which is read a slot
+later. Of what stays in the difference of both, the share `FIRST_SHARE` is A's, and the rest is B's.
+This is taken from the current, times max(0, 1 - `CLEAR_NOISES` v / v_cell), since a difference that
+is hardly above noise may be noise.
 
-A port that was not read has its last current; that is less certain by `STALE_SHARE` of it for each
-frame since then.
+A port that was not read keeps its last current. Its deviation grows by `STALE_SHARE` of the current
+with each frame since then.
 """
 
 from typing import Final, NamedTuple
@@ -41,18 +44,20 @@ from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 STALE_SHARE: Final = 0.03
 # Ports that no frame has shown yet are taken for as old as so many frames. Chosen: as above.
 _NEVER_FRAMES: Final = 30
-# What A has of the difference that lines make between A and B, in modes with these two alone.
-# Measured in firmware/sim with its preset `desk`: 0.75 to 0.85, by the length of slots.
+# Share of A in the difference that lines that charge make between A and B, in modes with these two
+# alone. Measured in firmware/sim with its preset `desk`: 0.75 to 0.85, by the length of slots.
 FIRST_SHARE: Final = 0.8
-# What is less than so many times the noise does not stay. Chosen: two deviations; less would follow
-# noise, and make of two readings hardly more than one.
+# A disagreement v_cell below so many times v counts as noise. Chosen: two deviations; with less,
+# the correction would follow noise, and two readings would tell hardly more than one.
 CLEAR_NOISES: Final = 4.0
 
 
 class Shown(NamedTuple):
-    """What a frame has shown: its ports; of all readings, also the two others.
+    """What a frame has shown.
 
-    offset_ratio: of each reading (4,) [V/Vdd]. noise: v.
+    ports: its currents.
+    offset_ratio: o_k of each reading (4,) [V/Vdd]; None: not all of the frame was read.
+    noise: v; None: the same.
     """
 
     ports: PortCurrents
@@ -81,7 +86,7 @@ class PartialEnds:
 
     def keep(self, shown: Shown) -> None:
         """A frame of all readings has shown this."""
-        # Without noise, all readings of a frame may agree: then it does not show how much there is.
+        # The readings of a frame may all agree by chance. Such a frame, of noise 0, tells nothing.
         noises = [each for each in (shown.noise, self._rest.noise) if each]
         self._last = shown._replace(noise=min(noises, default=None))
         self.region = None
@@ -101,7 +106,8 @@ class PartialEnds:
             signal -= self._last.offset_ratio
         signal = signal[..., kinds]
         by_each = signal / slope
-        # Where rest is a mean of many scans, it hardly shows any noise.
+        # The rest readings may be a mean of many scans, which shows hardly any noise: a scan has at
+        # least that of rounding.
         noise = max(self._last.noise or self._noise(by_each, slope), 2.0 * self._rounding)
         square_ohm = float(slope @ slope)
         current = signal @ slope / square_ohm

@@ -32,10 +32,11 @@ TOUCHED_STDS: Final = 2.0
 # Deviation of a touched cell before it is read, because nobody knows how hard the touch is: a
 # factor of twenty, either way.
 UNLIMITED_STD: Final = 3.0
-# A rise that must not go unnoticed.
+# A rise of a cell that must not go unnoticed: where a cell that seems to be at rest may have risen
+# by more, `joint` widens its deviation.
 HIDDEN_LOG: Final = 0.3
-# How well `touch` has to know a cell, else it asks `joint`: by what few touches leave out, it is
-# less precise.
+# If `touch` knows a touched cell less well than this, it lets `joint` answer: `touch` is less
+# precise, because it takes all other cells to be at rest.
 CLEAR_LOG: Final = 0.1
 # Under fingertips a larger share of the cells is touched: the frame is crowded.
 CROWDED_SHARE: Final = 0.3
@@ -57,7 +58,7 @@ SEGMENT_STD: Final = 0.1
 UNKNOWN_LEAD_OHM: Final = 100.0
 # Deviation that all leads share, if nobody has told them: a margin of yarn makes kilohms.
 UNKNOWN_LEAD_STD_OHM: Final = 2000.0
-# The same of usual leads: a switch and a crimp.
+# Deviation that all leads share, if they are usual ones: a switch and a crimp.
 USUAL_LEAD_STD_OHM: Final = 150.0
 # Deviation that all leads share, if they are told, as a share of them.
 LEAD_STD: Final = 0.05
@@ -65,9 +66,9 @@ LEAD_STD: Final = 0.05
 # skin is still, and where it has just been bent.
 STEADY_FADE: Final = 0.01
 AGILE_FADE: Final = 0.6
-# How likely it is before any lesson that a skin bends.
+# How likely it is, before any lesson, that a skin has just been bent.
 AGILE_SHARE: Final = 0.5
-# Share of what lessons have said of that, which is left after each lesson.
+# Share of what lessons have told of this that is left after each further lesson.
 MEMORY: Final = 0.8
 
 # Steps of a fit, after which it gives up: it bounds the time of a frame.
@@ -214,7 +215,8 @@ def siemens_std(
     # limit they are exp(k layer_std) - 1 above their mean, where the first order has k layer_std.
     # The part that comes from them grows by that ratio. At the other limit
     # they are off by less than k layer_std, so there the first order is enough.
-    # A lead may be larger than a fit takes it for; less than nothing it cannot be.
+    # A lead may be larger than the fit takes it for, which widens the limit upwards alone: below 0
+    # it cannot be.
     reach = wires.reach_stds
     wider = np.expm1(reach * wires.layer_std) / (reach * wires.layer_std)
     more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_reach**2 - 1.0) * leads_log_std**2

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a region: its cells alone are fitted, the others stay as the last whole frame has them.
 
-Symbols are those of `sparse_fit`; k are the cells of the region, and at once its ports. The skin of
-the last whole frame, g0, takes the place of the untouched one, and d = exp(x) - g0 may be negative:
+Symbols are those of `sparse_fit`. The k cells of the region are also its ports, by the same
+numbers. The skin of the last whole frame, g0, takes the place of the untouched one, so that d may
+be negative, which is exp(x) - g0:
 
     v = (1 + M_kk diag(d))^-1 H_kk ,   rho = rho0 - sum_k H d v ,   d rho / d g_e = -v_e^2 .
 
@@ -27,8 +28,8 @@ from ohmskin.estimate.prior import CLOSE_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
 from ohmskin.estimate.sparse_fit import Cells, RestNetwork
 from ohmskin.estimate.wire_belief import WireBelief
 
-# Steps of a frame. Chosen: it begins at the frame before, a millisecond ago; one that needs more is
-# fitted as a whole.
+# Most steps of a frame; one that needs more is fitted as a whole. Chosen: a frame begins at the
+# frame before, which is a millisecond old.
 MOST_STEPS: Final = 6
 
 

@@ -37,8 +37,8 @@ the place of one factor of each product.
 A frame starts from no touched cells. Gauss-Newton steps on x minimise |r|^2 and the prior of the
 cells. Where a reading then shows more current than the model explains, the cells that would explain
 most in their row and column are added, until no reading asks for one; a cell that falls back to
-rest is taken out. The last steps know that wires are known to P only, and weigh the readings by
-S^-1.
+rest is taken out. In the last steps, wires may differ from what is believed by P, so the readings
+are weighed by S^-1.
 """
 
 from dataclasses import dataclass
@@ -344,7 +344,8 @@ class FewTouches:
     def converge(self, cells: Cells, log_siemens: Float) -> None:
         """Steps from here until none matters; cells that fall back to rest leave.
 
-        It starts from what counts as touched at the least: what a touch adds must be above 0.
+        Conductances start at the least that counts as touched, or above: what a touch adds must be
+        above 0.
         If steps still matter after `MAX_ITERATIONS`, it ends all the same: `asked_for` and
         `explain` judge what there is.
         """
@@ -465,7 +466,8 @@ class FewTouches:
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
         # By how much a mean that is one deviation off moves x: A^-1 J S^-1 W, of the means in W.
         by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, by_mean_std)
-        # The lesson's S: whatever these touches are, they are noise without limit.
+        # The S of the lesson has the touches as noise without limit, because nobody knows how hard
+        # they are, and what leads differ by in so far as their mean is not known.
         by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
         odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
         noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
