@@ -79,10 +79,9 @@ _ASK_AGAIN_S = 6.5
 # A board has taken its new speed this long after its answer came. Chosen: a command that came too
 # early would be lost, and the next one would come after the board has returned to its old speed.
 _SPEED_CHANGE_S: Final = 0.02
-_BROKEN: Final = "open it again; if that does not help, flash it with 'ohmskin flash'"
-
-
+# Remedies of errors.
 _FLASH: Final = "flash it with 'ohmskin flash'"
+_BROKEN: Final = f"open it again; if that does not help, {_FLASH}"
 
 
 def _size(of: Hello | Scan) -> str:
@@ -144,7 +143,7 @@ class Session(Device):
                     return
         speaks = self._decoder.stats.line.octets > 0
         said = "sends bytes that are no frames" if speaks else "is silent"
-        remedy = "is it the skin board's port? Check its cable, and flash it with 'ohmskin flash'"
+        remedy = f"is it the skin board's port? Check its cable, and {_FLASH}"
         raise DeviceSilent(f"{self.name} {said}", remedy)
 
     def close(self) -> None:
@@ -259,6 +258,5 @@ class Session(Device):
             case Hello():
                 self._hello = message
             case ForeignHello():
-                layouts = f"0x{message.layout_crc:04X}, this host 0x{protocol.LAYOUT_CRC:04X}"
-                problem = f"{self.name}: board speaks layout {layouts}"
-                raise ProtocolMismatch(problem, _FLASH)
+                both = f"0x{message.layout_crc:04X}, this host 0x{protocol.LAYOUT_CRC:04X}"
+                raise ProtocolMismatch(f"{self.name}: board speaks layout {both}", _FLASH)
