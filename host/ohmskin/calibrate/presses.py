@@ -232,9 +232,10 @@ class Calibrator:
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
     found: the wires by presses; None before `learn_wires`.
 
-    No earlier rest says how the untouched skin reads. So a cell counts as touched if it conducts
-    far more than most others do, g > `TOUCHED_TIMES` max(quantile of g, 0.5e-6 S), whatever wires
-    and scatter of cells make of g; and by later scans, if its level falls by `LOST_SHARE` of rest.
+    There is no earlier rest to compare with. So a cell counts as touched at rest if it conducts far
+    more than most others: g > `TOUCHED_TIMES` max(quantile of g, 0.5e-6 S), a limit that wires and
+    the scatter of cells do not reach. It also counts as touched at rest if its level is lower in
+    later scans, by more than `LOST_SHARE` of rest.
 
     :raises TareRefused: something touched the skin while its rest was measured.
     """

@@ -163,7 +163,7 @@ def _cells(rest: Rest, no_row: Bool, no_column: Bool) -> tuple[Float, Float]:
 def _shorted(
     axis: int, current: Float, siemens: Float, judged: Bool, std_lsb: float
 ) -> list[list[int]]:
-    """Groups of rows (axis 0) or columns (axis 1) that are one electrode.
+    """Groups of rows (axis 0) or columns (axis 1) that are shorted to each other.
 
     judged: which cells are in no open line, (R, C).
     std_lsb: deviation of a port's current, by noise [LSB].

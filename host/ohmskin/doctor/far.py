@@ -178,12 +178,12 @@ class FarSkin:
 
 
 class Fit(NamedTuple):
-    """Segments of lines, by the cost of the module.
+    """Segments of lines at which the module's cost is least.
 
     ohm: the segments, (..., L, n) [ohm].
-    covariance: of these, widened where the readings do not fit, (..., L, n, n) [ohm^2].
-    cost: the least one, (..., L).
-    by_lead: how the segments follow the lead, (..., L, n) [1].
+    covariance: of the segments, widened where the readings do not fit, (..., L, n, n) [ohm^2].
+    cost: what the cost is there, (..., L).
+    by_lead: d ohm / d lead: how the segments change if the lead is taken for more, (..., L, n) [1].
     """
 
     ohm: Float
@@ -225,7 +225,8 @@ class _Layer:
         self.loss_ohm, self.std_ohm, self.floating_ohm = loss_std_floating
         self.shorts, (self.lead_ohm, self.lead_std_ohm) = shorts, lead_ohm
         self._silent = silent
-        # A shorted line has currents of others in its wire, so that u = l + A r does not hold.
+        # The wire of a shorted line also carries currents of the lines that it is shorted to, so
+        # that u = l + A r does not hold.
         self._alone = ~np.isin(self.numbers, [n for group in self.shorts for n in group])
 
     def fit_lines(self, current_share: Float, lead_ohm: tuple[float, float]) -> None:

@@ -32,7 +32,7 @@ LONGEST_TIMES: Final = 2.0
 
 
 class Step(Enum):
-    """What `gather` does next. It is reported with a detail, which is named here."""
+    """What `gather` does next. It is reported with a detail: the comment beside each says which."""
 
     SELF_TEST = auto()  # None
     SKIN = auto()  # seconds for which the untouched skin is scanned

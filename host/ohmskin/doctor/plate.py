@@ -9,11 +9,11 @@ symbol shape     meaning
 p      (R, C)    plate: conductances of its resistors, 0 where it has none [S]
 g      (R, C)    conductances that `joint` estimates from the mean readings [S]
 s      (R, C, 4) shown: what each reading shows of its current, the reading or what it lacks to Vdd
-                 [LSB]; from the start, as it would be without the leads of both lines
+                 [LSB]; corrected to what it would be if both lines had no leads
 rho    (R, C)    port resistances of the plate [ohm]
 ====== ========= ===========================================================================
 
-The rules, in this order; each takes what those before it have found as it is:
+The rules, in this order; each one takes what those before it have found for known:
 
 - Lines are swapped if g is like p with its lines in another order.
 - The reference resistors are rho s / (1024 - s_top - s_bottom), the median over the plate's
@@ -22,7 +22,8 @@ The rules, in this order; each takes what those before it have found as it is:
 - From p, but for these cells, the circuit predicts s. A straight line is fitted to the readings of
   each configuration over their predictions. It shows gain, offset and bow of the converter.
 
-A factor common to all resistances changes no reading and cannot be known.
+A factor that is common to all resistances, references included, changes no reading. So it cannot be
+known.
 """
 
 from dataclasses import dataclass, replace
@@ -60,7 +61,7 @@ LEAST_SPAN_LSB: Final = 50.0
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The most that a sound board has. ``ohmskin verify --help`` has sources of the first three.
+    """The most that a sound board has. ``ohmskin verify --help`` says why, of the first three.
 
     cell_percent: error of a resistor [%].
     reference_percent: error of a reference resistor [%].
@@ -154,8 +155,8 @@ class PlateExam:
 
     def _in_order(self, shown: Float, board: SkinKnowledge, diagnosis: Diagnosis) -> Float:
         """`shown`, with lines that are swapped put right: at most some rows and some columns."""
-        # Compared are shares of the loop with the references, which are between 0 and 1. So an open
-        # joint does not count for more than a swap.
+        # What is compared are shares of cells in the loop with the references, from 0 to 1. So an
+        # open joint, whose resistance is without limit, does not count for more than a swap.
         siemens = (_estimate(shown, board).cell_siemens, self.plate)
         measured, plate = (cell / (cell + 1 / board.ref_ohm) for cell in siemens)
         for _ in range(2):
@@ -229,7 +230,7 @@ class PlateExam:
                     off_percent=float(self.error_percent[worst]) if there else None,
                     most_percent=most,
                 )
-        # Smaller resistors in parallel hide these.
+        # Resistors that the readings do not tell: smaller ones in parallel hide them.
         hidden = is_there & ~is_open & (self.std_percent > most)
         diagnosis.measured["resistors_not_told"] = int(hidden.sum())
         errors = np.abs(self.error_percent[is_there & ~self.wrong])

@@ -54,8 +54,9 @@ class Estimate:
     bottom_wire_ohm: the same of the bottom layer.
     top_wire_ohm_std: standard deviation of top_wire_ohm (R, C) [ohm].
     bottom_wire_ohm_std: standard deviation of bottom_wire_ohm (R, C) [ohm].
-    chi2: mean square of the readings' residuals, over the variance of a reading; at far ends, of
-        the ports' currents, over theirs. It is about 1 or less if the model holds.
+    chi2: mean square of the residuals of readings, over the variance of a reading; where far ends
+        or a region are read, the same of the currents of ports. It is about 1 or less if the model
+        holds.
     iterations: steps of the method, 1 where it has none.
     converged: whether the method converged and the readings can be trusted: message is empty.
     message: why not, in words.

@@ -62,10 +62,11 @@ class RegionFit:
     """Fits frames of one region, one after the other.
 
     log_cells, log_cells_std: of all cells, those outside as in the whole frame, (RC,).
-    wires_log_std, leads_log_std: the parts of it that come from the means of the wires, (RC,).
+    wires_log_std, leads_log_std: the parts of log_cells_std that come from the means of the layers,
+        and from the mean lead, (RC,).
     modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
     iterations: steps of the last frame.
-    misfit: 0: a frame that does not fit is not answered by its region.
+    misfit: always 0, because a frame that does not fit gets no answer here.
     """
 
     misfit: Final = 0.0

@@ -221,7 +221,7 @@ class Touched:
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     lesson: what the readings say of the wires.
-    misfit: 0: readings that these touches do not explain are not answered by them.
+    misfit: always 0, because readings that these touches do not explain get no answer here.
     """
 
     cells: Cells
@@ -249,9 +249,10 @@ class SparseFit:
     net: the untouched skin.
     untouched: the same as a touched skin without touches: each frame starts from it.
     current: its port currents per Vdd, (RC,) [S].
-    model_variance: of these, by the drift of cells and by what is not known of wires, (RC,) [S^2].
+    model_variance: of these currents, by the drift of cells and the uncertainty of wires, (RC,)
+        [S^2].
     path_ohm: wires and leads between each cell and its sensed ends, (RC,).
-    path_std_ohm: how far that may be off, (RC,).
+    path_std_ohm: standard deviation of path_ohm, (RC,).
     """
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
@@ -335,14 +336,14 @@ class FewTouches:
         self._compare()
 
     def _compare(self) -> None:
-        """s and r of the present model."""
+        """Compute s and r of the present model."""
         # A touched cell explains its own port, so nothing but the readings has to be noise there.
         self._std = self._untouched_std.copy()
         self._std[self.cells] = self._reading_std[self.cells]
         self._residual = (self._measured - self._current) / self._std
 
     def converge(self, cells: Cells, log_siemens: Float) -> None:
-        """Steps from here until none matters; cells that fall back to rest leave.
+        """Step from these cells until no step matters; cells that fall back to rest are taken out.
 
         Conductances start at the least that counts as touched, or above: what a touch adds must be
         above 0.
@@ -498,9 +499,11 @@ class FewTouches:
         return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
-        """Whether wires matter to a port, (RC,): to those of the touched cells they always do.
+        """Ports whose readings wires may move by more than a share of their noise, (RC,).
 
-        Touches let more current through the port's own wires: I^2 path is what these take of it.
+        An error of path_ohm changes the current by I^2 times the error. What that is at rest, the
+        cells at rest have taken up; a touch lets more current through. The ports of touched cells
+        are always among them.
         """
         skin = self._skin
         move = (self._current**2 - skin.current**2) * skin.path_std_ohm

@@ -2,7 +2,7 @@
 """The link's definition, read from ``protocol/frames.toml``: the only source of its numbers.
 
 A `Definition` maps names to `Frame`. A `Frame` packs and unpacks payloads as dictionaries, in which
-the value of an enum field is a name. How a frame is put into bytes is in `framing`, above.
+the value of an enum field is a name. `framing` puts such payloads into frames.
 
 No number of the link is written in Python, so board and host cannot drift apart: a board says by
 the CRC of its layout which definition it was built from. `NOW` is that of this host, whose contents

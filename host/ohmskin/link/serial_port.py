@@ -106,7 +106,10 @@ class SerialLink:
 
 
 def _explain(path: str, exc: Exception) -> tuple[str, str]:
-    """Problem and remedy: what systems call them differs, and what pyserial keeps of that too."""
+    """Problem and remedy, in words.
+
+    Systems call the same problem by different numbers and texts, and pyserial keeps either of them.
+    """
     number = getattr(exc, "errno", None)
     text = str(exc)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFound" in text:
