@@ -45,7 +45,7 @@ from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import UNKNOWN_LEAD_OHM, UNLIMITED_STD, USUAL_LEAD_STD_OHM
+from ohmskin.estimate.prior import UNLIMITED_STD, USUAL_LEAD_STD_OHM
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Scan
@@ -130,14 +130,14 @@ class Kneading:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         if not calibrator.shows_wires:
             calibrator.take_wires(self._found_wires(log))
-        levels = self._levels(calibrator.estimator, self._spaced(MOST_SCANS), progress)
+        levels = self._levels(calibrator.estimator, self._spaced(), progress)
         return TotalFit(self._totals(levels, log)).fit()
 
-    def _spaced(self, most: int) -> Bool:
-        """Which scans to use, (n,): pauses, ends of presses, and at most so many others."""
+    def _spaced(self) -> Bool:
+        """Which scans to use, (n,): pauses, ends of presses, and at most `MOST_SCANS` others."""
         counts = np.cumsum(self._press >= 0)
         step_s = float(np.median(np.diff(self.time_s)))
-        every = max(round(SCAN_STEP_S / step_s), int(counts[-1] // most) + 1, 1)
+        every = max(round(SCAN_STEP_S / step_s), int(counts[-1] // MOST_SCANS) + 1, 1)
         is_edge = np.diff(self._press, append=-1) != 0
         is_edge[1:] |= is_edge[:-1]
         return np.asarray(self._is_clear & ((self._press < 0) | is_edge | (counts % every == 0)))
@@ -147,7 +147,7 @@ class Kneading:
 
         most_cells: the cells of all these scans together are about as many at most.
         """
-        used, press = self._spaced(MOST_SCANS), np.maximum.accumulate(self._press)
+        used, press = self._spaced(), np.maximum.accumulate(self._press)
         cells = int(np.count_nonzero(used & (self._press >= 0))) * self.shape[0] * self.shape[1]
         return np.asarray(used & (press // STRETCH % (cells // most_cells + 1) == 0))
 
@@ -156,7 +156,7 @@ class Kneading:
         knowledge = self._calibrator.knowledge
         told = knowledge.nominal_wire_ohm
         centre, std = (of_wires[:2] for of_wires in wire_prior(told))
-        lead_ohm, lead_std_ohm = told.lead_or(UNKNOWN_LEAD_OHM, USUAL_LEAD_STD_OHM)
+        lead_ohm, lead_std_ohm = told.lead_or_usual(USUAL_LEAD_STD_OHM)
         w, scale = centre, None
         if told.both is None:
             w = np.minimum(w, np.log(START_OHM))

@@ -243,7 +243,7 @@ def wire_prior(told: WireOhm) -> tuple[Float, Float]:
     for ohm, log_std in zip(told[:2], told[3:5], strict=True):
         centre.append(np.log(UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3)))
         std.append(UNTOLD_STD if ohm is None else np.hypot(LAYER_STD, log_std or 0.0))
-    lead_ohm, lead_std_ohm = told.lead_or(UNKNOWN_LEAD_OHM, UNTOLD_LEAD_STD_OHM)
+    lead_ohm, lead_std_ohm = told.lead_or_usual(UNTOLD_LEAD_STD_OHM)
     centre.append(lead_ohm / UNKNOWN_LEAD_OHM)
     std.append(max(lead_std_ohm, 1e-3) / UNKNOWN_LEAD_OHM)
     return np.array(centre), np.array(std)

@@ -218,7 +218,7 @@ def _judge_cells(
     rows, columns = siemens.shape
     top, bottom = rest.wire_ohm
     path_ohm = bottom * np.arange(1, rows + 1)[:, None] + top * np.arange(1, columns + 1)
-    path_ohm += 2 * rest.lead_ohm(limits.SWITCH_LEAD_STD_OHM)[0]
+    path_ohm += 2 * rest.lead_ohm[0]
     # A saturated cell shows the wires up to it, and these may be above nominal by the share that is
     # no fault. The cell itself conducts more than the hardest touch could make it.
     most_ohm = (1 + limits.CHANGED_SHARE) * path_ohm + 1 / HIGHEST_TOUCH_SIEMENS

@@ -67,7 +67,6 @@ from ohmskin.doctor.limits import (
     FEW_STDS,
     KNOWN_STD,
     MANY_STDS,
-    SWITCH_LEAD_STD_OHM,
 )
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
@@ -534,7 +533,7 @@ def examine_far(
     for is_open, shorts in zip(near.open_lines, near.shorts, strict=True):
         left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
         kept.append([n for n in range(len(is_open)) if n not in left_out])
-    skin, expected_lead = FarSkin(rest, kept), rest.lead_ohm(SWITCH_LEAD_STD_OHM)
+    skin, expected_lead = FarSkin(rest, kept), rest.lead_ohm
     layers = [
         _Layer(axis, kept, near.shorts[axis], loss_std_floating, expected_lead, silent)
         for axis, (loss_std_floating, silent) in enumerate(

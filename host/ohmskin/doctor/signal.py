@@ -35,10 +35,9 @@ from numpy.typing import ArrayLike, NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READING_SIGN, READINGS_PER_CELL
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
-from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB
+from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB, SWITCH_LEAD_STD_OHM
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
-from ohmskin.estimate.prior import UNKNOWN_LEAD_OHM
 from ohmskin.link.clock import slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -190,12 +189,10 @@ class Rest:
     offset_lsb: float = 0.0
     told: WireOhm = NO_WIRES
 
-    def lead_ohm(self, unknown_std_ohm: float) -> tuple[float, float]:
-        """The usual lead of all lines, and its standard deviation [ohm].
-
-        unknown_std_ohm: the deviation of a lead that nobody has told.
-        """
-        ohm, std_ohm = self.told.lead_or(UNKNOWN_LEAD_OHM, unknown_std_ohm)
+    @property
+    def lead_ohm(self) -> tuple[float, float]:
+        """The usual lead of all lines, and its standard deviation [ohm]."""
+        ohm, std_ohm = self.told.lead_or_usual(SWITCH_LEAD_STD_OHM)
         return ohm, max(std_ohm, 1.0)  # 1 ohm: a precision is made of it
 
     @property

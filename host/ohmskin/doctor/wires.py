@@ -62,7 +62,6 @@ from ohmskin.doctor.limits import (
     FEW_STDS,
     KNOWN_STD,
     PRESSED_LSB,
-    SWITCH_LEAD_STD_OHM,
 )
 from ohmskin.doctor.signal import NOISE_S, Look, Rest, rounding_std_lsb, settling_values
 from ohmskin.estimate.base import Estimator
@@ -242,7 +241,7 @@ class CornerScans:
 
     def measure(self, rest: Rest) -> list[WireShare]:
         """The share of all wires, then that of each row and column; empty if none was pressed."""
-        lead_ohm, lead_std_ohm = rest.lead_ohm(SWITCH_LEAD_STD_OHM)
+        lead_ohm, lead_std_ohm = rest.lead_ohm
         at_rest = _ports(rest.ratio, rest.std_lsb, self._matrix, lead_ohm)
         most = max(map(len, self._codes.values()), default=0)
         measured = []

@@ -20,7 +20,7 @@ from ohmskin.circuit.skin import (
     current_std,
     is_near,
 )
-from ohmskin.estimate.prior import LEAD_STD
+from ohmskin.estimate.prior import LEAD_STD, UNKNOWN_LEAD_OHM
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
@@ -59,13 +59,13 @@ class WireOhm(NamedTuple):
                 raise ValueError(f"{name} is {number:g}, it must be from 0 to {MAX_OHM:g}")
         return self
 
-    def lead_or(self, ohm: float, std_ohm: float) -> tuple[float, float]:
-        """The lead and its standard deviation [ohm]; these two where nobody has told the lead.
+    def lead_or_usual(self, std_ohm: float) -> tuple[float, float]:
+        """The lead and its deviation [ohm]; the usual lead and `std_ohm` where nobody has told it.
 
         A lead that was told without its deviation is known to the share `LEAD_STD`.
         """
         if self.lead is None:
-            return ohm, std_ohm
+            return UNKNOWN_LEAD_OHM, std_ohm
         return self.lead, self.lead_std_ohm or LEAD_STD * self.lead
 
     @property

@@ -92,7 +92,6 @@ from ohmskin.estimate.prior import (
     SEGMENT_STD,
     STEADY_FADE,
     UNKNOWN_LAYER_STD,
-    UNKNOWN_LEAD_OHM,
     UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
     UNTOLD_REACH_STDS,
@@ -192,7 +191,7 @@ class WireBelief(ABC):
         if may_be_bent or not layer_stds.all():
             layer_stds = np.hypot(layer_std, layer_stds)
         layer_stds = np.maximum(layer_stds, 0.01)
-        lead_ohm, lead_std_ohm = wires.lead_or(UNKNOWN_LEAD_OHM, UNKNOWN_LEAD_STD_OHM)
+        lead_ohm, lead_std_ohm = wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)
         lead_std_ohm = max(lead_std_ohm, 1e-3)
         self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
         self._prior_covariance = np.diag([*layer_stds, lead_std_ohm]) ** 2
