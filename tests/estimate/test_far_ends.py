@@ -16,7 +16,7 @@ from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.protocol import MODES
 from places import DATA
 from skins import ten_bits
-from studies.trials import skin_at_rest, touch
+from studies.trials import finger_trial, skin_at_rest, touch
 
 ALL = "abcdefgh"
 ENDS = [(True, True), (True, False), (False, True), (False, False)]
@@ -337,6 +337,24 @@ def test_far_ends_that_were_their_near_ends_at_rest_are_named_sooner(
         return [name in reader.read(one, in_order=True).fault for one in frames].index(True)
 
     assert first_named(0) > first_named(1) == first_named(2)
+
+
+@pytest.mark.parametrize("apart", [0.025, -0.025])
+def test_references_that_are_off_are_no_fault_of_a_far_line(apart: float) -> None:
+    """Once, what they change was half of what a line seemed to lose: 5 of these frames."""
+    random = np.random.default_rng(24002)
+    trial = finger_trial(8, 8, 60, 24002, sigma_cells=(0.6, 1.0), peak_siemens=(3e-5, 3e-4))
+    told = trial.rest.ref_top_ohm
+    skins = [
+        replace(each, ref_top_ohm=told * (1 + apart), ref_bottom_ohm=told * (1 - apart))
+        for each in (trial.rest, *trial.frames)
+    ]
+    rest, *frames = map(seen, skins)
+    known = SkinKnowledge(8, 8, adc_bits=10, rest_ratio=rest, reading_names=tuple("aebf"))
+    estimator = make_estimator("joint", known)
+    for frame in frames:
+        noisy = frame + 0.3 / 1024 * random.standard_normal(frame.shape)
+        assert estimator.estimate(ten_bits(noisy)).converged
 
 
 def test_other_cells_may_carry_more_to_far_ends_than_the_ports_own() -> None:

@@ -157,6 +157,7 @@ class MeasuredWires(WireBelief):
         normal, right = np.eye(4), np.zeros(4)
         normal[3, 3], right[3] = 1.0 / lead_variance, lead_ohm / lead_variance
         own = np.array([SEGMENT_STD, SEGMENT_STD * abs(self.means[2])])
+        of_lines: list[tuple[int, Float]] = []
         for layer, sign in ((0, 1.0), (1, -1.0)):
             if not self.far[layer]:
                 continue
@@ -165,8 +166,7 @@ class MeasuredWires(WireBelief):
             lines = np.moveaxis(np.array([*columns, weight]), 1 + layer, 1)
             x, of_ports = lines[:-1], lines[-1]
             products = np.einsum("alp,blp,lp->lab", x, x, of_ports)
-            if ports is not self._judged:
-                self._notice(layer, products)
+            of_lines.append((layer, products.copy()))
             shared = products[:, [0, 2]] * own[:, None]
             system = np.eye(2) + shared[:, :, [0, 2]] * own
             products -= shared.transpose(0, 2, 1) @ np.linalg.solve(system, shared)
@@ -175,30 +175,38 @@ class MeasuredWires(WireBelief):
             at = [layer, 2, 3]
             normal[np.ix_(at, at)] += summed[:3, :3]
             right[at] += summed[:3, 3]
-        self._judged = ports
         covariance = np.asarray(np.linalg.inv(normal), np.float64)
-        return covariance @ right, covariance
+        factors = covariance @ right
+        if ports is not self._judged:
+            self._judged = ports
+            for layer, products in of_lines:
+                self._notice(layer, products, factors[3])
+        return factors, covariance
 
-    def _notice(self, layer: int, products: Float) -> None:
+    def _notice(self, layer: int, products: Float, lead_ohm: float) -> None:
         """Notice lines that lose much less than the usual line, and layers that lose nothing.
 
         Judged is the loss of each line as a share of what the believed wires and lead would lose,
         by least squares. What has been noticed stays until a frame shows that the line loses as it
-        should.
+        should. Lines are compared without what the mean lead of this frame is off: references that
+        differ from what is told look like that, in all lines, and are all of what a line loses
+        where little of it carries current.
 
-        products (lines, 4, 4): ab of q, h, ones and p.
+        products (lines, 4, 4): ab of q, h, ones and p. lead_ohm: the mean lead of this frame.
         """
-        lead_ohm = max(float(self._means_before[0][2]), 0.0)
-        of_loss = products[:, 0] + lead_ohm * products[:, 2]
+        believed_ohm = max(float(self._means_before[0][2]), 0.0)
+        of_loss = products[:, 0] + believed_ohm * products[:, 2]
         per_offset = of_loss[:, 1] / (products[:, 1, 1] + 1.0)
-        precision = of_loss[:, 0] + lead_ohm * of_loss[:, 2] - per_offset * of_loss[:, 1]
+        precision = of_loss[:, 0] + believed_ohm * of_loss[:, 2] - per_offset * of_loss[:, 1]
         precision = np.maximum(precision, 1e-9)
         share = (of_loss[:, 3] - per_offset * products[:, 1, 3]) / precision
+        per_ohm = (of_loss[:, 2] - per_offset * products[:, 1, 2]) / precision
+        of_line = share - (lead_ohm - believed_ohm) * per_ohm
         reach = OFF_STDS * np.sqrt(1.0 / precision + SEGMENT_STD**2)
-        usual = OFF_SHARE * np.sort(share)[share.size // 2]  # faster than median
+        usual = OFF_SHARE * np.sort(of_line)[of_line.size // 2]  # faster than median
         off = self._off[layer]
-        off[share + reach < usual] = True
-        off[share - reach > usual] = False
+        off[of_line + reach < usual] = True
+        off[of_line - reach > usual] = False
         # A layer whose wires are known may have been bent, but not so far that it loses nothing.
         sound = np.where(off, 0.0, precision)
         total = max(float(sound.sum()), 1e-9)
