@@ -95,6 +95,20 @@ def test_numbers_of_a_scale_are_where_they_were_printed_on_a_busy_machine() -> N
     assert found_s[far] == pytest.approx(expected_s[kept][far], abs=0.02)
 
 
+@pytest.mark.parametrize("busy_s", [11.0, 16.0])
+def test_times_of_a_scale_never_go_back(busy_s: float) -> None:
+    """Numbers that had waited were counted as lost; when they waited less, some were taken back."""
+    true_s = 0.1 * np.arange(1200)
+    # From 20 s on, a busy machine lets all numbers wait: first for 0.5 s, then for 0.2 s.
+    waits_s = np.where((true_s >= 20) & (true_s < 20 + busy_s), 0.5, 0.0)
+    waits_s += np.where((true_s >= 20 + busy_s) & (true_s < 20 + 2 * busy_s), 0.2, 0.0)
+    waits_s += np.random.default_rng(1).uniform(0, 0.02, true_s.size)
+    found_s = printed_s(np.maximum.accumulate(true_s + waits_s))
+    assert np.all(np.diff(found_s) >= 0)
+    sound = (true_s < 5) | (true_s > 20 + 2 * busy_s + 15)
+    assert found_s[sound] == pytest.approx(true_s[sound], abs=0.01)
+
+
 def test_a_scale_that_prints_when_it_likes_keeps_its_times() -> None:
     random = np.random.default_rng(2)
     arrival_s = np.cumsum(random.exponential(0.3, 300))

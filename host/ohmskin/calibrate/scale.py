@@ -76,7 +76,10 @@ def _in_steps(arrival_s: Float) -> Float:
     lost = np.zeros_like(number)
     for first, last in pairwise(earliest):
         more = round(float(late_s[last] - late_s[first]) / step_s)
-        if more > -lost[-1]:  # what was counted as lost may be taken back, and no more than that
+        # Delays that begin look like lost numbers, and are counted, too. Where they end, nothing is
+        # taken back: numbers would then be earlier than those before them. A count that stays too
+        # high does no harm, because only changes of the count move the lines fitted below.
+        if more > 0:
             lost[first + 1 + int(np.argmax(np.diff(arrival_s[first : last + 1]))) :] += more
     times_s = without_delays_s(np.asarray(step_s * (number + lost)), arrival_s)
     is_even = np.median(arrival_s - times_s) < max(step_s, MOST_LATE_S)
