@@ -1,36 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One frame's fit of all resistances: what `joint` minimises, and what it says of the answer.
+"""One frame's fit of all resistances: what `joint` minimises, and how certain the answer is.
 
 Symbols
 
 ====== ============ ============================================================= ==========
 symbol shape        meaning                                                       unit
 ====== ============ ============================================================= ==========
-n                   means of the wires: of the segments of both layers, of the
-                    leads; and of the leaks, if there are any (`wire_belief`)
+n                   number of means: the logs of the mean segment of each layer,
+                    the mean lead, and two leaks if there are any (`wire_belief`)
 x      (RC + n,)    log resistances of cells, and the means                       log ohm,
                                                                                   ohm, uS
 m      (RC + n,)    what the prior expects of x                                   as x
 P      (RC+n, RC+n) covariance of the prior
 u      (RC + n,)    deviations from the prior: x = m + P^1/2 u                    1
-y, h   (RC,)        measured and modelled port currents per Vdd, over noise       1
+y, h   (RC,)        measured and modelled port currents per Vdd, over their noise 1
 J      (RC, RC + n) dh / du                                                       1
-W      (RC, w)      dh / dw s, w the log segments and the leads, s the deviation  1
-                    that each has of its own
-N      (RC, RC)     covariance of y: of its noise and of what is not in x         1
-S      (RC, RC)     covariance of y, N + J J^T: of all that is not certain        1
+W      (RC, w)      dh / dw times s, where w are the log segments and the leads,  1
+                    and s the deviation of each from its mean
+N      (RC, RC)     covariance of y by its noise and by W: by all that x lacks    1
+S      (RC, RC)     covariance of y by all that is not certain, N + J J^T         1
 O      (RC, RC + n) J whitened: L^-1 J, with L L^T = S                            1
 ====== ============ ============================================================= ==========
 
-Minimised is (y - h)^T N^-1 (y - h) + |u|^2, P of the cells re-weighted for the tails of their prior
-at every step. What wires have of their own is small: it is noise, N = 1 + W W^T, and afterwards
-W^T S^-1 (y - h(u) + J u) says what it has been. The steps are Gauss-Newton's in the space of the
-readings (Tarantola 2005, eq. 3.51),
+Minimised is (y - h)^T N^-1 (y - h) + |u|^2. The prior of the cells has tails, and P is that of a
+normal: so P of the cells is made anew for these tails at every step (`CellPrior.normal`). What each
+wire differs by from its mean is small. So it is not in x, but is taken for noise, N = 1 + W W^T;
+after the fit, W^T S^-1 (y - h(u) + J u) is the most probable value of it, over s. The steps are
+those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
 
     u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 
-and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. J, N and S are made anew only where
-those of the step before, used once more, would still move something.
+and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. Making J, N and S takes most of the
+time. So each step is first tried with those of the step before, and they are made anew only if this
+step still moves something.
 """
 
 from functools import cached_property
@@ -55,15 +57,15 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.wire_belief import Lesson, WireBelief
 
-# Fits that find their way take fewer steps. After these, a step that turns back by more than this
-# share of the one before is shortened. Chosen.
+# Most fits take fewer steps. Later ones that turn back are shortened (`_damped`). Chosen.
 USUAL_ITERATIONS: Final = 12
+# A step turns back if its share along the step before is below this. Chosen.
 TURNED_SHARE: Final = -0.25
-# After so many steps, a fit with so large a chi-square per port ends: no skin gives these readings,
-# and steps for many cells take long. Chosen: in the tests it was larger in 140 of 16,400 fits after
-# 12 steps, and none of them converged.
+# A fit with a larger chi-square per port after `USUAL_ITERATIONS` ends: no skin gives these
+# readings, and on large skins each step takes long. Chosen: in the tests, 140 of 16,400 fits had a
+# larger one after 12 steps, and none of them converged.
 HOPELESS_MISFIT: Final = 100.0
-# Limits of a cell's log resistance.
+# Limits of a cell's log resistance [log ohm].
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
 
 
@@ -91,7 +93,7 @@ class FullFit:
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
         self.log_cells: Float = start
-        self._mean_stds = np.zeros(len(belief.means))  # u of them
+        self._mean_stds = np.zeros(len(belief.means))  # u of the means
         self._moved_log = np.inf  # the most that a log resistance can have moved since N was made
         self._evaluate()
         self._minimise()
@@ -102,7 +104,8 @@ class FullFit:
         self._means = self._belief.means_off(self._mean_stds)
         self._circuit = self._belief.circuit(self.log_cells, self._means)
         series_ohm = self._ref_ohm + self._belief.leads_of_port * self._means[2]
-        # No reading has less in series than the references: a step may make leads negative.
+        # A step may make the mean lead negative. Half of the references is far below what any port
+        # has in series, and keeps the current finite.
         self._modelled = 1.0 / (self._circuit.port_ohm + max(series_ohm, 0.5 * self._ref_ohm))
         self._residual = (self._current - self._modelled) * self._weight
         self._prior = self._prior.about(self._means)
@@ -119,15 +122,15 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J and S for the present state.
 
-        W takes longest of all slopes. So N is kept until a log resistance may have moved by more
-        than `SEGMENT_STD`, 10 %. That changes W by about 10 %, and what segments have of their own
-        is not known as well as that.
+        Of all slopes, those of W take the longest time. So N is kept until a log resistance may
+        have moved by more than `SEGMENT_STD`, 10 %. Such a move changes W by about 10 %, and W need
+        not be more exact: nobody knows to 10 % by how much segments differ.
         """
         if self._moved_log > SEGMENT_STD:
             self._moved_log = 0.0
             self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
             self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
-            # N without leads, and what these add for each ohm^2.
+            # N without leads; and what leads add to it, for each ohm^2 of their variance.
             self._noise = gram(self._by_segment)
             np.einsum("ii->i", self._noise)[:] += 1.0
             self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
@@ -144,11 +147,14 @@ class FullFit:
         self._slopes, self._factor = self._factorised(self._cell_std)
 
     def _with_leads(self, own_ohm: float) -> Float:
-        """N, if leads have a deviation of so many ohm of their own."""
+        """N, if each lead has this deviation from the mean lead [ohm]."""
         return self._noise + own_ohm**2 * self._of_leads
 
     def _factorised(self, cell_std: Float, odd_lead_ohm: float = 0.0) -> tuple[Float, Float]:
-        """J for cells of these deviations (RC,), and L. odd_lead_ohm: what N has not of leads."""
+        """J for cells of these deviations (RC,), and L.
+
+        odd_lead_ohm: a further deviation of leads from the mean lead, which N does not have [ohm].
+        """
         cells = cell_std.size
         slopes = np.empty((cells, cells + self._mean_stds.size))
         np.multiply(self._by_cell, cell_std, out=slopes[:, :cells])
@@ -157,11 +163,11 @@ class FullFit:
         return slopes, cholesky(gram(slopes, onto=noise))
 
     def _minimise(self) -> None:
-        """Steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
+        """Take steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
 
-        Each is first tried with the slopes of the one before; late ones are shortened if they turn
-        back. The circuit is not evaluated after the last move: `modelled`, `misfit` and `wires` are
-        what the last step has forecast.
+        Each step is first tried with the slopes of the step before. From `USUAL_ITERATIONS` on,
+        steps that turn back are shortened. The circuit is not evaluated after the last move:
+        `modelled`, `misfit` and `wires` are as the last step has forecast them.
         """
         self._linearise()
         step, moved_stds = self._step()
@@ -174,7 +180,8 @@ class FullFit:
             before = step
             self._evaluate()
             step, moved_stds = self._step()
-            # Old slopes are a little wrong, so by them the last step must be at most half as large.
+            # Old slopes are a little wrong. So a step that they give is the last one only if it is
+            # at most half as large as the last step may be.
             if moved_stds >= 0.5 * CLOSE_STDS:
                 self._linearise()
                 step, moved_stds = self._step()
@@ -185,9 +192,10 @@ class FullFit:
     def _step(self) -> tuple[Float, float]:
         """The step u' - u, and the largest move it makes, in deviations of a reading or of a cell.
 
-        J is in deviations that cells had at the last linearisation, but their prior, a normal that
-        follows the tail (`CellPrior.normal`), is that of the present state. Its slope is (x -
-        centre) / present variance. So u of a cell is this slope times the older deviation.
+        The columns of J are per deviation that the cells had at the last linearisation. The prior
+        of the cells, a normal that follows the tail (`CellPrior.normal`), is that of the present
+        state: the slope of half its -2 log p is (x - centre) / present variance. So that the step
+        has this slope in it, u of a cell is the slope times the older deviation.
         """
         cell_stds = (self.log_cells - self._centre) * self._cell_std / self._variance
         present = np.concatenate([cell_stds, self._mean_stds])
@@ -198,7 +206,7 @@ class FullFit:
         return step, float(max(np.abs(readings_step).max(), np.abs(cells_step).max()))
 
     def _move(self, step: Float) -> None:
-        """Take a step, or so much of it that no log resistance moves by more than MAX_STEP_LOG."""
+        """Take a step; less of it if a log resistance would move by more than `MAX_STEP_LOG`."""
         step, stds_step = step[: self.log_cells.size], step[self.log_cells.size :]
         means_step = self._belief.means_off(stds_step) - self._belief.means
         # A cell that would leave its limits goes to the limit, and does not shorten the whole step.
@@ -213,10 +221,10 @@ class FullFit:
 
     @cached_property
     def wires(self) -> Float:
-        """Logs of the segments, and leads, (w,): their mean's, and what each has of its own.
+        """Logs of the segments, and the leads, (w,): the mean, and how much each differs from it.
 
-        The latter was noise of covariance W W^T. Of a residual whose whole covariance is S, its
-        most probable share is W^T S^-1 times the residual.
+        In the fit, these differences were noise of covariance W W^T. In a residual whose whole
+        covariance is S, the most probable differences, over s, are W^T S^-1 times the residual.
         """
         segments_off = SEGMENT_STD * (self._weighted_residual @ self._by_segment)
         leads_off = self._own_lead_ohm**2 * (self._weighted_residual @ self._by_lead)
@@ -224,31 +232,33 @@ class FullFit:
 
     @property
     def modelled(self) -> Float:
-        """Port currents of the model, (RC,) [S], with what wires have of their own.
+        """Port currents of the model, (RC,) [S], with each wire as `wires` has it.
 
-        By the same rule, the share of the readings' noise, whose covariance is 1, is S^-1 times the
-        residual; the rest of the measured current is the model's.
+        The noise of the readings has the covariance 1. So, by the rule of `wires`, the most
+        probable noise is S^-1 times the residual. The model is the measured current less this
+        noise.
         """
         return self._current - self._weighted_residual / self._weight
 
     @property
     def misfit(self) -> float:
-        """Chi-square per port: the mean square of that noise."""
+        """Chi-square per port: the mean square of the most probable noise of the readings."""
         return float(self._weighted_residual @ self._weighted_residual) / self._current.size
 
     @cached_property
     def surprise(self) -> float:
         """The misfit over what this model expects of it: about 1 or less if the model holds.
 
-        A residual of covariance S has a most probable noise, S^-1 times it, of covariance S^-1: the
-        mean square of that is the trace of S^-1. It is much less than 1 per port where cells and
-        wires are free to explain the readings, so the misfit itself says little.
+        If the residual has the covariance S, its most probable noise, S^-1 times the residual, has
+        the covariance S^-1. So the misfit is expected to be the trace of S^-1 over the number of
+        ports. Where cells and wires are free to explain the readings, that is much less than 1, and
+        the misfit alone does not show whether the model holds.
         """
         expected = inverse_trace(self._factor) / self._current.size
         return self.misfit / max(expected, 1e-12)
 
     def _conclude(self) -> None:
-        """Posterior deviations of the cells: log_cells_std and wires_log_std, by the last J and S.
+        """Posterior deviations of the cells by the last J and S: log_cells_std and its parts.
 
         With c the deviation of a cell's prior, that of its posterior is c (1 - l)^1/2. (c is that
         of the normal in use: for a touched cell, its distance from rest.) l is the cell's diagonal
@@ -257,15 +267,15 @@ class FullFit:
         of a cell by the element (cell, mean) of O^T O: its part of the cell's deviation is c times
         that. The layers are independent, and their parts are added as variances.
 
-        That holds for cells whose prior can be believed. Those that may be touched unnoticed
-        (`_find_unnoticed`) get a wider deviation c' instead of c. The fit stays as it is. S becomes
-        wider by them: with H the columns of O of these cells, each times (c'^2 / c^2 - 1)^1/2, it
-        is S' = L (1 + H H^T) L^T. So neighbours, which share readings with them, become less
-        certain too (Woodbury):
+        This holds for cells whose prior can be believed. Cells that may be touched unnoticed
+        (`_find_unnoticed`) get a wider deviation c' instead of c. The fit itself stays as it is. S
+        grows by these cells: with H the columns of O of these cells, each times
+        (c'^2 / c^2 - 1)^1/2, it becomes S' = L (1 + H H^T) L^T. So their neighbours, which are in
+        the same readings, become less certain, too (Woodbury):
 
             J^T S'^-1 J = O^T O - O^T H (1 + H^T H)^-1 H^T O .
 
-        The last term is the correction. After it, the columns of J of these cells grow by c' / c.
+        The last term is `correction`. After it, the columns of J of these cells grow by c' / c.
         """
         cell_std, cells = self._cell_std, slice(self._cell_std.size)
         whitened = solve_lower(self._factor, self._slopes)
@@ -288,49 +298,53 @@ class FullFit:
         self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:
-        """Cells that the prior holds at rest and that may be touched; their deviation c' (RC,).
+        """Which cells may be touched although the prior holds them at rest; and c', both (RC,).
 
         A cell counts as at rest if the fit leaves it within one deviation of rest: there the prior
-        is the narrow normal, and not its tail. It may be touched all the same: a touch that is
-        small for the readings, because much else conducts there, need not be small for the cell.
+        is the narrow normal, and not its tail. Such a cell may be touched all the same. Where much
+        else conducts beside it, the touch hardly changes the readings, but it may still be large
+        for the cell.
 
         learned: l, the share of the prior's variance that the readings have removed, (RC,).
         """
         prior = self._prior
         fitted_log = prior.expected - self.log_cells  # rise of the log conductance in the fit
         at_rest = np.abs(fitted_log) < prior.std
-        # What the readings alone say. The fit is the product of two normals, the prior and theirs.
-        # So it has moved the cell by l times the rise that they show, of variance c^2 (1 - l) / l.
+        # What do the readings alone say of the cell? The fit is the product of two normals, that of
+        # the prior and that of the readings. So it has moved the cell by l times the rise that the
+        # readings show, and the variance of this rise is c^2 (1 - l) / l.
         share = np.maximum(learned, 1e-9)
         rise_log = fitted_log / share
         rise_std = prior.std * np.sqrt(np.maximum(1 - learned, 1e-12) / share)
         if prior.is_crowded(self.log_cells):
-            # Between many touched cells hardly any current is that of one at rest. That it is at
-            # rest is then the prior's opinion alone, and it may have any force.
+            # Between many touched cells, a cell at rest carries hardly any of the current. That it
+            # is at rest is then said by the prior alone, and there may be any force on it.
             unnoticed, rise_log = at_rest, np.maximum(rise_log, UNLIMITED_STD)
         else:
-            # A touch may be unnoticed if the rise, two deviations up, would be one that matters,
-            # and if it is itself larger than one deviation.
+            # A touch may be unnoticed under two conditions: the rise that the readings show, with
+            # two deviations more, would matter; and this rise is larger than its deviation, and so
+            # not mere noise.
             unnoticed = at_rest & (rise_log + 2 * rise_std > HIDDEN_LOG) & (rise_log > rise_std)
-        # A normal about rest, of a deviation that reaches as far as the rise that the readings show
-        # and one deviation of it further. Where they show next to nothing, it is very wide.
+        # c' reaches from rest to the rise that the readings show, and one deviation of the rise
+        # further. Where the readings show next to nothing of the cell, c' is very wide.
         unnoticed_std = rise_log + rise_std
-        # No deviation becomes narrower.
+        # No cell gets a narrower deviation than it had.
         return unnoticed & (unnoticed_std > self._cell_std), unnoticed_std
 
     def cells_by_means(self) -> Float:
-        """How the fitted cells follow the means, (RC, n): d log r / d m, for the same readings."""
+        """How fitted cells follow the means, for the same readings, (RC, n): d log r / d mean."""
         return self._cells_by(self._by_mean)
 
     def cells_by_leaks(self) -> Float:
-        """The same by what neighbouring rows, and columns, leak into each other, (RC, 2) [1/uS]."""
+        """How they follow the leaks between neighbouring rows, and columns, (RC, 2) [1/uS]."""
         return self._cells_by(self._weighted(1e-6 * self._circuit.by_leaks()))
 
     def _cells_by(self, slopes: Float) -> Float:
-        """How the fitted cells follow what changes y - h by -`slopes`, the readings being kept.
+        """How the fitted cells follow something else, for the same readings, (RC, k).
 
-        The answer is that of cells alone: P J^T (N + J P J^T)^-1 times that, P their prior's
-        variance.
+        If it changes h by `slopes` (RC, k), the residual changes by -`slopes`, and the cells, of
+        all unknowns alone, follow to keep h as it is. With J the columns of the cells alone, their
+        u change by -J^T (N + J J^T)^-1 `slopes`.
         """
         by_cell = self._by_cell * self._cell_std
         factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
@@ -338,10 +352,10 @@ class FullFit:
 
     @property
     def lesson(self) -> Lesson:
-        """What the readings say of the means, whatever the touched cells are."""
-        # The belief wants the residual at its own means, not at those that the fit has found.
+        """What the readings say of the means, however hard the touches are."""
+        # The belief takes the residual at its own means, and not at those that the fit has found.
         residual = self._residual + self._per_mean_std @ self._mean_stds
-        # A touched cell is noise without limit; one at rest is known to its drift.
+        # A touched cell is noise of nearly any size; a cell at rest is known to its drift.
         touched = np.abs(self._prior.rise_stds(self.log_cells)) > TOUCHED_STDS
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
         _, factor = self._factorised(cell_std, self._belief.odd_lead_ohm())
@@ -349,11 +363,12 @@ class FullFit:
 
 
 def _damped(step: Float, before: Float) -> Float:
-    """So much of a step as leads to where there are no steps, if it turns back on the one before.
+    """A shorter step in the same direction, if this step turns back on the one before.
 
-    On the line through both, a step is r times the one before. Were it linear in the place, it
-    would be 0 after 1 / (1 - r) of this step. Where wires and cells explain the same readings,
-    whole steps go back and forth for ever, with r about -1.
+    Along the step before, this step is r times as long (`turned`). If steps change linearly from
+    place to place, there is a place where they are 0: after the share 1 / (1 - r) of this step.
+    Where wires and cells can explain the same readings, whole steps would go back and forth for
+    ever, with r about -1.
     """
     square = before @ before
     turned = float(step @ before) / max(float(square), 1e-12)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`joint`: every resistance of the skin at once, from one circuit for all readings.
 
-RC readings do not determine 3RC resistances, so a prior does the rest, and the answer carries a
-standard deviation that says how much of it is prior:
+RC readings do not determine 3RC resistances. A prior does the rest, and the standard deviations of
+the answer say how much of it comes from the prior:
 
 - a cell is near its rest resistance, or touched. This is what removes ghosts that the readings do
   not exclude.
@@ -48,40 +48,46 @@ from ohmskin.estimate.region_fit import RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
 from ohmskin.estimate.wire_belief import FAR_LOG, MOST_FITS, LearnedWires, WireBelief
 
-# Both numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
-# table "What each number earns" of docs/estimate.md says what came of it.
+# The first two numbers are chosen. `make ablate` measures them with half, twice and none of each,
+# and the table "What each number earns" of docs/estimate.md says what came of it.
 
-# Fits of the rest readings, each about the median of the one before.
+# Fits of the rest readings. Each has a prior about the median of the cells that the fit before it
+# found.
 REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
-# Lines leak if that explains so much of how cells differ at rest: the gain in twice the log
-# likelihood. Chosen: chance gains 25 in one of 270,000 skins, exp(-25 / 2) by the F distribution.
+
+# A skin leaks if leaks explain so much of how cells differ at rest: it is the gain in twice the log
+# likelihood. Chosen: by chance, one sound skin of 270,000 gains as much, exp(-25 / 2) by the F
+# distribution.
 DAMP_GAIN: Final = 25.0
-# Fits of the leaks, each from the one before. Chosen: the last moves them by less than their
-# deviation.
+# Fits of the leaks, each from the one before. Chosen: the last one moves the leaks by less than
+# their deviation.
 LEAK_FITS: Final = 8
-# [uS] The largest leak, and one that does not matter. Chosen: 10 kOhm at each crossing, which is a
-# wet skin, and a gigohm.
+# The largest leak at each crossing, and one that is too small to matter [uS]. Chosen: 10 kOhm, as
+# of a wet skin, and a gigohm.
 MOST_LEAK_US, LEAST_LEAK_US = 100.0, 1e-3
-# A leak differs from crossing to crossing, and dries: what is known of it, as a share. Chosen.
+# Standard deviation of a leak, as a share of it: leaks differ from crossing to crossing, and become
+# less while the skin dries. Chosen.
 LEAK_STD: Final = 0.2
-# A misfit that stays is a fault of the skin: the mean surprise of last frames is larger. Chosen:
-# dense touches of sound skins have up to 1.
+# The skin is at fault, and not a single frame, if the running mean of the frames' surprise
+# (`FullFit.surprise`) is above this. Chosen: on sound skins, dense touches have a surprise of up to
+# 1.
 STAYING_SURPRISE: Final = 1.2
 STAYS: Final = "other frames fit no touches: is a line shorted, or a yarn broken? ask the doctor"
-# Share of a frame in that mean.
+# Weight of the newest frame in this running mean.
 SURPRISE_SHARE: Final = 0.1
-# A frame counts as no more, and as this if nothing explains it. Chosen: it takes more than half of
-# the frames to make a fault.
+# No frame enters the mean with more surprise, and a frame that nothing explains enters it with
+# this. Chosen: more than half of the frames have to be odd before the skin is at fault.
 MOST_SURPRISE: Final = 1.8
-# Skins of fewer ports are not judged so. Chosen: of 3x3, a few odd readings make a frame.
+# Skins of fewer ports have no such mean. Chosen: on 3x3, a few odd readings spoil a whole frame.
 LEAST_STAYING_PORTS: Final = 16
-# The untouched skin is solved again if the mean lead has moved by more. Chosen: it moves readings
+# The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
 LEAST_LEAD_OHM: Final = 20.0
-# [ohm] Longer lines are not neglected to find a start, and may hide touches. Chosen: 8 segments of
-# 3 kOhm; from there on a fit takes fewer steps from rest.
+# A line that resists more than this from end to end is long [ohm]: to find where a fit starts, its
+# wire must not be neglected, and cells behind it may hide touches. Chosen: 8 segments of 3 kOhm.
+# From there on, a fit that starts at rest takes fewer steps.
 LONG_LINE_OHM: Final = 24e3
 
 
@@ -100,25 +106,27 @@ class JointEstimator(Estimator):
         self._belief: WireBelief = believe(self._shape, wires, far, may_be_bent=bent)
         self._prior: CellPrior | None = None
         self._finder: SparseFit | None = None
-        self._rest_wires_log_std = 0.0  # the most that wires have in a cell's deviation at rest
+        # The part of a cell's log deviation at rest that comes from the wires; the largest of all
+        # cells.
+        self._rest_wires_log_std = 0.0
         self.reset()
 
     def wires(self) -> WireOhm:
-        """As told, until a frame has taught more."""
+        """The wires that were told, until a frame has taught more of them."""
         learned = self._belief.learned()
         return super().wires() if learned is None else learned
 
     def leak_ohm(self) -> tuple[float, float] | None:
-        """What leaks from row to row, and from column to column, at each crossing [ohm].
+        """Resistance of the leaks between rows, and between columns, at each crossing [ohm].
 
-        None: the rest readings show no leaks, or were not told.
+        None: the rest readings show no leaks, or nobody has told rest readings.
         """
         self.rest()
         by_row, by_column = np.maximum(self._belief.leak_siemens(self._belief.means), 1e-9)
         return (1 / float(by_row), 1 / float(by_column)) if len(self._belief.means) > 3 else None
 
     def wires_are(self) -> str:
-        """By what was told, and by how well the belief knows both layers since."""
+        """Layers that were told are "known"; others are "assumed" until frames have taught them."""
         if self._belief.untold:
             return ASSUMED if self._belief.is_assumed else "learned"
         return "known"
@@ -127,8 +135,8 @@ class JointEstimator(Estimator):
         """Forget the frames before, and what they revealed of the wires."""
         super().reset()
         self._cells_before: Float | None = None  # what `matrix` found in the last frame it started
-        self._touches = 0  # of the last fit
-        self._surprise = 0.0  # the mean of those of the last fits
+        self._touches = 0  # touched cells in the last fit
+        self._surprise = 0.0  # running mean of the surprise of the fits so far
         # The last whole frame, for regions of the frames after it; and the last region.
         self._whole: FullFit | Touched | WholeFrame | None = None
         self._region: RegionFit | None = None
@@ -140,9 +148,10 @@ class JointEstimator(Estimator):
         try:
             return self._answer(ports)
         except np.linalg.LinAlgError:
-            # Nonsense in exact readings of far ends does this, because only noise prevents that
-            # `far_wires` divides by 0. No other readings are known to. Each cell is answered as if
-            # alone. No model was fitted: chi2 only compares readings with their own current.
+            # Impossible readings of far ends that are told to be exact do this: only a noise above
+            # 0 keeps `far_wires` from dividing by 0. No other readings are known that do it. The
+            # answer takes each cell for the only one of its port. No model was fitted, so chi2 only
+            # compares readings with their own current.
             return Solution(
                 cell_siemens=conductance_from_current(ports.current, self.knowledge.ref_ohm),
                 cell_siemens_std=np.full(self._shape, MAX_CELL_SIEMENS),
@@ -151,7 +160,11 @@ class JointEstimator(Estimator):
             )
 
     def _answer(self, ports: PortReadings) -> Solution:
-        """The answer for one frame: its last fit, if what it teaches of the wires wants several."""
+        """The answer for one frame.
+
+        Where a fit moves what is believed of the wires too far for its slopes, the frame is fitted
+        again, and the last fit is the answer.
+        """
         again = False
         for _ in range(MOST_FITS):
             solution, again = self._fitted(ports, again=again)
@@ -160,7 +173,14 @@ class JointEstimator(Estimator):
         return solution
 
     def _fitted(self, ports: PortReadings, *, again: bool) -> tuple[Solution, bool]:
-        """A few touches for `touch`, else the fit of all resistances; and `after_fit` of it."""
+        """One fit of a frame, and whether the frame has to be fitted again.
+
+        The fit is that of a few touches where these are the answer, as they may be for `touch`;
+        else it is the fit of all resistances. The belief about the wires learns from it.
+
+        again: the frame has been fitted before. What this fit teaches takes the place of what the
+            last one has taught.
+        """
         prior = self._prior_of(ports)
         if ports.region is not None and (part := self._of_region(prior, ports)):
             return self._solution(ports, part), False
@@ -190,10 +210,11 @@ class JointEstimator(Estimator):
         return solution, again
 
     def _few_touches(self, prior: CellPrior, ports: PortReadings) -> FewTouches | None:
-        """The touched cells, if they are few.
+        """The touched cells, if they are few; else None.
 
-        Trying takes time, and under a finger that stays, few touches explain no frame. So they are
-        not tried after a fit with many. Where wires hide even cells at rest, no few are sure.
+        To look for few touches takes time, and under a finger that stays on the skin no frame has
+        few. So after a fit with many touches nothing is looked for. Nor is it where wires hide even
+        the cells at rest: there nobody can be sure that touches are few.
         """
         hidden = self._rest_wires_log_std > REST_STD
         if hidden or self._touches > most_touches(self._shape):
@@ -203,7 +224,10 @@ class JointEstimator(Estimator):
         return self._finder.find(ports)
 
     def _of_region(self, prior: CellPrior, ports: PortReadings) -> RegionFit | None:
-        """The answer by the cells that were read, about the last whole frame; None: not by them."""
+        """A fit of the cells that were read; the others stay as in the last whole frame.
+
+        None: there is no whole frame yet, or this fit does not explain the readings.
+        """
         assert ports.region is not None
         if self._whole is None:
             return None
@@ -216,7 +240,10 @@ class JointEstimator(Estimator):
         return self._region if self._region.explains(ports) else None
 
     def _explained_by(self, touches: FewTouches) -> Touched | None:
-        """The answer, if these few touches are all that the frame shows: never, for `joint`."""
+        """The answer of these few touches, if they are all that the frame shows.
+
+        For `joint` it is always None: `joint` fits all resistances of every frame.
+        """
         return None
 
     def _solution(
@@ -230,8 +257,8 @@ class JointEstimator(Estimator):
         stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
-        # A model that misses the readings by more than their noise, or than it expects, is wrong by
-        # as much more.
+        # Where the model misses the readings by more than their noise, or by more than it expects
+        # to, it is wrong somewhere. So all deviations are widened by the ratio.
         surprise = fit.surprise if isinstance(fit, FullFit) else 0.0
         wider = max(1.0, fit.misfit, surprise) ** 0.5
         return Solution(
@@ -249,7 +276,8 @@ class JointEstimator(Estimator):
         """Why this fit cannot be the answer; empty if it can."""
         if message := self._belief.fault or fit.message:
             return message
-        # On a leaky skin, short lines hide cells at rest, too; touches conduct more than these.
+        # On a leaky skin, short lines hide cells at rest as well. That is no reason to doubt: a
+        # touch conducts more than a cell at rest, and short lines do not hide it.
         if self._rest_wires_log_std > REST_STD and self._line_ohm() > LONG_LINE_OHM:
             return "wires resist too much: even cells at rest are uncertain"
         if fit.misfit > MAX_CHI2:
@@ -265,23 +293,24 @@ class JointEstimator(Estimator):
         return ""
 
     def _line_ohm(self) -> float:
-        """What the longer lines resist, from end to end."""
+        """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""
         return float((np.exp(self._belief.means[:2]) * self._shape[::-1]).max())
 
     def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
         """Log resistances of the cells to start from, (RC,).
 
-        They are those of the touches that `find` found, even if `explain` rejected them. Where it
-        found none, they are what `matrix` finds. That neglects wires, so its cells come out a
-        little too soft. This is wanted: from softer cells, the fit does not fall into the wrong
-        minimum of one hard touch behind long wires. Where far ends show that wires resist so much
-        that they must not be neglected, the cells start at rest.
+        They are those of the few touches that `SparseFit.find` found, even if
+        `FewTouches.explain` rejected these. Where `find` found none, they are what `matrix` finds.
+        `matrix` neglects wires, so its cells come out a little too soft. This is wanted: from
+        softer cells, the fit does not fall into the wrong minimum of one hard touch behind long
+        wires. Where far ends show that wires resist too much to be neglected, the cells start at
+        rest.
         """
         if touches is not None:
             return touches.log_cells
         if all(self._belief.far) and self._line_ohm() > LONG_LINE_OHM:
             return prior.expected
-        # To start from, cells that miss each reading by one deviation are near enough.
+        # `matrix` may end early: cells that miss each reading by one deviation are a good start.
         tolerance = float(ports.current.size)
         fit = CellFit(ports, self.knowledge.ref_ohm, self._cells_before, tolerance)
         self._cells_before = None if fit.message else fit.best.cell
@@ -303,16 +332,17 @@ class JointEstimator(Estimator):
         return prior
 
     def _prior_followed(self, prior: CellPrior) -> CellPrior:
-        """This prior, or one about the means of the wires as they are believed now.
+        """This prior, or a new one if what is believed of the wires has moved too far from it.
 
-        Few touches are found in a network that is solved for these means. Small changes of what is
-        believed are corrected in each frame, to first order, and larger ones need a new solution.
-        Readings of two far ends have no wires of their own lines in them, so there a change has to
-        be larger before it matters.
+        `SparseFit` solves its network once for each prior, with the mean wires that this prior is
+        about. Each frame corrects small changes of the mean wires to first order; larger ones need
+        a new prior and network. Where rows and columns are both sensed at far ends, no reading has
+        the wires of its own lines in it. So there a change has to be larger before it matters.
         """
         means = self._belief.means
-        # Cells at rest follow the layers by slopes, which hold for small moves only. (Readings at
-        # far ends hardly have these wires in them.)
+        # Cells at rest follow the layers by slopes, which hold for small moves only. After a larger
+        # move, the rest readings are fitted again. (Readings at far ends hardly depend on the
+        # layers.)
         if not any(self._belief.far) and np.abs(means - self._rest_means)[:2].max() > FAR_LOG:
             return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
@@ -322,13 +352,13 @@ class JointEstimator(Estimator):
         return prior
 
     def _prior_by_level(self, ports: PortReadings) -> CellPrior:
-        """All cells at the level of this frame, or of one before it with a lower level.
+        """All cells at the lowest level that this frame or one before it has shown.
 
-        A level is one number for all cells: what has always been pressed is not taken for rest, as
-        it would be cell by cell.
+        The level is one number for all cells. If each cell had its own, a cell that has been
+        pressed from the beginning would be taken for a cell at rest.
         """
         log_ohm, before = -np.log(rest_level(ports.current, self.knowledge.ref_ohm)), self._prior
-        # Touches only raise a level. So the lowest one, of most ohms, is nearest to rest.
+        # Touches only raise the level. So the lowest one, with the most ohms, is nearest to rest.
         if before is not None and log_ohm <= before.expected[0]:
             return before
         cells = ports.current.size
@@ -340,11 +370,14 @@ class JointEstimator(Estimator):
         return CellPrior(logs, stds, np.zeros((cells, len(means))), means)
 
     def _prior_by_rest(self, ports: PortReadings, before: CellPrior | None = None) -> CellPrior:
-        """Log resistances of the untouched cells, and how well they are known: by the same fit.
+        """Log resistances of the untouched cells, and how well they are known.
 
-        Its prior has all cells alike. It is made again about the median of what was found, because
-        a level that is wrong for many cells by a little would weigh more than the readings. With
-        the prior `before`, by other wires, that median is near, and one fit from there is enough.
+        The rest readings are fitted like a frame, with a prior that has all cells alike, at one
+        level. The fit is repeated with the level at the median of the cells that were found: a
+        level that is a little wrong for all cells would weigh more than the readings.
+
+        before: the prior for what was believed of the wires until now. Its median is near the new
+            one, so that one fit is enough. None: there is none yet.
         """
         if before is None:
             level = rest_level(ports.current, self.knowledge.ref_ohm)
@@ -359,18 +392,22 @@ class JointEstimator(Estimator):
         self._rest_means = means = self._belief.means
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
-        # Where wires hide even cells at rest, these follow them too far for slopes to say how.
+        # Where wires hide even cells at rest, cells depend on the wires too strongly for slopes.
         hidden = self._rest_wires_log_std > REST_STD
         by_means = alike.by_means if hidden else fit.cells_by_means()
         std = np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
         return CellPrior(log_cells, std, by_means, means)
 
     def _expect_leaks(self, ports: PortReadings, fit: FullFit) -> tuple[CellPrior, FullFit]:
-        """Find what lines leak, from a fit without leaks, for the belief; the last fit of rest."""
+        """Find the leaks, and let the belief expect them. Returns `_fit_rest` with these leaks.
+
+        fit: of the rest readings, without leaks.
+        """
         leaks_us = np.zeros(2)
         for _ in range(LEAK_FITS):
             _, more_us, stds_us = leaks_of(fit)
-            # Half a step: cells do not follow leaks linearly, and whole steps go back and forth.
+            # Only half of each step is taken: cells do not follow leaks linearly, and whole steps
+            # would go back and forth.
             leaks_us = np.clip(leaks_us + 0.5 * more_us, 0.0, MOST_LEAK_US)
             self._belief.expect_leaks(leaks_us, np.full(2, LEAST_LEAK_US))
             alike, fit = self._fit_rest(ports, fit.log_cells)
@@ -396,17 +433,20 @@ class JointEstimator(Estimator):
 def leaks_of(fit: FullFit) -> tuple[float, Float, Float]:
     """What neighbouring rows, and columns, leak into each other beyond what a rest fit supposes.
 
-    By leaks that were neglected, the lines at the edge, of one neighbour, seem to conduct less than
-    others. So the leaks are those with which cells at rest are most alike, by least squares.
-    Returns the gain of that in twice the log likelihood (0 where leaks would have to be negative),
-    the leaks, and their deviations, (2,) [uS].
+    Where leaks are neglected, the cells of the lines at the edge seem to conduct less than others,
+    because these lines have one neighbour alone. So the leaks are found, by least squares, as those
+    with which the cells at rest are most alike.
+
+    Returns three things: the gain in twice the log likelihood (0 where leaks would have to be
+    negative), the leaks, and their deviations, each (2,) [uS].
     """
     off, by_leaks = fit.log_cells - fit.log_cells.mean(), fit.cells_by_leaks()
     by_leaks = by_leaks - by_leaks.mean(axis=0)
     covariance = np.linalg.pinv(by_leaks.T @ by_leaks)  # a single line leaks into none
     leaks_us = -covariance @ by_leaks.T @ off
     left = off + by_leaks @ leaks_us
-    # Cells that differ by less than they drift tell nothing. The mean and the leaks are fitted.
+    # `drift` keeps cells that differ by less than they drift from telling of leaks. Three numbers
+    # are fitted: the mean and two leaks.
     square, drift, free = left @ left, off.size * REST_STD**2, max(off.size - 3, 0)
     gain = free * float(np.log((off @ off + drift) / (square + drift)))
     stds_us = np.sqrt(covariance.diagonal() * (square + drift) / max(free, 1))
@@ -419,8 +459,11 @@ class TouchEstimator(JointEstimator):
     name: ClassVar[str] = "touch"
 
     def _explained_by(self, touches: FewTouches) -> Touched | None:
-        """The answer of these few touches; None if they leave something open, or one uncertain."""
-        # Where wires are assumed, the fit of all resistances learns them sooner.
+        """The answer of these few touches.
+
+        None: they do not explain the frame, or leave one of the touched cells uncertain.
+        """
+        # Where wires are assumed, the fit of all resistances teaches them sooner.
         if self.knowledge.rest_ratio is None or self._belief.is_assumed:
             return None
         touched = touches.explain()
