@@ -25,12 +25,13 @@ from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
 
-# An open cell counts as so much. Chosen: no converter sees a gigohm, and logs of it stay finite.
+# An open cell counts as so much [S]. Chosen: no converter sees a gigohm, and its log is finite.
 MIN_CELL_SIEMENS: Final = 1e-9
-# Standard deviation of the log of a board's references, as far as both are off alike. Chosen: usual
-# resistors are within 1 % (E96), and the pins that drive them add less: some 30 ohm to 30 kOhm.
+# Standard deviation of the log of a board's references, for an error that both have in common.
+# Chosen: usual resistors are within 1 % (E96), and the pins that drive them add less than that:
+# some 30 ohm to 30 kOhm.
 REF_LOG_STD: Final = 0.01
-# A shorted cell counts as so much. Chosen: beside references of 30 kOhm, an ohm is nothing.
+# A shorted cell counts as so much [S]. Chosen: beside references of 30 kOhm, an ohm is nothing.
 MAX_CELL_SIEMENS: Final = 1.0
 
 
@@ -53,7 +54,7 @@ class WireOhm(NamedTuple):
     lead_std_ohm: float | None = None
 
     def check(self) -> Self:
-        """Itself. Raises ValueError, naming the field, for what is not within 0..`MAX_OHM`."""
+        """Return this object. Raises ValueError, naming the field, if one is not 0..`MAX_OHM`."""
         for name, number in zip(WIRE_FIELDS, self, strict=True):
             if number is not None and not 0 <= number <= MAX_OHM:
                 raise ValueError(f"{name} is {number:g}, it must be from 0 to {MAX_OHM:g}")
@@ -97,8 +98,9 @@ class SkinKnowledge:
     nominal_wire_ohm: what is known of the wires.
     reading_names: the names of the readings of each cell, in their order.
     may_be_bent: whether the skin may have been bent since its wires were measured.
-    ref_log_std: standard deviation of the log of the references, as far as both are off alike; 0:
-        they are exact. Readings are ratios: all resistances have this error, and none shows it.
+    ref_log_std: standard deviation of the log of the references, for an error that both have in
+        common; 0: they are exact. All resistances then have this error, and no reading shows it,
+        because readings are ratios.
     """
 
     rows: int
@@ -145,7 +147,7 @@ class SkinKnowledge:
 
     @property
     def checked_names(self) -> tuple[str, ...]:
-        """The names of the readings that `check_ratio` returns: some of a to d are all of them."""
+        """The names of the readings that `check_ratio` returns: at near ends always a to d."""
         return NEAR if is_near(self.reading_names) else self.reading_names
 
     @property
@@ -167,11 +169,13 @@ class SkinKnowledge:
 def check_ratio(
     ratio: ArrayLike, rows: int, columns: int, name: str = "ratio", of: Sequence[str] = NEAR
 ) -> Float:
-    """Readings `of` these names as float64 (R, C, n), or ValueError naming the first bad cell.
+    """Readings as float64 (R, C, n). Raises ValueError, naming the first bad cell.
 
-    At near ends, n is 4, and a reading that was not taken is NaN. A frame of mode half or quick may
-    be of shape (R, C, 2) or (R, C, 1) as well. The readings that were taken must be the same at all
-    crossings of some rows with some columns.
+    of: the names of the n readings.
+
+    At near ends, the result has n = 4, and a reading that was not taken is NaN. A frame of mode
+    half or quick may also be given as (R, C, 2) or (R, C, 1). At all crossings of the rows with the
+    columns that were read, the same readings must have been taken.
     """
     readings = np.asarray(ratio, dtype=np.float64)
     of_near, width = is_near(of), readings.shape[-1] if readings.ndim else 0
@@ -198,7 +202,7 @@ def check_ratio(
 
 
 def _read_of_lines(ratio: Float) -> Bool:
-    """Which of the readings (R, C, n) must be there, if all that are NaN were not asked for."""
+    """Which of the readings (R, C, n) must be there: those of lines and names that were read."""
     is_read = ~np.isnan(ratio)
     rows, columns, kinds = (np.any(is_read, axis=axes) for axes in ((1, 2), (0, 2), (0, 1)))
     if not kinds.any():

@@ -16,21 +16,22 @@ r      (RC,)        residual (I_read - I(g)) / s                                
 J      (RC, RC)     -dr/dg in units of the scale of g                              1
 ====== ============ ============================================================== =========
 
-Without wires, each stripe is one node. So g is a network of R+C nodes, with RC unknowns and as many
-port resistances. Minimised is |r|^2, the chi-square of the readings, with g within its bounds. With
-d rho_p / d g_e = -v_pe^2 (Tellegen's theorem), the slopes are
+Without wires, each stripe is one node. So the cells are a network of R+C nodes, with RC unknowns
+and as many port resistances. Minimised is |r|^2, the chi-square of the readings, with g within its
+bounds. With d rho_p / d g_e = -v_pe^2 (Tellegen's theorem), the slopes are
 
     dI_p / dg_e = I_p^2 v_pe^2 .
 
 They are exact, and all of them follow from one inverse of size R+C. Steps are those of
 Levenberg-Marquardt, on the cells that no bound holds, scaled by max(g, 1e-7 S).
 
-I is far from linear in g: the reference resistors limit it. The port conductance G = 1 / rho is
-nearly linear in g. So far from the solution, r is the residual of G, carried over to the current,
+I is far from linear in g, because the reference resistors limit it. The port conductance
+G = 1 / rho is nearly linear in g. So far from the solution, the residual of G is used in place of
+r. As a current, and over s, it is
 
-    r (1 + G_read R_s) / (1 + G R_s) ,   R_s = R_top + R_bottom ,
+    r (1 + G_read R_s) / (1 + G R_s) ,   R_s = R_top + R_bottom .
 
-and a lone cell is solved in one step.
+With it, a skin of a single cell is solved in one step.
 
 Source: the network and its Jacobian are the resistance-matrix approach of Shu et al., IEEE Sensors
 Journal 15(1), 2015; the weights, bounds and standard deviations are ours.
@@ -49,28 +50,28 @@ from ohmskin.estimate.ohm import conductance_from_current, port_current
 from ohmskin.estimate.port_faults import MOST_CELLS_RATIO
 from ohmskin.estimate.port_readings import PortReadings
 
-# Most steps in a frame. Chosen: twice what the hardest frame of the reference takes; a frame that
-# does not converge must end, too.
+# Most steps in a frame: one that does not converge must end, too. Chosen: twice what the hardest
+# frame of the reference takes.
 MAX_ITERATIONS: Final = 40
 # Converged if an undamped step would lower the chi-square, summed over all ports, by less. Chosen:
 # no cell then moves by more than 1/100, the root of this, of its standard deviation.
 CHI2_TOLERANCE: Final = 1e-4
-# Steps are in shares of the conductance, or of this where it is less. Chosen: a tenth of a cell at
-# rest, so that one step can bring back an open cell.
+# The scale of a cell, in which its steps are counted, is its conductance, or this if that is less
+# [S]. Chosen: a tenth of a cell at rest, so that one step can bring back an open cell.
 SCALE_FLOOR_SIEMENS: Final = 1e-7
-# Precision that a prior adds to each cell, in shares of its scale. Chosen: a cell that the readings
-# say nothing of has a deviation of 1000 scales, and the system stays definite.
+# Precision that a prior adds to each cell [1 / scale^2], so that the system stays definite. Chosen:
+# a cell that the readings say nothing of has a deviation of 1000 scales.
 _RIDGE: Final = 1e-6
-# Above this chi-square per port, the residual of G is used, which leads near the minimum. Below, r
-# itself is used, which leads to it. Chosen: ten deviations of each port.
+# Above this chi-square per port, the residual of G is used, which leads near the minimum; below it,
+# r is used, which leads to the minimum itself. Chosen: ten deviations of each port.
 _FAR_CHI2: Final = 100.0
-# Damping up to this share of the diagonal leaves a step nearly that of Gauss-Newton. Chosen: such a
-# step may still tell that the fit has converged.
+# With damping up to this share of the diagonal, a step is nearly one of Gauss-Newton, and may tell
+# that the fit has converged. Chosen.
 _LIGHT_DAMPING: Final = 1e-3
-# A fit whose steps need more damping than this has failed. Chosen: such a step moves no number.
+# A fit whose steps need more damping than this has failed. Chosen: such a step is lost in rounding.
 _LARGEST_DAMPING: Final = 1e12
-# How often a step is solved, each time with those cells held that it took over a bound. Chosen:
-# what is not found in a few rounds is found by the next step.
+# A step is solved so often at most, each time with those cells held at their bound that would have
+# gone beyond it. Chosen: cells that a few rounds do not find are found by the next step.
 _BOUND_ROUNDS: Final = 5
 
 
@@ -99,8 +100,9 @@ def voltage_squared(impedance: Float, rows: int) -> Float:
 class MatrixEstimator(Estimator):
     """No wires, all cells at once. Starts from the previous frame, or from `ohm` if that is nearer.
 
-    It has converged if, within 40 iterations, no step lowers the chi-square by `CHI2_TOLERANCE`,
-    and the cells give the readings to `MOST_CELLS_RATIO`: neglected wires make a tenth of it.
+    A frame has converged if, within `MAX_ITERATIONS`, no step lowers the chi-square any more by
+    `CHI2_TOLERANCE`, and if the cells give the readings to within `MOST_CELLS_RATIO`. (That wires
+    are neglected makes a tenth of this.)
     Standard deviations are the roots of the diagonal of (J^T J)^-1 at the solution, also for a
     cell that ends on a bound. They are wider by the root of |r|^2 / RC where that exceeds 1.
     """
@@ -171,13 +173,13 @@ class CellFit:
         self._current_std = ports.current_std.ravel()
         self._ref_ohm, self._tolerance = ref_ohm, tolerance
         self._far_chi2 = _FAR_CHI2 * self._target.size
-        # 1 / (1 + G_read R_s), of a current that the most conductive cell allows.
+        # 1 / (1 + G_read R_s). A larger current than the most conductive cell allows is cut.
         feasible = np.minimum(self._target, port_current(MAX_CELL_SIEMENS, ref_ohm))
         self._target_share = 1.0 - feasible * ref_ohm
         self.iterations = 0
         afresh = conductance_from_current(ports.current, ref_ohm)
         trial = self._try(afresh if before is None else before)
-        # A scene that jumped is nearer to the plain estimate than to the frame before it.
+        # After a sudden change, the plain estimate is nearer than the frame before.
         if before is not None and trial.chi2 > self._far_chi2:
             trial = min(trial, self._try(afresh), key=lambda one: one.chi2)
         self._move_to(trial)
@@ -213,7 +215,7 @@ class CellFit:
         self._ridge = max(_RIDGE, 1e-14 * float(self._diagonal.max()))
 
     def _run(self) -> str:
-        """Minimise; returns why not converged, or an empty string."""
+        """Minimise. Returns why it did not converge, or an empty string."""
         damping = 0.0
         is_far = self.best.chi2 > self._far_chi2
         while self.iterations < MAX_ITERATIONS:
@@ -222,12 +224,13 @@ class CellFit:
             self.iterations += 1
             self._linearise()
             gradient = self._far_gradient if is_far else self._gradient
-            # Which cells a bound holds is worth finding out near the solution only.
+            # Only near the solution is it worth the time to find out which cells a bound holds.
             cell = self._stepped(gradient, damping, 1 if is_far else _BOUND_ROUNDS)
             if cell is not None:
-                # By so much the step lowers the chi-square, as far as it is quadratic.
+                # By so much the step would lower the chi-square if this were quadratic.
                 gain = float((cell - self.best.cell).ravel() / self._scale @ self._gradient)
-                # Where no cells explain the readings, rounding of a large chi-square counts.
+                # Where no cells explain the readings, the chi-square is large, and its rounding is
+                # larger than the tolerance.
                 tolerance = max(self._tolerance, 1e-9 * self.best.chi2)
                 if abs(gain) < tolerance and damping <= _LIGHT_DAMPING and not is_far:
                     return ""
@@ -264,7 +267,7 @@ class CellFit:
             system, target, free = normal, gradient, ~held
             if not free.any():
                 break
-            if held.any():  # what held cells have stepped explains a part of the target
+            if held.any():  # the steps of the held cells are a part of the solution
                 system = normal[np.ix_(free, free)]
                 target = gradient[free] - normal[np.ix_(free, held)] @ step[held]
             _, step[free], failed = lapack.dposv(system, target, lower=1)

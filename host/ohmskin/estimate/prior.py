@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is expected of a skin's resistances before a frame is read: of its cells, and of its wires.
 
-RC readings do not determine 3RC resistances; these numbers decide the rest. What frames say of the
-wires corrects what is believed of them (`wire_belief`).
+RC readings do not determine 3RC resistances; these numbers decide the rest. What is believed of the
+wires is corrected by what frames show of them (`wire_belief`).
 """
 
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ from ohmskin.arrays import Float
 
 # All numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
 # table "What each number earns" of docs/estimate.md says what came of it.
-# _STD and _LOG: a deviation and a difference of the log of a resistance, where 0.1 is about 10 %.
-# _STDS: a number of standard deviations.
+# Names that end in _STD and _LOG are a deviation and a difference of the log of a resistance, where
+# 0.1 is about 10 %. Names that end in _STDS are numbers of standard deviations.
 
 # Deviation of a cell from the level of all cells, while its rest readings are being fitted.
 UNTOUCHED_STD: Final = 1.0
@@ -50,8 +50,8 @@ UNKNOWN_WIRE_OHM: Final = 150.0
 UNKNOWN_LAYER_STD: Final = 0.7
 # Deviation that all segments share, of a layer whose nominal value is told: stretch, temperature.
 LAYER_STD: Final = 0.3
-# Deviation of each segment from what its layer shares, and of each lead from the mean lead, as a
-# share of that.
+# Deviation of each segment from the mean of its layer, and of each lead from the mean lead, as a
+# share of the mean.
 SEGMENT_STD: Final = 0.1
 # A lead that nobody has told: the switch of a CD74HC4067 at 5 V (data sheet: 70 typically, 160 at
 # most), and a crimp.
@@ -62,28 +62,30 @@ UNKNOWN_LEAD_STD_OHM: Final = 2000.0
 USUAL_LEAD_STD_OHM: Final = 150.0
 # Deviation that all leads share, if they are told, as a share of them.
 LEAD_STD: Final = 0.05
-# Share of what is known of the layers that fades before each lesson, because skins bend: where the
-# skin is still, and where it has just been bent.
+# Share of what is known of the layers that fades before each lesson, because skins bend: the first
+# for a skin that lies still, the second for a skin that has just been bent.
 STEADY_FADE: Final = 0.01
 AGILE_FADE: Final = 0.6
-# How likely it is, before any lesson, that a skin has just been bent.
+# Probability, before any lesson, that the skin has just been bent.
 AGILE_SHARE: Final = 0.5
-# Share of what lessons have told of this that is left after each further lesson.
+# Lessons tell which of the two fades fits better, by a score for each. At each further lesson, this
+# share of a score is kept.
 MEMORY: Final = 0.8
 
-# Steps of a fit, after which it gives up: it bounds the time of a frame.
+# A fit gives up after so many steps, so that the time of a frame is bounded.
 MAX_ITERATIONS: Final = 40
-# The step that moves no reading and no cell by more deviations is the last.
+# A step that moves no reading and no cell by more deviations is the last one.
 CLOSE_STDS: Final = 0.5
-# Chi-square per port, above which no resistances explain the readings.
+# With a larger chi-square per port, no resistances explain the readings.
 MAX_CHI2: Final = 1.5
-# The longest step of a fit, a factor of 4.5; a frame with a cell that differs by more is news.
+# No step of a fit moves a log resistance by more, which is a factor of 4.5. And a frame in which a
+# cell differs from the last lesson by as much may teach something new of the wires.
 MAX_STEP_LOG: Final = 1.5
-# Where errors are skewed, the deviation stated is the distance to the limit of so many deviations,
-# divided by as many.
+# Where errors are skewed, the limit of so many deviations is computed. The deviation that is stated
+# is the distance to this limit, divided by so many.
 REACH_STDS: Final = 2.0
-# The same of wires that nobody told and no frame has taught. Chosen: at 1 kOhm a segment, layers
-# are 2.7 of their deviations above the usual ones.
+# The same for deviations upwards, while nobody has told the wires and no frame has taught them.
+# Chosen: layers of 1 kOhm a segment are 2.7 of their deviations above `UNKNOWN_WIRE_OHM`.
 UNTOLD_REACH_STDS: Final = 3.0
 
 
@@ -91,13 +93,13 @@ UNTOLD_REACH_STDS: Final = 3.0
 class CellPrior:
     """Log resistance of the cells: normal near rest, heavy-tailed further away.
 
-    With d the distance from `expected` over `std`, -2 log p is d^2 up to d = 1, and goes on with
-    the same slope as 1 + log(d^2): the density falls as 1 / d, the same for all hardnesses of a
-    touch. Cells at rest are a quadratic problem, which costs no iterations; being touched is
-    unlikely, but how hard, once a cell is, costs little.
+    With d the distance from `expected` over `std`, -2 log p is d^2 up to d = 1. From there it goes
+    on as 1 + log(d^2), with the same slope at d = 1: the density falls slowly there, as 1 / d. For
+    cells at rest the problem is quadratic, and needs few steps. That a cell is touched is unlikely;
+    but once it is, a hard touch costs little more than a soft one.
 
-    The rest readings show a cell and its wires together. So what is expected of cells is right for
-    one value of the means of the wires (`wire_belief`); for others, it follows these.
+    The rest readings show a cell and its wires together. So `expected` is right for one value of
+    the means of the wires (`wire_belief`) alone; for other values, `about` corrects it.
 
     expected: log resistances at rest, (RC,) [log ohm].
     std: deviation of a cell that is not touched, (RC,).
@@ -111,7 +113,7 @@ class CellPrior:
     means: Float
 
     def about(self, means: Float) -> "CellPrior":
-        """The same for other means of the wires, (n,)."""
+        """This prior for other means of the wires, (n,)."""
         expected = self.expected + self.by_means @ (means - self.means)
         return CellPrior(expected, self.std, self.by_means, means)
 
@@ -130,8 +132,9 @@ class CellPrior:
     def is_soft(self, log_ohm: Float, shape: tuple[int, int]) -> bool:
         """Whether cells (RC,) rise as under soft fingertips: many of them, neighbours alike.
 
-        The difference of two numbers of correlation c has 2 (1 - c) times the variance of each. So
-        differences of neighbours that are smaller on average say that neighbours correlate by more.
+        If two numbers have the correlation c, the variance of their difference is 2 (1 - c) times
+        the variance of each. So if the differences of neighbours are smaller than this with c =
+        `SOFT_CORRELATION`, neighbours correlate by more.
         """
         if not self.is_crowded(log_ohm):
             return False
@@ -142,9 +145,9 @@ class CellPrior:
     def for_soft_touches(self) -> "CellPrior":
         """The prior under soft fingertips, where rest is no more likely than a touch.
 
-        Every cell is near the level at rest within a wide deviation. With the narrow one, a few
-        hard touches behind long wires seem more likely than many soft ones, because fewer cells
-        have to leave rest.
+        The deviation about rest is wide for every cell. With the narrow one, a few hard touches
+        behind long wires would seem more likely than many soft touches, because fewer cells have
+        to leave rest.
         """
         return replace(self, std=np.maximum(self.std, UNTOUCHED_STD))
 
@@ -166,7 +169,7 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
     """Conductance of untouched cells, all alike, from port currents per Vdd (R, C) [S].
 
     A port of R x C equal cells g, without wires, has (R + C - 1) / (R C g) ohm. Touches make every
-    port conduct more, most of all those of touched cells: this goes by the median port.
+    port conduct more, and most of all the ports of touched cells. So the median port is taken.
     """
     rows, columns = current_siemens.shape
     current = float(np.median(current_siemens))
@@ -178,9 +181,10 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
 class WireStds(NamedTuple):
     """How well the means of a skin's wires are known.
 
-    layer_std: standard deviation of the log of the layer that is known less.
-    lead_reach: standard deviation of the mean lead, over that which fits take it to have.
-    reach_stds: at the limit of so many deviations, wires decide what is stated upwards.
+    layer_std: standard deviation of the log of the mean segment, of the layer that is known less.
+    lead_reach: standard deviation of the mean lead, divided by the one with which frames are fitted
+        (under fingertips, fits expect usual leads).
+    reach_stds: how many deviations away the upper limit is.
     """
 
     layer_std: float
@@ -204,32 +208,33 @@ def siemens_std(
     wires: how well the means are known.
     series_ohm: leads and wires to the cell, and references.
 
-    What is normal is the error of the port current u = 1 / (r + series), not that of g = 1 / r. So
-    the limits of k deviations are found for u, and carried over to g: each deviation stated is the
-    distance to its limit over k. k is `REACH_STDS`, upwards `wires.reach_stds`. Behind much series
-    resistance the upper limit is far: there a cell may be anything that a touch makes of it.
+    The error of the port current I = 1 / (r + series) is normal, and that of g = 1 / r is not. So
+    the limits of k deviations are found for I, and carried over to g: each deviation stated is the
+    distance from g to its limit, divided by k. k is `wires.reach_stds` upwards, and `REACH_STDS`
+    downwards. Behind much series resistance the upper limit is far away: the cell may conduct as
+    much as the hardest touch.
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
-    # The cell conducts most if its wires resist most. Wires are normal in their log. So at this
-    # limit they are exp(k layer_std) - 1 above their mean, where the first order has k layer_std.
-    # The part that comes from them grows by that ratio. At the other limit
-    # they are off by less than k layer_std, so there the first order is enough.
-    # A lead may be larger than the fit takes it for, which widens the limit upwards alone: below 0
-    # it cannot be.
+    # The cell conducts most if its wires resist most. Wires are normal in their log. So at the
+    # upper limit they are exp(k layer_std) - 1 above their mean, where the first order has
+    # k layer_std. The part of the deviation that comes from wires grows by this ratio. At the lower
+    # limit, wires are off by less than k layer_std, so there the first order is enough.
+    # The mean lead may be larger than the fit expects, which widens the deviation upwards alone: a
+    # lead cannot be as much smaller, because none is below 0.
     reach = wires.reach_stds
     wider = np.expm1(reach * wires.layer_std) / (reach * wires.layer_std)
     more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_reach**2 - 1.0) * leads_log_std**2
     up_std = np.sqrt(log_std**2 + more)
-    # d log u = - r / (r + series) d log r. So at the limits the current is (1 +- off) u, and the
-    # whole resistance is (r + series) / (1 +- off). Less `series_ohm`, that is the cell's.
+    # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the
+    # whole resistance is (r + series) / (1 +- off). The cell's is this less `series_ohm`.
     off_per_std = cell_ohm / (cell_ohm + series_ohm)
     off_up = reach * up_std * off_per_std
     off_down = np.minimum(REACH_STDS * log_std * off_per_std, 1.0 - 1e-6)
     lowest_ohm = (cell_ohm - off_up * series_ohm) / (1.0 + off_up)
     highest_ohm = (cell_ohm + off_down * series_ohm) / (1.0 - off_down)
     highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
-    # The hardest touch may be so near that the distance to it is less than the cell's deviation, or
-    # below 0. The deviation to first order is the least that is stated.
+    # A cell may conduct nearly as much as the hardest touch, or more. Then the distance to the
+    # limit is too small, or below 0. So no less than the deviation to first order is stated.
     up = np.maximum(siemens * log_std, (highest - siemens) / reach)
     return np.asarray(up), np.asarray((siemens - 1.0 / highest_ohm) / REACH_STDS)

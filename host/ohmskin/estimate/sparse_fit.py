@@ -13,15 +13,16 @@ M      (RC, RC) voltage over cell e per current forced through cell f from outsi
 d      (k,)     what the touches add to the conductance of k cells                 S
 q      (k, RC)  current that the added conductance draws, per port current         1
 v      (RC, RC) voltage over cell e per current through port p, cells touched      ohm
-x      (k,)     log conductances of the k cells in the model, others are at rest   log S
+x      (k,)     log conductances of the k touched cells; all others are at rest    log S
 I      (RC,)    port currents per Vdd                                              S
-s      (RC,)    their noise: of the readings, of cells at rest and wires           S
+s      (RC,)    deviation of I by noise of readings, drift of cells at rest, wires S
 r      (RC,)    residual (I_read - I) / s, I_read the measured currents            1
 J      (k, RC)  dI / dx / s                                                        1
 A      (k, k)   J J^T and the precision of the prior of x                          1
-W      (m, n)   dI / dw / s P^1/2, w the logs of segments and leads, P their       1
-                covariance, at the m ports they matter to; n = 2RC + R+C + 3
-S      (m, m)   covariance of r at these ports with wires in it, 1 + W W^T         1
+W      (m, n)   dI / dw / s P^1/2 at the m ports where wires matter; w are the log 1
+                segments and the leads, P is their covariance. n = 2RC + R+C and
+                the number of means (`wire_belief`)
+S      (m, m)   covariance of r at these ports by noise and wires, 1 + W W^T       1
 ====== ======== ================================================================== ==========
 
 H, M and v are voltages per ampere, hence in ohms; in the code they are called `..._volt`.
@@ -30,15 +31,16 @@ The untouched skin is solved once. Added conductances are a change of rank k (Wo
 
     q = (diag(1/d) + M_kk)^-1 H_k ,   rho = rho0 - sum_k H_k q ,   v = H - M_k^T q ,
 
-over the touched cells v_k = q / d. All derivatives follow: d rho / d g_e = -v_e^2 (Tellegen). At
-far ends, where a port is driven and sensed at different ends, H, q and v of the sensed ends take
-the place of one factor of each product.
+and over the touched cells v_k = q / d. All derivatives follow from v: d rho / d g_e = -v_e^2
+(Tellegen). At far ends, a port is driven and sensed at different ends. There, one factor of each
+product is H, q or v of the sensed ends.
 
-A frame starts from no touched cells. Gauss-Newton steps on x minimise |r|^2 and the prior of the
-cells. Where a reading then shows more current than the model explains, the cells that would explain
-most in their row and column are added, until no reading asks for one; a cell that falls back to
-rest is taken out. In the last steps, wires may differ from what is believed by P, so the readings
-are weighed by S^-1.
+A frame starts without touched cells. Gauss-Newton steps on x minimise |r|^2 and the prior of the
+cells. Where a reading then shows more current than the model explains, it asks for its cell: of
+these cells, those that would explain most in their row and in their column are added. This goes on
+until no reading asks for a cell. A cell that falls back to rest is taken out. In the last steps,
+wires may differ from what is believed of them, with the covariance P. So the readings are weighed
+by S^-1 there.
 """
 
 from dataclasses import dataclass
@@ -71,12 +73,12 @@ NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 # All numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
 # table "What each number earns" of docs/estimate.md says what came of it.
 
-# Touches for each line, on average, that are still few; a fingertip covers more.
+# Touches are few if there are at most so many for each line, on average. A fingertip makes more.
 MAX_TOUCHES_PER_LINE: Final = 0.5
 # A reading that shows more current than the model by so many deviations asks for its cell.
 DEMAND_STDS: Final = 4.0
-# A cell that would have to add less than this share of the largest in its row, or of the largest in
-# its column, is a ghost of these.
+# A cell that asks counts as a ghost if it would add less conductance than this share of the largest
+# in its row, or of the largest in its column.
 RIVAL_SHARE: Final = 0.5
 # Wires matter to a reading if they may move it by more than this share of its noise.
 HEAVY_SHARE: Final = 0.1
@@ -84,9 +86,9 @@ _MAX_LOG_SIEMENS: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
 class RestNetwork(PortCircuit):
-    """rho0, H and M of cells (R, C) [S] that all conduct, and wires [ohm], one number a layer.
+    """rho0, H and M of a skin whose cells all conduct, and whose wires are alike in each layer.
 
-    cell_siemens: the cells, (RC,).
+    cell_siemens: conductances of the cells, (RC,) [S]; given as (R, C).
     port_volt, sense_volt: H by the driven and by the sensed ends of the ports, (cells, ports).
     cell_volt: M, (RC, RC).
     own_slope: -d rho / d g of each cell at its own port, (RC,) [ohm^2].
@@ -127,7 +129,8 @@ class RestNetwork(PortCircuit):
     def by_wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
         """d rho / dw of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC).
 
-        cell_current, sense_current: of a current through the driven ends, and the sensed ends.
+        cell_current, sense_current: the currents through the cells that a current of one makes
+            which flows through the driven ends, or through the sensed ends, of a port.
         """
         slopes = wire_current(cell_current.reshape(-1, *self.shape))
         if any(self.far):
@@ -164,9 +167,9 @@ class TouchedNetwork:
         self.port_ohm = rest.port_ohm - (sense_volt * self._drawn).sum(axis=0)
 
     def own_slope(self, cells: Cells) -> tuple[Float, Float]:
-        """-d rho / d g of some cells, each at its own port; and the diagonal of the touched M."""
+        """-d rho / d g of some cells, each at its own port, and their M[e, e], cells touched."""
         rest = self._rest
-        if not self._cells.size:  # most frames begin and end here: it saves a tenth of their time
+        if not self._cells.size:  # as in most frames: this saves a tenth of their time
             return rest.own_slope[cells], rest.cell_volt[cells, cells]
         coupling = rest.cell_volt[self._cells[:, None], cells]
         by_forced = solve_positive(self._system, coupling)  # q, of currents forced through cells
@@ -179,7 +182,7 @@ class TouchedNetwork:
         return volt * sense_volt, cell_volt
 
     def by_leaks(self, ports: Cells) -> Float:
-        """d rho / d leak of rows, and of columns, at each crossing, (m, 2) [ohm / S], of ports.
+        """Slopes of rho of m ports by the leaks of rows, and of columns, (m, 2) [ohm / S].
 
         The current that the touches draw lowers the voltage between neighbouring lines.
         """
@@ -196,7 +199,10 @@ class TouchedNetwork:
         return leak_slopes(volt, sensed, rest.shape)
 
     def cell_current(self, ports: Cells) -> tuple[Float, Float]:
-        """Currents through all cells per current through some ports, (m, RC): driven, sensed."""
+        """Currents through all cells per current through driven ends, and through sensed ends.
+
+        Both are of m ports, (m, RC).
+        """
         rest, cell_volt_of_touched = self._rest, self._rest.cell_volt[self._cells]
         siemens = rest.cell_siemens.copy()
         siemens[self._cells] += self._added
@@ -211,9 +217,9 @@ class TouchedNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """What a few touches explain: the answer of `touch`, with what a `FullFit` says as well.
+    """The answer of a few touches. It has the attributes of a `FullFit` that answers are made of.
 
-    cells: which are touched, (k,).
+    cells: the touched cells, (k,).
     log_cells: log resistances of all cells, (RC,) [log ohm].
     log_cells_std: their deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
@@ -221,7 +227,7 @@ class Touched:
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     lesson: what the readings say of the wires.
-    misfit: always 0, because readings that these touches do not explain get no answer here.
+    misfit: always 0: where few touches do not explain the readings, there is no `Touched`.
     """
 
     cells: Cells
@@ -243,15 +249,15 @@ def most_touches(shape: tuple[int, int]) -> float:
 class SparseFit:
     """Fits the frames of a skin (R, C), each by itself.
 
-    most: touches that are still few; with more, a frame is not for it.
-    least_log_siemens: log conductances from which cells are touched, (RC,).
-    series_ohm: references, and leads of a port: all that is in series with the skin [ohm].
-    net: the untouched skin.
-    untouched: the same as a touched skin without touches: each frame starts from it.
-    current: its port currents per Vdd, (RC,) [S].
-    model_variance: of these currents, by the drift of cells and the uncertainty of wires, (RC,)
-        [S^2].
-    path_ohm: wires and leads between each cell and its sensed ends, (RC,).
+    most: how many touches are still few. Frames with more have no answer here.
+    least_log_siemens: a cell counts as touched if its log conductance is above this, (RC,).
+    series_ohm: the references and the leads of a port, which are in series with the skin [ohm].
+    net: the network of the untouched skin.
+    untouched: the same as a `TouchedNetwork` without touches, from which each frame starts.
+    current: port currents of the untouched skin per Vdd, (RC,) [S].
+    model_variance: variance of these currents by the drift of cells and by what is not known of
+        wires, (RC,) [S^2].
+    path_ohm: wires and leads from each cell to the sensed ends of its lines, (RC,).
     path_std_ohm: standard deviation of path_ohm, (RC,).
     """
 
@@ -270,8 +276,9 @@ class SparseFit:
         self.untouched = TouchedNetwork(net, NO_CELLS, np.zeros(0))
         self.current = 1.0 / (net.port_ohm + self.series_ohm)
         siemens = net.cell_siemens[:, None]
-        # By the log of a resistance, the slope of I is I^2 times that of rho, but for the sign. For
-        # a cell that of rho is v v' g, for wires likewise (Tellegen).
+        # The slope of I by the log of a resistance is I^2 times the slope of rho, but for the sign.
+        # The slope of rho is v v' g for a cell, v' by the sensed ends, and likewise for a wire
+        # (Tellegen).
         by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
         currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
         by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
@@ -291,14 +298,14 @@ class SparseFit:
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""
         frame = FewTouches(self, ports)
-        # Never from the frame before: cells would stay in the model that no reading asks for.
+        # A frame never starts from the frame before it: cells that no reading asks for would stay.
         frame.converge(NO_CELLS, np.zeros(0))
         for _ in range(MAX_ITERATIONS):
             asked, added_siemens = frame.asked_for()
             if not asked.size:
                 return frame if frame.cells.size <= self.most else None
             cells = np.concatenate([frame.cells, asked])
-            # Twice as many may be in the model for a while: some are ghosts, and these leave again.
+            # Twice as many cells may be in the model for a while: ghosts among them leave again.
             if cells.size > 2 * self.most:
                 return None
             log_siemens = np.log(self.net.cell_siemens[asked] + added_siemens)
@@ -307,24 +314,25 @@ class SparseFit:
 
 
 class FewTouches:
-    """One frame: the cells in the model, and all that follows from them.
+    """One frame: the touched cells in its model, and all that follows from them.
 
-    cells: touched cells, (k,).
-    log_siemens: x, (k,).
+    cells: the touched cells, (k,).
+    log_siemens: x, their log conductances, (k,) [log S].
     steps: Gauss-Newton steps taken.
     """
 
     def __init__(self, skin: SparseFit, ports: PortReadings) -> None:
         self._skin = skin
         self._measured, self._reading_std = ports.current.ravel(), ports.current_std.ravel()
-        # s of ports whose own cell is at rest. At first it is approximate: cells at rest and wires
-        # move the currents as in an untouched skin. `explain` makes it anew for these touches.
+        # s of ports whose own cell is at rest. It is approximate at first: the drift of cells and
+        # the wires move the currents as if nothing were touched. `explain` makes it anew, for the
+        # touches that were found.
         self._untouched_std = np.sqrt(self._reading_std**2 + skin.model_variance)
         self._target_ohm = 1.0 / np.maximum(self._measured, 1e-12) - skin.series_ohm
         self.steps = 0
 
     def _place(self, cells: Cells, log_siemens: Float) -> None:
-        """Take these cells for the touched ones: network, currents, residual."""
+        """Take these cells for touched, and compute network, currents and residual."""
         skin = self._skin
         self.cells, self.log_siemens = cells, log_siemens
         self._siemens = np.exp(log_siemens)
@@ -337,7 +345,8 @@ class FewTouches:
 
     def _compare(self) -> None:
         """Compute s and r of the present model."""
-        # A touched cell explains its own port, so nothing but the readings has to be noise there.
+        # A touched cell can explain whatever its own port reads. So cells at rest and wires are no
+        # noise there: only the readings are.
         self._std = self._untouched_std.copy()
         self._std[self.cells] = self._reading_std[self.cells]
         self._residual = (self._measured - self._current) / self._std
@@ -345,10 +354,9 @@ class FewTouches:
     def converge(self, cells: Cells, log_siemens: Float) -> None:
         """Step from these cells until no step matters; cells that fall back to rest are taken out.
 
-        Conductances start at the least that counts as touched, or above: what a touch adds must be
-        above 0.
-        If steps still matter after `MAX_ITERATIONS`, it ends all the same: `asked_for` and
-        `explain` judge what there is.
+        Conductances start at the least that counts as touched, or above it, because a touch must
+        add more than 0. If steps still matter after `MAX_ITERATIONS`, they end all the same:
+        `asked_for` and `explain` judge what was reached.
         """
         self._place(cells, np.maximum(log_siemens, self._skin.least_log_siemens[cells]))
         for _ in range(MAX_ITERATIONS):
@@ -368,9 +376,9 @@ class FewTouches:
         return np.asarray(slopes * self._siemens[:, None] * (self._current**2 / self._std))
 
     def _stepped(self, system: Float, pull: Float) -> tuple[Float, bool]:
-        """x after a step, (k,), and whether that is the last that matters.
+        """x after a step, (k,), and whether no further step would matter.
 
-        system: J J^T, (k, k). It is written into: it becomes A, by the precision of the prior.
+        system: J J^T, (k, k). It is overwritten by A: the precision of the prior is added.
         pull: J r, (k,).
         """
         centre, variance = self._skin.prior.normal(-self.log_siemens, self.cells)
@@ -384,11 +392,12 @@ class FewTouches:
         return self.log_siemens + step, bool(is_last)
 
     def asked_for(self) -> tuple[Cells, Float]:
-        """Cells that readings ask for, and what each, alone, would have to add [S].
+        """Cells that readings ask for, and the conductance that each would have to add alone [S].
 
-        A current above the model's by `DEMAND_STDS` asks for its cell. Of these cells, one counts
-        if it would add at least `RIVAL_SHARE` of the largest in its row, and of the largest in its
-        column. A ghost would add less, as its current passes three touches in series.
+        A current above the model's by `DEMAND_STDS` asks for its cell. Such a cell counts if it
+        would add at least `RIVAL_SHARE` of what the largest in its row would add, and of the
+        largest in its column. A ghost would add less, because its current passes three touches in
+        series.
         """
         skin = self._skin
         asks = self._residual > DEMAND_STDS
@@ -397,11 +406,13 @@ class FewTouches:
         if not asked.size:
             return asked, np.zeros(0)
         slope, cell_volt = self._touched.own_slope(asked)
-        # A port cannot have less resistance than its wires. Wires may be shorter than believed, so
-        # half of them is allowed for. A reading that shows still less, by noise, is taken as that:
-        # it asks for a very hard touch, and not for one of negative resistance.
+        # A port has at least the resistance of its wires. They may resist less than is believed, so
+        # that half of it is taken for the least. Where noise makes a reading show still less, this
+        # least counts: the reading then asks for a very hard touch, and not for a touch of negative
+        # resistance.
         target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
-        # One cell more is a change of rank 1: rho - target = slope / (1 / d + M), solved for 1 / d.
+        # One cell more is a change of rank 1. It lowers rho to the target, and so
+        # rho - target = slope / (1 / d + M), which is solved for 1 / d.
         missing_ohm = np.maximum(self._touched.port_ohm[asked] - target_ohm, 1e-9)
         added_ohm = slope / missing_ohm - cell_volt
         added_siemens = 1.0 / np.maximum(added_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
@@ -419,12 +430,12 @@ class FewTouches:
         return log_cells
 
     def explain(self) -> Touched | None:
-        """The last steps, with wires known to their covariance only.
+        """Take the last steps, in which wires are uncertain by P, and return their answer.
 
-        None if the readings reject these touches. They do so at ports where wires matter (heavy) by
-        their chi-square. Elsewhere (light) they do so if a port draws less current than the model,
-        because no further touch makes it draw less. `find` has already judged light ports that draw
-        more: the strongest of them would have added its cell.
+        None: the readings reject these touches. Ports where wires matter (heavy) reject them by
+        their chi-square. Each other port (light) rejects them if it draws less current than the
+        model, because no further touch makes a port draw less. Light ports that draw more need no
+        test: the strongest of them would have added its cell in `find`.
         """
         if not self.cells.size:
             return self._nothing_touched()
@@ -435,12 +446,12 @@ class FewTouches:
         self._compare()
         residual_covariance = gram(wires, onto=np.eye(ports.size, order="F"))  # S
         factor = cholesky(residual_covariance)
-        # The network was solved with wires as they were believed then. `offset` is what newer ones
-        # change in these residuals, to first order.
+        # The network was solved with the mean wires that the prior is about. `offset` is how the
+        # means that are believed now change these residuals, to first order.
         belief = self._skin.belief
         by_mean_std = wires[:, -len(belief.means) :]
         offset = belief.moved_since(self._skin.prior.means, by_mean_std)
-        for _ in range(2):  # `converge` has led near, by steps without S
+        for _ in range(2):  # two steps are enough: `converge` has led near, without S
             slopes = self._slopes()
             residual = self._residual[ports] - offset
             heavy_slopes, light_slopes = slopes[:, ports], slopes[:, light]
@@ -459,16 +470,17 @@ class FewTouches:
             return None
         if self._residual[light].min(initial=0.0) < -DEMAND_STDS:
             return None
-        # The residual has the covariance S, and the noise of the readings in it 1. So S^-1 times
-        # the residual is the most probable noise. The rest comes from wires that differ from what
-        # is believed, and belongs to the model. So does `offset`, which `_current` does not have.
+        # The residual has the covariance S, of which the noise of the readings has 1. So S^-1 times
+        # the residual is the most probable noise. The rest of the residual comes from wires that
+        # differ from what is believed, and belongs to the model. `offset` belongs to it as well,
+        # and is not yet in `_current`.
         modelled = self._current.copy()
         modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
-        # By how much a mean that is one deviation off moves x: A^-1 J S^-1 W, of the means in W.
+        # A mean that is one deviation off moves x by its column of A^-1 J S^-1 W.
         by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, by_mean_std)
-        # The S of the lesson has the touches as noise without limit, because nobody knows how hard
-        # they are, and what leads differ by in so far as their mean is not known.
+        # The lesson has more in its S. Touches are noise of nearly any size, because nobody knows
+        # how hard they are. And leads differ by more if the mean lead is not known.
         by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
         odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
         noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
@@ -477,7 +489,7 @@ class FewTouches:
         return self._answer(covariance_of_cells, np.abs(by_means), modelled, lesson)
 
     def _nothing_touched(self) -> Touched | None:
-        """The answer if no cell is touched; None if a current is below an untouched skin's."""
+        """The answer if no cell is touched; None if a port draws less than in an untouched skin."""
         if self._residual.min() < -DEMAND_STDS:
             return None
         none = np.zeros((0, len(self._skin.belief.means)))
@@ -487,9 +499,10 @@ class FewTouches:
     def _answer(
         self, covariance: Float, by_means: Float, modelled: Float, lesson: Lesson
     ) -> Touched:
-        """covariance, and what a deviation of each mean moves: (k, k) and (k, n), of touched cells.
+        """The answer, in which cells at rest have the deviation of their prior.
 
-        Others have their prior's deviation.
+        covariance: of x, (k, k).
+        by_means: how far a mean that is one deviation off moves x, (k, number of means).
         """
         prior, cells = self._skin.prior, self.cells
         std, of_means = prior.std.copy(), np.zeros((modelled.size, by_means.shape[1]))
@@ -499,11 +512,11 @@ class FewTouches:
         return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, lesson)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
-        """Ports whose readings wires may move by more than a share of their noise, (RC,).
+        """At which ports wires may move the reading by more than `HEAVY_SHARE` of its noise, (RC,).
 
-        An error of path_ohm changes the current by I^2 times the error. What that is at rest, the
-        cells at rest have taken up; a touch lets more current through. The ports of touched cells
-        are always among them.
+        An error of path_ohm changes the current by I^2 times the error. At rest it changes nothing,
+        because the fit of the rest readings has put the error into the cells at rest. So only what
+        I^2 is above its value at rest counts. Wires always matter at the ports of touched cells.
         """
         skin = self._skin
         move = (self._current**2 - skin.current**2) * skin.path_std_ohm
@@ -512,9 +525,10 @@ class FewTouches:
         return heavy
 
     def _sharpened(self, ports: Cells) -> tuple[Float, Float]:
-        """s of all ports (RC,), at these ports by the touched network; and W at these ports.
+        """s of all ports (RC,), made anew at m of them; and W at these m ports.
 
-        At these ports, s has the drift of cells at rest alone: wires are in S.
+        At these ports, s has the noise of the readings and the drift of cells at rest as the
+        touched network shows it. It no longer has the wires, because these are in S.
         """
         skin, net = self._skin, self._skin.net
         currents, sensed = self._touched.cell_current(ports)
