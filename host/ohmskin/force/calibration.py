@@ -66,24 +66,25 @@ FORMAT: Final = "ohmskin calibration"
 # Version of the file's layout, which is described above; a file of another one is refused. Chosen:
 # the first layout counts as 1.
 SCHEMA: Final = 1
-# A larger file is not read. Chosen: `MAX_CELLS` cells of 13 fields take about 1 MB.
+# A larger file is not read. Chosen: `MAX_CELLS` cells with all fields take less than 1 MB.
 MAX_FILE_BYTES: Final = 4_000_000
-# No number of a file is larger. Chosen: far beyond any force, time or conductance in any unit, and
-# the slope of any power law in siemens; and sums of its square do not overflow.
+# No number of a file is larger. Chosen: it is far beyond any force, time or conductance in any
+# unit, and beyond the slope of any power law in siemens; yet sums of its square do not overflow.
 MAX_NUMBER: Final = 1e60
-# There are so many unit ids: the link has an integer for them.
+# There are so many unit ids: the link has an integer of a fixed size for them.
 UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
-# The fields of the file, by where their values are kept: in the calibration itself, with their
-# types; in its rests; in its `WireOhm`; in its model, of which some may be null.
+# The fields of the file, by where a `Calibration` keeps their values: in itself, with their types;
+# in its two rests; and in its model. (Those of its `WireOhm` are `WIRE_FIELDS`.)
 _OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str}
 _RESTS: Final = ("rest", "tare")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
+# Those of the model that may be null.
 _NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """The untouched skin, as a method sees it. Raises ValueError, naming the field, for bad values.
+    """The untouched skin, as a method reads it. Raises ValueError, naming the field, if it is bad.
 
     date: when it was read, ISO 8601.
     ratio: its readings, (R, C, 4) [1].
@@ -106,7 +107,7 @@ class Rest:
     @classmethod
     def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
         """What `method` makes of the rest readings in `knowledge`."""
-        # Noise may put the level of a cell that conducts nothing below 0, which no level is.
+        # By noise, a cell that conducts nothing may come out below 0, where no level can be.
         level = np.maximum(make_estimator(method, knowledge).rest_level(), 0.0)
         return cls(date, np.asarray(knowledge.rest_ratio), level)
 
@@ -122,9 +123,9 @@ class Calibration:
     method: the one that gave the levels, one of `LEVEL_METHODS`.
     rest: the untouched skin before the presses.
     model: the curve of every cell.
-    indenter_area_m2: what the skin was pressed with [m^2]; None: anything, since the total force
-        was measured.
-    nominal_wire_ohm: a wire segment of each layer.
+    indenter_area_m2: the area of what the skin was pressed with [m^2]; None: it was pressed with
+        anything, because the total force was measured.
+    nominal_wire_ohm: the wire segments of each layer, and the leads.
     tare: the untouched skin of a later date, which is used in place of `rest`; None: there is none.
     mode: which readings the scans hold, a name of the enum `mode`.
     geometry: where the cells are; None: nobody has said so.
@@ -179,7 +180,10 @@ class Calibration:
         return self.rest if self.tare is None else self.tare
 
     def check(self, board: Hello, *, force: bool = False) -> None:
-        """Raise ValueError unless this calibration is of this board's skin. force: of any unit."""
+        """Raise ValueError unless this calibration is of this board's skin.
+
+        force: the skin of another unit will do.
+        """
         if (board.rows, board.columns) != (self.rows, self.columns):
             sizes = f"{self.rows}x{self.columns} skin, the board scans {board.rows}x{board.columns}"
             raise ValueError(f"this calibration is of a {sizes}: calibrate this skin")
@@ -234,7 +238,7 @@ def load_calibration(path: PathName) -> Calibration:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON. Raises ValueError for a field that stands in it twice."""
+    """The fields of a JSON object as a dict. Raises ValueError for a field that stands twice."""
     content: dict[str, Any] = {}
     for name, value in pairs:
         if name in content:
@@ -312,12 +316,12 @@ def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         np.nan if cell is None and may_be_null else _value(name, cell, wanted)
         for cell in cells.flat
     ]
-    # Texts are cut: an array keeps as many characters for each cell as its longest text has.
+    # Texts are cut to 16 characters: numpy takes as much memory for each cell as for the longest.
     return np.array(values, dtype="U16" if wanted is str else wanted).reshape(shape)
 
 
 def _value(name: str, value: Any, wanted: type) -> Any:
-    """A value of JSON, if it is of this type; float: any number within `MAX_NUMBER`."""
+    """The value, if JSON has it as this type; as float, any number within `MAX_NUMBER`."""
     kind = type(value)
     if kind is not wanted and (kind, wanted) != (int, float):
         raise ValueError(f"{name} holds {kind.__name__}, not {wanted.__name__}")

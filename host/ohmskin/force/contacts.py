@@ -9,14 +9,15 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 
-# A contact moves by at most so many cells between two scans. Chosen: at 30 Hz, a finger at 0.5 m/s
-# passes over 1.7 cells of 1 cm. What is farther away is another contact.
+# A contact moves by at most so many cells between two scans; what is farther away is another one.
+# Chosen: at 30 Hz, a finger at 0.5 m/s passes over 1.7 cells of 1 cm.
 FARTHEST_CELLS: Final = 2.0
-# A contact that is gone for less time [us] stays the same. Chosen: a light touch flickers about its
-# threshold for some scans, and no finger comes back to a place within a tenth of a second.
+# A contact that is gone and comes back within this time keeps its number [us]. Chosen: a light
+# touch flickers about its threshold for some scans, and no finger leaves a place and comes back
+# within a tenth of a second.
 MEMORY_US: Final = 100_000
-# Contacts of the scan before are remembered for so long [us]: a board may scan once a second
-# (rate_mhz_min of frames.toml), and a scan may be lost.
+# Contacts that were in the scan before are remembered for this longer time [us]. Chosen: a board
+# may scan only once a second (rate_mhz_min of frames.toml), and one scan may be lost.
 SLOWEST_SCAN_US: Final = 20 * MEMORY_US
 # Which neighbours adjoin, for scipy: those along an edge or at a corner.
 _EIGHT_NEIGHBOURS: Final = np.ones((3, 3), dtype=np.int_)
@@ -30,8 +31,8 @@ class Contact:
     row, column: the centre, sum of F_e position_e / sum of F_e over the contact's cells e, in cell
         units; 0 is the centre of the first cell.
     force_n: sum of F_e [N].
-    force_n_std: sum of the cells' standard deviations [N]: they share wires, so that their errors
-        may all have one sign.
+    force_n_std: sum of the cells' standard deviations [N]. (Not the root of a sum of squares: the
+        cells share wires, so that their errors may all have one sign.)
     cells: which cells it covers, (R, C).
     position_m: the same centre in the frame of the skin's `Geometry` (3,) [m]; None: not known.
     normal: the mean of the cells' normals there (3,), of length 1; None: not known.
@@ -55,11 +56,12 @@ class Contact:
 
 
 class ContactTracker:
-    """Finds the contacts of each scan, and gives those that were there before the same numbers.
+    """Finds the contacts of each scan. A contact that was there before keeps its number.
 
     Contacts of two scans are matched so that the sum of the distances of their centres is least
-    (the assignment problem). A contact is never matched with one farther than `FARTHEST_CELLS`
-    away. A contact that is gone is remembered for `MEMORY_US`. Where two merge, one number ends.
+    (the assignment problem). A contact is never matched with one that is farther away than
+    `FARTHEST_CELLS`. A contact that is gone is remembered for `MEMORY_US`. Where two contacts
+    merge, one of the two numbers ends.
     """
 
     def __init__(self) -> None:
@@ -74,7 +76,7 @@ class ContactTracker:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
         for identity, (_, last_us) in list(self._remembered.items()):
             longest_us = SLOWEST_SCAN_US if last_us == self._before_us else MEMORY_US
-            # The time goes back where a board was reset.
+            # The board's time goes back when the board is reset: then nothing is remembered.
             if not 0 <= time_us - last_us <= longest_us:
                 del self._remembered[identity]
         self._before_us = time_us
@@ -96,7 +98,8 @@ def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
     centres, were = (np.array([(c.row, c.column) for c in contacts]) for contacts in (now, before))
     away = np.hypot(*(centres[:, None] - were[None]).transpose(2, 0, 1))
     too_far = away > FARTHEST_CELLS
-    # One pair too far apart costs more than all others together: as few as possible are made.
+    # A pair that is too far apart costs more than all others together. So as few of them as
+    # possible are made, and these are left out below.
     away[too_far] = FARTHEST_CELLS * (1 + sum(away.shape))
     pairs = zip(*linear_sum_assignment(away), strict=True)
     return {one: before[other].identity for one, other in pairs if not too_far[one, other]}

@@ -100,7 +100,7 @@ class ForceModel:
 
     @cached_property
     def is_power(self) -> Bool:
-        """Which cells have a power law, (R, C): texts take long to compare."""
+        """Which cells have a power law, (R, C). Kept, because texts take long to compare."""
         return np.asarray(self.kind == POWER)
 
     def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
@@ -123,9 +123,9 @@ class ForceModel:
         powered = above**self.exponent
         by_slope = np.where(self.is_power, powered, x) * self.slope_std
         by_exponent = self.slope * powered * logarithm * self.exponent_std
-        # J K J^T; the exponent of a linear cell has no error. The slope of a power law is that at
-        # 1 S, far from any press: where its error is large, so is that of the exponent, and the two
-        # nearly cancel. Rounding may then leave less than 0.
+        # J K J^T; the exponent of a linear cell has no error. The slope of a power law is the force
+        # at 1 S, far from any press. So where its error is large, the error of the exponent is
+        # large as well, and both nearly cancel. Then rounding may leave less than 0.
         by_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
         reported_n = self.slope * powered  # of a linear cell, b is 1
         scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
@@ -171,7 +171,7 @@ def force_by(curve: ForceModel | Curve, x: Float) -> Float:
 
 
 def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
-    """d of the module [N]: how far the force is off if x is off by dx."""
+    """d of the module's equations [N]: how far the force is off if x is off by dx."""
     here = force_by(curve, x)
     return np.maximum(force_by(curve, x + dx) - here, here - force_by(curve, x - dx))
 
@@ -179,7 +179,7 @@ def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
 def require(name: str, good: Bool, what: str) -> None:
     """Raise ValueError, naming the first cell, unless all are good, (R, C).
 
-    what: the text says that the cell is this.
+    what: the error says that the cell is this.
     """
     if not good.all():
         row, column = (int(index) for index in np.argwhere(~good)[0])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading follows the contacts: a region around them, and whole scans in between.
 
-A region of a few lines is read ten times as often as the whole skin. What it cannot show is a touch
-elsewhere, so whole scans come `WHOLE_HZ` times a second; and a touch that is new may be the ghost
-of others outside, so the scan after it is a whole one.
+A region of a few lines is read ten times as often as the whole skin. It does not show a touch that
+is elsewhere, so whole scans come in between, `WHOLE_HZ` times a second. And a new touch in a region
+may be the ghost of touches outside, so the scan after it is a whole one.
 """
 
 import threading
@@ -19,32 +19,36 @@ from ohmskin.files import Closing
 from ohmskin.link.device import Device, Region
 from ohmskin.link.messages import Scan
 
-# Whole scans come so often at least [Hz]. Chosen: a new touch is seen within a tenth of a second,
-# even if it comes just behind a whole scan; the scan, its way and its estimate included.
+# Whole scans come at least so often [Hz]. Chosen: a new touch is seen within a tenth of a second,
+# even if it comes just after a whole scan; this includes the time of the scan, of its way to the
+# host and of its estimate.
 WHOLE_HZ: Final = 18.0
-# Lines around the touched ones that are read, too. Chosen: a fingertip that moves by a line is
-# still inside when the next region is asked for.
+# So many lines on each side of the touched ones are read, too. Chosen: a fingertip that moves by a
+# line is still inside when the next region is asked for.
 MARGIN: Final = 1
-# A region that has so many lines more than it needs stays. Chosen: each command takes some
-# milliseconds, and a fingertip that trembles needs none.
+# A region stays while it has at most so many lines more than it needs. Chosen: a fingertip that
+# trembles needs no new region, and each command takes some milliseconds.
 SPARE: Final = 1
-# A region of more of the cells is no faster than all of them. Chosen.
+# If a region would have a larger share of the cells, the whole skin is read, which takes hardly
+# longer. Chosen.
 MOST_SHARE: Final = 0.6
-# How regions are read, unless told: as fast as is accurate (docs/accuracy.md).
+# How regions are read, unless told: as fast as they are still accurate (docs/accuracy.md).
 FOLLOWING: Final = Region(mode="quick", whole_mode="near")
-# What is asked for before a board has said how long scans take, and how often it is asked again.
+# Each so many-th scan is a whole one, until the board has said how long scans take.
 _FIRST_EVERY: Final = 20
+# A region is asked for at most so often: once more if the board's answer shows that whole scans
+# would come too often or too seldom.
 _TRIES: Final = 2
 
 
 class Lines(NamedTuple):
-    """Rows and columns of a region, first and behind the last of each."""
+    """Rows and columns of a region, as ranges of their numbers."""
 
     rows: range
     columns: range
 
     def holds(self, other: "Lines") -> bool:
-        """Whether all cells of the other one are in this one."""
+        """Whether all cells of the other region are in this one."""
         return all(
             mine.start <= others.start and others.stop <= mine.stop
             for mine, others in zip(self, other, strict=True)
@@ -74,9 +78,10 @@ class Focus(Closing):
         self._ask(None)
 
     def follow(self, touched: Bool, contacts: int, scan: Scan) -> None:
-        """After a scan that showed these cells (R, C) touched, and so many contacts.
+        """Tell what a scan has shown: touched cells (R, C), and so many contacts.
 
-        A command takes some milliseconds, in which scans wait.
+        If another region is needed, this gives a command to the board. It takes some milliseconds,
+        in which scans wait.
         """
         is_new, self._contacts = contacts > self._contacts, contacts
         lines = wanted_lines(touched, self._lines)
@@ -88,7 +93,7 @@ class Focus(Closing):
                 self._ask(lines)
 
     def close(self) -> None:
-        """Let the board scan as before. May be called again."""
+        """Let the board scan as it did before this focus. May be called again."""
         with self._lock, suppress(DeviceLost, CommandRefused):
             if not self._closed:
                 self._closed = True
@@ -110,7 +115,7 @@ class Focus(Closing):
                 break
 
     def _whole_every(self, cells: int) -> int:
-        """Each how many-th scan is a whole one, for a region of so many cells."""
+        """One in how many scans must be a whole one, for a region of so many cells."""
         if not self._cell_s:
             return _FIRST_EVERY
         return max(int((1 / WHOLE_HZ - self._whole_s) / (self._cell_s * cells)) + 1, 2)

@@ -11,10 +11,11 @@ n      (R, C, 3) unit normal there, out of the skin                             
 F      (R, C)    force normal to the skin; it pushes against n                   N
 ====== ========= =============================================================== ======
 
-In the calibration file, `Geometry.told` says it by kind:
+In the calibration file, `Geometry.told` says where the cells are, by kind:
 
 ``flat``      x = column * pitch_m[0], y = row * pitch_m[1], n along z
-``cylinder``  the same, bent: columns go round the axis y at radius_m, the first at (0, y, radius_m)
+``cylinder``  the same, bent: along a row, cells go round the axis y at radius_m, from
+              (0, y, radius_m)
 ``table``     position_m and normal of every cell
 """
 
@@ -29,7 +30,7 @@ from ohmskin.arrays import Float
 from ohmskin.files import PathName, naming, read_bounded
 from ohmskin.force.contacts import Contact
 
-# What the file says of each kind. A pitch is two numbers, a table has (R, C, 3) of them.
+# What the file says of each kind. A pitch is two numbers; a table has (R, C, 3) numbers of each.
 KINDS: Final = {
     "flat": ("pitch_m",),
     "cylinder": ("pitch_m", "radius_m"),
@@ -42,9 +43,10 @@ _FARTHEST_M: Final = 100.0
 _LEAST_RADIUS_M: Final = 1e-4
 # A frame's name has at most so many characters. Chosen: names of links in URDF files are shorter.
 _LONGEST_NAME: Final = 100
-# A file of taxels is not larger. Chosen: `MAX_CELLS` of them with their meshes' names.
+# A larger file of taxels is not read. Chosen: `MAX_CELLS` taxels with their meshes' names fit.
 _MAX_FILE_BYTES: Final = 1_000_000
-# A line of such a file. White space parts numbers, so that there is one way to read it.
+# A line of such a file. Numbers are separated by white space, so that a line matches in one way
+# alone, and no line makes the search slow.
 _SIX_NUMBERS: Final = r"\s*[-+.\deE]+" + r"\s+[-+.\deE]+" * 5 + r"\s*"
 
 
@@ -84,7 +86,7 @@ class Geometry:
         object.__setattr__(self, "normal", normal / length)
 
     def _cells(self) -> tuple[Float, Float]:
-        """p and n; these not yet of length 1."""
+        """p and n; the normals do not have the length 1 yet."""
         if self.kind == "table":
             return self.told["position_m"], self.told["normal"]
         across_m, along_m = self.told["pitch_m"]
@@ -121,7 +123,7 @@ class Geometry:
 
     @classmethod
     def of_file(cls, path: PathName, rows: int, columns: int, frame_id: str) -> Self:
-        """The geometry that a file says in the order of rows, as other robots' tools write it.
+        """The geometry in a file that lists the cells row by row, as other robots' tools write it.
 
         Lines ``x y z nx ny nz`` [m], one a taxel, as for iCub's skin (other lines are passed over);
         or URDF, whose ``<array>`` or ``<taxel idx= xyz= rpy=>`` are those of the package

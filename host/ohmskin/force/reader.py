@@ -4,8 +4,8 @@
     scan -> estimate (a method, told the untouched skin) -> forces (a calibration) -> contacts
 
 `SkinReader` reads one scan after the other in this way. `CalibratedSkin` is a device with such
-readers: one for `latest`, and one for each loop over its scans, because every way of reading sees
-other scans and so must follow contacts by itself.
+readers: one for `latest`, and one for each loop over its scans. They see different scans, so each
+of them must follow contacts by itself.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from ohmskin.link.protocol import MODES
 if TYPE_CHECKING:
     from ohmskin.record.recording import Tare
 
-# The method where neither a calibration nor the user says one: docs/accuracy.md compares them.
+# The method where neither a calibration nor the user names one: docs/accuracy.md compares methods.
 DEFAULT_METHOD: Final = "joint"
 # A tare is the mean of the scans of so many seconds [s], unless told. Chosen: the mean of 90 scans
 # has a tenth of the noise of one scan, and nobody has to wait for long.
 TARE_S: Final = 1.0
-# An error text names so many touched cells, and counts the others. Chosen: they fit into a line.
+# An error names so many touched cells, and counts the others. Chosen: so many fit into a line.
 _NAMED_CELLS: Final = 4
 
 
@@ -52,12 +52,12 @@ _NAMED_CELLS: Final = 4
 class ForceScan(Scan):
     """A scan, and what it shows.
 
-    force_n: normal force of each cell, (R, C) [N]; NaN where `ForceModel.predict` has none, and
+    force_n: normal force of each cell, (R, C) [N]; NaN where `ForceModel.predict` gives none, and
         everywhere without a calibration.
-    force_n_std: its standard deviation, (R, C) [N]; NaN where `predict` has none.
+    force_n_std: its standard deviation, (R, C) [N]; NaN where `predict` gives none.
     contacts: touched cells that adjoin. Without a calibration, their force is the rise of their
         conductance [S].
-    estimate: what all of this was read from. Its ``message`` says why readings cannot be
+    estimate: the estimate of which all this was made. Its ``message`` says why readings cannot be
         trusted.
     geometry: where the cells are; None: the calibration does not say it.
     """
@@ -102,15 +102,15 @@ class Untouched:
 class _SharedKnowledge:
     """What all readers of one skin know together, whatever way each of them reads its scans.
 
-    A tare that one reader takes must hold for all, and what one has learned of the wires must be
-    kept, whichever reader is asked.
+    A tare that one reader takes must hold for all of them. And `calibration` must have the wires
+    that were learned, whichever reader has learned them and whichever is asked.
 
-    board: the one that scans the skin.
+    board: the board that scans the skin.
     calibration: gives newtons; None: there is none.
     rests: the rest of the calibration, or None where there is no calibration; after it, one rest
         for each tare that was not undone. The last of them is the rest in force.
-    last_estimator: that of the reader that has read last. It has seen the most touches, and so
-        knows most of the wires.
+    last_estimator: the estimator of the reader that has read last. It is taken for the one that
+        has seen the most touches, and so knows most of the wires.
     """
 
     def __init__(self, board: Hello, calibration: Calibration | None, ref_log_std: float) -> None:
@@ -126,9 +126,9 @@ class _SharedKnowledge:
     def take_recorded(self, ratio: Float) -> None:
         """Take the tare that a played scan comes with, unless it was taken before.
 
-        It was, for most scans: all scans from one recorded tare to the next come with the same
-        array, and several readers may read them. Arrays are compared by identity, because another
-        tare may have equal numbers: whoever undoes a tare records the rest before it once more.
+        Most scans come with one that was: all scans from one recorded tare to the next have the
+        same array, and several readers may read them. Arrays are compared by identity, because
+        another tare may have equal numbers: undoing a tare records the rest before it once more.
         """
         with self._lock:
             if not any(ratio is recorded for recorded in self._recorded):
@@ -149,16 +149,17 @@ class _SharedKnowledge:
 class SkinReader:
     """Reads scan after scan of one skin: the same scans in the same order give the same forces.
 
-    board: the one that scans it.
-    calibration: gives newtons, as long as the method is its own.
+    board: the board that scans the skin.
+    calibration: gives newtons, as long as the method is that of the calibration.
     method: a name of `LEVEL_METHODS`; by default the calibration's, or `DEFAULT_METHOD`.
     force: take the calibration of another unit.
     ref_log_std: how well both references are known (`SkinKnowledge`). Newtons do not depend on it.
 
-    focus: is told what scans show, so that the board follows contacts; None: it does not.
+    The attribute `focus` may be set: it is told what scans show, so that the board follows the
+    contacts. None: the board does not follow them.
 
     The latest tare is the rest, whether `tare` took it or a played scan came with it
-    (`Scan.rest_ratio`). Scans are read by one thread; all else may be called from any thread.
+    (`Scan.rest_ratio`). Only one thread may read scans; all else may be called from any thread.
 
     :raises ValueError: no such method, or other cells, another mode or unit than were calibrated.
     """
@@ -182,7 +183,7 @@ class SkinReader:
 
     def another(self) -> SkinReader:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
-        other = copy(self)  # what is shared stays shared
+        other = copy(self)  # both have the same `_shared`
         other._begin()
         return other
 
@@ -225,10 +226,11 @@ class SkinReader:
         return replace(calibration, tare=None if rest is calibration.rest else rest)
 
     def warm_up(self) -> None:
-        """Read a made-up scan of the untouched skin, where it is known, by a reader that goes.
+        """Estimate a made-up scan of the untouched skin once, with a reader that is not kept.
 
-        A first estimate loads modules for most of a second. Scans would wait for it meanwhile, and
-        whoever reads every scan would be late for hundreds of them.
+        The first estimate takes most of a second, because it loads modules. Scans would wait
+        meanwhile, and a program that reads every scan would be late for hundreds of them. Without a
+        calibration nothing is done: no readings of the untouched skin are known.
         """
         board, calibration = self.board, self.calibration
         if calibration is not None:
@@ -237,19 +239,19 @@ class SkinReader:
             reader.read(Scan(codes, 0, 0, 0.0, 0, mode=board.mode))
 
     def use(self, method: str) -> None:
-        """Go on with another method, from the next scan on. Raises ValueError for no such."""
-        self._shared.estimator(method, self.rest)  # is made to raise here, and not at the scan
+        """Use another method from the next scan on. Raises ValueError if there is none so named."""
+        self._shared.estimator(method, self.rest)  # so that an error comes here, not at the scan
         self._wanted = method
 
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
         """Take these readings (R, C, 4) for the rest. Returns what a `Recorder` keeps.
 
-        force: even if cells seem touched: rest may have drifted.
+        force: take them even if cells seem touched, as where the rest has drifted.
 
         :raises TareRefused: something touches the skin.
         """
-        # A new estimator judges them: that of the scans begins each frame from the one before,
-        # which may show a touch.
+        # A new estimator judges the readings. The one that reads the scans would begin from the
+        # frame before, which may show a touch.
         touched = self._shared.estimator(self._wanted, self.rest).estimate(rest_ratio).touched
         if touched.any() and not force:
             remedy = "take everything off the skin, or force the tare if nothing is on it"
@@ -258,7 +260,7 @@ class SkinReader:
         return self._to_record(rest_ratio)
 
     def tare_by(self, device: Device, seconds: float = TARE_S, *, force: bool = False) -> Tare:
-        """`tare` with the mean of the device's coming scans, of so many seconds.
+        """`tare` with the mean of the scans of the device in the coming seconds.
 
         :raises TareRefused: something touches the skin.
         :raises DeviceLost: as `Device.mean_ratio`.
@@ -269,7 +271,9 @@ class SkinReader:
         return replace(self.tare(rest_ratio, force=force), host_time_s=device.now_s)
 
     def undo_tare(self) -> Tare | None:
-        """Return to the rest before the last tare. Returns that, for a `Recorder`, if it is known.
+        """Go back to the rest before the last tare. Returns this rest as a tare, for a `Recorder`.
+
+        None: the rest before the last tare is not known.
 
         :raises TareRefused: there is no tare.
         """
@@ -284,9 +288,9 @@ class SkinReader:
         return Tare.of(rest_ratio, self.board, time.monotonic())
 
     def check_mode(self, mode: str) -> None:
-        """Raise ValueError if the board scans now what the estimator does not take.
+        """Raise ValueError if the board now scans in a mode that the estimator cannot read.
 
-        Near ends are read in several modes, and a rest of one of them serves all.
+        Several modes read near ends. A rest of one of these is good for all of them.
         """
         if mode != self.board.mode and not is_near((*MODES[mode], *MODES[self.board.mode])):
             raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
@@ -296,7 +300,7 @@ class SkinReader:
         self.check_mode(scan.mode)
         if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
-        if self._made_for != (self._wanted, self.rest):  # rests are equal if they are the same one
+        if self._made_for != (self._wanted, self.rest):  # rests are compared by identity
             self._make()
         frame = self._estimator.estimate(scan.ratio, scan.reading_names)
         self._shared.last_estimator = self._estimator
@@ -304,7 +308,7 @@ class SkinReader:
         at_rest = np.median(frame.level) if self._rest_level is None else self._rest_level
         rise = np.asarray(frame.level - at_rest)
         force_n = force_n_std = np.full(rise.shape, np.nan)
-        # Without newtons, contacts are summed and centred by what there is: the rise.
+        # Without newtons, the rise takes the place of the force in sums and centres of contacts.
         of_contacts = np.maximum(rise, 0.0), frame.level_std
         calibration, geometry = self._shared.calibration, None
         if calibration is not None and self.has_forces:
@@ -337,18 +341,22 @@ class SkinReader:
         self._estimator = self._shared.estimator(method, rest)
         self._rest_level: Float | None = None  # (R, C) [S; 1 for `voltage`]; None: unknown
         if isinstance(rest, Rest) and self.has_forces:
-            self._rest_level = rest.level  # as it was when the curves were learned above it
-        elif rest is not None:  # what this method makes of it; noise may put that below 0
+            self._rest_level = rest.level  # the same level that the curves were learned above
+        elif rest is not None:  # what this method makes of the rest, which may be below 0 by noise
             self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
 
 
 class CalibratedSkin(Closing):
     """A device whose scans carry forces, and which can be tared. Made by ``ohmskin.open``.
 
-    device: the board or recording alone, with all its commands. force: take the calibration of
-    another unit. focus: scans follow the contacts while somebody iterates (`focus`); a `Region`
-    says how the region is read. Iterating and `latest` are those of `Device`, with forces. Where
-    another unit comes behind the same line, they end by DeviceLost.
+    device: the board or recording alone, with all its commands.
+    calibration: gives the forces.
+    force: take it even if it is of another unit.
+    focus: scans follow the contacts while somebody iterates (`focus`); a `Region` says how the
+        region is read.
+
+    Iterating and `latest` are as those of `Device`, with forces. If another unit is plugged in at
+    the same port, they raise DeviceLost.
 
     :raises ValueError: the calibration is of another unit or geometry.
     """
@@ -419,7 +427,7 @@ class CalibratedSkin(Closing):
         return self._reader.tare_by(self.device, seconds, force=force)
 
     def undo_tare(self) -> Tare:
-        """Return to the rest before the last tare. Returns that, for a `Recorder`.
+        """Go back to the rest before the last tare. Returns this rest as a tare, for a `Recorder`.
 
         :raises TareRefused: there is no tare.
         """

@@ -35,9 +35,10 @@ _TARE_SCANS: Final = 90
 class SimulatedSkin:
     """The skin of a calibration, pressed by whatever forces a program says.
 
-    calibration: its curves, its rest, its wires, and where it says nothing of these, those of
-    emulated skins. noise_lsb: of the converter, before rounding [LSB]. seed: of the noise, and of
-    the wires, which scatter by 10 % about what the calibration says.
+    calibration: its curves, rest and wires are those of the skin; where it does not know the wires,
+        they are those of emulated skins.
+    noise_lsb: standard deviation of the converter's noise, before rounding [LSB].
+    seed: of the noise, and of the wires, which scatter by 10 % about what the calibration says.
 
     >>> skin = SimulatedSkin(ohmskin.load_calibration("skin.json"))
     >>> skin.step(force_n, time_s=0.01).force_n.shape

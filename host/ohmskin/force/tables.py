@@ -41,7 +41,8 @@ FORMATS: Final = (*OF_READINGS, ".parquet")
 _OF_SCAN: Final = ("number", "missed", "time_ns")
 _OF_CELLS: Final = ("force_n", "force_n_std")
 _OF_CONTACT: Final = ("row", "column", "force_n", "force_n_std")
-# Scans of a group of rows in a .parquet. Chosen: programs read whole groups; 1 MB of 8x8.
+# A group of rows in a .parquet has so many scans. Chosen: programs read whole groups, and these are
+# 1 MB of an 8x8 skin.
 _GROUP_SCANS: Final = 2048
 
 
@@ -50,7 +51,7 @@ def load_forces(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of the module's table, of the scans from `begin_s` to `end_s` [s after the first].
 
-    0 is to the last. An hour of 8x8 at 90 Hz takes 200 MB: `export` keeps less in memory.
+    end_s = 0: to the last scan. An hour of 8x8 at 90 Hz takes 200 MB; `export` needs less memory.
 
     :raises RecordingError: the recording cannot be read.
     :raises ValueError: the calibration is of another unit, size or mode.
@@ -69,8 +70,10 @@ def export(
 ) -> Part:
     """Write what `load_forces` gives to `out`, complete or not at all: one of `FORMATS`.
 
-    calibration: None: readings (`ohmskin.record.export`), as .npz or .csv. watch: is told how many
-    bytes of the recording were read. Returns what was written.
+    calibration: None: readings are written (`ohmskin.record.export`), as .npz or .csv.
+    watch: is told how many bytes of the recording were read.
+
+    Returns what was written.
 
     :raises RecordingError: as `load_forces`; they are too many for a readings file.
     :raises ValueError: as `load_forces`; an unknown format, or `out` cannot be written.
